@@ -1,0 +1,40 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: demo test prove lint docs clean
+
+demo: $(READY)
+	$(BIN)/curate demo
+
+test: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+prove: $(READY)
+	$(BIN)/python -m pytest -m slow
+
+lint: $(READY)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy curate db pipelines
+
+docs: $(READY)
+	$(BIN)/python -m pipelines.reference
+
+clean:
+	rm -rf $(VENV) demo
+
+# The CPU build of torch is taken where the index offers one and no GPU is in sight; the constraint
+# accepts either build of the same version.
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "curate needs Python 3.11 or newer; name one: make PYTHON=python3.12 ..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	@command -v nvidia-smi >/dev/null 2>&1 \
+		|| $(BIN)/pip install -q -c constraints.txt torch==2.13.0+cpu 2>/dev/null \
+		|| echo "The index offers no CPU build of torch; installing the general one."
+	$(BIN)/pip install -q -c constraints.txt -e '.[test,lint]'
+	@$(BIN)/python -c 'from curate.datasets.open3d_loader import load; load()'
+	@touch $@

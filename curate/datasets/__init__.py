@@ -1,0 +1,1 @@
+"""Readers of LiDAR-camera data sets, one file each."""

@@ -1,0 +1,37 @@
+"""What every data set offers."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from curate.detections import Annotations
+from curate.frames import Frame, FrameFiles
+
+
+class Dataset(Protocol):
+    """LiDAR-camera frames by name.
+
+    Every method that reads a file raises `DataError` with the file, the place in it and the remedy
+    where it is missing, damaged or malformed.
+    """
+
+    name: str
+
+    def frame_ids(self) -> tuple[str, ...]:
+        """All frames, in sorted order."""
+        ...
+
+    def splits(self) -> Mapping[str, tuple[str, ...]]:
+        """The named lists of frames that the data set ships (KITTI's ImageSets); may be empty."""
+        ...
+
+    def files(self, frame_id: str) -> FrameFiles:
+        """Where the frame's files lie; does not open them."""
+        ...
+
+    def read(self, frame_id: str, *, image: bool = False) -> Frame:
+        """The frame's points and calibration, and its image where asked for."""
+        ...
+
+    def annotations(self, frame_id: str) -> Annotations:
+        """The frame's ground truth."""
+        ...

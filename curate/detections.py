@@ -1,0 +1,100 @@
+"""Boxes with scores and categories: what a detector answers, and what annotators wrote.
+
+`boxes` is (n, 7) float64 everywhere: x, y, z of the box centre, length, width, height in metres,
+and yaw in radians, counter-clockwise from the x axis in (-pi, pi], all in the LiDAR frame.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+CATEGORIES = ("Car", "Pedestrian", "Cyclist")
+
+
+def empty_boxes() -> np.ndarray:
+    """(0, 7) float64."""
+    return np.zeros((0, 7))
+
+
+def as_categories(names: Sequence[str] | np.ndarray) -> np.ndarray:
+    """Category names as an (n,) array of str that also holds for n = 0."""
+    return np.asarray(names, dtype=np.str_).reshape(-1)
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What a detector answers for one frame.
+
+    Attributes:
+        boxes: (n, 7) in the LiDAR frame.
+        scores: (n,) float64 in [0, 1].
+        categories: (n,) str.
+    """
+
+    boxes: np.ndarray
+    scores: np.ndarray
+    categories: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def select(self, index: np.ndarray) -> Self:
+        """The detections at `index` (integers or a mask), in that order."""
+        return type(self)(self.boxes[index], self.scores[index], self.categories[index])
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No detections."""
+        return cls(empty_boxes(), np.zeros(0), as_categories([]))
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """The ground truth of one frame, in the LiDAR frame.
+
+    DontCare regions have category "DontCare", a 2D box, and NaN in `boxes`.
+
+    Attributes:
+        boxes: (n, 7) in the LiDAR frame.
+        categories: (n,) str.
+        truncated: (n,) float64, share of the object outside the image, 0 to 1.
+        occluded: (n,) int64, KITTI's levels 0 to 3.
+        alpha: (n,) float64, observation angle in radians.
+        boxes_2d: (n, 4) float64 left, top, right, bottom in pixels.
+    """
+
+    boxes: np.ndarray
+    categories: np.ndarray
+    truncated: np.ndarray
+    occluded: np.ndarray
+    alpha: np.ndarray
+    boxes_2d: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def select(self, index: np.ndarray) -> Self:
+        """The annotations at `index` (integers or a mask), in that order."""
+        return type(self)(
+            self.boxes[index],
+            self.categories[index],
+            self.truncated[index],
+            self.occluded[index],
+            self.alpha[index],
+            self.boxes_2d[index],
+        )
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No annotations."""
+        nothing = np.zeros(0)
+        return cls(
+            empty_boxes(),
+            as_categories([]),
+            nothing,
+            nothing.astype(np.int64),
+            nothing,
+            np.zeros((0, 4)),
+        )

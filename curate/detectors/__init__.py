@@ -1,0 +1,1 @@
+"""3D detectors, one file each."""

@@ -1,0 +1,61 @@
+"""Every error that curate raises on purpose, each with its exit code.
+
+CurateError (1)
+├── ConfigError (2)      a setting or an argument is wrong
+├── DataError (3)        a file of a data set is missing, damaged or malformed
+├── ModelError (4)       a detector or segmenter cannot be used as it is
+├── LeakageError (5)     ground truth would reach a place where it must not be
+├── WorkspaceError (6)   a workspace or a stage's input is not there
+├── DatabaseError (7)    the database refuses, is damaged, or is of another version
+└── FramesFailed (8)     the command ended, but some frames failed; they are recorded
+
+Each message is one line: what is wrong, in which file and where, what to do.
+"""
+
+
+class CurateError(Exception):
+    """Root of the tree; `exit_code` is the exit status of the command that raised it."""
+
+    exit_code = 1
+
+
+class ConfigError(CurateError):
+    """A setting or an argument is wrong."""
+
+    exit_code = 2
+
+
+class DataError(CurateError):
+    """A file of a data set is missing, damaged or malformed."""
+
+    exit_code = 3
+
+
+class ModelError(CurateError):
+    """A detector or segmenter cannot be used as it is."""
+
+    exit_code = 4
+
+
+class LeakageError(CurateError):
+    """Ground truth would reach a place where it must not be."""
+
+    exit_code = 5
+
+
+class WorkspaceError(CurateError):
+    """A workspace, or the input of a stage, is not there."""
+
+    exit_code = 6
+
+
+class DatabaseError(CurateError):
+    """The database refuses, is damaged, or is of another version."""
+
+    exit_code = 7
+
+
+class FramesFailed(CurateError):  # noqa: N818 - it reports frames, it is not itself a fault
+    """The command ended, but some frames failed; each is recorded with its error."""
+
+    exit_code = 8

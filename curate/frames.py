@@ -1,0 +1,62 @@
+"""What the sensors saw: one LiDAR sweep, one image, and the calibration between them.
+
+Frames of reference: LiDAR is x forward, y left, z up, metres; the rectified camera is x right,
+y down, z forward, metres; the image is in pixels from the top left corner.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where the LiDAR and the camera stand to each other.
+
+    Attributes:
+        projection: (3, 4) rectified camera frame to image pixels (KITTI's P2).
+        lidar_to_camera: (4, 4) LiDAR frame to rectified camera frame (KITTI's R0_rect * Tr).
+    """
+
+    projection: np.ndarray
+    lidar_to_camera: np.ndarray
+
+    @property
+    def lidar_to_image(self) -> np.ndarray:
+        """(3, 4) LiDAR frame to homogeneous image pixels."""
+        return self.projection @ self.lidar_to_camera
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One LiDAR-camera frame.
+
+    Attributes:
+        frame_id: name of the frame within its data set, e.g. "000008".
+        points: (n, 4) float32, x, y, z in metres in the LiDAR frame and intensity in [0, 1].
+        calibration: see `Calibration`.
+        image_size: (width, height) in pixels.
+        image: (height, width, 3) uint8 RGB, or None where the reader was told to leave it out.
+    """
+
+    frame_id: str
+    points: np.ndarray
+    calibration: Calibration
+    image_size: tuple[int, int]
+    image: np.ndarray | None = None
+
+    def with_points(self, points: np.ndarray) -> Self:
+        """The same frame with other points."""
+        return replace(self, points=points)
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """Where a frame's files lie; `label` is None where the frame has no label file."""
+
+    points: Path
+    image: Path
+    calibration: Path
+    label: Path | None

@@ -1,0 +1,1 @@
+"""Boxes, their overlap, projection into the image, and the similarity transform."""

@@ -1,0 +1,72 @@
+"""The augmentation A of the method: flip, rotation about z and uniform scale, and its inverse."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+
+def wrap_angle(angle_rad: np.ndarray) -> np.ndarray:
+    """Angles in radians, wrapped to (-pi, pi]."""
+    return -(np.mod(-np.asarray(angle_rad) + np.pi, 2 * np.pi) - np.pi)
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """A(x): first y := -y if `flip_y`, then a rotation about z, then all coordinates times `scale`.
+
+    Attributes:
+        flip_y: mirror over the x axis.
+        rotation_rad: counter-clockwise about z, radians.
+        scale: uniform, > 0.
+    """
+
+    flip_y: bool = False
+    rotation_rad: float = 0.0
+    scale: float = 1.0
+
+    @classmethod
+    def draw(
+        cls,
+        generator: np.random.Generator,
+        *,
+        flip_probability: float = 0.5,
+        rotation_limit_rad: float = np.pi / 4,
+        scale_range: tuple[float, float] = (0.95, 1.05),
+    ) -> Self:
+        """A random similarity, uniform in rotation and scale."""
+        return cls(
+            bool(generator.random() < flip_probability),
+            float(generator.uniform(-rotation_limit_rad, rotation_limit_rad)),
+            float(generator.uniform(*scale_range)),
+        )
+
+    def apply_to_points(self, points: np.ndarray) -> np.ndarray:
+        """A of (n, >=3) points; columns after the third are kept. Same dtype."""
+        moved = points.copy()
+        moved[:, :3] = points[:, :3] @ self._matrix().T.astype(points.dtype)
+        return moved
+
+    def apply_to_boxes(self, boxes: np.ndarray) -> np.ndarray:
+        """A of (n, 7) boxes."""
+        moved = np.array(boxes, dtype=np.float64)
+        moved[:, :3] = moved[:, :3] @ self._matrix().T
+        moved[:, 3:6] *= self.scale
+        yaw = -moved[:, 6] if self.flip_y else moved[:, 6]
+        moved[:, 6] = wrap_angle(yaw + self.rotation_rad)
+        return moved
+
+    def invert_boxes(self, boxes: np.ndarray) -> np.ndarray:
+        """A^-1 of (n, 7) boxes."""
+        moved = np.array(boxes, dtype=np.float64)
+        moved[:, :3] = moved[:, :3] @ self._matrix() / self.scale**2
+        moved[:, 3:6] /= self.scale
+        yaw = moved[:, 6] - self.rotation_rad
+        moved[:, 6] = wrap_angle(-yaw if self.flip_y else yaw)
+        return moved
+
+    def _matrix(self) -> np.ndarray:
+        """(3, 3) with A(p) = matrix @ p; its inverse is its transpose over scale squared."""
+        cos, sin = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
+        mirror = -1.0 if self.flip_y else 1.0
+        return self.scale * np.array([[cos, -sin * mirror, 0], [sin, cos * mirror, 0], [0, 0, 1]])

@@ -1,0 +1,1 @@
+"""Priors: independent evidence for a label, one file each."""

@@ -1,0 +1,1 @@
+"""Sources of semantic maps, one file each."""

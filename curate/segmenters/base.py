@@ -1,0 +1,33 @@
+"""What every segmenter offers."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from curate.frames import Frame
+
+
+@dataclass(frozen=True)
+class SemanticMap:
+    """The semantic class of every pixel of a frame's image.
+
+    Attributes:
+        class_ids: (height, width) uint8.
+        category_classes: the class ids that count as pixels of a category, e.g. Cyclist = bicycle
+            and person.
+    """
+
+    class_ids: np.ndarray
+    category_classes: Mapping[str, tuple[int, ...]]
+
+
+class Segmenter(Protocol):
+    """Names the semantic class of every pixel; raises `ModelError` or `DataError`."""
+
+    needs_image: bool
+
+    def segment(self, frame: Frame) -> SemanticMap:
+        """The frame's semantic map, in the size of its image."""
+        ...

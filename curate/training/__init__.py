@@ -1,0 +1,1 @@
+"""Training a detector from weighted labels."""

@@ -1,0 +1,1 @@
+"""Policies that turn evidence into weights, one file each."""

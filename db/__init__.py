@@ -1,0 +1,1 @@
+"""The memory of curate: tables, sessions, bulk reading and writing, migrations."""

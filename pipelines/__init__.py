@@ -1,0 +1,1 @@
+"""The order of work: stages, the runner, configuration and the command line."""
