@@ -1,0 +1,220 @@
+"""The KITTI object data set, or any data in its layout.
+
+Source: Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the readme of its
+object development kit. Two layouts are read: ROOT/training/{velodyne,image_2,calib,label_2} and the
+flat ROOT/{velodyne,image_2,calib,label_2}; label_2 and ROOT/ImageSets/*.txt are optional.
+"""
+
+import logging
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from curate.atomic import replace_file
+from curate.datasets.images import read_image, read_image_size
+from curate.datasets.kitti_labels import read_objects, to_annotations
+from curate.detections import Annotations
+from curate.errors import DataError
+from curate.frames import Calibration, Frame, FrameFiles
+
+_log = logging.getLogger(__name__)
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+POINT_BYTES = 16  # x, y, z, intensity, float32 each
+CALIBRATION_SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
+
+
+class KittiDataset:
+    """A `Dataset` in KITTI's layout; its frames are the ones that have a velodyne file.
+
+    Args:
+        root: the folder that holds training/, or velodyne/ itself.
+
+    Raises:
+        DataError: neither is there.
+    """
+
+    name = "kitti"
+
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root)
+        homes = [self.root / "training", self.root]
+        home = next((home for home in homes if (home / "velodyne").is_dir()), None)
+        if home is None:
+            raise DataError(
+                f"{self.root}: holds neither training/velodyne nor velodyne; "
+                "name the root of a data set in KITTI's layout"
+            )
+        self._home = home
+
+    def frame_ids(self) -> tuple[str, ...]:
+        """All frames with a velodyne file, in sorted order."""
+        return self._frame_ids
+
+    @cached_property
+    def _frame_ids(self) -> tuple[str, ...]:
+        return tuple(sorted(path.stem for path in (self._home / "velodyne").glob("*.bin")))
+
+    def splits(self) -> Mapping[str, tuple[str, ...]]:
+        """The lists of ROOT/ImageSets, by file name; they may name frames that are not there.
+
+        KITTI's own test.txt names frames of ROOT/testing, which have the same numbers as other
+        frames of ROOT/training. It is therefore left out where ROOT/testing exists or where
+        ROOT/training is read.
+
+        Raises:
+            DataError: a list names something that is no frame id.
+        """
+        lists = {path.stem: path for path in sorted((self.root / "ImageSets").glob("*.txt"))}
+        if self._home != self.root and lists.pop("test", None):
+            _log.info("%s: ImageSets/test.txt is of testing/ and is left out", self.root)
+        return {name: _read_frame_list(path) for name, path in lists.items()}
+
+    def files(self, frame_id: str) -> FrameFiles:
+        """Where the frame's files lie; `label` is None where there is no label file.
+
+        Raises:
+            DataError: the name would lead out of the data set.
+        """
+        _check_frame_id(frame_id)
+        images = [self._home / "image_2" / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
+        label = self._home / "label_2" / f"{frame_id}.txt"
+        return FrameFiles(
+            points=self._home / "velodyne" / f"{frame_id}.bin",
+            image=next((image for image in images if image.exists()), images[0]),
+            calibration=self._home / "calib" / f"{frame_id}.txt",
+            label=label if label.exists() else None,
+        )
+
+    def read(self, frame_id: str, *, image: bool = False) -> Frame:
+        """The frame's points and calibration, and its image where asked for.
+
+        Raises:
+            DataError: a file is missing, damaged or malformed.
+        """
+        files = self.files(frame_id)
+        points = read_points(files.points)
+        calibration = read_calibration(files.calibration)
+        if not image:
+            return Frame(frame_id, points, calibration, read_image_size(files.image))
+        pixels = read_image(files.image)
+        height, width = pixels.shape[:2]
+        return Frame(frame_id, points, calibration, (width, height), pixels)
+
+    def annotations(self, frame_id: str) -> Annotations:
+        """The frame's ground truth in the LiDAR frame, DontCare regions included.
+
+        Raises:
+            DataError: there is no label file, or it is malformed.
+        """
+        files = self.files(frame_id)
+        if files.label is None:
+            raise DataError(f"{self._home / 'label_2' / frame_id}.txt: no such label file")
+        return to_annotations(read_objects(files.label), read_calibration(files.calibration))
+
+
+def read_points(path: Path) -> np.ndarray:
+    """The (n, 4) float32 points of a velodyne file: x, y, z in metres, intensity. May be empty.
+
+    Raises:
+        DataError: the file is missing or truncated, or holds NaN or infinite numbers.
+    """
+    content = _read_bytes(path, "velodyne")
+    if len(content) % POINT_BYTES:
+        raise DataError(
+            f"{path}: {len(content)} bytes are no multiple of {POINT_BYTES} "
+            "(x, y, z, intensity as float32); the file is truncated, fetch it again"
+        )
+    points = np.frombuffer(bytearray(content), dtype="<f4").reshape(-1, 4)
+    finite = np.isfinite(points)
+    if not finite.all():
+        bad = np.flatnonzero(~finite.all(axis=1))
+        raise DataError(
+            f"{path}: {len(bad)} of {len(points)} points are NaN or infinite, "
+            f"the first is point {bad[0]}; remove them from the file"
+        )
+    return points
+
+
+def read_calibration(path: Path) -> Calibration:
+    """The calibration of the left colour camera (P2, R0_rect, Tr_velo_to_cam).
+
+    Raises:
+        DataError: the file is missing, or one of the three is missing, has a wrong number of
+            entries, or is not finite.
+    """
+    matrices: dict[str, np.ndarray] = {}
+    text = _read_bytes(path, "calibration").decode("utf-8", errors="replace")
+    for number, line in enumerate(text.splitlines(), start=1):
+        key, _, entries = line.partition(":")
+        if key in CALIBRATION_SHAPES:
+            matrices[key] = _parse_matrix(entries, CALIBRATION_SHAPES[key], f"{path}:{number}")
+    missing = [key for key in CALIBRATION_SHAPES if key not in matrices]
+    if missing:
+        raise DataError(f"{path}: no line {' and no line '.join(f'{key}:' for key in missing)}")
+    rectify, extrinsic = np.eye(4), np.eye(4)
+    rectify[:3, :3] = matrices["R0_rect"]
+    extrinsic[:3] = matrices["Tr_velo_to_cam"]
+    lidar_to_camera = rectify @ extrinsic
+    if abs(np.linalg.det(lidar_to_camera)) < 1e-6:
+        raise DataError(f"{path}: R0_rect times Tr_velo_to_cam cannot be inverted")
+    return Calibration(matrices["P2"], lidar_to_camera)
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Writes a calibration file that `read_calibration` reads back exactly.
+
+    The whole way from the LiDAR to the rectified camera is in Tr_velo_to_cam, R0_rect is the
+    identity. P0, P1 and P3 repeat P2, for readers that take lines by number.
+    """
+    matrices = dict.fromkeys(("P0", "P1", "P2", "P3"), calibration.projection)
+    matrices["R0_rect"] = np.eye(3)
+    matrices["Tr_velo_to_cam"] = calibration.lidar_to_camera[:3]
+    matrices["Tr_imu_to_velo"] = np.eye(4)[:3]
+    lines = [
+        f"{key}: {' '.join(f'{entry:.16e}' for entry in matrix.ravel())}\n"
+        for key, matrix in matrices.items()
+    ]
+    replace_file(path, "".join(lines).encode())
+
+
+def _parse_matrix(entries: str, shape: tuple[int, int], place: str) -> np.ndarray:
+    try:
+        numbers = np.array([float(entry) for entry in entries.split()])
+    except ValueError as error:
+        raise DataError(f"{place}: {error}; a calibration line holds only numbers") from None
+    if len(numbers) != shape[0] * shape[1]:
+        raise DataError(f"{place}: {len(numbers)} numbers, expected {shape[0]} x {shape[1]}")
+    if not np.isfinite(numbers).all():
+        raise DataError(f"{place}: holds NaN or infinite numbers")
+    return numbers.reshape(shape)
+
+
+def _read_frame_list(path: Path) -> tuple[str, ...]:
+    names: list[str] = []
+    text = _read_bytes(path, "frame list").decode("utf-8", errors="replace")
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip():
+            try:
+                _check_frame_id(line.strip())
+            except DataError as error:
+                raise DataError(f"{path}:{number}: {error}") from None
+            names.append(line.strip())
+    return tuple(names)
+
+
+def _check_frame_id(frame_id: str) -> None:
+    """DataError where the id could lead out of the data set's folders."""
+    if not frame_id or frame_id.startswith(".") or {"/", "\\", "\0"} & set(frame_id):
+        raise DataError(f"{frame_id!r} is no frame id: it must be a plain file name such as 000008")
+
+
+def _read_bytes(path: Path, kind: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such {kind} file") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from error

@@ -1,0 +1,255 @@
+"""Compiled kernels on rotated rectangles: their overlap, and all that is decided by it.
+
+The common area is Green's theorem on the edges of the larger rectangle in the frame of the smaller:
+the integral of y dx along each edge, with y clamped to the smaller rectangle's width and x to its
+length. Nothing is divided by a difference that can vanish, so touching, nested and nearly parallel
+rectangles need no special care; exactly aligned ones are products of their common sides, so that a
+box has an overlap of exactly 1 with itself.
+
+All kernels stay in this one file: numba's cache on disk watches the file of a kernel only, so that
+a kernel elsewhere would go on using an old copy of the functions here.
+"""
+
+import numpy as np
+from numba import njit
+
+# Angles closer than this to a multiple of 90 degrees are rounding (yaw + pi, wrapped, for
+# example); the area changes by less than 1e-12 of the product of the sides.
+_ALIGNED_SINE = 1e-12
+
+# Columns of the table that `rectangle_table` makes of boxes.
+_X, _Y, _Z, _HALF_LENGTH, _HALF_WIDTH, _HALF_HEIGHT, _COS, _SIN, _RADIUS, _AREA = range(10)
+
+
+@njit(cache=True, nogil=True)
+def rectangle_table(boxes: np.ndarray) -> np.ndarray:
+    """(n, 10) what the other kernels need of (n, 7) boxes, computed once per box.
+
+    A box with a side that is not positive gets an area of 0: it overlaps nothing.
+    """
+    table = np.empty((len(boxes), 10))
+    for i in range(len(boxes)):
+        length, width, height = boxes[i, 3], boxes[i, 4], boxes[i, 5]
+        table[i, _X], table[i, _Y], table[i, _Z] = boxes[i, 0], boxes[i, 1], boxes[i, 2]
+        table[i, _HALF_LENGTH], table[i, _HALF_WIDTH] = length / 2, width / 2
+        table[i, _HALF_HEIGHT] = height / 2
+        table[i, _COS], table[i, _SIN] = np.cos(boxes[i, 6]), np.sin(boxes[i, 6])
+        table[i, _RADIUS] = np.hypot(length, width) / 2
+        table[i, _AREA] = length * width if length > 0 and width > 0 else 0.0
+    return table
+
+
+@njit(cache=True, nogil=True)
+def _common_length(offset: float, half_a: float, half_b: float) -> float:
+    """Length that two intervals share; b's centre lies at `offset` from a's."""
+    return max(0.0, min(half_a, offset + half_b) - max(-half_a, offset - half_b))
+
+
+@njit(cache=True, nogil=True)
+def _edge_integral(
+    x0: float, y0: float, x1: float, y1: float, half_x: float, half_y: float
+) -> float:
+    """Integral of y dx along an edge, y clamped to +-half_y and x to +-half_x."""
+    start = min(max(x0, -half_x), half_x)
+    end = min(max(x1, -half_x), half_x)
+    if start == end:
+        return 0.0
+    slope = (y1 - y0) / (x1 - x0)
+    y_start = y0 + slope * (start - x0)
+    y_end = y1 + slope * (end - x1)
+    low, high = min(y_start, y_end), max(y_start, y_end)
+    if low >= -half_y and high <= half_y:
+        return (end - start) * (low + high) / 2
+    if high <= -half_y:
+        return -half_y * (end - start)
+    if low >= half_y:
+        return half_y * (end - start)
+    inner_low, inner_high = max(low, -half_y), min(high, half_y)
+    inner = (inner_high - inner_low) * (inner_low + inner_high) / 2
+    outer = half_y * ((high - inner_high) - (inner_low - low))
+    return (end - start) * (inner + outer) / (high - low)
+
+
+@njit(cache=True, nogil=True)
+def _precedes(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
+    """Whether row i of `a` is the frame of reference; the same for (a, b) and (b, a)."""
+    if a[i, _AREA] != b[j, _AREA]:
+        return bool(a[i, _AREA] < b[j, _AREA])
+    for column in range(_RADIUS):
+        if a[i, column] != b[j, column]:
+            return bool(a[i, column] < b[j, column])
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _area_in_frame_of(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
+    """Common area of rectangles a[i] and b[j], computed in the frame of a[i]."""
+    half_x, half_y = a[i, _HALF_LENGTH], a[i, _HALF_WIDTH]
+    away_x, away_y = b[j, _X] - a[i, _X], b[j, _Y] - a[i, _Y]
+    x = a[i, _COS] * away_x + a[i, _SIN] * away_y
+    y = a[i, _COS] * away_y - a[i, _SIN] * away_x
+    cos = a[i, _COS] * b[j, _COS] + a[i, _SIN] * b[j, _SIN]
+    sin = a[i, _COS] * b[j, _SIN] - a[i, _SIN] * b[j, _COS]
+    length, width = b[j, _HALF_LENGTH], b[j, _HALF_WIDTH]
+    if abs(sin) < _ALIGNED_SINE:
+        return _common_length(x, half_x, length) * _common_length(y, half_y, width)
+    if abs(cos) < _ALIGNED_SINE:
+        return _common_length(x, half_x, width) * _common_length(y, half_y, length)
+    forward_x, forward_y = cos * length, sin * length
+    left_x, left_y = -sin * width, cos * width
+    x0, y0 = x + forward_x + left_x, y + forward_y + left_y
+    x1, y1 = x - forward_x + left_x, y - forward_y + left_y
+    x2, y2 = x - forward_x - left_x, y - forward_y - left_y
+    x3, y3 = x + forward_x - left_x, y + forward_y - left_y
+    # Counter-clockwise, the area is minus the integral.
+    return -(
+        _edge_integral(x0, y0, x1, y1, half_x, half_y)
+        + _edge_integral(x1, y1, x2, y2, half_x, half_y)
+        + _edge_integral(x2, y2, x3, y3, half_x, half_y)
+        + _edge_integral(x3, y3, x0, y0, half_x, half_y)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _common_area(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
+    """Common area of rectangles a[i] and b[j]; 0 where a side is not positive or not finite."""
+    reach = a[i, _RADIUS] + b[j, _RADIUS]
+    away_x, away_y = b[j, _X] - a[i, _X], b[j, _Y] - a[i, _Y]
+    smaller = min(a[i, _AREA], b[j, _AREA])
+    if not (away_x * away_x + away_y * away_y < reach * reach and smaller > 0):
+        return 0.0
+    if _precedes(a, i, b, j):
+        area = _area_in_frame_of(a, i, b, j)
+    else:
+        area = _area_in_frame_of(b, j, a, i)
+    return min(max(area, 0.0), smaller)
+
+
+@njit(cache=True, nogil=True)
+def _bev_iou(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
+    """Intersection over union of the footprints a[i] and b[j]."""
+    common = _common_area(a, i, b, j)
+    if common == 0:
+        return 0.0
+    return common / (a[i, _AREA] + b[j, _AREA] - common)
+
+
+@njit(cache=True, nogil=True)
+def _iou_3d(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
+    """Intersection over union of the cuboids a[i] and b[j]."""
+    height_a, height_b = 2 * a[i, _HALF_HEIGHT], 2 * b[j, _HALF_HEIGHT]
+    if not (height_a > 0 and height_b > 0):
+        return 0.0
+    offset = b[j, _Z] - a[i, _Z]
+    shared = _common_length(offset, a[i, _HALF_HEIGHT], b[j, _HALF_HEIGHT])
+    shared = min(shared, height_a, height_b)
+    common = shared * _common_area(a, i, b, j) if shared > 0 else 0.0
+    if common == 0:
+        return 0.0
+    return common / (a[i, _AREA] * height_a + b[j, _AREA] * height_b - common)
+
+
+@njit(cache=True, nogil=True)
+def iou_matrix(a: np.ndarray, b: np.ndarray, with_height: bool) -> np.ndarray:  # noqa: FBT001
+    """(n, m) IoU of the rectangle tables a and b, of cuboids or of footprints.
+
+    Only pairs whose x ranges can meet are looked at: b is visited in the order of x.
+    """
+    matrix = np.zeros((len(a), len(b)))
+    order = np.argsort(b[:, _X])
+    sorted_x = b[order, _X]
+    largest_radius = 0.0
+    for j in range(len(b)):
+        largest_radius = max(largest_radius, b[j, _RADIUS])
+    for i in range(len(a)):
+        reach = a[i, _RADIUS] + largest_radius
+        first = np.searchsorted(sorted_x, a[i, _X] - reach)
+        for position in range(first, len(b)):
+            if sorted_x[position] > a[i, _X] + reach:
+                break
+            j = order[position]
+            matrix[i, j] = _iou_3d(a, i, b, j) if with_height else _bev_iou(a, i, b, j)
+    return matrix
+
+
+@njit(cache=True, nogil=True)
+def grouped_iou(
+    a: np.ndarray, starts_a: np.ndarray, b: np.ndarray, starts_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs that overlap in bird's eye view, group by group.
+
+    Args:
+        a: (n, 10) rectangle table; group g is rows starts_a[g] to starts_a[g + 1].
+        starts_a: (groups + 1,) int64.
+        b: (m, 10) rectangle table, grouped alike by `starts_b`.
+        starts_b: (groups + 1,) int64.
+
+    Returns:
+        Row in a, row in b, BEV IoU and 3D IoU of each pair, ascending by (row in a, row in b).
+    """
+    rows_a, rows_b = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    bev, volumes = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
+    for group in range(len(starts_a) - 1):
+        for i in range(starts_a[group], starts_a[group + 1]):
+            for j in range(starts_b[group], starts_b[group + 1]):
+                overlap = _bev_iou(a, i, b, j)
+                if overlap > 0:
+                    rows_a.append(i)
+                    rows_b.append(j)
+                    bev.append(overlap)
+                    volumes.append(_iou_3d(a, i, b, j))
+    return np.array(rows_a), np.array(rows_b), np.array(bev), np.array(volumes)
+
+
+@njit(cache=True, nogil=True)
+def _cell(value: float, low: float, cell: float, count: int) -> int:
+    """Index of the grid cell of a coordinate; the last cells take what lies outside."""
+    position = (value - low) / cell
+    if not position > 0:  # NaN too
+        return 0
+    return min(int(min(position, 1e9)), count - 1)
+
+
+@njit(cache=True, nogil=True)
+def greedy_nms(table: np.ndarray, order: np.ndarray, iou_threshold: float) -> np.ndarray:
+    """Greedy non-maximum suppression on BEV IoU.
+
+    Each box is compared with the kept boxes of its own and the eight neighbouring cells of a grid
+    whose cells are as wide as the largest box.
+
+    Args:
+        table: (n, 10) rectangle table.
+        order: (n,) int64, the rows from the best to the worst.
+        iou_threshold: a box goes when its IoU with a kept box is above this.
+
+    Returns:
+        (k,) int64 kept rows, in `order`.
+    """
+    low_x, low_y, high_x, high_y, cell = np.inf, np.inf, -np.inf, -np.inf, 1e-6
+    for i in range(len(table)):
+        low_x, high_x = min(low_x, table[i, _X]), max(high_x, table[i, _X])
+        low_y, high_y = min(low_y, table[i, _Y]), max(high_y, table[i, _Y])
+        cell = max(cell, 2 * table[i, _RADIUS])
+    cell = max(cell, (high_x - low_x) / 256, (high_y - low_y) / 256)
+    count_x = _cell(high_x, low_x, cell, 258) + 1
+    count_y = _cell(high_y, low_y, cell, 258) + 1
+    newest = np.full((count_x, count_y), -1)
+    older = np.full(len(table), -1)
+    kept = np.empty(len(table), np.int64)
+    number = 0
+    for i in order:
+        cell_x = _cell(table[i, _X], low_x, cell, count_x)
+        cell_y = _cell(table[i, _Y], low_y, cell, count_y)
+        suppressed = False
+        for near_x in range(max(cell_x - 1, 0), min(cell_x + 2, count_x)):
+            for near_y in range(max(cell_y - 1, 0), min(cell_y + 2, count_y)):
+                j = newest[near_x, near_y]
+                while j >= 0 and not suppressed:
+                    suppressed = _bev_iou(table, i, table, j) > iou_threshold
+                    j = older[j]
+        if not suppressed:
+            older[i] = newest[cell_x, cell_y]
+            newest[cell_x, cell_y] = i
+            kept[number] = i
+            number += 1
+    return kept[:number]

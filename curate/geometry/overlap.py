@@ -1,0 +1,44 @@
+"""Intersection over union of rotated boxes: of their footprints, and of their volumes.
+
+Exact up to rounding; a box and its copy, also one turned by half a turn, give exactly 1, and
+the order of the two arguments never matters. A box with a side that is zero, negative or not finite
+overlaps nothing, itself included.
+"""
+
+import numpy as np
+
+from curate.geometry.boxes import as_boxes
+from curate.geometry.kernels import grouped_iou, iou_matrix, rectangle_table
+
+
+def bev_iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+    """(n, m) bird's eye view IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
+    return iou_matrix(_table(boxes_a), _table(boxes_b), False)
+
+
+def iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+    """(n, m) volume IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
+    return iou_matrix(_table(boxes_a), _table(boxes_b), True)
+
+
+def overlapping_pairs(
+    boxes_a: np.ndarray, starts_a: np.ndarray, boxes_b: np.ndarray, starts_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """All pairs with a BEV IoU above 0 within groups of boxes, such as the frames of a split.
+
+    Args:
+        boxes_a: (n, 7); group g is the rows starts_a[g] to starts_a[g + 1].
+        starts_a: (groups + 1,) integers, from 0 to n.
+        boxes_b: (m, 7), grouped alike by `starts_b`.
+        starts_b: (groups + 1,) integers, from 0 to m.
+
+    Returns:
+        Row in a, row in b, BEV IoU and 3D IoU of each pair, ascending by (row in a, row in b).
+    """
+    groups_a = np.ascontiguousarray(starts_a, dtype=np.int64)
+    groups_b = np.ascontiguousarray(starts_b, dtype=np.int64)
+    return grouped_iou(_table(boxes_a), groups_a, _table(boxes_b), groups_b)
+
+
+def _table(boxes: np.ndarray) -> np.ndarray:
+    return rectangle_table(as_boxes(boxes))

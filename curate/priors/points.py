@@ -1,0 +1,187 @@
+"""The point prior rho_diff (Eq. 8): a box with few LiDAR points in it is hard to be sure of.
+
+Source: An et al., Remote Sensing 15(3):627, 2023.
+"""
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+
+from curate.detections import Annotations, Detections
+from curate.errors import ConfigError
+from curate.frames import Frame
+from curate.geometry.points_in_boxes import count_points_in_boxes
+
+logger = logging.getLogger(__name__)
+
+Statistic = Literal["median", "mean", "quantile", "fixed"]
+
+
+@dataclass(frozen=True)
+class PointSettings:
+    """How m_th(c) follows from the ground truth of category c in X_l.
+
+    Attributes:
+        statistic: of the point counts of c's ground-truth boxes; "fixed" uses `fixed` and looks at
+            none of them.
+        quantile: for "quantile", in [0, 1].
+        fixed: for "fixed", in points.
+        fallback: m_th of a category without ground truth in X_l, in points.
+    """
+
+    statistic: Statistic = "median"
+    quantile: float = 0.5
+    fixed: float = 5.0
+    fallback: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for a setting without meaning."""
+        if self.statistic not in get_args(Statistic):
+            known = ", ".join(get_args(Statistic))
+            raise ConfigError(
+                f"point prior: unknown statistic {self.statistic!r}; choose one of {known}"
+            )
+        if not 0 <= self.quantile <= 1:
+            raise ConfigError(f"point prior: quantile must be in [0, 1], not {self.quantile}")
+        if not (self.fixed >= 1 and self.fallback >= 1):
+            raise ConfigError("point prior: fixed and fallback must be at least 1 point")
+
+
+@dataclass(frozen=True)
+class PointThresholds:
+    """What was learned from X_l.
+
+    Attributes:
+        values: m_th per category, in points, at least 1.
+        ground_truths: number of ground-truth boxes per category that it was learned from.
+        fallbacks: the categories that had none and got the fallback.
+    """
+
+    values: Mapping[str, float]
+    ground_truths: Mapping[str, int]
+    fallbacks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PointEvidence:
+    """The point prior's columns for n labels.
+
+    Attributes:
+        points: (n,) int64 m, LiDAR points inside the box.
+        points_threshold: (n,) m_th of the label's category.
+        rho_diff: (n,) min(m, m_th) / m_th.
+    """
+
+    points: np.ndarray
+    points_threshold: np.ndarray
+    rho_diff: np.ndarray
+
+    @property
+    def rho(self) -> np.ndarray:
+        """(n,) rho_diff."""
+        return self.rho_diff
+
+
+_DEFAULT = PointSettings()
+
+
+def points_threshold(
+    counts_per_ground_truth: np.ndarray, settings: PointSettings = _DEFAULT
+) -> float:
+    """m_th of one category, at least 1 so that a box without a point is never trusted.
+
+    Args:
+        counts_per_ground_truth: (g,) LiDAR points inside each ground-truth box of the category.
+        settings: which statistic; its fallback is the answer for g = 0.
+    """
+    if settings.statistic == "fixed":
+        return float(settings.fixed)
+    if len(counts_per_ground_truth) == 0:
+        return float(settings.fallback)
+    if settings.statistic == "mean":
+        value = np.mean(counts_per_ground_truth)
+    else:
+        share = 0.5 if settings.statistic == "median" else settings.quantile
+        value = np.quantile(counts_per_ground_truth, share)
+    return max(float(value), 1.0)
+
+
+def learn_thresholds(
+    samples: Iterable[tuple[Frame, Annotations]],
+    categories: Sequence[str],
+    settings: PointSettings = _DEFAULT,
+) -> PointThresholds:
+    """m_th of each category from labeled frames; warns for a category without ground truth.
+
+    Args:
+        samples: the frames of X_l, never of X_u, with their ground truth. Their points must be
+            cropped, or not, as those of the frames that will be scored.
+        categories: which categories need a threshold.
+        settings: see `PointSettings`.
+    """
+    counts: dict[str, list[np.ndarray]] = {category: [] for category in categories}
+    for frame, annotations in samples:
+        wanted = annotations.select(np.isin(annotations.categories, list(categories)))
+        inside = count_points_in_boxes(frame.points, wanted.boxes)
+        for category, found in counts.items():
+            found.append(inside[wanted.categories == category])
+    merged = {c: np.concatenate([np.zeros(0), *found]) for c, found in counts.items()}
+    missing = [] if settings.statistic == "fixed" else [c for c, m in merged.items() if not len(m)]
+    for category in missing:
+        logger.warning(
+            "point prior: no ground truth of %s in the labeled frames; its threshold is the "
+            "fallback of %g points",
+            category,
+            settings.fallback,
+        )
+    return PointThresholds(
+        values={c: points_threshold(m, settings) for c, m in merged.items()},
+        ground_truths={c: len(m) for c, m in merged.items()},
+        fallbacks=tuple(missing),
+    )
+
+
+@dataclass(frozen=True)
+class PointPrior:
+    """rho_diff = min(m, m_th(c)) / m_th(c).
+
+    Attributes:
+        thresholds: m_th per category, in points; `PointThresholds.values`.
+    """
+
+    thresholds: Mapping[str, float]
+    name: ClassVar[str] = "points"
+    rho_column: ClassVar[str] = "rho_diff"
+    needs_image: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError where a threshold is not a positive number."""
+        for category, value in self.thresholds.items():
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigError(
+                    f"point prior: the threshold of {category} must be positive, not {value}"
+                )
+
+    def score(self, frame: Frame, detections: Detections) -> PointEvidence:
+        """Count the points of the frame in each box and compare with the threshold.
+
+        Raises:
+            ConfigError: a detection's category has no threshold.
+        """
+        threshold = self._threshold_per_label(detections.categories)
+        points = np.asarray(count_points_in_boxes(frame.points, detections.boxes), dtype=np.int64)
+        return PointEvidence(points, threshold, np.minimum(points, threshold) / threshold)
+
+    def _threshold_per_label(self, categories: np.ndarray) -> np.ndarray:
+        """(n,) float64."""
+        names, inverse = np.unique(categories, return_inverse=True)
+        unknown = [str(name) for name in names if name not in self.thresholds]
+        if unknown:
+            raise ConfigError(
+                f"point prior: no threshold for category {', '.join(unknown)}; "
+                "add it to the configured categories and learn the thresholds again",
+            )
+        return np.array([self.thresholds[str(name)] for name in names], dtype=np.float64)[inverse]

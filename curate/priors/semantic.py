@@ -1,0 +1,178 @@
+"""The semantic prior rho_anno (Eq. 9): the image should show the label's class where the box lies.
+
+Source: An et al., Remote Sensing 15(3):627, 2023. Its prose says "arithmetic mean" of the score and
+the share of class pixels, its printed formula is a square root: geometric is the default here.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+
+from curate.detections import Detections
+from curate.errors import ConfigError, ModelError
+from curate.frames import Frame
+from curate.geometry.projection import image_rectangles
+from curate.segmenters.base import Segmenter, SemanticMap
+
+Mean = Literal["geometric", "product", "arithmetic"]
+Outside = Literal["neutral", "drop"]
+
+
+@dataclass(frozen=True)
+class SemanticSettings:
+    """How score s and class share S/A become rho_anno.
+
+    Attributes:
+        mean: "geometric" sqrt(s S/A), "product" s S/A, "arithmetic" (s + S/A) / 2.
+        outside: for a box that the image does not show, "neutral" gives rho_anno = s, "drop" 0.
+    """
+
+    mean: Mean = "geometric"
+    outside: Outside = "neutral"
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for an unknown option."""
+        for value, kind, noun in ((self.mean, Mean, "mean"), (self.outside, Outside, "outside")):
+            if value not in get_args(kind):
+                known = ", ".join(get_args(kind))
+                raise ConfigError(
+                    f"semantic prior: unknown {noun} {value!r}; choose one of {known}"
+                )
+
+
+@dataclass(frozen=True)
+class SemanticEvidence:
+    """The semantic prior's columns for n labels.
+
+    Attributes:
+        mask_pixels: (n,) int64 S, pixels of the label's classes in its rectangle.
+        box_pixels: (n,) int64 A, pixels of the rectangle; 0 where the image does not show the box.
+        rho_anno: (n,) in [0, 1].
+    """
+
+    mask_pixels: np.ndarray
+    box_pixels: np.ndarray
+    rho_anno: np.ndarray
+
+    @property
+    def rho(self) -> np.ndarray:
+        """(n,) rho_anno."""
+        return self.rho_anno
+
+
+_DEFAULT = SemanticSettings()
+
+
+@dataclass(frozen=True)
+class SemanticPrior:
+    """rho_anno = sqrt(s * S / A) with the semantic map of a segmenter.
+
+    Attributes:
+        segmenter: names the class of every pixel.
+        settings: see `SemanticSettings`.
+    """
+
+    segmenter: Segmenter
+    settings: SemanticSettings = _DEFAULT
+    name: ClassVar[str] = "semantic"
+    rho_column: ClassVar[str] = "rho_anno"
+
+    @property
+    def needs_image(self) -> bool:
+        """Whether the segmenter reads the image."""
+        return self.segmenter.needs_image
+
+    def score(self, frame: Frame, detections: Detections) -> SemanticEvidence:
+        """Segment the frame and look at each box's rectangle.
+
+        Raises:
+            ConfigError: the segmenter has no classes for a detection's category.
+            ModelError: the semantic map is not in the size of the image.
+        """
+        if len(detections) == 0:
+            nothing = np.zeros(0, dtype=np.int64)
+            return SemanticEvidence(nothing, nothing, np.zeros(0))
+        semantic_map = self.segmenter.segment(frame)
+        width, height = frame.image_size
+        if semantic_map.class_ids.shape != (height, width):
+            shown = " x ".join(str(side) for side in semantic_map.class_ids.shape[::-1])
+            raise ModelError(
+                f"frame {frame.frame_id}: the semantic map is {shown}, the image {width} x "
+                f"{height} pixels; make the segmenter answer in the size of the image",
+            )
+        rectangles = image_rectangles(detections.boxes, frame.calibration, frame.image_size)
+        mask_pixels, box_pixels = count_pixels(rectangles, detections.categories, semantic_map)
+        rho = semantic_trust(detections.scores, mask_pixels, box_pixels, self.settings)
+        return SemanticEvidence(mask_pixels, box_pixels, rho)
+
+
+def semantic_trust(
+    scores: np.ndarray,
+    mask_pixels: np.ndarray,
+    box_pixels: np.ndarray,
+    settings: SemanticSettings = _DEFAULT,
+) -> np.ndarray:
+    """rho_anno (Eq. 9) from (n,) scores and (n,) pixel counts S and A."""
+    share = mask_pixels / np.maximum(box_pixels, 1)
+    if settings.mean == "geometric":
+        rho = np.sqrt(scores * share)
+    elif settings.mean == "product":
+        rho = scores * share
+    else:
+        rho = (scores + share) / 2
+    return np.where(box_pixels > 0, rho, scores if settings.outside == "neutral" else 0.0)
+
+
+def count_pixels(
+    rectangles: np.ndarray, categories: np.ndarray, semantic_map: SemanticMap
+) -> tuple[np.ndarray, np.ndarray]:
+    """S and A of each rectangle: a pixel counts where the rectangle touches any part of it.
+
+    Pixel (row r, column c) is the square [c, c+1) x [r, r+1), so the columns are floor(left) to
+    ceil(right) - 1, at least one, and those of them that the image has; rows likewise.
+
+    Args:
+        rectangles: (n, 4) left, top, right, bottom in pixels, NaN where the image shows nothing.
+        categories: (n,) str.
+        semantic_map: see `SemanticMap`.
+
+    Returns:
+        (n,) int64 pixels of the category's classes, (n,) int64 pixels.
+
+    Raises:
+        ConfigError: the semantic map has no classes for a category.
+    """
+    height, width = semantic_map.class_ids.shape
+    seen = ~np.isnan(rectangles).any(axis=1)
+    corners = np.where(seen[:, None], rectangles, 0.0)
+    first = np.floor(corners[:, :2])
+    last = np.maximum(np.ceil(corners[:, 2:]), first + 1)
+    left, top = np.clip(first, 0, (width, height)).astype(np.int64).T
+    right, bottom = np.clip(last, 0, (width, height)).astype(np.int64).T
+    box_pixels = np.where(seen, (right - left) * (bottom - top), 0)
+    mask_pixels = np.zeros(len(rectangles), dtype=np.int64)
+    for category in np.unique(categories):
+        k = np.flatnonzero(seen & (categories == category))
+        total = _integral(semantic_map, str(category))
+        mask_pixels[k] = (
+            total[bottom[k], right[k]]
+            - total[top[k], right[k]]
+            - total[bottom[k], left[k]]
+            + total[top[k], left[k]]
+        )
+    return mask_pixels, box_pixels
+
+
+def _integral(semantic_map: SemanticMap, category: str) -> np.ndarray:
+    """(height + 1, width + 1) class pixels above and left of each pixel corner."""
+    import cv2
+
+    if category not in semantic_map.category_classes:
+        raise ConfigError(
+            f"semantic prior: the segmenter has no classes for category {category}; "
+            "name the class ids that count for it in the segmenter's class table",
+        )
+    counts = np.zeros(256, dtype=np.uint8)
+    counts[list(semantic_map.category_classes[category])] = 1
+    return np.asarray(cv2.integral(counts[semantic_map.class_ids]))

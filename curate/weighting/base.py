@@ -1,0 +1,131 @@
+"""What every curation policy offers: a weight for each label of a round, from its evidence."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from curate.errors import ConfigError, DataError
+
+
+@dataclass(frozen=True)
+class Age:
+    """How far the self-paced schedule has come: round e of E.
+
+    Attributes:
+        round: e, from 1.
+        rounds: E.
+    """
+
+    round: int
+    rounds: int
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError unless 1 <= e <= E."""
+        if not 1 <= self.round <= self.rounds:
+            raise ConfigError(
+                f"round {self.round} of {self.rounds} does not exist; "
+                "a round counts from 1 to the number of rounds",
+            )
+
+    @property
+    def share(self) -> float:
+        """The share e / E, in (0, 1]."""
+        return self.round / self.rounds
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of the n labels of a round, over all its frames, as aligned columns.
+
+    Attributes:
+        frame_index: (n,) integer, which frame a label belongs to; any numbering.
+        category: (n,) str.
+        score: (n,) in [0, 1].
+        loss: (n,) consistency loss L, not negative; NaN where no reprediction matched.
+        rho: (n,) trust of each prior by column name ("rho_diff", "rho_anno"), in [0, 1];
+            NaN where a prior has not scored a label.
+    """
+
+    frame_index: np.ndarray
+    category: np.ndarray
+    score: np.ndarray
+    loss: np.ndarray
+    rho: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raises DataError where a column is not aligned or out of its range."""
+        columns = {"frame_index": self.frame_index, "category": self.category, **self._numbers()}
+        for name, column in columns.items():
+            if column.shape != (len(self.loss),):
+                raise DataError(
+                    f"evidence: column {name} has shape {column.shape}, loss has "
+                    f"{len(self.loss)} labels; give one value per label",
+                )
+        for name, column in self._numbers().items():
+            limit = np.finfo(np.float64).max if name == "loss" else 1.0
+            wrong = np.flatnonzero((column < 0) | (column > limit))
+            if len(wrong):
+                raise DataError(
+                    f"evidence: {name} of label {wrong[0]} is {column[wrong[0]]}; "
+                    f"it must be between 0 and {limit:g}",
+                )
+
+    def __len__(self) -> int:
+        return len(self.loss)
+
+    @property
+    def matched(self) -> np.ndarray:
+        """(n,) bool, whether a reprediction matched."""
+        return ~np.isnan(self.loss)
+
+    @cached_property
+    def rho_det(self) -> np.ndarray:
+        """(n,) product of the priors that scored a label; 1 where none did."""
+        product = np.ones(len(self))
+        for rho in self.rho.values():
+            product *= np.where(np.isnan(rho), 1.0, rho)
+        return product
+
+    def _numbers(self) -> dict[str, np.ndarray]:
+        """The columns that have a range."""
+        return {"score": self.score, "loss": self.loss, **self.rho}
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A policy's answer for the n labels of a round.
+
+    Attributes:
+        v: (n,) float64 weight in [0, 1]; 0 means ignore.
+        lambda_u: (n,) the age parameter that the label was held against; NaN where the policy has
+            none, or where no label of the label's group matched.
+    """
+
+    v: np.ndarray
+    lambda_u: np.ndarray
+
+    @classmethod
+    def without_age(cls, v: np.ndarray) -> "Weights":
+        """Weights of a policy that has no age parameter."""
+        return cls(v, np.full(len(v), np.nan))
+
+
+class Policy(Protocol):
+    """Weighs the labels of a round."""
+
+    @property
+    def name(self) -> str:
+        """As it is stored beside the weights."""
+        ...
+
+    @property
+    def uses_unlabeled(self) -> bool:
+        """False where a student of this policy trains on X_l alone."""
+        ...
+
+    def weigh(self, evidence: Evidence, age: Age) -> Weights:
+        """The weight of every label, in the order of the evidence."""
+        ...

@@ -1,0 +1,20 @@
+"""No pseudo-labels: the student trains as long again on X_l alone, the yardstick of the others."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from curate.weighting.base import Age, Evidence, Weights
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """v = 0, and no unlabeled frame is trained on."""
+
+    name: ClassVar[str] = "baseline"
+    uses_unlabeled: ClassVar[bool] = False
+
+    def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
+        """0 for every label."""
+        return Weights.without_age(np.zeros(len(evidence)))

@@ -1,0 +1,40 @@
+"""The plain score threshold: a label counts fully or not at all."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from curate.errors import ConfigError
+from curate.weighting.base import Age, Evidence, Weights
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """v = 1 where the score is at least the threshold, else 0.
+
+    Attributes:
+        threshold: in [0, 1].
+        per_category: thresholds of the categories that have their own.
+    """
+
+    threshold: float = 0.3
+    per_category: Mapping[str, float] = field(default_factory=dict)
+    name: ClassVar[str] = "threshold"
+    uses_unlabeled: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for a threshold that is no score."""
+        for category, value in {"every category": self.threshold, **self.per_category}.items():
+            if not 0 <= value <= 1:
+                raise ConfigError(
+                    f"policy threshold: the threshold for {category} must be in [0, 1], not {value}"
+                )
+
+    def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
+        """1 or 0 for every label."""
+        threshold = np.full(len(evidence), self.threshold)
+        for category, value in self.per_category.items():
+            threshold[evidence.category == category] = value
+        return Weights.without_age((evidence.score >= threshold).astype(np.float64))

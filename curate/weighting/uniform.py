@@ -1,0 +1,20 @@
+"""Every label weighs 1: unfiltered pseudo-labels, as in UDA."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from curate.weighting.base import Age, Evidence, Weights
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """v = 1."""
+
+    name: ClassVar[str] = "uniform"
+    uses_unlabeled: ClassVar[bool] = True
+
+    def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
+        """1 for every label."""
+        return Weights.without_age(np.ones(len(evidence)))

@@ -1,0 +1,313 @@
+"""The tables of curate, in pipeline order.
+
+Boxes are x, y, z of the centre, length, width, height in metres and yaw in radians in the LiDAR
+frame. Everything that a stage found out about label k of a frame carries the same key
+(round, frame_id, k), so evidence joins without a thought and leaves with its prediction.
+"""
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from sqlalchemy import (
+    CheckConstraint,
+    DateTime,
+    Float,
+    ForeignKey,
+    ForeignKeyConstraint,
+    Index,
+    Integer,
+    MetaData,
+    Text,
+    UniqueConstraint,
+    text,
+)
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
+RECTANGLE_COLUMNS = ("image_left", "image_top", "image_right", "image_bottom")
+
+Key = Annotated[int, mapped_column(Integer, primary_key=True, autoincrement=False)]
+Metres = Annotated[float, mapped_column(Float(53), comment="metres, LiDAR frame")]
+Radians = Annotated[float, mapped_column(Float(53), comment="radians, (-pi, pi]")]
+Pixels = Annotated[float, mapped_column(Float(53), comment="pixels")]
+Share = Annotated[float, mapped_column(Float(53), comment="0 to 1")]
+Number = Annotated[float, mapped_column(Float(53))]
+Name = Annotated[str, mapped_column(Text)]
+
+
+class Base(DeclarativeBase):
+    """Root of the models."""
+
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "ck": "ck_%(table_name)s_%(constraint_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+
+
+class Box:
+    """The seven numbers of a box."""
+
+    x: Mapped[Metres]
+    y: Mapped[Metres]
+    z: Mapped[Metres]
+    length: Mapped[Metres]
+    width: Mapped[Metres]
+    height: Mapped[Metres]
+    yaw: Mapped[Radians]
+
+
+def _evidence(*more: Any) -> tuple[Any, ...]:
+    """Keys of a table whose rows belong to a prediction and leave with it."""
+    key = ForeignKeyConstraint(
+        ["round", "frame_id", "k"],
+        ["prediction.round", "prediction.frame_id", "prediction.k"],
+        ondelete="CASCADE",
+    )
+    return (key, *more, {"sqlite_with_rowid": False})
+
+
+class Frame(Base):
+    """A LiDAR-camera frame and the split that it belongs to."""
+
+    __tablename__ = "frame"
+    __table_args__ = (
+        UniqueConstraint("dataset", "frame"),
+        UniqueConstraint("id", "split"),
+        CheckConstraint("split IN ('labeled', 'unlabeled', 'val')", name="split"),
+        CheckConstraint(
+            "split <> 'unlabeled' OR label_path IS NULL", name="unlabeled_has_no_label"
+        ),
+    )
+
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    dataset: Mapped[Name]
+    frame: Mapped[str] = mapped_column(Text, comment="frame id within the data set")
+    split: Mapped[str] = mapped_column(Text, comment="labeled | unlabeled | val")
+    points_path: Mapped[str] = mapped_column(Text, comment="relative to the data set's root")
+    image_path: Mapped[str] = mapped_column(Text, comment="relative to the data set's root")
+    calibration_path: Mapped[str] = mapped_column(Text, comment="relative to the data set's root")
+    label_path: Mapped[str | None] = mapped_column(
+        Text, comment="relative to the data set's root; never for unlabeled frames"
+    )
+
+
+class GroundTruth(Base):
+    """What annotators wrote, for labeled and val frames only.
+
+    The key holds the frame's split as well, so a row for an unlabeled frame cannot exist.
+    """
+
+    __tablename__ = "ground_truth"
+    __table_args__ = (
+        ForeignKeyConstraint(["frame_id", "split"], ["frame.id", "frame.split"]),
+        CheckConstraint("split IN ('labeled', 'val')", name="never_unlabeled"),
+        {"sqlite_with_rowid": False},
+    )
+
+    frame_id: Mapped[Key]
+    k: Mapped[Key]
+    split: Mapped[Name]
+    category: Mapped[Name]
+    x: Mapped[Metres | None]
+    y: Mapped[Metres | None]
+    z: Mapped[Metres | None]
+    length: Mapped[Metres | None]
+    width: Mapped[Metres | None]
+    height: Mapped[Metres | None]
+    yaw: Mapped[Radians | None]
+    truncated: Mapped[Share]
+    occluded: Mapped[int] = mapped_column(Integer, comment="KITTI's levels 0 to 3")
+    alpha: Mapped[Radians]
+    image_left: Mapped[Pixels]
+    image_top: Mapped[Pixels]
+    image_right: Mapped[Pixels]
+    image_bottom: Mapped[Pixels]
+
+
+class Checkpoint(Base):
+    """A trained detector, or the one that the user brought."""
+
+    __tablename__ = "checkpoint"
+    __table_args__ = (UniqueConstraint("round", "policy"),)
+
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    round: Mapped[int] = mapped_column(
+        Integer, comment="the round that made it; 0 before the first"
+    )
+    policy: Mapped[str] = mapped_column(
+        Text, comment="whose weights it learned from; '' for round 0"
+    )
+    detector: Mapped[Name]
+    path: Mapped[str] = mapped_column(Text, comment="relative to the workspace, or absolute")
+    sha256: Mapped[Name]
+    created_at: Mapped[datetime] = mapped_column(DateTime(timezone=True))
+
+
+class Round(Base):
+    """One round e of E: the teacher's answers, their evidence, their weights, the student."""
+
+    __tablename__ = "round"
+
+    number: Mapped[Key]
+    rounds: Mapped[int] = mapped_column(Integer, comment="E: e/E is the age of Eq. 4")
+    teacher_id: Mapped[int | None] = mapped_column(ForeignKey("checkpoint.id"))
+    config: Mapped[str] = mapped_column(Text, comment="the whole configuration, JSON")
+    code_version: Mapped[Name]
+    seed: Mapped[int] = mapped_column(Integer)
+
+
+class Prediction(Box, Base):
+    """Label k of a frame: one box of f(x; w)."""
+
+    __tablename__ = "prediction"
+    __table_args__ = (
+        Index("ix_prediction_category_score", "round", "category", "score"),
+        {"sqlite_with_rowid": False},
+    )
+
+    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
+    k: Mapped[Key]
+    category: Mapped[Name]
+    score: Mapped[Share]
+
+
+class RepredictionView(Base):
+    """The similarity A of one augmented view of a frame."""
+
+    __tablename__ = "reprediction_view"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
+    view: Mapped[Key]
+    flip_y: Mapped[int] = mapped_column(Integer, comment="1 if y was mirrored, first")
+    rotation_rad: Mapped[float] = mapped_column(Float(53), comment="about z, radians, second")
+    scale: Mapped[float] = mapped_column(Float(53), comment="of all coordinates, third")
+
+
+class Reprediction(Box, Base):
+    """One box of A^-1 f(A(x); w), and the prediction that it was matched with."""
+
+    __tablename__ = "reprediction"
+    __table_args__ = (
+        ForeignKeyConstraint(
+            ["round", "frame_id", "view"],
+            ["reprediction_view.round", "reprediction_view.frame_id", "reprediction_view.view"],
+            ondelete="CASCADE",
+        ),
+        {"sqlite_with_rowid": False},
+    )
+
+    round: Mapped[Key]
+    frame_id: Mapped[Key]
+    view: Mapped[Key]
+    k: Mapped[int] = mapped_column(
+        Integer, primary_key=True, autoincrement=False, comment="number within the view"
+    )
+    category: Mapped[Name]
+    score: Mapped[Share]
+    matched_k: Mapped[int | None] = mapped_column(Integer, comment="prediction.k; null = no match")
+    iou: Mapped[float | None] = mapped_column(Float(53), comment="BEV IoU of the match")
+    score_loss: Mapped[float | None] = mapped_column(Float(53), comment="-ln of this score")
+    box_loss: Mapped[float | None] = mapped_column(Float(53), comment="sum of smooth L1, beta 1/9")
+
+
+class Consistency(Base):
+    """The consistency loss L of a prediction, the mean over the views that matched."""
+
+    __tablename__ = "consistency"
+    __table_args__ = _evidence()
+
+    round: Mapped[Key]
+    frame_id: Mapped[Key]
+    k: Mapped[Key]
+    loss: Mapped[float | None] = mapped_column(Float(53), comment="L; null = no match, no evidence")
+    views: Mapped[int] = mapped_column(Integer)
+    matched_views: Mapped[int] = mapped_column(Integer)
+
+
+class PointPrior(Base):
+    """Eq. 8: LiDAR points inside the box against those inside labeled boxes."""
+
+    __tablename__ = "point_prior"
+    __table_args__ = _evidence()
+
+    round: Mapped[Key]
+    frame_id: Mapped[Key]
+    k: Mapped[Key]
+    points: Mapped[int] = mapped_column(Integer, comment="m")
+    points_threshold: Mapped[float] = mapped_column(Float(53), comment="m_th of the category")
+    rho_diff: Mapped[Share]
+
+
+class SemanticPrior(Base):
+    """Eq. 9: pixels of the category's classes inside the projected box."""
+
+    __tablename__ = "semantic_prior"
+    __table_args__ = _evidence()
+
+    round: Mapped[Key]
+    frame_id: Mapped[Key]
+    k: Mapped[Key]
+    mask_pixels: Mapped[int] = mapped_column(Integer, comment="S")
+    box_pixels: Mapped[int] = mapped_column(Integer, comment="A; 0 = outside the image")
+    rho_anno: Mapped[Share]
+
+
+class Weight(Base):
+    """The reliability weight v that one policy gives a label; policies stand side by side."""
+
+    __tablename__ = "weight"
+    __table_args__ = _evidence(Index("ix_weight_policy_v", "round", "policy", "v"))
+
+    round: Mapped[Key]
+    frame_id: Mapped[Key]
+    k: Mapped[Key]
+    policy: Mapped[str] = mapped_column(Text, primary_key=True)
+    lambda_u: Mapped[float | None] = mapped_column(Float(53), comment="Eq. 4; null where unused")
+    rho_det: Mapped[float | None] = mapped_column(Float(53), comment="product of the priors")
+    v: Mapped[Share]
+
+
+class Task(Base):
+    """What was done: one row per frame of a frame stage, one without frame per round stage."""
+
+    __tablename__ = "task"
+    __table_args__ = (
+        CheckConstraint("state IN ('done', 'empty', 'failed')", name="state"),
+        CheckConstraint("(state = 'failed') = (error IS NOT NULL)", name="error_iff_failed"),
+        Index(
+            "uq_task_frame",
+            "round",
+            "stage",
+            "frame_id",
+            unique=True,
+            sqlite_where=text("frame_id IS NOT NULL"),
+            postgresql_where=text("frame_id IS NOT NULL"),
+        ),
+        Index(
+            "uq_task_round",
+            "round",
+            "stage",
+            "variant",
+            unique=True,
+            sqlite_where=text("frame_id IS NULL"),
+            postgresql_where=text("frame_id IS NULL"),
+        ),
+    )
+
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    round: Mapped[int] = mapped_column(Integer)
+    stage: Mapped[Name]
+    variant: Mapped[str] = mapped_column(Text, comment="policy or format of a round stage, else ''")
+    frame_id: Mapped[int | None] = mapped_column(ForeignKey("frame.id"))
+    fingerprint: Mapped[str] = mapped_column(Text, comment="of all that the result depends on")
+    state: Mapped[str] = mapped_column(Text, comment="done | empty | failed")
+    error: Mapped[str | None] = mapped_column(Text)
+    seconds: Mapped[Number]

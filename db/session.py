@@ -1,0 +1,118 @@
+"""Opening a database: pragmas, migrations, and errors in our own words."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from alembic import command
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Connection, Engine, create_engine, event, make_url
+from sqlalchemy.exc import DBAPIError
+
+from curate.errors import DatabaseError, LeakageError
+from db.views import create_views
+
+# A writer that finds another one waits this long before it gives up.
+BUSY_TIMEOUT_MS = 30_000
+
+
+class Database:
+    """A migrated database behind one engine.
+
+    Args:
+        url: an SQLAlchemy URL, e.g. "sqlite:////data/run/curate.db".
+
+    Raises:
+        DatabaseError: it cannot be opened, is damaged, or a newer curate has written it.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = make_url(url)
+        self.engine = _engine(url)
+        with _own_words(self.url.database):
+            self._migrate()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection for queries."""
+        with _own_words(self.url.database), self.engine.connect() as connection:
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """One transaction: all of it is kept, or nothing."""
+        writer = self.engine.execution_options(sqlite_begin="IMMEDIATE")
+        with _own_words(self.url.database), writer.begin() as connection:
+            yield connection
+
+    def close(self) -> None:
+        """Gives every connection back."""
+        self.engine.dispose()
+
+    def _migrate(self) -> None:
+        config = Config()
+        config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+        script = ScriptDirectory.from_config(config)
+        with self.engine.connect() as connection:
+            current = MigrationContext.configure(connection).get_current_revision()
+        if current == script.get_current_head():
+            return
+        if current is not None and current not in {r.revision for r in script.walk_revisions()}:
+            raise DatabaseError(
+                f"{self.url.database}: written by a newer curate (schema {current}); update curate"
+            )
+        with self.writing() as connection:
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+            create_views(connection)
+
+
+def _engine(url: str) -> Engine:
+    engine = create_engine(url)
+    if engine.dialect.name == "sqlite":
+        event.listen(engine, "connect", _set_pragmas)
+        event.listen(engine, "begin", _begin)
+    return engine
+
+
+def _set_pragmas(connection: Any, _record: Any) -> None:
+    # The driver's own transactions are off, so that DDL is transactional too; see _begin.
+    connection.isolation_level = None
+    cursor = connection.cursor()
+    cursor.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
+    cursor.execute("PRAGMA journal_mode = WAL")
+    cursor.execute("PRAGMA synchronous = NORMAL")
+    cursor.execute("PRAGMA foreign_keys = ON")
+    cursor.close()
+
+
+def _begin(connection: Connection) -> None:
+    # Taking the write lock at once lets a second writer wait instead of failing half way.
+    mode = connection.get_execution_options().get("sqlite_begin", "DEFERRED")
+    connection.exec_driver_sql(f"BEGIN {mode}")
+
+
+@contextmanager
+def _own_words(name: str | None) -> Iterator[None]:
+    """Turns the driver's errors into one line that names the database and the remedy."""
+    try:
+        yield
+    except DBAPIError as error:
+        if "ground truth of an unlabeled frame" in str(error.orig):
+            raise LeakageError(f"{name}: {error.orig} must not be stored") from error
+        raise DatabaseError(f"{name}: {error.orig}{_remedy(str(error.orig))}") from error
+
+
+def _remedy(message: str) -> str:
+    remedies = {
+        "malformed": "; restore a backup, or rebuild it with `sqlite3 OLD .recover | sqlite3 NEW`",
+        "not a database": "; this file is damaged or of another kind, move it away or restore it",
+        "locked": "; another process is writing, wait for it or end it",
+        "readonly": "; give yourself write permission on the file and its folder",
+        "unable to open": "; check that the folder exists and can be written",
+        "full": "; free space on the disk and run the command again, finished frames are kept",
+    }
+    return next((remedy for sign, remedy in remedies.items() if sign in message), "")

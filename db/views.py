@@ -1,0 +1,44 @@
+"""Views for people who query."""
+
+from sqlalchemy import Connection, text
+
+# The columns of `weighted_labels`, here and in every exported file; their order is the format's.
+WEIGHTED_LABELS = (
+    "round", "frame", "k", "category",
+    "x", "y", "z", "length", "width", "height", "yaw",
+    "score", "loss", "points", "points_threshold", "rho_diff",
+    "mask_pixels", "box_pixels", "rho_anno", "rho_det",
+    "lambda_u", "policy", "weight",
+)  # fmt: skip
+
+_VIEWS = {
+    "weighted_labels": """
+        SELECT p.round, f.frame, p.k, p.category,
+               p.x, p.y, p.z, p.length, p.width, p.height, p.yaw,
+               p.score, c.loss, pp.points, pp.points_threshold, pp.rho_diff,
+               sp.mask_pixels, sp.box_pixels, sp.rho_anno, w.rho_det,
+               w.lambda_u, w.policy, w.v AS weight
+        FROM weight AS w
+        JOIN prediction AS p ON p.round = w.round AND p.frame_id = w.frame_id AND p.k = w.k
+        JOIN frame AS f ON f.id = w.frame_id
+        LEFT JOIN consistency AS c
+            ON c.round = w.round AND c.frame_id = w.frame_id AND c.k = w.k
+        LEFT JOIN point_prior AS pp
+            ON pp.round = w.round AND pp.frame_id = w.frame_id AND pp.k = w.k
+        LEFT JOIN semantic_prior AS sp
+            ON sp.round = w.round AND sp.frame_id = w.frame_id AND sp.k = w.k
+        WHERE f.split = 'unlabeled'
+    """,
+    "failed_frames": """
+        SELECT t.round, t.stage, f.frame, f.split, t.error
+        FROM task AS t JOIN frame AS f ON f.id = t.frame_id
+        WHERE t.state = 'failed'
+    """,
+}
+
+
+def create_views(connection: Connection) -> None:
+    """(Re)creates every view."""
+    for name, query in _VIEWS.items():
+        connection.execute(text(f"DROP VIEW IF EXISTS {name}"))
+        connection.execute(text(f"CREATE VIEW {name} AS {query}"))

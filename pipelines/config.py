@@ -1,0 +1,168 @@
+"""The configuration of a workspace, `curate.toml`: sections, defaults, and what they may hold."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from curate.detections import CATEGORIES
+from curate.errors import ConfigError
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0)]
+AtLeastOne = Annotated[int, Field(ge=1)]
+Options = dict[str, Any]
+
+
+class Section(BaseModel):
+    """A section refuses keys that it does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DatasetSection(Section):
+    """Where the frames are."""
+
+    kind: str = "kitti"
+    root: Path
+    categories: tuple[str, ...] = CATEGORIES
+    options: Options = {}
+
+
+class DetectorSection(Section):
+    """Who guesses."""
+
+    name: str = "pillars"
+    path: Path | None = None  # of a detector that the user brings
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    minimum_score: Share = 0.1
+    camera_view: bool = True  # the detector sees only the points that the camera sees
+    options: Options = {}
+
+
+class SegmenterSection(Section):
+    """Who names pixels."""
+
+    name: str = "none"
+    path: Path | None = None
+    classes: str = "voc"
+    options: Options = {}
+
+
+class RepredictSection(Section):
+    """The augmented copies A(x), and the consistency loss between the answers."""
+
+    views: AtLeastOne = 1
+    flip_probability: Share = 0.5
+    rotation_limit_rad: Annotated[float, Field(ge=0)] = 0.7853981633974483
+    scale_range: tuple[Positive, Positive] = (0.95, 1.05)
+    score_weight: Annotated[float, Field(ge=0)] = 1.0
+    box_weight: Annotated[float, Field(ge=0)] = 2.0
+    beta: Positive = 1 / 9
+    minimum_iou: Share = 0.1
+
+
+class PointsSection(Section):
+    """Eq. 8."""
+
+    statistic: Literal["median", "mean", "quantile", "fixed"] = "median"
+    quantile: Share = 0.5
+    fixed: dict[str, Positive] = {}
+    fallback: Positive = 5.0
+
+
+class SemanticSection(Section):
+    """Eq. 9."""
+
+    mean: Literal["geometric", "product", "arithmetic"] = "geometric"
+    outside: Literal["neutral", "drop"] = "neutral"
+
+
+class SolveSection(Section):
+    """Which policy weighs the labels that the trainer sees, and its settings."""
+
+    policy: str = "pspsl"
+    lambda_over: Literal["round", "category", "frame"] = "round"
+    lambda_quantile: Share | None = None  # in place of the maximum of Eq. 4
+    options: dict[str, Options] = {}  # by policy, e.g. options.threshold.threshold = 0.3
+
+
+class TrainSection(Section):
+    """How the detector learns."""
+
+    preset: Literal["small", "kitti"] = "small"
+    pretrain_steps: AtLeastOne = 600
+    round_steps: AtLeastOne = 600
+    batch_size: AtLeastOne = 4
+    threads: AtLeastOne = 2
+    zero_weight: Literal["ignore", "background"] = "ignore"
+    start: Literal["teacher", "scratch"] = "teacher"
+    options: Options = {}
+
+
+class RunSection(Section):
+    """How the work is organised."""
+
+    rounds: AtLeastOne = 3
+    seed: int = 0
+    priors: tuple[str, ...] = ("points", "semantic")
+    executor: str = "serial"
+    workers: AtLeastOne = 1
+    database: str | None = None  # an SQLAlchemy URL; default: curate.db in the workspace
+
+
+class Config(Section):
+    """All sections."""
+
+    dataset: DatasetSection
+    detector: DetectorSection = DetectorSection()
+    segmenter: SegmenterSection = SegmenterSection()
+    repredict: RepredictSection = RepredictSection()
+    points: PointsSection = PointsSection()
+    semantic: SemanticSection = SemanticSection()
+    solve: SolveSection = SolveSection()
+    train: TrainSection = TrainSection()
+    run: RunSection = RunSection()
+
+
+def read_config(path: Path) -> Config:
+    """The configuration in a TOML file.
+
+    Raises:
+        ConfigError: the file is not TOML, or some settings are wrong; all of them are named.
+    """
+    try:
+        return Config.model_validate(tomllib.loads(path.read_text()))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file; `curate init` makes a workspace") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not TOML: {error}") from error
+    except ValidationError as error:
+        faults = "; ".join(
+            f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors()
+        )
+        raise ConfigError(f"{path}: {faults}") from error
+
+
+def write_config(path: Path, config: Config) -> None:
+    """Writes every setting as TOML, defaults included, so that a user sees what can be set."""
+    document = config.model_dump(mode="json", exclude_none=True)
+    lines = []
+    for section, settings in document.items():
+        lines += [f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in settings.items())]
+        lines.append("")
+    path.write_text("\n".join(lines))
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{escaped}"'
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{_toml(k)} = {_toml(v)}' for k, v in value.items())}}}"
+    return repr(value)

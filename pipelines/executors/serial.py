@@ -1,0 +1,15 @@
+"""The default executor: this process, one frame after the other."""
+
+from collections.abc import Iterable, Iterator
+
+from pipelines.executors.base import FrameFunction, FrameJob, Outcome, attempt
+
+
+class SerialExecutor:
+    """Works on frames in their order."""
+
+    def map(self, function: FrameFunction, jobs: Iterable[FrameJob]) -> Iterator[Outcome]:
+        """One outcome per job, in order."""
+        function.open()
+        for job in jobs:
+            yield attempt(function, job)
