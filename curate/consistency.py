@@ -52,9 +52,9 @@ class Consistency:
     Attributes:
         matched: (n,) int64 index of the matched reprediction, -1 for none.
         iou: (n,) BEV IoU with it.
-        score_loss: (n,) score_weight * -ln s', with s' the reprediction's score.
-        box_loss: (n,) box_weight * sum of smooth L1 over the seven residuals.
-        loss: (n,) score_loss + box_loss.
+        score_loss: (n,) -ln s', with s' the reprediction's score; without its weight.
+        box_loss: (n,) sum of smooth L1 over the seven residuals; without its weight.
+        loss: (n,) score_weight * score_loss + box_weight * box_loss.
     """
 
     matched: np.ndarray
@@ -105,9 +105,10 @@ def consistency(
             "drop such boxes in the detector",
         )
     score_loss, box_loss = np.full((2, len(predictions)), np.nan)
-    score_loss[found] = settings.score_weight * -np.log(np.clip(targets.scores, SCORE_FLOOR, 1.0))
-    box_loss[found] = settings.box_weight * smooth_l1(residuals, settings.beta).sum(axis=1)
-    return Consistency(matched, iou, score_loss, box_loss, score_loss + box_loss)
+    score_loss[found] = -np.log(np.clip(targets.scores, SCORE_FLOOR, 1.0))
+    box_loss[found] = smooth_l1(residuals, settings.beta).sum(axis=1)
+    loss = settings.score_weight * score_loss + settings.box_weight * box_loss
+    return Consistency(matched, iou, score_loss, box_loss, loss)
 
 
 def mean_over_views(views: Sequence[Consistency]) -> MeanConsistency:
@@ -167,7 +168,8 @@ def residual(anchors: np.ndarray, targets: np.ndarray) -> np.ndarray:
 def smooth_l1(difference: np.ndarray, beta: float) -> np.ndarray:
     """0.5 x^2 / beta where |x| < beta, |x| - 0.5 beta elsewhere."""
     size = np.abs(difference)
-    return np.where(size < beta, 0.5 * size**2 / beta, size - 0.5 * beta)
+    loss: np.ndarray = np.where(size < beta, 0.5 * size**2 / beta, size - 0.5 * beta)
+    return loss
 
 
 def _canonical_order(detections: Detections, category: str) -> np.ndarray:

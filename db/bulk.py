@@ -16,8 +16,11 @@ def table(name: str) -> Table:
 
 
 def columns(name: str) -> tuple[str, ...]:
-    """The columns of a table, in the order in which `insert` expects their values."""
-    return tuple(table(name).columns.keys())
+    """The columns of a table, in the order in which `insert` expects their values.
+
+    A surrogate key is not among them: the database draws it.
+    """
+    return tuple(column.name for column in table(name).columns if column.name != "id")
 
 
 def insert(connection: Connection, name: str, rows: Iterable[Row]) -> None:

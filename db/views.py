@@ -2,15 +2,6 @@
 
 from sqlalchemy import Connection, text
 
-# The columns of `weighted_labels`, here and in every exported file; their order is the format's.
-WEIGHTED_LABELS = (
-    "round", "frame", "k", "category",
-    "x", "y", "z", "length", "width", "height", "yaw",
-    "score", "loss", "points", "points_threshold", "rho_diff",
-    "mask_pixels", "box_pixels", "rho_anno", "rho_det",
-    "lambda_u", "policy", "weight",
-)  # fmt: skip
-
 _VIEWS = {
     "weighted_labels": """
         SELECT p.round, f.frame, p.k, p.category,

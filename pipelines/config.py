@@ -1,6 +1,7 @@
 """The configuration of a workspace, `curate.toml`: sections, defaults, and what they may hold."""
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -68,8 +69,8 @@ class PointsSection(Section):
 
     statistic: Literal["median", "mean", "quantile", "fixed"] = "median"
     quantile: Share = 0.5
-    fixed: dict[str, Positive] = {}
-    fallback: Positive = 5.0
+    fixed: Annotated[float, Field(ge=1)] = 5.0
+    fallback: Annotated[float, Field(ge=1)] = 5.0
 
 
 class SemanticSection(Section):
@@ -83,8 +84,8 @@ class SolveSection(Section):
     """Which policy weighs the labels that the trainer sees, and its settings."""
 
     policy: str = "pspsl"
-    lambda_over: Literal["round", "category", "frame"] = "round"
-    lambda_quantile: Share | None = None  # in place of the maximum of Eq. 4
+    scope: Literal["round", "category", "frame"] = "round"  # which labels share one lambda
+    quantile: Annotated[float, Field(gt=0, le=1)] | None = None  # in place of Eq. 4's maximum
     options: dict[str, Options] = {}  # by policy, e.g. options.threshold.threshold = 0.3
 
 
@@ -133,16 +134,26 @@ def read_config(path: Path) -> Config:
         ConfigError: the file is not TOML, or some settings are wrong; all of them are named.
     """
     try:
-        return Config.model_validate(tomllib.loads(path.read_text()))
+        return make_config(tomllib.loads(path.read_text()), str(path))
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file; `curate init` makes a workspace") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not TOML: {error}") from error
+
+
+def make_config(document: Mapping[str, Any], source: str) -> Config:
+    """The configuration in a document.
+
+    Raises:
+        ConfigError: some settings are wrong; all of them are named, with their source.
+    """
+    try:
+        return Config.model_validate(document)
     except ValidationError as error:
         faults = "; ".join(
             f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors()
         )
-        raise ConfigError(f"{path}: {faults}") from error
+        raise ConfigError(f"{source}: {faults}") from error
 
 
 def write_config(path: Path, config: Config) -> None:

@@ -80,13 +80,6 @@ SEGMENTERS = Registry(
         "degraded": "curate.segmenters.degraded:DegradedSegmenter",
     },
 )
-PRIORS = Registry(
-    "prior",
-    {
-        "points": "curate.priors.points:PointPrior",
-        "semantic": "curate.priors.semantic:SemanticPrior",
-    },
-)
 POLICIES = Registry(
     "policy",
     {

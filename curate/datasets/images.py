@@ -19,7 +19,7 @@ def read_image(path: Path) -> np.ndarray:
     Raises:
         DataError: the file is missing, truncated or no image.
     """
-    return np.ascontiguousarray(decode(path, cv2.IMREAD_COLOR)[:, :, ::-1])
+    return cv2.cvtColor(decode_image(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
 def read_image_size(path: Path) -> tuple[int, int]:
@@ -28,19 +28,35 @@ def read_image_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: the file is missing or no image.
     """
-    with _opened(path) as file:
-        header = file.read(PNG_HEADER_BYTES)
+    header = _read_bytes(path, PNG_HEADER_BYTES)
     if len(header) == PNG_HEADER_BYTES and header.startswith(PNG_SIGNATURE + b"\0\0\0\rIHDR"):
         width, height = struct.unpack(">II", header[16:])
         return int(width), int(height)
-    height, width = decode(path, cv2.IMREAD_COLOR).shape[:2]
+    height, width = decode_image(path, cv2.IMREAD_COLOR).shape[:2]
     return width, height
 
 
-def decode(path: Path, mode: int) -> np.ndarray:
-    """The pixels of an image file as OpenCV decodes them under `mode`.
+def decode_image(path: Path, mode: int) -> np.ndarray:
+    """The pixels of an image file as OpenCV decodes them under `mode` (cv2.IMREAD_...).
 
     Raises:
         DataError: the file is missing, truncated or no image.
     """
-    ...
+    content = _read_bytes(path)
+    if content.startswith(PNG_SIGNATURE) and PNG_END not in content:
+        raise DataError(f"{path}: the PNG ends before its end mark; fetch the file again")
+    # OpenCV asserts that the buffer is not empty, and answers None to what it cannot decode.
+    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), mode) if content else None
+    if pixels is None:
+        raise DataError(f"{path}: no readable image ({len(content)} bytes); fetch the file again")
+    return pixels
+
+
+def _read_bytes(path: Path, limit: int = -1) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(limit)
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such image file") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from error

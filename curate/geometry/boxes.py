@@ -29,7 +29,8 @@ def bev_corners(boxes: np.ndarray) -> np.ndarray:
     cos, sin = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
     x = cos * offsets[..., 0] - sin * offsets[..., 1]
     y = sin * offsets[..., 0] + cos * offsets[..., 1]
-    return np.stack([x, y], axis=2) + boxes[:, None, :2]
+    corners: np.ndarray = np.stack([x, y], axis=2) + boxes[:, None, :2]
+    return corners
 
 
 def box_corners(boxes: np.ndarray) -> np.ndarray:

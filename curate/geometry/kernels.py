@@ -20,8 +20,10 @@ _ALIGNED_SINE = 1e-12
 # Columns of the table that `rectangle_table` makes of boxes.
 _X, _Y, _Z, _HALF_LENGTH, _HALF_WIDTH, _HALF_HEIGHT, _COS, _SIN, _RADIUS, _AREA = range(10)
 
+_Pair = tuple[float, float]
 
-@njit(cache=True, nogil=True)
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def rectangle_table(boxes: np.ndarray) -> np.ndarray:
     """(n, 10) what the other kernels need of (n, 7) boxes, computed once per box.
 
@@ -39,17 +41,16 @@ def rectangle_table(boxes: np.ndarray) -> np.ndarray:
     return table
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _common_length(offset: float, half_a: float, half_b: float) -> float:
     """Length that two intervals share; b's centre lies at `offset` from a's."""
     return max(0.0, min(half_a, offset + half_b) - max(-half_a, offset - half_b))
 
 
-@njit(cache=True, nogil=True)
-def _edge_integral(
-    x0: float, y0: float, x1: float, y1: float, half_x: float, half_y: float
-) -> float:
-    """Integral of y dx along an edge, y clamped to +-half_y and x to +-half_x."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _edge_integral(from_: _Pair, to: _Pair, half_sides: _Pair) -> float:
+    """Integral of y dx along an edge, x and y clamped to plus and minus the half sides."""
+    (x0, y0), (x1, y1), (half_x, half_y) = from_, to, half_sides
     start = min(max(x0, -half_x), half_x)
     end = min(max(x1, -half_x), half_x)
     if start == end:
@@ -70,7 +71,7 @@ def _edge_integral(
     return (end - start) * (inner + outer) / (high - low)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _precedes(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
     """Whether row i of `a` is the frame of reference; the same for (a, b) and (b, a)."""
     if a[i, _AREA] != b[j, _AREA]:
@@ -81,7 +82,7 @@ def _precedes(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _area_in_frame_of(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
     """Common area of rectangles a[i] and b[j], computed in the frame of a[i]."""
     half_x, half_y = a[i, _HALF_LENGTH], a[i, _HALF_WIDTH]
@@ -97,44 +98,49 @@ def _area_in_frame_of(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
         return _common_length(x, half_x, width) * _common_length(y, half_y, length)
     forward_x, forward_y = cos * length, sin * length
     left_x, left_y = -sin * width, cos * width
-    x0, y0 = x + forward_x + left_x, y + forward_y + left_y
-    x1, y1 = x - forward_x + left_x, y - forward_y + left_y
-    x2, y2 = x - forward_x - left_x, y - forward_y - left_y
-    x3, y3 = x + forward_x - left_x, y + forward_y - left_y
+    front_left = (x + forward_x + left_x, y + forward_y + left_y)
+    rear_left = (x - forward_x + left_x, y - forward_y + left_y)
+    rear_right = (x - forward_x - left_x, y - forward_y - left_y)
+    front_right = (x + forward_x - left_x, y + forward_y - left_y)
+    half_sides = (half_x, half_y)
     # Counter-clockwise, the area is minus the integral.
     return -(
-        _edge_integral(x0, y0, x1, y1, half_x, half_y)
-        + _edge_integral(x1, y1, x2, y2, half_x, half_y)
-        + _edge_integral(x2, y2, x3, y3, half_x, half_y)
-        + _edge_integral(x3, y3, x0, y0, half_x, half_y)
+        _edge_integral(front_left, rear_left, half_sides)
+        + _edge_integral(rear_left, rear_right, half_sides)
+        + _edge_integral(rear_right, front_right, half_sides)
+        + _edge_integral(front_right, front_left, half_sides)
     )
 
 
-@njit(cache=True, nogil=True)
-def _common_area(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
-    """Common area of rectangles a[i] and b[j]; 0 where a side is not positive or not finite."""
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _near(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
+    """Whether the circles around a[i] and b[j] meet; no where a number is NaN."""
     reach = a[i, _RADIUS] + b[j, _RADIUS]
     away_x, away_y = b[j, _X] - a[i, _X], b[j, _Y] - a[i, _Y]
+    return bool(away_x * away_x + away_y * away_y < reach * reach)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _common_area(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
+    """Common area of rectangles a[i] and b[j]; 0 where a side is not positive or not finite."""
     smaller = min(a[i, _AREA], b[j, _AREA])
-    if not (away_x * away_x + away_y * away_y < reach * reach and smaller > 0):
+    if not smaller > 0:
         return 0.0
-    if _precedes(a, i, b, j):
-        area = _area_in_frame_of(a, i, b, j)
-    else:
-        area = _area_in_frame_of(b, j, a, i)
-    return min(max(area, 0.0), smaller)
+    a_first = _precedes(a, i, b, j)
+    area = _area_in_frame_of(a, i, b, j) if a_first else _area_in_frame_of(b, j, a, i)
+    return float(min(max(area, 0.0), smaller))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _bev_iou(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
     """Intersection over union of the footprints a[i] and b[j]."""
     common = _common_area(a, i, b, j)
     if common == 0:
         return 0.0
-    return common / (a[i, _AREA] + b[j, _AREA] - common)
+    return float(common / (a[i, _AREA] + b[j, _AREA] - common))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _iou_3d(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
     """Intersection over union of the cuboids a[i] and b[j]."""
     height_a, height_b = 2 * a[i, _HALF_HEIGHT], 2 * b[j, _HALF_HEIGHT]
@@ -146,33 +152,33 @@ def _iou_3d(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
     common = shared * _common_area(a, i, b, j) if shared > 0 else 0.0
     if common == 0:
         return 0.0
-    return common / (a[i, _AREA] * height_a + b[j, _AREA] * height_b - common)
+    return float(common / (a[i, _AREA] * height_a + b[j, _AREA] * height_b - common))
 
 
-@njit(cache=True, nogil=True)
-def iou_matrix(a: np.ndarray, b: np.ndarray, with_height: bool) -> np.ndarray:  # noqa: FBT001
+@njit(cache=True, nogil=True, error_model="numpy")
+def iou_matrix(a: np.ndarray, b: np.ndarray, with_height: bool) -> np.ndarray:
     """(n, m) IoU of the rectangle tables a and b, of cuboids or of footprints.
 
     Only pairs whose x ranges can meet are looked at: b is visited in the order of x.
     """
     matrix = np.zeros((len(a), len(b)))
     order = np.argsort(b[:, _X])
-    sorted_x = b[order, _X]
+    b = b[order]
     largest_radius = 0.0
     for j in range(len(b)):
         largest_radius = max(largest_radius, b[j, _RADIUS])
     for i in range(len(a)):
         reach = a[i, _RADIUS] + largest_radius
-        first = np.searchsorted(sorted_x, a[i, _X] - reach)
-        for position in range(first, len(b)):
-            if sorted_x[position] > a[i, _X] + reach:
+        for j in range(np.searchsorted(b[:, _X], a[i, _X] - reach), len(b)):
+            if b[j, _X] > a[i, _X] + reach:
                 break
-            j = order[position]
-            matrix[i, j] = _iou_3d(a, i, b, j) if with_height else _bev_iou(a, i, b, j)
+            if _near(a, i, b, j):
+                overlap = _iou_3d(a, i, b, j) if with_height else _bev_iou(a, i, b, j)
+                matrix[i, order[j]] = overlap
     return matrix
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def grouped_iou(
     a: np.ndarray, starts_a: np.ndarray, b: np.ndarray, starts_b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -187,12 +193,12 @@ def grouped_iou(
     Returns:
         Row in a, row in b, BEV IoU and 3D IoU of each pair, ascending by (row in a, row in b).
     """
-    rows_a, rows_b = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    rows_a, rows_b = [0 for _ in range(0)], [0 for _ in range(0)]  # typed by their elements
     bev, volumes = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for group in range(len(starts_a) - 1):
         for i in range(starts_a[group], starts_a[group + 1]):
             for j in range(starts_b[group], starts_b[group + 1]):
-                overlap = _bev_iou(a, i, b, j)
+                overlap = _bev_iou(a, i, b, j) if _near(a, i, b, j) else 0.0
                 if overlap > 0:
                     rows_a.append(i)
                     rows_b.append(j)
@@ -201,7 +207,27 @@ def grouped_iou(
     return np.array(rows_a), np.array(rows_b), np.array(bev), np.array(volumes)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _may_exceed(a: np.ndarray, i: int, b: np.ndarray, j: int, threshold: float) -> bool:
+    """Whether the BEV IoU can be above the threshold, from b[j]'s extents in the frame of a[i]."""
+    away_x, away_y = b[j, _X] - a[i, _X], b[j, _Y] - a[i, _Y]
+    cos = abs(a[i, _COS] * b[j, _COS] + a[i, _SIN] * b[j, _SIN])
+    sin = abs(a[i, _COS] * b[j, _SIN] - a[i, _SIN] * b[j, _COS])
+    most = _common_length(
+        a[i, _COS] * away_x + a[i, _SIN] * away_y,
+        a[i, _HALF_LENGTH],
+        cos * b[j, _HALF_LENGTH] + sin * b[j, _HALF_WIDTH],
+    ) * _common_length(
+        a[i, _COS] * away_y - a[i, _SIN] * away_x,
+        a[i, _HALF_WIDTH],
+        sin * b[j, _HALF_LENGTH] + cos * b[j, _HALF_WIDTH],
+    )
+    most = min(most, a[i, _AREA], b[j, _AREA])
+    # The margin keeps rounding from deciding.
+    return bool(most * (1 + threshold) * (1 + 1e-9) > threshold * (a[i, _AREA] + b[j, _AREA]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cell(value: float, low: float, cell: float, count: int) -> int:
     """Index of the grid cell of a coordinate; the last cells take what lies outside."""
     position = (value - low) / cell
@@ -210,7 +236,7 @@ def _cell(value: float, low: float, cell: float, count: int) -> int:
     return min(int(min(position, 1e9)), count - 1)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def greedy_nms(table: np.ndarray, order: np.ndarray, iou_threshold: float) -> np.ndarray:
     """Greedy non-maximum suppression on BEV IoU.
 
@@ -245,7 +271,8 @@ def greedy_nms(table: np.ndarray, order: np.ndarray, iou_threshold: float) -> np
             for near_y in range(max(cell_y - 1, 0), min(cell_y + 2, count_y)):
                 j = newest[near_x, near_y]
                 while j >= 0 and not suppressed:
-                    suppressed = _bev_iou(table, i, table, j) > iou_threshold
+                    if _near(table, i, table, j) and _may_exceed(table, i, table, j, iou_threshold):
+                        suppressed = _bev_iou(table, i, table, j) > iou_threshold
                     j = older[j]
         if not suppressed:
             older[i] = newest[cell_x, cell_y]

@@ -5,10 +5,16 @@ from typing import Self
 
 import numpy as np
 
+from curate.errors import ConfigError
+
 
 def wrap_angle(angle_rad: np.ndarray) -> np.ndarray:
-    """Angles in radians, wrapped to (-pi, pi]."""
-    return -(np.mod(-np.asarray(angle_rad) + np.pi, 2 * np.pi) - np.pi)
+    """Angles in radians, wrapped to (-pi, pi]; those in the range already stay as they are."""
+    angle_rad = np.asarray(angle_rad, dtype=np.float64)
+    wrapped = np.pi - np.mod(np.pi - angle_rad, 2 * np.pi)
+    # Just above pi the remainder is rounded to the divisor, and the result to -pi.
+    wrapped = np.where(wrapped <= -np.pi, np.pi, wrapped)
+    return np.where((angle_rad > -np.pi) & (angle_rad <= np.pi), angle_rad, wrapped)
 
 
 @dataclass(frozen=True)
@@ -19,11 +25,21 @@ class Similarity:
         flip_y: mirror over the x axis.
         rotation_rad: counter-clockwise about z, radians.
         scale: uniform, > 0.
+
+    Raises:
+        ConfigError: the rotation is not finite, or the scale not finite and positive.
     """
 
     flip_y: bool = False
     rotation_rad: float = 0.0
     scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.rotation_rad) and np.isfinite(self.scale) and self.scale > 0):
+            raise ConfigError(
+                f"a similarity needs a finite rotation and a positive scale, not "
+                f"rotation {self.rotation_rad} rad and scale {self.scale}"
+            )
 
     @classmethod
     def draw(
@@ -45,6 +61,13 @@ class Similarity:
         """A of (n, >=3) points; columns after the third are kept. Same dtype."""
         moved = points.copy()
         moved[:, :3] = points[:, :3] @ self._matrix().T.astype(points.dtype)
+        return moved
+
+    def invert_points(self, points: np.ndarray) -> np.ndarray:
+        """A^-1 of (n, >=3) points; columns after the third are kept. Same dtype."""
+        moved = points.copy()
+        inverse = self._matrix() / self.scale**2
+        moved[:, :3] = points[:, :3] @ inverse.astype(points.dtype)
         return moved
 
     def apply_to_boxes(self, boxes: np.ndarray) -> np.ndarray:

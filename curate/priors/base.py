@@ -27,8 +27,8 @@ class PriorEvidence(Protocol):
 class Prior(Protocol):
     """Trusts or mistrusts each label of a frame; rho_det is the product over the priors."""
 
-    name: str
-    rho_column: str
+    name: ClassVar[str]
+    rho_column: ClassVar[str]
 
     @property
     def needs_image(self) -> bool:

@@ -129,8 +129,9 @@ def count_pixels(
 ) -> tuple[np.ndarray, np.ndarray]:
     """S and A of each rectangle: a pixel counts where the rectangle touches any part of it.
 
-    Pixel (row r, column c) is the square [c, c+1) x [r, r+1), so the columns are floor(left) to
-    ceil(right) - 1, at least one, and those of them that the image has; rows likewise.
+    As in KITTI, pixel (row r, column c) is centred on the coordinates (c, r) and the whole image is
+    the rectangle 0, 0, width - 1, height - 1. The columns of a rectangle are therefore left to
+    right, both rounded (halves up) and both included, as far as the image has them; rows likewise.
 
     Args:
         rectangles: (n, 4) left, top, right, bottom in pixels, NaN where the image shows nothing.
@@ -145,11 +146,9 @@ def count_pixels(
     """
     height, width = semantic_map.class_ids.shape
     seen = ~np.isnan(rectangles).any(axis=1)
-    corners = np.where(seen[:, None], rectangles, 0.0)
-    first = np.floor(corners[:, :2])
-    last = np.maximum(np.ceil(corners[:, 2:]), first + 1)
-    left, top = np.clip(first, 0, (width, height)).astype(np.int64).T
-    right, bottom = np.clip(last, 0, (width, height)).astype(np.int64).T
+    nearest = np.floor(np.where(seen[:, None], rectangles, 0.0) + 0.5)
+    left, top = np.clip(nearest[:, :2], 0, (width, height)).astype(np.int64).T
+    right, bottom = np.clip(nearest[:, 2:] + 1, 0, (width, height)).astype(np.int64).T
     box_pixels = np.where(seen, (right - left) * (bottom - top), 0)
     mask_pixels = np.zeros(len(rectangles), dtype=np.int64)
     for category in np.unique(categories):

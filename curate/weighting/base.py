@@ -79,7 +79,7 @@ class Evidence:
     @property
     def matched(self) -> np.ndarray:
         """(n,) bool, whether a reprediction matched."""
-        return ~np.isnan(self.loss)
+        return np.asarray(~np.isnan(self.loss))
 
     @cached_property
     def rho_det(self) -> np.ndarray:

@@ -93,7 +93,8 @@ def age_parameter(
     hardest = maximum if quantile is None else _quantile(loss, member, count, quantile)
     parameter = age.share * hardest + (1.0 - age.share) * mean
     # Rounding can lift the mean of equal losses above them all, and would let them pass.
-    return np.minimum(parameter, maximum)[group]
+    lambda_u: np.ndarray = np.minimum(parameter, maximum)[group]
+    return lambda_u
 
 
 def _check(policy: str, scope: str, quantile: float | None) -> None:

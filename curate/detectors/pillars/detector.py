@@ -1,0 +1,144 @@
+"""The trained pillar detector: frames in, boxes out, in ONNX Runtime on CPU and torch on a GPU."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from curate.detections import Detections
+from curate.detectors.pillars.checkpoint import (
+    GRAPH_DIGEST,
+    Checkpoint,
+    digest_of,
+    graph_path,
+    load_checkpoint,
+    write_graph,
+)
+from curate.detectors.pillars.encoding import Pillars, decode, encode_points
+from curate.errors import ConfigError, ModelError
+from curate.frames import Frame
+from curate.geometry.nms import nms_bev
+
+# Scores and box codes of one frame.
+_Answers = tuple[np.ndarray, np.ndarray]
+
+
+class PillarDetector:
+    """Finds boxes with a checkpoint that `curate.training` has made.
+
+    Args:
+        checkpoint: its safetensors file.
+        device: "cpu", or a torch device such as "cuda".
+        score_threshold: boxes with a lower score are left out.
+        nms_iou: BEV IoU above which the better box of a category suppresses the other.
+        threads: for the network, on CPU.
+
+    Raises:
+        ModelError: the checkpoint is missing, damaged or of another kind.
+        ConfigError: there is no such device.
+    """
+
+    def __init__(
+        self,
+        checkpoint: Path,
+        *,
+        device: str = "cpu",
+        score_threshold: float = 0.1,
+        nms_iou: float = 0.2,
+        threads: int = 1,
+    ) -> None:
+        self._checkpoint = load_checkpoint(checkpoint)
+        self._score_threshold = score_threshold
+        self._nms_iou = nms_iou
+        self._answers = (
+            _onnx_answers(checkpoint, self._checkpoint, threads)
+            if device == "cpu"
+            else _torch_answers(checkpoint, self._checkpoint, device)
+        )
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """What the detector can find."""
+        return self._checkpoint.categories
+
+    def predict(self, frame: Frame) -> Detections:
+        """See `curate.detectors.base.Detector`."""
+        preset = self._checkpoint.preset
+        pillars = encode_points(frame.points, preset)
+        if len(pillars.slots) == 0:
+            return Detections.empty()
+        scores, codes = self._answers(pillars)
+        found = decode(scores, codes, self.categories, preset, self._score_threshold)
+        kept = [np.zeros(0, dtype=np.int64)]
+        for category in self.categories:
+            of_category = np.flatnonzero(found.categories == category)
+            best = nms_bev(found.boxes[of_category], found.scores[of_category], self._nms_iou)
+            kept.append(of_category[best])
+        index = np.concatenate(kept)
+        return found.select(index[np.argsort(-found.scores[index], kind="stable")])
+
+
+def _onnx_answers(
+    path: Path, checkpoint: Checkpoint, threads: int
+) -> Callable[[Pillars], _Answers]:
+    """The checkpoint's ONNX graph in ONNX Runtime; made where it is missing or outdated."""
+    import onnxruntime
+    from onnxruntime.capi.onnxruntime_pybind11_state import (
+        Fail,
+        InvalidGraph,
+        InvalidProtobuf,
+        NoSuchFile,
+    )
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+
+    def open_session() -> onnxruntime.InferenceSession:
+        return onnxruntime.InferenceSession(
+            str(graph_path(path)), options, providers=["CPUExecutionProvider"]
+        )
+
+    digest = digest_of(path)
+    try:
+        session = open_session()
+        outdated = session.get_modelmeta().custom_metadata_map.get(GRAPH_DIGEST) != digest
+    except (Fail, InvalidGraph, InvalidProtobuf, NoSuchFile):
+        outdated = True
+    if outdated:
+        write_graph(path, checkpoint, digest)
+        session = open_session()
+
+    def answers(pillars: Pillars) -> _Answers:
+        inputs = {"features": pillars.features, "slots": pillars.slots[:, None]}
+        scores, codes = session.run(["scores", "codes"], inputs)
+        return scores, codes
+
+    return answers
+
+
+def _torch_answers(
+    path: Path, checkpoint: Checkpoint, device: str
+) -> Callable[[Pillars], _Answers]:
+    """The network itself, on a GPU."""
+    import torch
+
+    from curate.detectors.pillars.network import Peaks, network_of
+
+    try:
+        place = torch.device(device)
+        network = Peaks(network_of(checkpoint)).eval().to(place)
+    except (RuntimeError, AssertionError) as error:
+        message = str(error).splitlines()[0]
+        raise ConfigError(f"device {device!r} cannot be used: {message}") from None
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from None
+
+    def answers(pillars: Pillars) -> _Answers:
+        with torch.inference_mode():
+            features = torch.from_numpy(pillars.features).to(place)
+            scores, codes = network(features, torch.from_numpy(pillars.slots).to(place))
+        return scores.cpu().numpy(), codes.cpu().numpy()
+
+    return answers

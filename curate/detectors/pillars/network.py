@@ -1,0 +1,161 @@
+"""The pillar network: points to pillars, three scales over the ground, a heatmap and box codes."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from curate.detectors.pillars.checkpoint import Checkpoint
+from curate.detectors.pillars.encoding import BOX_CODE, POINT_FEATURES
+from curate.detectors.pillars.presets import Preset
+from curate.errors import ModelError
+
+# A cell holds an object with this probability before anything is learned.
+_PRIOR = 0.02
+
+
+class PillarNetwork(nn.Module):
+    """Maps the pillar features of b frames to logits and box codes.
+
+    All maps are channels-last: on CPU, convolutions and their gradients are about twice as fast
+    that way, and 1 x 1 convolutions are plain matrix products.
+    """
+
+    def __init__(self, preset: Preset, categories: int) -> None:
+        super().__init__()
+        self.preset = preset
+        self.categories = categories
+        first, second, third = preset.channels
+        head = preset.head_channels
+        self.points = nn.Sequential(
+            nn.Linear(POINT_FEATURES, preset.pillar_channels, bias=False),
+            nn.BatchNorm1d(preset.pillar_channels),
+            nn.ReLU(),
+        )
+        self.stem = _Pointwise(4 * preset.pillar_channels, first)
+        self.scale1 = _scale(first, first, preset.depths[0], down=False)
+        self.scale2 = _scale(first, second, preset.depths[1], down=True)
+        self.scale3 = _scale(second, third, preset.depths[2], down=True)
+        self.up3 = _Pointwise(third, second)
+        self.up2 = _Pointwise(second, head)
+        self.side1 = _Pointwise(first, head)
+        self.head = _convolution(head, head)
+        self.answer = nn.Linear(head, categories + BOX_CODE)
+        self.to(memory_format=torch.channels_last)
+        with torch.no_grad():
+            bias = self.answer.bias
+            bias.zero_()
+            bias[:categories] = torch.logit(torch.tensor(_PRIOR))
+
+    def forward(self, features: Tensor, slots: Tensor, frames: int) -> tuple[Tensor, Tensor]:
+        """The answers for a batch.
+
+        Args:
+            features: (n, POINT_FEATURES) of the points of all frames.
+            slots: (n,) row of each point's pillar in the canvas of all frames.
+            frames: b.
+
+        Returns:
+            (b, x cells, y cells, categories) logits and (b, x cells, y cells, BOX_CODE) codes.
+        """
+        cells_x, cells_y = self.preset.cells
+        canvas = _SlotMaximum.apply(self.points(features), slots, frames * cells_x * cells_y * 4)
+        fine = self.scale1(self.stem(canvas.view(frames, cells_x, cells_y, -1).permute(0, 3, 1, 2)))
+        middle = self.scale2(fine)
+        coarse = self.scale3(middle)
+        middle = middle + functional.interpolate(self.up3(coarse), scale_factor=2.0)
+        fine = self.side1(fine) + functional.interpolate(self.up2(middle), scale_factor=2.0)
+        answers = self.answer(self.head(fine).permute(0, 2, 3, 1))
+        return answers[..., : self.categories], answers[..., self.categories :]
+
+
+class Peaks(nn.Module):
+    """The network as it is used after training: one frame in, scores of local maxima out."""
+
+    def __init__(self, network: PillarNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, features: Tensor, slots: Tensor) -> tuple[Tensor, Tensor]:
+        """(x cells, y cells, categories) scores, 0 beside a higher one, and box codes."""
+        logits, codes = self.network(features, slots, 1)
+        logits = logits.permute(0, 3, 1, 2)
+        highest = functional.max_pool2d(logits, 3, stride=1, padding=1)
+        scores = torch.sigmoid(logits) * (logits == highest)
+        return scores.permute(0, 2, 3, 1)[0], codes[0]
+
+
+class _SlotMaximum(torch.autograd.Function):
+    """The maximum over the points of each slot, 0 in empty slots; inputs are not negative.
+
+    autograd's own scatter_reduce divides the gradient among equal maxima in several passes over
+    the whole canvas, which takes as long as a convolution. Here each of them gets it whole; exact
+    ties above zero come from copies of a point only.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, slots: Tensor, count: int) -> Tensor:
+        index = slots[:, None].expand(-1, values.shape[1])
+        highest = values.new_zeros(count, values.shape[1])
+        highest = highest.scatter_reduce(0, index, values, "amax", include_self=True)
+        ctx.save_for_backward(values, slots, highest)
+        return highest
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        values, slots, highest = ctx.saved_tensors
+        won = values == highest.index_select(0, slots)
+        return gradient.index_select(0, slots) * won, None, None
+
+
+class _Pointwise(nn.Module):
+    """A 1 x 1 convolution with batch norm and ReLU on channels-last maps."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__()
+        self.mix = nn.Linear(channels_in, channels_out, bias=False)
+        self.norm = nn.BatchNorm2d(channels_out)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """(b, channels_in, x, y) to (b, channels_out, x, y)."""
+        mixed = self.mix(maps.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+        return functional.relu(self.norm(mixed))
+
+
+def _convolution(channels_in: int, channels_out: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False),
+        nn.BatchNorm2d(channels_out),
+        nn.ReLU(inplace=True),
+    )
+
+
+def _scale(channels_in: int, channels_out: int, depth: int, *, down: bool) -> nn.Sequential:
+    first = [_convolution(channels_in, channels_out, 2)] if down else []
+    return nn.Sequential(*first, *(_convolution(channels_out, channels_out) for _ in range(depth)))
+
+
+def network_of(checkpoint: Checkpoint) -> PillarNetwork:
+    """The network with the checkpoint's weights, on CPU.
+
+    Raises:
+        ModelError: the checkpoint's tensors are not those of its preset.
+    """
+    network = PillarNetwork(checkpoint.preset, len(checkpoint.categories))
+    state = {name: torch.from_numpy(array) for name, array in checkpoint.weights.items()}
+    try:
+        network.load_state_dict(state)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise ModelError(f"damaged checkpoint: {reason}; train again") from None
+    return network
+
+
+def checkpoint_of(network: PillarNetwork, categories: tuple[str, ...]) -> Checkpoint:
+    """The network's present weights, copied."""
+    weights = {
+        name: tensor.detach().to("cpu", copy=True).contiguous().numpy()
+        for name, tensor in network.state_dict().items()
+    }
+    return Checkpoint(network.preset, categories, weights)

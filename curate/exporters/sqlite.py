@@ -1,0 +1,220 @@
+"""Weighted labels as one SQLite file: what a training needs, and what anyone can query with SQL.
+
+The file keeps the two kinds of truth apart by construction: a row of `ground_truth` can only refer
+to a frame of the labeled split, a row of `label` only to one of the unlabeled split, and other
+splits cannot be written at all.
+"""
+
+import json
+import os
+import sqlite3
+from collections.abc import Iterable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from curate.errors import DataError, LeakageError
+
+FORMAT_VERSION = 1
+
+WEIGHTED_LABEL_COLUMNS = (
+    "round", "frame", "k", "category", "x", "y", "z", "length", "width", "height", "yaw",
+    "score", "loss", "points", "points_threshold", "rho_diff", "mask_pixels", "box_pixels",
+    "rho_anno", "rho_det", "lambda_u", "policy", "weight",
+)  # fmt: skip
+GROUND_TRUTH_COLUMNS = (
+    "frame", "k", "category", "x", "y", "z", "length", "width", "height", "yaw",
+    "truncated", "occluded",
+)  # fmt: skip
+FRAME_COLUMNS = ("frame", "split", "points", "image", "calibration")
+
+# How many frames an error names.
+_NAMED_FRAMES = 5
+
+_TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
+CREATE TABLE frame (
+    frame TEXT PRIMARY KEY,
+    split TEXT NOT NULL CHECK (split IN ('labeled', 'unlabeled')),
+    points TEXT NOT NULL,       -- paths below meta.root
+    image TEXT,
+    calibration TEXT NOT NULL,
+    UNIQUE (frame, split)
+) STRICT;
+CREATE TABLE ground_truth (
+    frame TEXT NOT NULL,
+    k INTEGER NOT NULL,
+    category TEXT NOT NULL,
+    x REAL NOT NULL, y REAL NOT NULL, z REAL NOT NULL,  -- box centre, metres, LiDAR frame
+    length REAL NOT NULL, width REAL NOT NULL, height REAL NOT NULL,
+    yaw REAL NOT NULL,          -- radians, counter-clockwise from x
+    truncated REAL NOT NULL,    -- share outside the image
+    occluded INTEGER NOT NULL,  -- KITTI's levels 0 to 3
+    split TEXT GENERATED ALWAYS AS ('labeled') VIRTUAL,
+    FOREIGN KEY (frame, split) REFERENCES frame (frame, split)
+) STRICT;
+CREATE TABLE label (
+    round INTEGER NOT NULL,
+    frame TEXT NOT NULL,
+    k INTEGER NOT NULL,
+    category TEXT NOT NULL,
+    x REAL NOT NULL, y REAL NOT NULL, z REAL NOT NULL,  -- box centre, metres, LiDAR frame
+    length REAL NOT NULL, width REAL NOT NULL, height REAL NOT NULL,
+    yaw REAL NOT NULL,          -- radians, counter-clockwise from x
+    score REAL NOT NULL,
+    loss REAL,                  -- consistency loss L; NULL without a matched reprediction
+    points INTEGER,             -- LiDAR points in the box
+    points_threshold REAL,      -- m_th of the category
+    rho_diff REAL,              -- Eq. 8
+    mask_pixels INTEGER,        -- S, pixels of the category in the rectangle
+    box_pixels INTEGER,         -- A, pixels of the rectangle
+    rho_anno REAL,              -- Eq. 9
+    rho_det REAL,               -- rho_diff * rho_anno
+    lambda_u REAL,              -- age parameter, Eq. 4
+    policy TEXT NOT NULL,
+    weight REAL NOT NULL CHECK (weight BETWEEN 0 AND 1),  -- v; 0 is an ignore region
+    split TEXT GENERATED ALWAYS AS ('unlabeled') VIRTUAL,
+    FOREIGN KEY (frame, split) REFERENCES frame (frame, split)
+) STRICT;
+"""
+
+_VIEW = f"CREATE VIEW weighted_labels AS SELECT {', '.join(WEIGHTED_LABEL_COLUMNS)} FROM label;"
+
+# An index that exists during the load makes it several times slower.
+_INDEXES = """
+CREATE UNIQUE INDEX ground_truth_frame ON ground_truth (frame, k);
+CREATE UNIQUE INDEX label_frame ON label (frame, k, round, policy);
+ANALYZE;
+"""
+
+
+@dataclass(frozen=True)
+class LabelFileDescription:
+    """What the labels are about; becomes the table `meta`.
+
+    Attributes:
+        dataset: name of the data set, as in the registry.
+        root: folder that the paths of the frames are relative to.
+        categories: the categories to be learned, in the detector's order.
+        round: round that made the labels.
+        policy: policy that weighted them.
+        code_version: of curate.
+    """
+
+    dataset: str
+    root: Path
+    categories: tuple[str, ...]
+    round: int
+    policy: str
+    code_version: str
+
+    def as_meta(self) -> dict[str, str]:
+        """The rows of `meta`."""
+        return {
+            "format_version": str(FORMAT_VERSION),
+            "dataset": self.dataset,
+            "root": str(self.root),
+            "categories": json.dumps(list(self.categories)),
+            "round": str(self.round),
+            "policy": self.policy,
+            "code_version": self.code_version,
+        }
+
+
+def write_labels(
+    path: Path,
+    *,
+    description: LabelFileDescription,
+    frames: Iterable[tuple],
+    ground_truth: Iterable[tuple],
+    labels: Iterable[tuple],
+) -> None:
+    """Writes the label file at `path`, whole or not at all; rows are streamed.
+
+    Args:
+        path: an existing file is replaced.
+        description: see `LabelFileDescription`.
+        frames: rows of `FRAME_COLUMNS`; paths relative to the description's root.
+        ground_truth: rows of `GROUND_TRUTH_COLUMNS`, of labeled frames only.
+        labels: rows of `WEIGHTED_LABEL_COLUMNS`, of unlabeled frames only. Python numbers, not
+            numpy's.
+
+    Raises:
+        LeakageError: ground truth of a frame that is not labeled, or a frame of another split.
+        DataError: a row does not fit its table, or a label belongs to no unlabeled frame.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial.unlink(missing_ok=True)
+    try:
+        with closing(sqlite3.connect(partial, isolation_level=None)) as connection:
+            _fill(connection, path, description, (frames, ground_truth, labels))
+        with partial.open("rb") as written:
+            os.fsync(written.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def refuse_leakage(connection: sqlite3.Connection, path: Path) -> None:
+    """LeakageError where a label file holds ground truth of frames that are not labeled."""
+    leaked = _strangers(connection, "ground_truth", "labeled")
+    if leaked:
+        raise LeakageError(
+            f"{path}: ground truth of frames outside the labeled split: {leaked}; "
+            "only labeled frames may bring ground truth into a training"
+        )
+
+
+def _fill(
+    connection: sqlite3.Connection,
+    path: Path,
+    description: LabelFileDescription,
+    rows: tuple[Iterable[tuple], Iterable[tuple], Iterable[tuple]],
+) -> None:
+    # The file is thrown away unless it gets finished: no journal is needed to undo a half.
+    connection.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;" + _TABLES)
+    connection.execute("BEGIN")
+    columns = (FRAME_COLUMNS, GROUND_TRUTH_COLUMNS, WEIGHTED_LABEL_COLUMNS)
+    try:
+        connection.executemany("INSERT INTO meta VALUES (?, ?)", description.as_meta().items())
+        for table, names, table_rows in zip(
+            ("frame", "ground_truth", "label"), columns, rows, strict=True
+        ):
+            marks = ", ".join("?" * len(names))
+            insert = f"INSERT INTO {table} ({', '.join(names)}) VALUES ({marks})"  # noqa: S608
+            connection.executemany(insert, table_rows)
+        refuse_leakage(connection, path)
+        _refuse_stray_labels(connection, path)
+        connection.executescript(_VIEW + _INDEXES)
+    except sqlite3.IntegrityError as error:
+        if "split IN" in str(error):
+            raise LeakageError(
+                f"{path}: a frame's split is neither labeled nor unlabeled; "
+                "frames of other splits (val) are never trained on"
+            ) from None
+        raise DataError(f"{path}: a row was refused: {error}") from None
+    except (sqlite3.ProgrammingError, sqlite3.InterfaceError) as error:
+        raise DataError(f"{path}: a row does not fit its table: {error}") from None
+    except sqlite3.OperationalError as error:
+        raise DataError(f"{path}: cannot be written: {error}") from None
+
+
+def _refuse_stray_labels(connection: sqlite3.Connection, path: Path) -> None:
+    strays = _strangers(connection, "label", "unlabeled")
+    if strays:
+        raise DataError(
+            f"{path}: labels of frames outside the unlabeled split: {strays}; "
+            "export labels of unlabeled frames only"
+        )
+
+
+def _strangers(connection: sqlite3.Connection, table: str, split: str) -> str:
+    """The frames that a table may not refer to, as text; empty where there are none."""
+    query = (
+        f"SELECT DISTINCT frame FROM {table} WHERE frame NOT IN "  # noqa: S608
+        "(SELECT frame FROM frame WHERE split = ?) ORDER BY frame"
+    )
+    names = [row[0] for row in connection.execute(query, (split,))]
+    more = f" and {len(names) - _NAMED_FRAMES} more" if len(names) > _NAMED_FRAMES else ""
+    return ", ".join(names[:_NAMED_FRAMES]) + more

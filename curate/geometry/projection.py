@@ -1,0 +1,106 @@
+"""Projection from the LiDAR frame into the image (KITTI: Geiger et al., IJRR 2013, eq. 8)."""
+
+import numpy as np
+
+from curate.frames import Calibration
+from curate.geometry.boxes import box_corners
+
+# What is nearer to the camera than this is cut away: at depth 0 the projection has no bounds.
+_NEAR_METRES = 0.1
+
+# The twelve edges of `box_corners`: bottom ring, top ring, verticals.
+_EDGE_STARTS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3])
+_EDGE_ENDS = np.array([1, 2, 3, 0, 5, 6, 7, 4, 4, 5, 6, 7])
+
+
+def project_points(
+    points_lidar: np.ndarray, calibration: Calibration
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where points appear in the image.
+
+    Args:
+        points_lidar: (n, >=3) x, y, z in metres in the LiDAR frame.
+        calibration: of the frame.
+
+    Returns:
+        (n, 2) pixels from the left and from the top, without meaning where the depth is not
+        positive (NaN at depth 0), and (n,) depth along the optical axis in metres.
+    """
+    projected = _homogeneous(points_lidar[:, :3], calibration)
+    depth = projected[:, 2]
+    divisor = np.where(depth == 0, np.nan, depth)
+    return projected[:, :2] / divisor[:, None], depth
+
+
+def in_view(
+    points: np.ndarray, calibration: Calibration, image_size: tuple[int, int]
+) -> np.ndarray:
+    """(n,) bool, whether (n, >=3) LiDAR points lie before the camera and inside its image.
+
+    Args:
+        points: x, y, z in metres in the LiDAR frame, first of the columns.
+        calibration: of the frame.
+        image_size: (width, height) in pixels.
+    """
+    pixels, depth = project_points(points, calibration)
+    inside = (pixels >= 0) & (pixels < np.asarray(image_size))
+    return inside.all(axis=1) & (depth > 0)
+
+
+def image_rectangles(
+    boxes: np.ndarray, calibration: Calibration, image_size: tuple[int, int]
+) -> np.ndarray:
+    """The 2D boxes of 3D boxes: the rectangle around each projected box, clipped to the image.
+
+    Of a box that reaches behind the camera, the part before the near plane counts.
+
+    Args:
+        boxes: (n, 7) in the LiDAR frame.
+        calibration: of the frame.
+        image_size: (width, height) in pixels.
+
+    Returns:
+        (n, 4) left, top, right, bottom in pixels, within [0, width - 1] and [0, height - 1]; NaN
+        where the box lies behind the camera or its rectangle outside the image.
+    """
+    corners = box_corners(boxes)
+    projected = _homogeneous(corners.reshape(-1, 3), calibration).reshape(-1, 8, 3)
+    outline = _clip_at_near_plane(projected)
+    with np.errstate(invalid="ignore"):
+        pixels = outline[..., :2] / outline[..., 2:]
+    seen = ~np.isnan(pixels)
+    low = np.min(pixels, axis=1, where=seen, initial=np.inf)
+    high = np.max(pixels, axis=1, where=seen, initial=-np.inf)
+    last_pixel = np.asarray(image_size) - 1.0
+    rectangles = np.hstack([np.clip(low, 0, last_pixel), np.clip(high, 0, last_pixel)])
+    rectangles[~((high > 0) & (low < last_pixel)).all(axis=1)] = np.nan
+    return rectangles
+
+
+def _homogeneous(points_lidar: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """(n, 3) image points as (u * depth, v * depth, depth)."""
+    matrix = calibration.lidar_to_image
+    points = np.asarray(points_lidar, dtype=np.float64)
+    projected: np.ndarray = points @ matrix[:, :3].T + matrix[:, 3]
+    return projected
+
+
+def _clip_at_near_plane(corners: np.ndarray) -> np.ndarray:
+    """Outlines of the parts of boxes that lie before the near plane.
+
+    Args:
+        corners: (n, 8, 3) homogeneous image points in the order of `box_corners`.
+
+    Returns:
+        (n, 20, 3): the corners and the points where the 12 edges pierce the near plane; NaN for
+        corners behind it and edges that do not pierce it.
+    """
+    starts, ends = corners[:, _EDGE_STARTS], corners[:, _EDGE_ENDS]
+    depth_start, depth_end = starts[..., 2], ends[..., 2]
+    pierces = (depth_start < _NEAR_METRES) != (depth_end < _NEAR_METRES)
+    along = np.where(pierces, _NEAR_METRES - depth_start, np.nan)
+    along = along / np.where(pierces, depth_end - depth_start, 1.0)
+    pierced = starts + along[..., None] * (ends - starts)
+    pierced[..., 2] = np.where(pierces, _NEAR_METRES, np.nan)
+    visible = np.where((corners[..., 2] >= _NEAR_METRES)[..., None], corners, np.nan)
+    return np.concatenate([visible, pierced], axis=1)

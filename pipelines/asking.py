@@ -1,0 +1,72 @@
+"""Read-only questions in SQL."""
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import create_engine, make_url
+from sqlalchemy.exc import DBAPIError
+
+from curate.errors import ConfigError, DatabaseError
+
+# What SQLite may do for a question: read tables and call functions, nothing else. ATTACH would read
+# other files, PRAGMA could switch the protection off.
+ALLOWED = frozenset(
+    {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
+)
+FORBIDDEN_FUNCTIONS = frozenset({"load_extension", "readfile", "writefile", "edit"})
+
+
+def ask(url: str, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
+    """The columns and the rows of a question.
+
+    Raises:
+        ConfigError: the SQL is wrong, or does more than read.
+        DatabaseError: the database cannot be opened.
+    """
+    if make_url(url).get_backend_name() == "sqlite":
+        return _ask_sqlite(Path(str(make_url(url).database)), sql)
+    return _ask_server(url, sql)
+
+
+def _ask_sqlite(path: Path, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
+    try:
+        connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+    except sqlite3.Error as error:
+        raise DatabaseError(f"{path}: {error}") from error
+    connection.execute("PRAGMA query_only = ON")
+    connection.set_authorizer(_authorize)
+    try:
+        cursor = connection.execute(sql)
+    except (sqlite3.Error, sqlite3.Warning) as error:
+        if "file is not a database" in str(error) or "malformed" in str(error):
+            raise DatabaseError(f"{path}: {error}") from error
+        raise ConfigError(_explain(str(error))) from error
+    if cursor.description is None:
+        raise ConfigError("query: not a question; write a SELECT")
+    return [column[0] for column in cursor.description], iter(cursor)
+
+
+def _authorize(action: int, first: str | None, second: str | None, *_: str | None) -> int:
+    """SQLite asks this before each thing that a statement would do."""
+    if action == sqlite3.SQLITE_FUNCTION and second in FORBIDDEN_FUNCTIONS:
+        return sqlite3.SQLITE_DENY
+    return sqlite3.SQLITE_OK if action in ALLOWED else sqlite3.SQLITE_DENY
+
+
+def _ask_server(url: str, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
+    connection = create_engine(url).connect().execution_options(postgresql_readonly=True)
+    try:
+        result = connection.exec_driver_sql(sql)
+    except DBAPIError as error:
+        raise ConfigError(_explain(str(error.orig))) from error
+    return list(result.keys()), (tuple(row) for row in result)
+
+
+def _explain(message: str) -> str:
+    if "not authorized" in message or "readonly" in message or "prohibited" in message:
+        return "query: only SELECT is allowed, the connection is read-only"
+    if "one statement" in message:
+        return "query: one statement at a time"
+    return f"query: {message}"

@@ -1,0 +1,109 @@
+"""The one place where sections of the configuration become objects of curate."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, TypeVar
+
+from curate.consistency import ConsistencySettings
+from curate.detectors.base import Detector
+from curate.errors import ConfigError
+from curate.priors.points import PointSettings
+from curate.priors.semantic import SemanticSettings
+from curate.segmenters.base import Segmenter
+from curate.weighting.base import Policy
+from pipelines import registry
+from pipelines.config import Config
+
+Kind = TypeVar("Kind")
+
+SHIPPED_SEGMENTER = Path(__file__).parent.parent / "curate/segmenters/models/simulated.onnx"
+
+
+def open_detector(config: Config, path: Path) -> Detector:
+    """The detector behind a checkpoint or a file that the user brought."""
+    section = config.detector
+    detector: Detector = registry.DETECTORS.build(
+        section.name,
+        path,
+        offered={
+            "minimum_score": section.minimum_score,
+            "device": device(config),
+            "categories": config.dataset.categories,
+            "threads": 1,
+        },
+        options=section.options,
+    )
+    return detector
+
+
+def device(config: Config) -> str:
+    """Where the detector runs: "cpu" or "cuda"."""
+    if config.detector.device != "auto":
+        return config.detector.device
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def open_segmenter(config: Config) -> Segmenter:
+    """The segmenter.
+
+    Raises:
+        ConfigError: none is configured, or it needs a path.
+    """
+    from curate.segmenters.classes import class_map
+
+    section = config.segmenter
+    path = segmenter_path(config)
+    if path is None:
+        raise ConfigError(
+            f"segmenter '{section.name}' needs a path: set segmenter.path in curate.toml, "
+            "or leave 'semantic' out of run.priors"
+        )
+    name, classes = section.name, section.classes
+    if name == "simulated":
+        name, classes = "onnx", "simulated"
+    segmenter: Segmenter = registry.SEGMENTERS.build(
+        name,
+        path,
+        offered={"classes": class_map(classes), "seed": config.run.seed},
+        options=section.options,
+    )
+    return segmenter
+
+
+def segmenter_path(config: Config) -> Path | None:
+    """The segmenter's model or folder; the project ships the one for simulated images."""
+    return SHIPPED_SEGMENTER if config.segmenter.name == "simulated" else config.segmenter.path
+
+
+def open_policy(config: Config, name: str) -> Policy:
+    """A policy with its settings."""
+    section = config.solve
+    policy: Policy = registry.POLICIES.build(
+        name,
+        offered={"scope": section.scope, "quantile": section.quantile},
+        options=section.options.get(name, {}),
+    )
+    return policy
+
+
+def consistency_settings(config: Config) -> ConsistencySettings:
+    """How predictions and repredictions are compared."""
+    return _from_section(ConsistencySettings, config.repredict)
+
+
+def point_settings(config: Config) -> PointSettings:
+    """How the point prior learns its thresholds."""
+    return _from_section(PointSettings, config.points)
+
+
+def semantic_settings(config: Config) -> SemanticSettings:
+    """How the semantic prior turns pixels into trust."""
+    return _from_section(SemanticSettings, config.semantic)
+
+
+def _from_section(settings: type[Kind], section: Any) -> Kind:
+    """A settings object from the section's values of the same names."""
+    names = [field.name for field in dataclasses.fields(settings)]  # type: ignore[arg-type]
+    return settings(**{name: getattr(section, name) for name in names})

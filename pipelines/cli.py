@@ -1,0 +1,69 @@
+"""The command `curate`: its commands, and errors as one line with their exit code."""
+
+import logging
+import sys
+
+import typer
+
+from curate.errors import CurateError
+from pipelines.commands import (
+    demo,
+    evaluate,
+    explain,
+    export,
+    graph,
+    init,
+    predict,
+    pretrain,
+    query,
+    repredict,
+    run,
+    score,
+    simulate,
+    solve,
+    status,
+    train_round,
+)
+
+app = typer.Typer(
+    name="curate",
+    help="Turns a 3D detector's guesses on unlabeled LiDAR-camera frames into weighted labels.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+for command in (
+    demo,
+    simulate,
+    init,
+    pretrain,
+    predict,
+    repredict,
+    score,
+    solve,
+    export,
+    train_round,
+    run,
+    status,
+    graph,
+    query,
+    explain,
+    evaluate,
+):
+    command.register(app)
+
+
+def main() -> None:
+    """Runs the command line; a wrong input ends in one line and its own exit code."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    try:
+        app()
+    except CurateError as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; run the command again, it continues\n")
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(0)

@@ -1,0 +1,41 @@
+"""curate explain: why a label has its weight."""
+
+from typing import Annotated
+
+import typer
+
+from pipelines.commands.options import (
+    JsonOption,
+    PolicyOption,
+    RoundOption,
+    WorkspaceOption,
+    open_workspace,
+    print_json,
+)
+
+
+def explain(
+    frame: Annotated[str, typer.Argument(help="Frame id, e.g. 000008.")],
+    k: Annotated[int, typer.Argument(min=0, help="Number of the label within the frame.")],
+    policy: PolicyOption = None,
+    round_number: RoundOption = None,
+    workspace: WorkspaceOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show every number behind a label's weight, the equation it enters, and the weight from them.
+
+    Example: curate explain 000008 0
+    """
+    from pipelines.explanation import explain_label
+
+    opened = open_workspace(workspace)
+    found = explain_label(opened, frame, k, round_number, policy or opened.config.solve.policy)
+    if as_json:
+        print_json(found)
+    else:
+        typer.echo(found.as_text())
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command."""
+    app.command()(explain)

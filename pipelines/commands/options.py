@@ -1,0 +1,127 @@
+"""Options that several commands share, and how commands print."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+if TYPE_CHECKING:
+    from pipelines.runner import Report
+    from pipelines.workspace import Workspace
+
+WorkspaceOption = Annotated[
+    Optional[Path],  # noqa: UP045 - typer reads this form on every Python
+    typer.Option("--workspace", "-w", help="Folder; default: the current one or one above it."),
+]
+RoundOption = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option("--round", min=1, help="Round; default: the first without a student."),
+]
+PolicyOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--policy", help="Policy; default: solve.policy of curate.toml."),
+]
+ExecutorOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--executor", help="serial or process; default: run.executor of curate.toml."),
+]
+WorkersOption = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option("--workers", min=1, help="Workers; more than one means --executor process."),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+
+def open_workspace(
+    folder: Path | None, executor: str | None = None, workers: int | None = None
+) -> "Workspace":
+    """The workspace, with what the command line changes for this run."""
+    from pipelines.workspace import Workspace
+
+    workspace = Workspace.open(folder)
+    changes: dict[str, Any] = {}
+    if workers is not None:
+        changes = {"workers": workers, "executor": "process" if workers > 1 else "serial"}
+    if executor is not None:
+        changes["executor"] = executor
+    return workspace.with_run(**changes)
+
+
+def print_json(value: Any) -> None:
+    """Prints a value, a dataclass or a list of them as JSON."""
+    typer.echo(json.dumps(value, indent=1, default=_plain))
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    return str(value)
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], title: str = "") -> None:
+    """Prints rows as a table; numbers are aligned to the right."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title or None, title_justify="left", header_style="bold")
+    cells = [[_cell(value) for value in row] for row in rows]
+    numeric = [
+        all(_is_number(row[i]) for row in cells) and bool(cells) for i in range(len(columns))
+    ]
+    for name, right in zip(columns, numeric, strict=True):
+        table.add_column(name, justify="right" if right else "left", overflow="fold")
+    for row in cells:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def print_report(report: "Report") -> None:
+    """One line on what a stage did, and the first errors of its failed frames."""
+    line = f"round {report.round}  {report.stage:<11} "
+    if report.summary:
+        line += report.summary
+    else:
+        line += f"{report.done} frames done, {report.labels} rows"
+        states: Mapping[str, int] = {"empty": report.empty, "failed": report.failed}
+        line += "".join(f", {n} {state}" for state, n in states.items() if n)
+        line += f", {report.kept} already done" if report.kept else ""
+    typer.echo(f"{line}  ({report.seconds:.1f} s)")
+    for frame, error in report.errors[:5]:
+        typer.echo(f"  failed {frame}: {error}", err=True)
+    if len(report.errors) > 5:
+        typer.echo("  ... all of them: curate status --failed", err=True)
+
+
+def end(reports: Sequence["Report"], *, as_json: bool) -> None:
+    """Ends a command that ran stages.
+
+    Raises:
+        FramesFailed: some frames failed.
+    """
+    from curate.errors import FramesFailed
+
+    if as_json:
+        print_json(list(reports))
+    failed = sum(report.failed for report in reports)
+    if failed:
+        raise FramesFailed(
+            f"{failed} frame results failed and are recorded; see `curate status --failed`, "
+            "mend the files and run the command again"
+        )
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text or "0")
+    except ValueError:
+        return False
+    return True

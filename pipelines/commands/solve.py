@@ -1,0 +1,26 @@
+"""curate solve: weigh the labels."""
+
+import typer
+
+from pipelines.commands.options import JsonOption, PolicyOption, RoundOption, WorkspaceOption
+from pipelines.commands.stages import run_round_command
+
+
+def solve(
+    policy: PolicyOption = None,
+    round_number: RoundOption = None,
+    workspace: WorkspaceOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Weigh every label of a round under a policy; policies stand side by side.
+
+    Policies: pspsl, spsl, uniform, threshold, baseline, or module:Class.
+
+    Example: curate solve --policy spsl
+    """
+    run_round_command("solve", workspace, round_number, policy, as_json=as_json)
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command."""
+    app.command()(solve)

@@ -1,0 +1,73 @@
+"""What the commands of single stages have in common."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipelines.commands.options import end, open_workspace, print_report
+
+
+def run_frame_command(
+    stages: Sequence[str] | None,
+    folder: Path | None,
+    round_number: int | None,
+    split: str,
+    executor: str | None,
+    workers: int | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Runs frame stages for a split; None stands for the configured priors."""
+    from curate.errors import ConfigError
+    from pipelines.progress import Bar
+    from pipelines.round import PRIORS, stage
+    from pipelines.rounds import open_round
+    from pipelines.runner import run_frames
+    from pipelines.stage import FrameStage
+    from pipelines.workspace import SPLITS
+
+    workspace = open_workspace(folder, executor, workers)
+    priors = workspace.config.run.priors
+    if split not in SPLITS:
+        raise ConfigError(f"--split {split}: use one of {', '.join(SPLITS)}")
+    names = priors if stages is None else stages
+    for name in names:
+        if stages is not None and name in PRIORS and name not in priors:
+            raise ConfigError(f"--prior {name}: not in run.priors of curate.toml; add it there")
+    context = open_round(workspace, round_number)
+    reports = []
+    for name in names:
+        try:
+            found = stage(name)
+        except StopIteration:
+            raise ConfigError(f"--prior {name}: use one of {', '.join(PRIORS)}") from None
+        if isinstance(found, FrameStage):
+            reports.append(run_frames(workspace, context, found, Bar(), split))
+            if not as_json:
+                print_report(reports[-1])
+    end(reports, as_json=as_json)
+
+
+def run_round_command(
+    name: str,
+    folder: Path | None,
+    round_number: int | None,
+    policy: str | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Runs a round stage for a policy."""
+    from pipelines.progress import Bar
+    from pipelines.round import stage
+    from pipelines.rounds import open_round
+    from pipelines.runner import run_round
+    from pipelines.stage import RoundStage
+
+    workspace = open_workspace(folder)
+    found = stage(name)
+    if not isinstance(found, RoundStage):
+        raise TypeError(name)
+    context = open_round(workspace, round_number)
+    report = run_round(workspace, context, found, policy or workspace.config.solve.policy, Bar())
+    if not as_json:
+        print_report(report)
+    end([report], as_json=as_json)

@@ -1,0 +1,46 @@
+"""curate status: how far the work is."""
+
+from typing import Annotated
+
+import typer
+
+from pipelines.commands.options import (
+    JsonOption,
+    WorkspaceOption,
+    open_workspace,
+    print_json,
+    print_table,
+)
+
+
+def status(
+    failed: Annotated[bool, typer.Option(help="List every failed frame with its error.")] = False,
+    workspace: WorkspaceOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show per round and stage what is done, empty, failed, waiting or stale.
+
+    Example: curate status --failed
+    """
+    from pipelines.overview import failed_frames, overview
+
+    opened = open_workspace(workspace)
+    if failed:
+        columns, rows = failed_frames(opened)
+    else:
+        columns, rows = overview(opened)
+    if as_json:
+        print_json([dict(zip(columns, row, strict=True)) for row in rows])
+    elif failed:
+        for number, stage, frame, split, error in rows:
+            typer.echo(f"round {number}  {stage}  {frame} ({split}): {error}")
+        typer.echo(f"{len(rows)} failed")
+    else:
+        splits = {split: len(opened.frames(split)) for split in ("labeled", "unlabeled", "val")}
+        counts = ", ".join(f"{count} {split}" for split, count in splits.items())
+        print_table(columns, rows, title=f"{opened.root}: {counts} frames")
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command."""
+    app.command()(status)

@@ -1,0 +1,189 @@
+"""What is stale and what is done, asked of the database.
+
+The fingerprint of a stage is a hash of all that its rows depend on: its settings and the
+fingerprints of the stages that write what it reads. A frame is done where its task carries the
+current fingerprint; a changed setting thus makes stale what follows, and only that.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, select
+
+from curate.errors import WorkspaceError
+from db import bulk
+from pipelines.round import active, frames_before, stage
+from pipelines.stage import FrameStage, RoundContext, RoundStage
+from pipelines.workspace import Workspace
+
+FINISHED = ("done", "empty")
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How many frames of a stage are in which state; `waiting` is all that is to be done."""
+
+    done: int
+    empty: int
+    failed: int
+    waiting: int
+
+
+@dataclass(frozen=True)
+class Once:
+    """The key of the task of a stage that is done once, not per frame.
+
+    Attributes:
+        round: e; 0 for what comes before the first.
+        stage: its name.
+        variant: the policy; "" where there is none.
+    """
+
+    round: int
+    stage: str
+    variant: str
+
+    def conditions(self) -> tuple[ColumnElement[bool], ...]:
+        """The task's row in SQL."""
+        task = bulk.table("task")
+        mine = {"round": self.round, "stage": self.stage, "variant": self.variant}
+        return (*(task.c[name] == value for name, value in mine.items()), task.c.frame_id.is_(None))
+
+
+def fingerprints(workspace: Workspace, context: RoundContext, policy: str) -> dict[str, str]:
+    """The current fingerprint of every active stage of a round.
+
+    A round stage's fingerprint here says what its frames must have gone through; `state` adds which
+    frames these were.
+    """
+    known: dict[str, str] = {
+        "frame": workspace.config.dataset.kind,
+        "ground_truth": digest(sorted(workspace.frames("labeled"))),
+        "teacher": context.teacher.sha256,
+    }
+    prints: dict[str, str] = {}
+    for each in active(workspace.config.run.priors):
+        settings = (
+            each.settings(workspace, context)
+            if isinstance(each, FrameStage)
+            else each.settings(workspace, context, policy)
+        )
+        inputs = [known[name] for name in each.reads if name in known]
+        prints[each.name] = digest([each.name, settings, inputs])
+        known |= dict.fromkeys(each.writes, prints[each.name])
+    return prints
+
+
+def waiting_frames(
+    workspace: Workspace, context: RoundContext, of: FrameStage, split: str
+) -> list[tuple[int, str, bool]]:
+    """Frames to work on: key, name, and whether an earlier stage found them empty.
+
+    They are those of the split that all earlier stages have finished and this one has not, or not
+    with its current fingerprint.
+    """
+    prints = fingerprints(workspace, context, workspace.config.solve.policy)
+    frame = bulk.table("frame")
+    query = select(frame.c.id, frame.c.frame).where(frame.c.split == split).order_by(frame.c.frame)
+    with workspace.database.reading() as connection:
+        frames = bulk.select(connection, query)
+        own = _states(connection, context.number, of.name, prints[of.name])
+        before = [
+            _states(connection, context.number, other.name, prints[other.name])
+            for other in frames_before(of, workspace.config.run.priors)
+        ]
+    return [
+        (key, name, any(states[key] == "empty" for states in before))
+        for key, name in frames
+        if own.get(key) not in FINISHED and all(states.get(key) in FINISHED for states in before)
+    ]
+
+
+def counts(workspace: Workspace, context: RoundContext, of: FrameStage, split: str) -> Counts:
+    """How far a stage is with a split."""
+    prints = fingerprints(workspace, context, workspace.config.solve.policy)
+    frames = set(workspace.frames(split).values())
+    with workspace.database.reading() as connection:
+        own = _states(connection, context.number, of.name, prints[of.name])
+    states = [own.get(key) for key in frames]
+    done, empty, failed = (states.count(state) for state in ("done", "empty", "failed"))
+    return Counts(done, empty, failed, len(states) - done - empty - failed)
+
+
+def complete_frames(workspace: Workspace, context: RoundContext) -> list[int]:
+    """The unlabeled frames that every stage before solve has finished, with at least one label.
+
+    Raises:
+        WorkspaceError: some frames wait; failed ones do not count as waiting, they are left out.
+    """
+    prints = fingerprints(workspace, context, workspace.config.solve.policy)
+    needed = frames_before(stage("solve"), workspace.config.run.priors)
+    frames = workspace.frames("unlabeled").values()
+    with workspace.database.reading() as connection:
+        states = {
+            other.name: _states(connection, context.number, other.name, prints[other.name])
+            for other in needed
+        }
+    failed = {key for of in states.values() for key, state in of.items() if state == "failed"}
+    for other in needed:
+        missing = sum(key not in states[other.name] and key not in failed for key in frames)
+        if missing:
+            raise WorkspaceError(
+                f"{other.name}: {missing} frames of round {context.number} are not done with the "
+                f"current settings; run `curate {other.command}`, or `curate run` for all stages"
+            )
+    return [key for key in frames if all(of.get(key) == "done" for of in states.values())]
+
+
+def round_fingerprint(
+    workspace: Workspace, context: RoundContext, of: RoundStage, policy: str, frames: Sequence[int]
+) -> str:
+    """The fingerprint of a round stage together with the frames that it would see."""
+    return digest([fingerprints(workspace, context, policy)[of.name], list(frames)])
+
+
+def round_state(workspace: Workspace, context: RoundContext, of: RoundStage, policy: str) -> str:
+    """The state of a round stage: "done", "stale", or "waiting" for its first run or its input."""
+    what = Once(context.number, of.name, policy)
+    query = select(bulk.table("task").c.fingerprint).where(*what.conditions())
+    with workspace.database.reading() as connection:
+        stored = bulk.select(connection, query)
+    if not stored:
+        return "waiting"
+    try:
+        frames = complete_frames(workspace, context)
+    except WorkspaceError:
+        return "stale"
+    current = round_fingerprint(workspace, context, of, policy, frames)
+    file = of.file(workspace, context, policy) if of.file else None
+    return "done" if stored == [(current,)] and (file is None or file.is_file()) else "stale"
+
+
+def is_current(workspace: Workspace, what: Once, fingerprint: str) -> bool:
+    """Whether it has been done with all that it depends on."""
+    query = select(bulk.table("task").c.fingerprint).where(*what.conditions())
+    with workspace.database.reading() as connection:
+        return bulk.select(connection, query) == [(fingerprint,)]
+
+
+def _states(
+    connection: Connection, round_number: int, stage: str, fingerprint: str
+) -> Mapping[int, str]:
+    """The state of each frame's task that carries the fingerprint."""
+    task = bulk.table("task")
+    query = select(task.c.frame_id, task.c.state).where(
+        task.c.round == round_number,
+        task.c.stage == stage,
+        task.c.fingerprint == fingerprint,
+        task.c.frame_id.is_not(None),
+    )
+    return dict(bulk.select(connection, query))
+
+
+def digest(value: Any) -> str:
+    """A hash of a value made of plain types."""
+    text = json.dumps(value, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

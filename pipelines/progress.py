@@ -1,0 +1,84 @@
+"""How a command shows that it is alive: a bar on a terminal, a line now and then in a log."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+Advance = Callable[[int, str], None]
+
+QUIET_S = 2.0
+LINE_EVERY_S = 15.0
+
+
+class Progress(Protocol):
+    """Shows the state of something long."""
+
+    @contextmanager
+    def track(self, what: str, total: int) -> Iterator[Advance]:
+        """Yields a function that takes how much more is done and a word on how it goes."""
+        ...
+
+
+class Silent:
+    """Shows nothing."""
+
+    @contextmanager
+    def track(self, what: str, total: int) -> Iterator[Advance]:  # noqa: ARG002
+        """Yields a function that does nothing."""
+        yield lambda _step, _note: None
+
+
+class Bar:
+    """A bar with rate and time left on a terminal; lines on anything else, to standard error."""
+
+    @contextmanager
+    def track(self, what: str, total: int) -> Iterator[Advance]:
+        """Yields a function that moves the bar."""
+        with _bar(what, total) if sys.stderr.isatty() else _lines(what, total) as advance:
+            yield advance
+
+
+@contextmanager
+def _bar(what: str, total: int) -> Iterator[Advance]:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.progress import Progress as RichProgress
+
+    with RichProgress(
+        TextColumn("  {task.description:<12}"),
+        BarColumn(bar_width=32),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=Console(stderr=True),
+        transient=True,
+    ) as bar:
+        task = bar.add_task(what, total=total, note="")
+        yield lambda step, note: bar.update(task, advance=step, note=note)
+
+
+@contextmanager
+def _lines(what: str, total: int) -> Iterator[Advance]:
+    start = last = time.monotonic()
+    done = 0
+
+    def advance(step: int, note: str) -> None:
+        nonlocal last, done
+        done += step
+        now = time.monotonic()
+        if now - start > QUIET_S and now - last > LINE_EVERY_S:
+            last = now
+            left = (now - start) * (total - done) / max(done, 1)
+            sys.stderr.write(f"  {what} {done}/{total}, {left:.0f} s left {note}\n")
+            sys.stderr.flush()
+
+    yield advance

@@ -1,0 +1,141 @@
+"""Which round it is, and which detector answers in it."""
+
+import json
+from pathlib import Path
+
+from sqlalchemy import Connection, func, select
+
+import curate
+from curate.errors import WorkspaceError
+from db import bulk
+from pipelines.registry import TRAINABLE
+from pipelines.stage import RoundContext, Teacher
+from pipelines.workspace import Workspace, sha256
+
+
+def is_trainable(workspace: Workspace) -> bool:
+    """Whether curate trains the configured detector; otherwise the user brings it."""
+    return workspace.config.detector.name in TRAINABLE
+
+
+def open_round(
+    workspace: Workspace, number: int | None = None, rounds: int | None = None
+) -> RoundContext:
+    """A round, made where it does not exist yet.
+
+    Args:
+        workspace: see `Workspace`.
+        number: e; None for the first that has no student yet.
+        rounds: E for a round that has no student yet; None for the configured number.
+
+    Raises:
+        WorkspaceError: the detector that would answer in the round does not exist yet.
+    """
+    students = _students(workspace)
+    wanted = rounds or workspace.config.run.rounds
+    if number is None:
+        number = next(e for e in range(1, wanted + 1) if e not in students or e == wanted)
+    teacher_id, teacher = find_teacher(workspace, number)
+    stored = _stored_rounds(workspace, number)
+    rounds = stored if stored and number in students else max(wanted, number)
+    row = {
+        "number": number,
+        "rounds": rounds,
+        "teacher_id": teacher_id,
+        "config": json.dumps(workspace.config.model_dump(mode="json")),
+        "code_version": curate.__version__,
+        "seed": workspace.config.run.seed,
+    }
+    table = bulk.table("round")
+    with workspace.database.writing() as connection:
+        changed = connection.execute(table.update().where(table.c.number == number).values(**row))
+        if changed.rowcount == 0:
+            connection.execute(table.insert().values(**row))
+    return RoundContext(number, rounds, workspace.config.run.seed, teacher)
+
+
+def peek_round(workspace: Workspace, number: int) -> RoundContext | None:
+    """A round as it is stored, without making or changing it; None where its teacher is gone."""
+    try:
+        _, teacher = find_teacher(workspace, number)
+    except WorkspaceError:
+        return None
+    rounds = _stored_rounds(workspace, number) or workspace.config.run.rounds
+    return RoundContext(number, max(rounds, number), workspace.config.run.seed, teacher)
+
+
+def find_teacher(workspace: Workspace, number: int) -> tuple[int, Teacher]:
+    """The key and the file of the detector that answers in a round.
+
+    Raises:
+        WorkspaceError: it does not exist yet.
+        ConfigError: the user's file does not exist.
+    """
+    if not is_trainable(workspace):
+        return _brought(workspace)
+    table = bulk.table("checkpoint")
+    policy = workspace.config.solve.policy if number > 1 else ""
+    query = select(table.c.id, table.c.path, table.c.sha256).where(
+        table.c.round == number - 1, table.c.policy == policy
+    )
+    with workspace.database.reading() as connection:
+        found = bulk.select(connection, query)
+    before = "curate pretrain" if number == 1 else f"curate train-round --round {number - 1}"
+    if not found:
+        raise WorkspaceError(f"round {number} has no teacher yet; run `{before}`")
+    key, path, digest = found[0]
+    if not (workspace.root / path).is_file():
+        raise WorkspaceError(f"{workspace.root / path}: the checkpoint is gone; run `{before}`")
+    return key, Teacher(workspace.root / path, digest)
+
+
+def register_checkpoint(
+    connection: Connection, workspace: Workspace, round_number: int, policy: str, path: Path
+) -> None:
+    """Stores a checkpoint in place of an earlier one of the same round and policy."""
+    table = bulk.table("checkpoint")
+    row = {
+        "detector": workspace.config.detector.name,
+        "path": workspace.relative(path),
+        "sha256": sha256(path),
+        "created_at": func.current_timestamp(),
+    }
+    same = (table.c.round == round_number, table.c.policy == policy)
+    if connection.execute(table.update().where(*same).values(**row)).rowcount == 0:
+        connection.execute(table.insert().values(round=round_number, policy=policy, **row))
+
+
+def _brought(workspace: Workspace) -> tuple[int, Teacher]:
+    """The detector that the user brought, which answers in every round."""
+    path = workspace.config.detector.path
+    if path is None:
+        raise WorkspaceError(
+            f"detector '{workspace.config.detector.name}' needs a path: set detector.path in "
+            f"{workspace.root / 'curate.toml'}"
+        )
+    path = workspace.root / path
+    digest = sha256(path)
+    table = bulk.table("checkpoint")
+    query = select(table.c.id, table.c.sha256).where(table.c.round == 0, table.c.policy == "")
+    with workspace.database.reading() as connection:
+        found = bulk.select(connection, query)
+    if not found or found[0][1] != digest:
+        with workspace.database.writing() as connection:
+            register_checkpoint(connection, workspace, 0, "", path)
+            found = bulk.select(connection, query)
+    return found[0][0], Teacher(path, digest)
+
+
+def _students(workspace: Workspace) -> set[int]:
+    """The rounds that have trained a student with the configured policy."""
+    table = bulk.table("checkpoint")
+    query = select(table.c.round).where(table.c.policy == workspace.config.solve.policy)
+    with workspace.database.reading() as connection:
+        return {row[0] for row in bulk.select(connection, query)}
+
+
+def _stored_rounds(workspace: Workspace, number: int) -> int | None:
+    table = bulk.table("round")
+    with workspace.database.reading() as connection:
+        rows = bulk.select(connection, select(table.c.rounds).where(table.c.number == number))
+    return rows[0][0] if rows else None

@@ -1,0 +1,239 @@
+"""Runs stages: plans by SQL, hands frames to an executor, and is the only writer.
+
+Rows and task states go into one transaction per batch, so a kill at any moment leaves every frame
+whole or untouched.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from sqlalchemy import Connection
+
+from db import bulk
+from pipelines import plan, registry
+from pipelines.executors.base import Executor, FrameJob, Outcome
+from pipelines.progress import Progress
+from pipelines.stage import FrameStage, Product, RoundContext, RoundJob, RoundStage
+from pipelines.workspace import Workspace
+
+READ_AHEAD = 256  # frames whose earlier rows are read at once
+FLUSH_FRAMES = 64
+FLUSH_S = 2.0
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a stage did.
+
+    Attributes:
+        stage: its name.
+        round: e.
+        done, empty, failed: frames that this run brought into these states.
+        kept: frames that had been finished before.
+        labels: rows written into the stage's main table.
+        seconds: wall-clock time.
+        summary: what a round stage says of itself; "" for a frame stage.
+        errors: (frame, error) of the failed frames.
+    """
+
+    stage: str
+    round: int
+    done: int = 0
+    empty: int = 0
+    failed: int = 0
+    kept: int = 0
+    labels: int = 0
+    seconds: float = 0.0
+    summary: str = ""
+    errors: tuple[tuple[str, str], ...] = ()
+
+
+def open_executor(workspace: Workspace) -> Executor:
+    """The configured executor."""
+    section = workspace.config.run
+    executor: Executor = registry.EXECUTORS.build(
+        section.executor, offered={"workers": section.workers}, options={}
+    )
+    return executor
+
+
+def run_frames(
+    workspace: Workspace, context: RoundContext, stage: FrameStage, progress: Progress, split: str
+) -> Report:
+    """Brings a stage up to date for every frame of a split that can be worked on."""
+    start = time.perf_counter()
+    waiting = plan.waiting_frames(workspace, context, stage, split)
+    total = len(workspace.frames(split))
+    writer = _Writer(workspace, context, stage)
+    with progress.track(stage.name, len(waiting)) as advance:
+        writer.skip([key for key, _, empty in waiting if empty])
+        advance(writer.empty, "")
+        jobs = [(key, name) for key, name, empty in waiting if not empty]
+        if jobs:
+            function = stage.function(workspace, context)
+            needs = "prediction" in stage.reads
+            outcomes = open_executor(workspace).map(
+                function, _jobs(workspace, context, jobs, with_predictions=needs)
+            )
+            for outcome in outcomes:
+                writer.add(outcome)
+                advance(1, f"{writer.failed} failed" if writer.failed else "")
+            writer.flush()
+    return Report(
+        stage=stage.name,
+        round=context.number,
+        done=writer.done,
+        empty=writer.empty,
+        failed=writer.failed,
+        kept=total - len(waiting),
+        labels=writer.labels,
+        seconds=time.perf_counter() - start,
+        errors=tuple(writer.errors),
+    )
+
+
+def run_round(
+    workspace: Workspace, context: RoundContext, stage: RoundStage, policy: str, progress: Progress
+) -> Report:
+    """Brings a round stage up to date for a policy."""
+    frames = plan.complete_frames(workspace, context)
+    return run_once(
+        workspace,
+        plan.Once(context.number, stage.name, policy),
+        plan.round_fingerprint(workspace, context, stage, policy, frames),
+        stage.file(workspace, context, policy) if stage.file else None,
+        lambda: stage.run(workspace, RoundJob(context, policy, frames), progress),
+    )
+
+
+def run_once(
+    workspace: Workspace,
+    what: plan.Once,
+    fingerprint: str,
+    file: Path | None,
+    make: Callable[[], Product],
+) -> Report:
+    """Does what is done once, unless it has been done with this fingerprint and its file is there.
+
+    Its rows and its task are stored in one transaction.
+    """
+    start = time.perf_counter()
+    if plan.is_current(workspace, what, fingerprint) and (file is None or file.is_file()):
+        return Report(what.stage, what.round, kept=1, summary="up to date")
+    product = make()
+    seconds = time.perf_counter() - start
+    with workspace.database.writing() as connection:
+        product.write(connection)
+        connection.execute(bulk.table("task").delete().where(*what.conditions()))
+        row = (what.round, what.stage, what.variant, None, fingerprint, "done", None, seconds)
+        bulk.insert(connection, "task", [row])
+    return Report(what.stage, what.round, done=1, seconds=seconds, summary=product.summary)
+
+
+def _jobs(
+    workspace: Workspace,
+    context: RoundContext,
+    frames: Sequence[tuple[int, str]],
+    *,
+    with_predictions: bool,
+) -> Iterator[FrameJob]:
+    """The jobs of frames, with their predictions where the stage needs them."""
+    for batch in _batched(frames, READ_AHEAD):
+        keys = [key for key, _ in batch]
+        found = workspace.predictions(context.number, keys) if with_predictions else {}
+        for key, name in batch:
+            yield FrameJob(key, name, found.get(key))
+
+
+def _batched(items: Sequence[Item], size: int) -> Iterator[Sequence[Item]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
+
+
+class _Writer:
+    """Collects outcomes and writes them, with their tasks, a batch per transaction."""
+
+    def __init__(self, workspace: Workspace, context: RoundContext, stage: FrameStage) -> None:
+        self.workspace = workspace
+        self.context = context
+        self.stage = stage
+        prints = plan.fingerprints(workspace, context, workspace.config.solve.policy)
+        self.fingerprint = prints[stage.name]
+        self.done = self.empty = self.failed = self.labels = 0
+        self.errors: list[tuple[str, str]] = []
+        self._waiting: list[Outcome] = []
+        self._flushed = time.monotonic()
+
+    def add(self, outcome: Outcome) -> None:
+        """Takes an outcome; it is stored with its batch."""
+        self._waiting.append(outcome)
+        if len(self._waiting) >= FLUSH_FRAMES or time.monotonic() - self._flushed > FLUSH_S:
+            self.flush()
+
+    def skip(self, keys: Sequence[int]) -> None:
+        """Records frames without predictions as empty."""
+        for batch in _batched(keys, READ_AHEAD):
+            with self.workspace.database.writing() as connection:
+                self._clear(connection, batch)
+                rows = [self._row(key, "empty", None, 0.0) for key in batch]
+                bulk.insert(connection, "task", rows)
+            self.empty += len(batch)
+
+    def flush(self) -> None:
+        """Stores what has been collected, whole or not at all."""
+        outcomes, self._waiting = self._waiting, []
+        self._flushed = time.monotonic()
+        if not outcomes:
+            return
+        with self.workspace.database.writing() as connection:
+            self._clear(connection, [outcome.job.frame_id for outcome in outcomes])
+            for table in self.stage.writes:
+                rows = [
+                    (self.context.number, outcome.job.frame_id, *row)
+                    for outcome in outcomes
+                    for row in outcome.rows.get(table, ())
+                ]
+                bulk.insert(connection, table, rows)
+            tasks = [
+                self._row(o.job.frame_id, self._state(o), o.error, o.seconds) for o in outcomes
+            ]
+            bulk.insert(connection, "task", tasks)
+        for outcome in outcomes:
+            self._count(outcome)
+
+    def _state(self, outcome: Outcome) -> str:
+        if outcome.error is not None:
+            return "failed"
+        return "done" if outcome.rows.get(self.stage.writes[-1]) else "empty"
+
+    def _count(self, outcome: Outcome) -> None:
+        state = self._state(outcome)
+        self.done += state == "done"
+        self.empty += state == "empty"
+        self.failed += state == "failed"
+        self.labels += len(outcome.rows.get(self.stage.writes[-1], ()))
+        if outcome.error is not None:
+            self.errors.append((outcome.job.frame, outcome.error))
+
+    def _clear(self, connection: Connection, keys: Sequence[int]) -> None:
+        """Removes what an earlier run stored; evidence leaves with its prediction."""
+        for table in self.stage.writes:
+            bulk.delete_frames(connection, table, self.context.number, keys)
+        task = bulk.table("task")
+        connection.execute(
+            task.delete().where(
+                task.c.round == self.context.number,
+                task.c.stage == self.stage.name,
+                task.c.frame_id.in_(keys),
+            )
+        )
+
+    def _row(self, key: int, state: str, error: str | None, seconds: float) -> bulk.Row:
+        """A row of `task`."""
+        what = (self.context.number, self.stage.name, "", key)
+        return (*what, self.fingerprint, state, error, seconds)

@@ -1,0 +1,30 @@
+"""All rounds, stage after stage."""
+
+from collections.abc import Iterator
+
+from pipelines.progress import Progress
+from pipelines.round import active
+from pipelines.rounds import is_trainable, open_round
+from pipelines.runner import Report, run_frames, run_round
+from pipelines.stage import FrameStage
+from pipelines.stages.pretrain import pretrain
+from pipelines.workspace import Workspace
+
+
+def run_all(workspace: Workspace, rounds: int | None, progress: Progress) -> Iterator[Report]:
+    """Brings every stage of every round up to date, and says what each did as it ends.
+
+    A detector that the user brings is not trained, so it has one round, without train-round.
+    """
+    trainable = is_trainable(workspace)
+    if trainable:
+        yield pretrain(workspace, progress)
+    total = (rounds or workspace.config.run.rounds) if trainable else 1
+    policy = workspace.config.solve.policy
+    for number in range(1, total + 1):
+        context = open_round(workspace, number, total)
+        for stage in active(workspace.config.run.priors):
+            if isinstance(stage, FrameStage):
+                yield run_frames(workspace, context, stage, progress, "unlabeled")
+            elif trainable or stage.name != "train-round":
+                yield run_round(workspace, context, stage, policy, progress)

@@ -1,0 +1,141 @@
+"""Setting a workspace up: which frames are labeled, and their ground truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import func, select
+
+from curate.datasets.base import Dataset
+from curate.detections import Annotations
+from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
+from db import bulk
+from pipelines.config import Config
+from pipelines.workspace import Workspace, open_dataset
+
+
+@dataclass(frozen=True)
+class Split:
+    """Frame names per split; no frame is in two."""
+
+    labeled: tuple[str, ...]
+    unlabeled: tuple[str, ...]
+    val: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Raises LeakageError where two splits share a frame."""
+        for one, other in (("labeled", "unlabeled"), ("labeled", "val"), ("unlabeled", "val")):
+            shared = sorted(set(getattr(self, one)) & set(getattr(self, other)))
+            if shared:
+                raise LeakageError(f"frames in both {one} and {other}: {', '.join(shared[:5])}")
+
+
+def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
+    """A workspace with its frames and the ground truth of X_l and val.
+
+    Everything is read before anything is written, so a damaged file leaves no half workspace.
+
+    Args:
+        root: the workspace's folder.
+        config: its settings.
+        labeled: share of the training frames, e.g. "0.04", or a file with a frame name per line.
+        val: likewise, of the frames outside the data set's own val list; "" for that list.
+
+    Raises:
+        ConfigError: a share or a list is wrong.
+        DataError: a label or calibration file of X_l or val is damaged.
+        WorkspaceError: the workspace exists with other frames or settings.
+    """
+    dataset = open_dataset(config)
+    split = choose_split(dataset, labeled, val, config.run.seed)
+    truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
+    workspace = Workspace.create(root, config)
+    stored = Split(*(tuple(workspace.frames(name)) for name in ("labeled", "unlabeled", "val")))
+    if stored == split:
+        return workspace
+    if any((stored.labeled, stored.unlabeled, stored.val)):
+        raise WorkspaceError(
+            f"{workspace.root}: exists with another split of the frames; choose another folder"
+        )
+    _store(workspace, dataset, split, truth)
+    return workspace
+
+
+def choose_split(dataset: Dataset, labeled: str, val: str, seed: int) -> Split:
+    """Which frames are labeled, unlabeled and val."""
+    lists = dataset.splits()
+    frames = lists.get("train") or dataset.frame_ids()
+    if not frames:
+        raise DataError("the data set holds no frames; --root should hold velodyne/ or training/")
+    generator = np.random.default_rng(seed)
+    held_out = _choose(dataset, frames, val, generator, "val") if val else lists.get("val", ())
+    pool = [frame for frame in frames if frame not in set(held_out)]
+    chosen = _choose(dataset, pool, labeled, generator, "labeled")
+    rest = sorted(set(pool) - set(chosen))
+    return Split(tuple(sorted(chosen)), tuple(rest), tuple(sorted(held_out)))
+
+
+def _choose(
+    dataset: Dataset, pool: Sequence[str], wish: str, generator: np.random.Generator, split: str
+) -> list[str]:
+    """Frames by share or by list; only frames with a label file can be chosen."""
+    if Path(wish).is_file():
+        names = Path(wish).read_text().split()
+        unknown = sorted(set(names) - set(pool))
+        if unknown:
+            raise ConfigError(f"{wish}: frame {unknown[0]} is not among the training frames")
+        return names
+    try:
+        share = float(wish)
+    except ValueError:
+        share = -1.0
+    if not 0 <= share <= 1:
+        raise ConfigError(f"--{split} {wish}: give a share between 0 and 1, or a file of frame ids")
+    if share == 0:
+        return []
+    with_label = [name for name in sorted(pool) if dataset.files(name).label]
+    count = max(1, round(share * len(pool)))
+    if count > len(with_label):
+        raise ConfigError(
+            f"--{split} {wish} asks for {count} frames, but only {len(with_label)} of {len(pool)} "
+            "have a label file; give a smaller share (0 for none)"
+        )
+    return list(generator.permutation(with_label)[:count].tolist())
+
+
+def _store(
+    workspace: Workspace, dataset: Dataset, split: Split, truth: dict[str, Annotations]
+) -> None:
+    root = workspace.config.dataset.root.resolve()
+    kind = workspace.config.dataset.kind
+    rows = []
+    for name in ("labeled", "unlabeled", "val"):
+        for frame in getattr(split, name):
+            files = dataset.files(frame)
+            label = None if name == "unlabeled" else files.label
+            paths = (files.points, files.image, files.calibration, label)
+            relative = [str(p.resolve().relative_to(root)) if p else None for p in paths]
+            rows.append((kind, frame, name, *relative))
+    table = bulk.table("frame")
+    with workspace.database.writing() as connection:
+        if connection.execute(select(func.count()).select_from(table)).scalar_one():
+            raise WorkspaceError(f"{workspace.root}: another command has just set it up")
+        bulk.insert(connection, "frame", rows)
+        query = select(table.c.frame, table.c.id, table.c.split)
+        keys = {frame: (key, of) for frame, key, of in bulk.select(connection, query)}
+        truth_rows = [
+            row for frame, found in truth.items() for row in _truth_rows(*keys[frame], found)
+        ]
+        bulk.insert(connection, "ground_truth", truth_rows)
+
+
+def _truth_rows(frame_id: int, split: str, found: Annotations) -> list[bulk.Row]:
+    """The rows of `ground_truth`; DontCare regions have no box."""
+    rows = []
+    for k in range(len(found)):
+        box = [None if np.isnan(number) else float(number) for number in found.boxes[k]]
+        kitti = (float(found.truncated[k]), int(found.occluded[k]), float(found.alpha[k]))
+        rectangle = map(float, found.boxes_2d[k])
+        rows.append((frame_id, k, split, str(found.categories[k]), *box, *kitti, *rectangle))
+    return rows

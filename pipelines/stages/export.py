@@ -1,0 +1,98 @@
+"""export: the weighted labels of a round as files that trainers read."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, select, text
+
+import curate
+from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS, LabelFileDescription, write_labels
+from db import bulk
+from db.models import BOX_COLUMNS
+from pipelines.assembly import open_policy
+from pipelines.progress import Progress
+from pipelines.stage import Product, RoundContext, RoundJob, Settings
+from pipelines.workspace import Workspace
+
+CURRENT = "labels.sqlite"
+
+
+def settings(_workspace: Workspace, _context: RoundContext, _policy: str) -> Settings:
+    """What the exported file depends on beside weights and ground truth."""
+    return {"format": 1}
+
+
+def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
+    """The exported file of a round and policy."""
+    return workspace.root / "exports" / f"round-{context.number:02d}-{policy}.sqlite"
+
+
+def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
+    """Writes the round's file; `labels.sqlite` becomes a copy where the policy is the trainer's."""
+    path = file(workspace, job.context, job.policy)
+    unlabeled = open_policy(workspace.config, job.policy).uses_unlabeled
+    labels = write_label_file(workspace, path, job.context.number, job.policy if unlabeled else "")
+    if job.policy == workspace.config.solve.policy:
+        partial = path.with_suffix(".partial")
+        shutil.copyfile(path, partial)
+        partial.replace(path.with_name(CURRENT))
+    return Product(f"{labels} labels in {workspace.relative(path)}", lambda _connection: None)
+
+
+def write_label_file(workspace: Workspace, path: Path, round_number: int, policy: str) -> int:
+    """X_l with its ground truth, and the labels that a policy weighted; none for policy ''.
+
+    Returns:
+        How many labels were written.
+    """
+    description = LabelFileDescription(
+        dataset=workspace.config.dataset.kind,
+        root=workspace.config.dataset.root.resolve(),
+        categories=workspace.config.dataset.categories,
+        round=round_number,
+        policy=policy,
+        code_version=curate.__version__,
+    )
+    with workspace.database.reading() as connection:
+        labels = label_rows(connection, round_number, policy)
+        write_labels(
+            path,
+            description=description,
+            frames=_frames(connection, {label[1] for label in labels}),
+            ground_truth=_ground_truth(connection),
+            labels=labels,
+        )
+    return len(labels)
+
+
+def label_rows(connection: Connection, round_number: int, policy: str) -> list[Any]:
+    """The rows of `weighted_labels` of a round and policy."""
+    query = text(
+        f"SELECT {', '.join(WEIGHTED_LABEL_COLUMNS)} FROM weighted_labels "  # noqa: S608 - fixed names
+        "WHERE round = :round AND policy = :policy ORDER BY frame, k"
+    )
+    return [tuple(r) for r in connection.execute(query, {"round": round_number, "policy": policy})]
+
+
+def _frames(connection: Connection, with_labels: set[str]) -> Iterator[tuple[Any, ...]]:
+    """Labeled frames, and the unlabeled ones that have labels."""
+    frame = bulk.table("frame")
+    paths = (frame.c.points_path, frame.c.image_path, frame.c.calibration_path)
+    query = select(frame.c.frame, frame.c.split, *paths).where(frame.c.split != "val")
+    for row in bulk.select(connection, query.order_by(frame.c.frame)):
+        if row[1] == "labeled" or row[0] in with_labels:
+            yield row
+
+
+def _ground_truth(connection: Connection) -> list[bulk.Row]:
+    truth, frame = bulk.table("ground_truth"), bulk.table("frame")
+    names = ("k", "category", *BOX_COLUMNS, "truncated", "occluded")
+    query = (
+        select(frame.c.frame, *(truth.c[name] for name in names))
+        .join(frame, frame.c.id == truth.c.frame_id)
+        .where(frame.c.split == "labeled", truth.c.x.is_not(None))
+        .order_by(frame.c.frame, truth.c.k)
+    )
+    return list(bulk.select(connection, query))

@@ -1,0 +1,85 @@
+"""predict: l = f(x; w), the teacher's boxes with low scores too."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from curate.detections import Detections
+from curate.errors import ModelError
+from curate.frames import Frame
+from curate.geometry.projection import in_view
+from pipelines.assembly import open_detector
+from pipelines.config import Config
+from pipelines.executors.base import FrameJob, FrameRows
+from pipelines.stage import RoundContext, Settings
+from pipelines.workspace import Workspace, open_dataset
+
+
+@dataclass
+class Predict:
+    """Finds the boxes of a frame."""
+
+    config: Config
+    teacher: Path
+
+    def open(self) -> None:
+        """Loads the detector."""
+        self.dataset = open_dataset(self.config)
+        self.detector = open_detector(self.config, self.teacher)
+
+    def __call__(self, job: FrameJob) -> FrameRows:
+        """The rows of `prediction`."""
+        found = self.detect(job.frame)
+        return {"prediction": [(k, *row) for k, row in enumerate(prediction_rows(found))]}
+
+    def detect(self, frame_id: str) -> Detections:
+        """The boxes of a frame, by falling score."""
+        frame = visible(self.dataset.read(frame_id), self.config)
+        return checked(self.detector.predict(frame), self.config)
+
+
+def visible(frame: Frame, config: Config) -> Frame:
+    """The frame as the detector sees it: only points in the camera's view, if so configured."""
+    if not config.detector.camera_view:
+        return frame
+    seen = in_view(frame.points[:, :3], frame.calibration, frame.image_size)
+    return frame.with_points(frame.points[seen])
+
+
+def checked(found: Detections, config: Config) -> Detections:
+    """The detections of the configured categories and scores, by falling score.
+
+    Raises:
+        ModelError: a box is not finite or has no size.
+    """
+    wanted = np.isin(found.categories, config.dataset.categories)
+    found = found.select(wanted & (found.scores >= config.detector.minimum_score))
+    numbers = np.column_stack([found.boxes, found.scores])
+    wrong = ~np.isfinite(numbers).all(axis=1) | (found.boxes[:, 3:6] <= 0).any(axis=1)
+    if wrong.any():
+        raise ModelError(
+            f"the detector answered a box that is not finite or has no size: "
+            f"{np.round(numbers[wrong][0], 3).tolist()} (x, y, z, l, w, h, yaw, score)"
+        )
+    return found.select(np.argsort(-found.scores, kind="stable"))
+
+
+def prediction_rows(found: Detections) -> list[tuple[object, ...]]:
+    """Category, score and box of each detection."""
+    columns = [found.categories.tolist(), found.scores.tolist(), *found.boxes.T.tolist()]
+    return list(zip(*columns, strict=True))
+
+
+def settings(workspace: Workspace, _context: RoundContext) -> Settings:
+    """What predictions depend on beside the frames and the teacher."""
+    config = workspace.config
+    return {
+        "detector": config.detector.model_dump(mode="json", exclude={"path"}),
+        "categories": config.dataset.categories,
+    }
+
+
+def function(workspace: Workspace, context: RoundContext) -> Predict:
+    """What predict does with a frame."""
+    return Predict(workspace.config, context.teacher.path)

@@ -1,0 +1,52 @@
+"""pretrain: the first teacher w_0, from X_l alone; a detector that the user brings needs none."""
+
+from sqlalchemy import Connection
+
+from curate.errors import ConfigError, WorkspaceError
+from pipelines import plan
+from pipelines.progress import Progress
+from pipelines.rounds import is_trainable, register_checkpoint
+from pipelines.runner import Report, run_once
+from pipelines.stage import Product
+from pipelines.stages.export import write_label_file
+from pipelines.stages.train_round import train_with_progress, training_settings
+from pipelines.workspace import Workspace
+
+
+def pretrain(workspace: Workspace, progress: Progress) -> Report:
+    """Trains w_0, unless it exists with the current settings.
+
+    Raises:
+        ConfigError: curate cannot train the configured detector.
+        WorkspaceError: there are no labeled frames.
+    """
+    config = workspace.config
+    if not is_trainable(workspace):
+        raise ConfigError(
+            f"detector '{config.detector.name}' needs no pretraining; run `curate predict`"
+        )
+    labeled = workspace.frames("labeled")
+    if not labeled:
+        raise WorkspaceError("no labeled frames to learn from; `curate init --labeled` takes some")
+    settings = config.train.model_dump(mode="json", exclude={"round_steps", "threads", "start"})
+    key = [settings, sorted(labeled), config.run.seed, config.detector.device, config.dataset.categories]
+    path = workspace.root / "checkpoints" / "round-00.safetensors"
+
+    def make() -> Product:
+        labels = workspace.root / "exports" / "labeled.sqlite"
+        write_label_file(workspace, labels, 0, "")
+        report = train_with_progress(
+            workspace,
+            labels=labels,
+            output=path,
+            settings=training_settings(workspace, config.train.pretrain_steps, 0),
+            start=None,
+            progress=progress,
+        )
+        summary = f"{report.steps} steps on {len(labeled)} frames, {workspace.relative(path)}"
+        return Product(summary, write)
+
+    def write(connection: Connection) -> None:
+        register_checkpoint(connection, workspace, 0, "", path)
+
+    return run_once(workspace, plan.Once(0, "pretrain", ""), plan.digest(key), path, make)

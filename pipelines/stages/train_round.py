@@ -1,0 +1,98 @@
+"""train-round: the student, from the exported labels and the teacher."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sqlalchemy import Connection
+
+from curate.errors import ConfigError
+from pipelines.assembly import device
+from pipelines.progress import Progress
+from pipelines.rounds import is_trainable, register_checkpoint
+from pipelines.stage import Product, RoundContext, RoundJob, Settings
+from pipelines.stages import export
+from pipelines.workspace import Workspace
+
+if TYPE_CHECKING:
+    from curate.training.trainer import TrainingReport, TrainingSettings
+
+
+def settings(workspace: Workspace, context: RoundContext, _policy: str) -> Settings:
+    """What a student depends on beside teacher and labels."""
+    section = workspace.config.train.model_dump(mode="json", exclude={"pretrain_steps", "threads"})
+    return {**section, "seed": context.seed, "device": workspace.config.detector.device}
+
+
+def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
+    """The student's checkpoint."""
+    plain = policy == workspace.config.solve.policy
+    name = f"round-{context.number:02d}" if plain else f"round-{context.number:02d}-{policy}"
+    return workspace.root / "checkpoints" / f"{name}.safetensors"
+
+
+def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
+    """Trains the student.
+
+    Raises:
+        ConfigError: curate cannot train the configured detector.
+    """
+    if not is_trainable(workspace):
+        raise ConfigError(
+            f"detector '{workspace.config.detector.name}' is not trained by curate; "
+            f"train it from {export.file(workspace, job.context, job.policy)}"
+        )
+    section = workspace.config.train
+    path = file(workspace, job.context, job.policy)
+    report = train_with_progress(
+        workspace,
+        labels=export.file(workspace, job.context, job.policy),
+        output=path,
+        settings=training_settings(workspace, section.round_steps, job.context.number),
+        start=job.context.teacher.path if section.start == "teacher" else None,
+        progress=progress,
+    )
+
+    def write(connection: Connection) -> None:
+        register_checkpoint(connection, workspace, job.context.number, job.policy, path)
+
+    return Product(f"{report.steps} steps, {workspace.relative(path)}", write)
+
+
+def training_settings(workspace: Workspace, steps: int, round_number: int) -> "TrainingSettings":
+    """The trainer's settings."""
+    from curate.training.trainer import TrainingSettings
+
+    section = workspace.config.train
+    return TrainingSettings(
+        preset=section.preset,
+        steps=steps,
+        batch_size=section.batch_size,
+        threads=section.threads,
+        zero_weight=section.zero_weight,
+        seed=workspace.config.run.seed + round_number,
+        device=device(workspace.config),
+        **section.options,
+    )
+
+
+def train_with_progress(
+    workspace: Workspace,
+    *,
+    labels: Path,
+    output: Path,
+    settings: "TrainingSettings",
+    start: Path | None,
+    progress: Progress,
+) -> "TrainingReport":
+    """Trains with a bar that counts steps and shows the loss."""
+    from curate.training.trainer import train
+
+    with progress.track(output.stem, settings.steps) as advance:
+        done = 0
+
+        def show(step: int, _steps: int, loss: float) -> None:
+            nonlocal done
+            advance(step - done, f"loss {loss:.2f}")
+            done = step
+
+        return train(labels, output, settings, start=start, progress=show)

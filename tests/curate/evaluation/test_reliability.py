@@ -1,0 +1,348 @@
+"""Reliability: right and wrong labels, and weights as their judge."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from oracles import ranking
+
+from curate.detections import Annotations, Detections, as_categories
+from curate.errors import ConfigError
+from curate.evaluation.reliability import (
+    JudgeSettings,
+    auroc,
+    average_precision,
+    bootstrap,
+    expected_calibration_error,
+    judge,
+    reliability_bins,
+    weighted_precision,
+    weighted_recall,
+)
+
+
+def car_at(x, y=0.0, length=4.0, z=0.0):
+    """A box of that length, 2 m wide."""
+    return [x, y, z, length, 2.0, 1.5, 0.0]
+
+
+def labels(boxes, scores=None, categories=None):
+    """Labels of cars unless told otherwise, with falling scores."""
+    n = len(boxes)
+    return Detections(
+        np.reshape(np.array(boxes, dtype=np.float64), (n, 7)),
+        np.linspace(0.9, 0.5, n) if scores is None else np.array(scores),
+        as_categories(["Car"] * n if categories is None else categories),
+    )
+
+
+def truth(boxes, categories=None, boxes_2d=None):
+    """Ground truth of cars unless told otherwise."""
+    n = len(boxes)
+    return Annotations(
+        np.reshape(np.array(boxes, dtype=np.float64), (n, 7)),
+        as_categories(["Car"] * n if categories is None else categories),
+        np.zeros(n),
+        np.zeros(n, dtype=np.int64),
+        np.zeros(n),
+        np.zeros((n, 4)) if boxes_2d is None else np.array(boxes_2d, dtype=np.float64),
+    )
+
+
+def test_a_label_is_right_above_the_minimum_iou_of_its_category():
+    """A shift of 0.8 m along 4 m is an IoU of 2/3: enough for a cyclist, not for a car."""
+    shifted = [car_at(0.8), car_at(20.8)]
+    found = judge(
+        labels(shifted, categories=["Car", "Cyclist"]),
+        truth([car_at(0), car_at(20)], ["Car", "Cyclist"]),
+    )
+    assert found.right.tolist() == [False, True]
+    assert found.matched.tolist() == [-1, 1]
+    assert found.iou == pytest.approx([2 / 3, 2 / 3])
+    assert found.counted.tolist() == [True, True]
+    assert found.ground_truths == {"Car": 1, "Pedestrian": 0, "Cyclist": 1}
+
+
+def test_an_iou_equal_to_the_minimum_is_wrong():
+    """The IoU must exceed it."""
+    settings_ = JudgeSettings(minimum_iou={"Car": 1.0})
+    assert not judge(labels([car_at(0)]), truth([car_at(0)]), settings_).right[0]
+
+
+def test_height_counts_for_3d_only():
+    """The same footprint 0.5 m higher: right in BEV, wrong in 3D."""
+    lifted = labels([car_at(0, z=0.5)])
+    assert judge(lifted, truth([car_at(0)]), JudgeSettings(overlap="bev")).right[0]
+    assert not judge(lifted, truth([car_at(0)]), JudgeSettings(overlap="3d")).right[0]
+
+
+def test_a_second_label_on_the_same_object_is_wrong():
+    """The higher score takes the object, whatever the order of the labels."""
+    twice = labels([car_at(0), car_at(0.2)], scores=[0.4, 0.6])
+    found = judge(twice, truth([car_at(0)]))
+    assert found.right.tolist() == [False, True]
+    assert found.counted.tolist() == [True, True]
+
+
+def test_a_label_takes_the_object_that_fits_best():
+    """Two objects qualify; the larger overlap wins and leaves the other free."""
+    objects = truth([car_at(0.4), car_at(0.0)])
+    found = judge(labels([car_at(0.05), car_at(0.35)]), objects)
+    assert found.matched.tolist() == [1, 0]
+
+
+def test_another_category_is_no_match():
+    """A perfect box with the wrong name is wrong."""
+    found = judge(labels([car_at(0)], categories=["Cyclist"]), truth([car_at(0)]))
+    assert not found.right[0]
+    assert found.counted[0]
+
+
+def test_a_label_on_a_neighbour_is_neutral_or_right():
+    """A van under a car label is neither; by option it counts as a car to be found."""
+    van = truth([car_at(0), car_at(20)], ["Van", "Car"])
+    twice = labels([car_at(0), car_at(0.1), car_at(20)])
+    neutral = judge(twice, van)
+    assert neutral.right.tolist() == [False, False, True]
+    assert neutral.counted.tolist() == [False, False, True]
+    assert neutral.ground_truths["Car"] == 1
+    right = judge(twice, van, JudgeSettings(neighbors_are="right"))
+    assert right.right.tolist() == [True, False, True]
+    assert right.counted.all()
+    assert right.ground_truths["Car"] == 2
+
+
+def test_labels_in_dont_care_regions_are_neutral():
+    """By the share of their own rectangle; invisible labels and right ones are counted."""
+    regions = truth(
+        [[np.nan] * 7, car_at(0)],
+        ["DontCare", "Car"],
+        [[0, 0, 10, 10], [0, 0, 0, 0]],
+    )
+    rectangles = np.array(
+        [[0, 0, 4, 4], [6, 0, 14, 10], [5, 0, 14, 10], [np.nan] * 4, [0, 0, 4, 4]]
+    )
+    found = judge(
+        labels([car_at(0), car_at(30), car_at(40), car_at(50), car_at(60)]),
+        regions,
+        rectangles=rectangles,
+    )
+    assert found.right.tolist() == [True, False, False, False, False]
+    # 4 of 8 pixels of width are exactly half, which is not more than half.
+    assert found.counted.tolist() == [True, True, False, True, False]
+
+
+@pytest.mark.parametrize("n", [0, 2])
+@pytest.mark.parametrize("m", [0, 2])
+def test_empty_frames_are_judged(n, m):
+    """No labels, no objects, or neither."""
+    boxes = [car_at(0), car_at(20)]
+    found = judge(labels(boxes[:n]), truth(boxes[:m]), rectangles=np.zeros((n, 4)))
+    assert found.right.tolist() == [m > 0] * n
+    assert found.counted.all()
+    assert found.ground_truths["Car"] == m
+
+
+def test_a_category_without_minimum_iou_is_named():
+    """The error names the category."""
+    with pytest.raises(ConfigError, match="Tram"):
+        judge(labels([car_at(0)], categories=["Tram"]), truth([]))
+
+
+@pytest.mark.parametrize("wrong", [{"overlap": "image"}, {"neighbors_are": "wrong"}])
+def test_unknown_options_are_refused(wrong):
+    """The error names the option."""
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        JudgeSettings(**wrong)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 12), st.sampled_from([0.2, 0.5, 0.9])), max_size=8),
+    st.lists(st.integers(0, 12), max_size=6),
+    st.randoms(use_true_random=False),
+)
+def test_judgement_is_one_to_one_and_blind_to_order(rows, places, random):
+    """Each object makes one label right at most; shuffled labels get the same verdicts."""
+    detections = labels([car_at(x / 4) for x, _ in rows], [score for _, score in rows])
+    objects = truth([car_at(x / 4) for x in places])
+    found = judge(detections, objects)
+    taken = found.matched[found.right]
+    assert len(set(taken)) == len(taken)
+    order = np.array(random.sample(range(len(rows)), len(rows)), dtype=np.int64)
+    again = judge(detections.select(order), objects)
+    verdict = sorted(zip(rows, found.right, strict=True))
+    assert verdict == sorted(zip([rows[i] for i in order], again.right, strict=True))
+
+
+WEIGHTED = st.lists(
+    st.tuples(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]) | st.floats(0, 1), st.booleans()),
+    min_size=1,
+    max_size=25,
+)
+
+
+def columns(rows):
+    """Weights and rights as arrays."""
+    return np.array([row[0] for row in rows]), np.array([row[1] for row in rows], dtype=bool)
+
+
+@given(WEIGHTED)
+def test_auroc_is_the_share_of_pairs_in_order(rows):
+    """Against every pair, ties counted half."""
+    weights, right = columns(rows)
+    assume(right.any() and not right.all())
+    assert auroc(weights, right) == pytest.approx(ranking.auroc(weights, right))
+    assert auroc(-weights, ~right) == pytest.approx(auroc(weights, right))
+
+
+@given(WEIGHTED)
+def test_average_precision_steps_over_distinct_weights(rows):
+    """Against the definition, threshold by threshold; blind to the order of ties."""
+    weights, right = columns(rows)
+    assume(right.any())
+    expected = ranking.average_precision(weights.tolist(), right.tolist())
+    assert average_precision(weights, right) == pytest.approx(expected)
+    assert average_precision(weights[::-1], right[::-1]) == pytest.approx(expected)
+
+
+def test_weighted_precision_and_recall_worked_out():
+    """Weight on right labels over all weight, and over all objects."""
+    weights, right = np.array([1.0, 0.5, 0.5, 0.0]), np.array([True, True, False, False])
+    assert weighted_precision(weights, right) == 0.75
+    assert weighted_recall(weights, right, 3) == 0.5
+
+
+def test_a_judge_that_is_always_right_scores_one():
+    """Weights that separate right from wrong, and weights that cannot."""
+    right = np.array([True, True, False, False, False])
+    assert auroc(np.array([0.9, 0.8, 0.7, 0.1, 0.0]), right) == 1.0
+    assert average_precision(np.array([0.9, 0.8, 0.7, 0.1, 0.0]), right) == 1.0
+    assert auroc(np.full(5, 0.3), right) == 0.5
+    assert average_precision(np.full(5, 0.3), right) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("right", [[], [True, True], [False, False]])
+def test_what_is_undefined_is_nan(right):
+    """No labels, all right, all wrong, no weight, no objects: NaN, never a crash."""
+    right = np.array(right, dtype=bool)
+    weights = np.full(len(right), 0.25)
+    assert np.isnan(auroc(weights, right))
+    assert np.isnan(average_precision(weights, right)) == (not right.any())
+    assert np.isnan(weighted_precision(weights * 0, right))
+    assert np.isnan(weighted_precision(weights, right)) == (len(right) == 0)
+    assert np.isnan(weighted_recall(weights, right, 0))
+    assert weighted_recall(weights, right, 2) == 0.25 * right.sum() / 2
+    assert np.isnan(expected_calibration_error(weights, right)) == (len(right) == 0)
+    assert np.isnan(reliability_bins(weights, right, 0).recall).all()
+
+
+def test_bins_hold_their_lower_edge_and_the_last_one_its_upper():
+    """Every weight in [0, 1] is in one bin; recall over the bins adds up."""
+    weights = np.array([0.0, 0.09, 0.1, 0.3, 0.7, 0.95, 1.0])
+    right = np.array([False, False, True, False, True, True, True])
+    table = reliability_bins(weights, right, 8)
+    assert table.labels.tolist() == [2, 1, 0, 1, 0, 0, 0, 1, 0, 2]
+    assert table.precision[[0, 1, 3, 7, 9]].tolist() == [0, 1, 0, 1, 1]
+    assert np.isnan(table.precision[2])
+    assert table.mean_weight[9] == pytest.approx(0.975)
+    assert table.recall.sum() == pytest.approx(4 / 8)
+
+
+def test_calibration_error_worked_out():
+    """Two bins: weights 0.2 with a quarter right, weights 0.8 all right."""
+    weights = np.array([0.2] * 4 + [0.8] * 4)
+    right = np.array([True, False, False, False] + [True] * 4)
+    assert expected_calibration_error(weights, right) == pytest.approx(0.5 * 0.05 + 0.5 * 0.2)
+
+
+def test_calibrated_weights_have_a_small_error_and_overconfident_ones_a_large_one():
+    """Rights drawn with the weight's own chance are recovered as calibrated."""
+    generator = np.random.default_rng(11)
+    weights = generator.random(20_000)
+    right = generator.random(20_000) < weights
+    assert expected_calibration_error(weights, right) < 0.02
+    assert expected_calibration_error(weights**0.25, right) > 0.2
+
+
+def test_bootstrap_interval_of_a_mean_is_the_normal_one():
+    """One label per frame: mean +- 1.96 standard errors, to the accuracy of the draws."""
+    values = np.random.default_rng(3).normal(5.0, 2.0, 400)
+    interval = bootstrap(
+        lambda drawn, _: float(values[drawn].mean()),
+        np.arange(400),
+        400,
+        np.random.default_rng(4),
+        replicates=4000,
+    )
+    half = 1.96 * values.std() / np.sqrt(400)
+    assert interval.low == pytest.approx(values.mean() - half, abs=0.15 * half)
+    assert interval.high == pytest.approx(values.mean() + half, abs=0.15 * half)
+    assert interval.undefined == 0.0
+
+
+def test_bootstrap_draws_whole_frames():
+    """Labels of a frame come and go together, frames without a label take part."""
+    frame_index = np.array([2, 0, 2, 0, 2])
+    seen = []
+
+    def statistic(drawn, frames):
+        assert len(frames) == 4
+        expected = [label for frame in frames for label in np.flatnonzero(frame_index == frame)]
+        assert drawn.tolist() == expected
+        seen.append(len(drawn))
+        return float(len(drawn))
+
+    bootstrap(statistic, frame_index, 4, np.random.default_rng(0), replicates=200)
+    assert 0 in seen
+    assert max(seen) > 5
+
+
+def test_copies_of_a_label_do_not_narrow_the_interval():
+    """Ten copies per frame carry no more evidence than one; labels drawn alone would say so."""
+    right = np.random.default_rng(1).random(60) < 0.5
+
+    def width(copies):
+        column = np.repeat(right, copies)
+        interval = bootstrap(
+            lambda drawn, _: float(column[drawn].mean()),
+            np.repeat(np.arange(60), copies),
+            60,
+            np.random.default_rng(2),
+        )
+        return interval.high - interval.low
+
+    assert width(10) == pytest.approx(width(1))
+
+
+def test_bootstrap_repeats_with_its_generator_and_reports_undefined_draws():
+    """Same generator, same interval; replicates without a right label are left out and counted."""
+    weights, right = np.array([0.9, 0.1, 0.4]), np.array([True, False, False])
+
+    def run(seed):
+        return bootstrap(
+            lambda drawn, _: auroc(weights[drawn], right[drawn]),
+            np.arange(3),
+            3,
+            np.random.default_rng(seed),
+            replicates=300,
+        )
+
+    assert run(7) == run(7)
+    assert 0 < run(7).undefined < 1
+    assert run(7).low == run(7).high == 1.0
+
+
+@pytest.mark.parametrize("frames", [0, 3])
+def test_bootstrap_without_labels_is_undefined(frames):
+    """No frames, or no labels in them: NaN, all draws undefined."""
+    nothing = np.zeros(0, dtype=np.int64)
+    interval = bootstrap(
+        lambda drawn, _: weighted_precision(np.zeros(len(drawn)), np.zeros(len(drawn), bool)),
+        nothing,
+        frames,
+        np.random.default_rng(0),
+        replicates=10,
+    )
+    assert np.isnan([interval.low, interval.high]).all()
+    assert interval.undefined == 1.0

@@ -1,0 +1,167 @@
+"""The point prior: thresholds learned from labeled frames, and Eq. 8."""
+
+import logging
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from curate.detections import Annotations, Detections, as_categories
+from curate.errors import ConfigError
+from curate.frames import Calibration, Frame
+from curate.priors.base import columns
+from curate.priors.points import PointPrior, PointSettings, learn_thresholds, points_threshold
+
+
+def frame_with(*crowds):
+    """A frame with so many points around (10 i, 0, 0) for the i-th number."""
+    points = np.zeros((sum(crowds), 4), dtype=np.float32)
+    points[:, 0] = np.repeat(10.0 * np.arange(len(crowds)), crowds)
+    return Frame("000000", points, Calibration(np.eye(3, 4), np.eye(4)), (10, 10))
+
+
+def boxes_at(*places):
+    """Boxes of 4 x 2 x 1.5 m around (10 i, 0, 0)."""
+    return np.array([[10.0 * i, 0, 0, 4, 2, 1.5, 0.1] for i in places]).reshape(-1, 7)
+
+
+def annotations_at(places, categories):
+    """Ground truth at those places."""
+    n = len(places)
+    return Annotations(
+        boxes_at(*places),
+        as_categories(categories),
+        np.zeros(n),
+        np.zeros(n, dtype=np.int64),
+        np.zeros(n),
+        np.zeros((n, 4)),
+    )
+
+
+def detections_at(places, categories):
+    """Labels at those places."""
+    return Detections(boxes_at(*places), np.full(len(places), 0.5), as_categories(categories))
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        (PointSettings(), 7.0),
+        (PointSettings("mean"), (1 + 3 + 11 + 25) / 4),
+        (PointSettings("quantile", quantile=1.0), 25.0),
+        (PointSettings("quantile", quantile=0.25), 2.5),
+        (PointSettings("fixed", fixed=12.0), 12.0),
+    ],
+)
+def test_each_statistic_is_what_its_name_says(settings, expected):
+    """Median, mean, quantile and fixed, on four boxes."""
+    assert points_threshold(np.array([25, 1, 11, 3]), settings) == pytest.approx(expected)
+
+
+def test_threshold_of_empty_boxes_is_one_point():
+    """A median of 0 would divide by 0 and trust empty boxes."""
+    assert points_threshold(np.zeros(9)) == 1.0
+    assert points_threshold(np.array([0, 0, 1])) == 1.0
+
+
+def test_thresholds_are_learned_per_category_over_all_frames():
+    """Each category's statistic runs over its boxes of all labeled frames."""
+    samples = [
+        (frame_with(10, 3), annotations_at([0, 1], ["Car", "Cyclist"])),
+        (frame_with(20, 40), annotations_at([0, 1], ["Car", "Car"])),
+        (frame_with(5), annotations_at([], [])),
+    ]
+    learned = learn_thresholds(samples, ("Car", "Cyclist"))
+    assert learned.values == {"Car": 20.0, "Cyclist": 3.0}
+    assert learned.ground_truths == {"Car": 3, "Cyclist": 1}
+    assert learned.fallbacks == ()
+
+
+def test_dont_care_and_foreign_categories_teach_nothing():
+    """NaN boxes of DontCare regions and unconfigured categories are left out."""
+    truth = annotations_at([0, 1, 0], ["Car", "Van", "DontCare"])
+    truth.boxes[2] = np.nan
+    learned = learn_thresholds([(frame_with(8, 100), truth)], ("Car",))
+    assert learned.values == {"Car": 8.0}
+    assert learned.ground_truths == {"Car": 1}
+
+
+def test_a_category_without_ground_truth_warns_and_falls_back(caplog):
+    """The warning names the category and the fallback that is used."""
+    with caplog.at_level(logging.WARNING):
+        learned = learn_thresholds(
+            [(frame_with(8), annotations_at([0], ["Car"]))],
+            ("Car", "Pedestrian"),
+            PointSettings(fallback=7.0),
+        )
+    assert learned.values == {"Car": 8.0, "Pedestrian": 7.0}
+    assert learned.fallbacks == ("Pedestrian",)
+    (record,) = caplog.records
+    assert "Pedestrian" in record.getMessage()
+    assert "7 points" in record.getMessage()
+
+
+def test_a_fixed_threshold_needs_no_ground_truth(caplog):
+    """It is not a fallback, so nobody is warned."""
+    learned = learn_thresholds([], ("Car",), PointSettings("fixed", fixed=9.0))
+    assert learned.values == {"Car": 9.0}
+    assert learned.fallbacks == ()
+    assert not caplog.records
+
+
+def test_evidence_is_equation_8():
+    """rho_diff = min(m, m_th) / m_th, with each category's own m_th."""
+    prior = PointPrior({"Car": 20.0, "Cyclist": 2.5})
+    found = prior.score(
+        frame_with(5, 50, 2), detections_at([0, 1, 2, 3], ["Car", "Car", "Cyclist", "Cyclist"])
+    )
+    assert found.points.tolist() == [5, 50, 2, 0]
+    assert found.points.dtype == np.int64
+    assert found.points_threshold.tolist() == [20.0, 20.0, 2.5, 2.5]
+    assert found.rho_diff.tolist() == [0.25, 1.0, 0.8, 0.0]
+
+
+def test_evidence_names_its_columns():
+    """The fields are the columns of the database, and rho is the one that the prior names."""
+    found = PointPrior({"Car": 2.0}).score(frame_with(1), detections_at([0], ["Car"]))
+    assert list(columns(found)) == ["points", "points_threshold", "rho_diff"]
+    assert columns(found)[PointPrior.rho_column] is found.rho
+
+
+@given(st.integers(0, 500), st.integers(0, 500), st.floats(1.0, 300.0))
+def test_more_points_are_never_trusted_less(few, more, threshold):
+    """rho_diff rises with m, stays in [0, 1], and is 1 from m_th on."""
+    few, more = sorted((few, more))
+    found = PointPrior({"Car": threshold}).score(
+        frame_with(few, more), detections_at([0, 1], ["Car", "Car"])
+    )
+    assert 0 <= found.rho_diff[0] <= found.rho_diff[1] <= 1
+    assert (found.rho_diff == 1).tolist() == [few >= threshold, more >= threshold]
+
+
+def test_an_empty_frame_has_empty_evidence():
+    """No label, no point, or neither."""
+    prior = PointPrior({"Car": 3.0})
+    assert prior.score(frame_with(4), Detections.empty()).rho.shape == (0,)
+    assert prior.score(frame_with(), detections_at([0], ["Car"])).rho.tolist() == [0.0]
+
+
+def test_a_category_without_a_threshold_is_named():
+    """The error says which category and what to do."""
+    with pytest.raises(ConfigError, match=r"Tram.*learn the thresholds again"):
+        PointPrior({"Car": 3.0}).score(frame_with(1), detections_at([0], ["Tram"]))
+
+
+@pytest.mark.parametrize("wrong", [{"statistic": "mode"}, {"quantile": 1.5}, {"fallback": 0.0}])
+def test_settings_without_meaning_are_refused(wrong):
+    """A setting out of its range is named."""
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        PointSettings(**wrong)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_a_threshold_must_be_a_positive_number(value):
+    """What cannot divide is refused before it does."""
+    with pytest.raises(ConfigError, match="Car"):
+        PointPrior({"Car": value})

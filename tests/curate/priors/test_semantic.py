@@ -1,0 +1,185 @@
+"""The semantic prior: counting pixels, and Eq. 9."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from oracles import pixels
+
+from curate.detections import Detections, as_categories
+from curate.errors import ConfigError, ModelError
+from curate.frames import Calibration, Frame
+from curate.priors.base import columns
+from curate.priors.semantic import (
+    SemanticPrior,
+    SemanticSettings,
+    count_pixels,
+    semantic_trust,
+)
+from curate.segmenters.base import SemanticMap
+
+WIDTH, HEIGHT = 80, 40
+CLASSES = {"Car": (7,), "Pedestrian": (15,), "Cyclist": (2, 15)}
+# A camera at the origin that looks along x, 40 pixels per unit of slope.
+CALIBRATION = Calibration(
+    projection=np.array([[40.0, 0, 40, 0], [0, 40.0, 20, 0], [0, 0, 1, 0]]),
+    lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
+)
+AHEAD = [10.0, 0.0, 0.0, 2.0, 4.0, 2.0, 0.0]
+BEHIND = [-10.0, 0.0, 0.0, 2.0, 4.0, 2.0, 0.0]
+
+
+@dataclass(frozen=True)
+class Painted:
+    """A segmenter that answers one map."""
+
+    class_ids: np.ndarray
+    needs_image: bool = False
+
+    def segment(self, frame):
+        """The map, whatever the frame."""
+        return SemanticMap(self.class_ids, CLASSES)
+
+
+def frame():
+    """A frame without points."""
+    return Frame("000007", np.zeros((0, 4), np.float32), CALIBRATION, (WIDTH, HEIGHT))
+
+
+def labels(boxes, scores, categories=None):
+    """Labels of cars unless told otherwise."""
+    names = ["Car"] * len(boxes) if categories is None else categories
+    return Detections(np.reshape(boxes, (-1, 7)), np.array(scores), as_categories(names))
+
+
+def test_evidence_counts_class_pixels_in_the_projected_rectangle():
+    """A car ahead: its near face spans 17.8 by 8.9 pixels around the centre of the image."""
+    class_ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+    class_ids[:, 40:] = 7
+    found = SemanticPrior(Painted(class_ids)).score(frame(), labels([AHEAD], [0.81]))
+    # Columns 31.1 to 48.9 and rows 15.6 to 24.4: pixels 31..49 and 16..24.
+    assert found.box_pixels.tolist() == [19 * 9]
+    assert found.mask_pixels.tolist() == [10 * 9]
+    assert found.rho_anno[0] == pytest.approx(np.sqrt(0.81 * 10 / 19))
+
+
+@pytest.mark.parametrize(
+    ("mean", "expected"),
+    [("geometric", np.sqrt(0.64 * 0.25)), ("product", 0.16), ("arithmetic", 0.445)],
+)
+def test_each_mean_is_what_its_name_says(mean, expected):
+    """Score 0.64, a quarter of the pixels."""
+    rho = semantic_trust(
+        np.array([0.64]), np.array([5]), np.array([20]), SemanticSettings(mean=mean)
+    )
+    assert rho[0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("mean", ["geometric", "product", "arithmetic"])
+@pytest.mark.parametrize(("outside", "expected"), [("neutral", 0.3), ("drop", 0.0)])
+def test_boxes_that_the_image_does_not_show(mean, outside, expected):
+    """Behind the camera: rho_anno is the score or 0, whichever mean; other boxes are untouched."""
+    prior = SemanticPrior(
+        Painted(np.full((HEIGHT, WIDTH), 7, np.uint8)), SemanticSettings(mean, outside)
+    )
+    found = prior.score(frame(), labels([BEHIND, AHEAD], [0.3, 1.0]))
+    assert found.box_pixels[0] == found.mask_pixels[0] == 0
+    assert found.rho_anno.tolist() == [expected, 1.0]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.lists(
+        st.tuples(
+            *[st.floats(-3.0, 15.0, width=32)] * 4,
+            st.sampled_from(sorted(CLASSES)),
+        ),
+        min_size=1,
+        max_size=6,
+    ),
+)
+@example(0, [(0.0, 0.0, 11.0, 8.0, "Cyclist"), (3.5, 2.5, 3.5, 2.5, "Car")])
+def test_counting_agrees_with_counting_one_by_one(seed, rows):
+    """Integral images against a loop over all pixels, fractional and overhanging rectangles."""
+    class_ids = np.random.default_rng(seed).choice(
+        np.array([0, 2, 7, 15, 255], np.uint8), size=(9, 12)
+    )
+    rectangles = np.array([[min(a, c), min(b, d), max(a, c), max(b, d)] for a, b, c, d, _ in rows])
+    names = as_categories([row[4] for row in rows])
+    mask_pixels, box_pixels = count_pixels(rectangles, names, SemanticMap(class_ids, CLASSES))
+    expected = [
+        pixels.count(rectangle, class_ids, CLASSES[str(name)])
+        for rectangle, name in zip(rectangles, names, strict=True)
+    ]
+    assert list(zip(mask_pixels.tolist(), box_pixels.tolist(), strict=True)) == expected
+
+
+def test_the_whole_image_is_all_its_pixels():
+    """The rectangle 0, 0, width - 1, height - 1 holds every pixel once."""
+    everything = np.array([[0.0, 0.0, WIDTH - 1.0, HEIGHT - 1.0]])
+    semantic_map = SemanticMap(np.full((HEIGHT, WIDTH), 7, np.uint8), CLASSES)
+    mask_pixels, box_pixels = count_pixels(everything, as_categories(["Car"]), semantic_map)
+    assert mask_pixels.tolist() == box_pixels.tolist() == [WIDTH * HEIGHT]
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0, 1), st.integers(0, 50), st.integers(0, 50)), min_size=1, max_size=9
+    ),
+    st.sampled_from(["geometric", "product", "arithmetic"]),
+    st.sampled_from(["neutral", "drop"]),
+)
+def test_trust_stays_within_0_and_1_and_rises_with_the_pixels(rows, mean, outside):
+    """Any score and counts; one more class pixel never lowers rho_anno."""
+    scores = np.array([row[0] for row in rows])
+    box_pixels = np.array([row[1] + row[2] for row in rows])
+    mask_pixels = np.array([row[1] for row in rows])
+    options = SemanticSettings(mean, outside)
+    rho = semantic_trust(scores, mask_pixels, box_pixels, options)
+    more = semantic_trust(scores, np.minimum(mask_pixels + 1, box_pixels), box_pixels, options)
+    assert ((rho >= 0) & (rho <= 1)).all()
+    assert (more >= rho).all()
+
+
+def test_evidence_names_its_columns():
+    """The fields are the columns of the database, and rho is the one that the prior names."""
+    prior = SemanticPrior(Painted(np.zeros((HEIGHT, WIDTH), np.uint8)))
+    found = prior.score(frame(), labels([AHEAD], [0.5]))
+    assert list(columns(found)) == ["mask_pixels", "box_pixels", "rho_anno"]
+    assert columns(found)[prior.rho_column] is found.rho
+
+
+@pytest.mark.parametrize("needs_image", [True, False])
+def test_the_prior_needs_what_its_segmenter_needs(needs_image):
+    """Images are read only where somebody looks at them."""
+    assert SemanticPrior(Painted(np.zeros((1, 1)), needs_image)).needs_image is needs_image
+
+
+def test_an_empty_frame_is_not_segmented():
+    """Without labels there is nothing to ask the segmenter, which may be slow."""
+    found = SemanticPrior(Painted(np.zeros((1, 1)))).score(frame(), Detections.empty())
+    assert found.rho.shape == found.mask_pixels.shape == found.box_pixels.shape == (0,)
+
+
+def test_a_map_of_another_size_is_refused():
+    """The error names the frame and both sizes."""
+    prior = SemanticPrior(Painted(np.zeros((HEIGHT, WIDTH - 1), np.uint8)))
+    with pytest.raises(ModelError, match=r"000007.*79 x 40.*80 x 40"):
+        prior.score(frame(), labels([AHEAD], [0.5]))
+
+
+def test_a_category_without_classes_is_refused():
+    """The error names the category."""
+    prior = SemanticPrior(Painted(np.zeros((HEIGHT, WIDTH), np.uint8)))
+    with pytest.raises(ConfigError, match="Tram"):
+        prior.score(frame(), labels([AHEAD], [0.5], ["Tram"]))
+
+
+@pytest.mark.parametrize("wrong", [{"mean": "harmonic"}, {"outside": "guess"}])
+def test_unknown_options_are_refused(wrong):
+    """The error names the option and what there is."""
+    with pytest.raises(ConfigError, match=r"choose one of"):
+        SemanticSettings(**wrong)

@@ -1,0 +1,120 @@
+"""The database: its schema, its refusals, and its errors in our own words."""
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+
+from curate.errors import DatabaseError, LeakageError
+from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS
+from db import bulk
+from db.models import Base
+from db.session import Database
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Database:
+    """An empty database."""
+    return Database(f"sqlite:///{tmp_path / 'curate.db'}")
+
+
+def _frame(database: Database, split: str) -> int:
+    with database.writing() as connection:
+        bulk.insert(connection, "frame", [("kitti", f"f-{split}", split, "p", "i", "c", None)])
+        return connection.exec_driver_sql(f"SELECT id FROM frame WHERE split = '{split}'").scalar_one()
+
+
+def _truth(frame_id: int, split: str) -> tuple:
+    return (frame_id, 0, split, "Car", *[1.0] * 7, 0.0, 0, 0.0, *[1.0] * 4)
+
+
+def test_migrations_make_the_tables_of_the_models(database: Database) -> None:
+    """No difference is left between the migrated schema and the models."""
+    with database.reading() as connection:
+        difference = compare_metadata(MigrationContext.configure(connection), Base.metadata)
+    assert difference == [], "make a migration: alembic -x url=... revision --autogenerate"
+
+
+def test_weighted_labels_has_exactly_the_columns_of_the_format(database: Database) -> None:
+    """The view and the exported file agree on names and order."""
+    with database.reading() as connection:
+        cursor = connection.exec_driver_sql("SELECT * FROM weighted_labels")
+        assert tuple(cursor.keys()) == WEIGHTED_LABEL_COLUMNS
+
+
+@pytest.mark.parametrize("claimed", ["labeled", "unlabeled", "val"])
+def test_ground_truth_of_an_unlabeled_frame_cannot_be_stored(
+    database: Database, claimed: str
+) -> None:
+    """Whatever split the row claims, the frame's own split decides."""
+    frame_id = _frame(database, "unlabeled")
+    with pytest.raises((LeakageError, DatabaseError)), database.writing() as connection:
+        bulk.insert(connection, "ground_truth", [_truth(frame_id, claimed)])
+
+
+def test_ground_truth_is_refused_with_foreign_keys_switched_off(
+    database: Database, tmp_path: Path
+) -> None:
+    """The sqlite3 shell, which does not check foreign keys, cannot do it either."""
+    frame_id = _frame(database, "unlabeled")
+    with sqlite3.connect(tmp_path / "curate.db") as raw:
+        raw.execute("PRAGMA foreign_keys = OFF")
+        marks = ", ".join("?" * len(bulk.columns("ground_truth")))
+        with pytest.raises(sqlite3.IntegrityError, match="unlabeled frame"):
+            raw.execute(f"INSERT INTO ground_truth VALUES ({marks})", _truth(frame_id, "labeled"))
+
+
+def test_a_labeled_frame_with_ground_truth_cannot_become_unlabeled(database: Database) -> None:
+    """The key of the ground truth holds the split."""
+    frame_id = _frame(database, "labeled")
+    with database.writing() as connection:
+        bulk.insert(connection, "ground_truth", [_truth(frame_id, "labeled")])
+    with pytest.raises(DatabaseError), database.writing() as connection:
+        connection.exec_driver_sql("UPDATE frame SET split = 'unlabeled'")
+
+
+def test_an_unlabeled_frame_has_no_label_path(database: Database) -> None:
+    """Not even the path of a label file is stored for X_u."""
+    row = ("kitti", "x", "unlabeled", "p", "i", "c", "label_2/x.txt")
+    with pytest.raises(DatabaseError), database.writing() as connection:
+        bulk.insert(connection, "frame", [row])
+
+
+def test_a_transaction_is_kept_whole_or_not_at_all(database: Database) -> None:
+    """An error takes back what the transaction had written."""
+    with pytest.raises(ZeroDivisionError), database.writing() as connection:
+        bulk.insert(connection, "frame", [("kitti", "x", "val", "p", "i", "c", None)])
+        raise ZeroDivisionError
+    with database.reading() as connection:
+        assert connection.exec_driver_sql("SELECT count(*) FROM frame").scalar_one() == 0
+
+
+def test_evidence_leaves_with_its_prediction(database: Database) -> None:
+    """Deleting a frame's predictions deletes what was found out about them."""
+    frame_id = _frame(database, "unlabeled")
+    with database.writing() as connection:
+        bulk.insert(connection, "round", [(1, 1, None, "{}", "0", 0)])
+        bulk.insert(connection, "prediction", [(1, frame_id, 0, "Car", 0.5, *[1.0] * 7)])
+        bulk.insert(connection, "weight", [(1, frame_id, 0, "spsl", 1.0, 1.0, 0.5)])
+        bulk.delete_frames(connection, "prediction", 1, [frame_id])
+        assert connection.exec_driver_sql("SELECT count(*) FROM weight").scalar_one() == 0
+
+
+def test_a_damaged_file_is_named_with_a_remedy(tmp_path: Path) -> None:
+    """Garbage in place of a database is a one-line error."""
+    path = tmp_path / "curate.db"
+    path.write_bytes(b"not a database at all" * 100)
+    with pytest.raises(DatabaseError, match=r"curate.db.*not a database.*restore") as error:
+        Database(f"sqlite:///{path}")
+    assert "\n" not in str(error.value)
+
+
+def test_a_database_of_a_newer_curate_is_refused(database: Database, tmp_path: Path) -> None:
+    """Its schema is unknown here."""
+    with database.writing() as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+    database.close()
+    with pytest.raises(DatabaseError, match="newer curate"):
+        Database(f"sqlite:///{tmp_path / 'curate.db'}")

@@ -1,0 +1,111 @@
+"""A toy world for tests of the pipeline: small frames in KITTI's layout and an honest detector."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from curate.datasets.kitti import write_calibration
+from curate.datasets.kitti_labels import from_annotations, write_objects
+from curate.detections import Annotations, Detections
+from curate.frames import Calibration, Frame
+from curate.segmenters.base import SemanticMap
+
+IMAGE_SIZE = (120, 40)
+SIZES = {"Car": (4.0, 1.8, 1.6), "Pedestrian": (0.8, 0.6, 1.7), "Cyclist": (1.8, 0.6, 1.7)}
+# The toy detector recognises a category by the brightness of its points.
+INTENSITIES = {"Car": 0.9, "Pedestrian": 0.8, "Cyclist": 0.7}
+
+
+def toy_calibration() -> Calibration:
+    """A camera at the LiDAR's origin that looks along x."""
+    projection = np.array([[60.0, 0, 60, 0], [0, 60, 20, 0], [0, 0, 1, 0]])
+    lidar_to_camera = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    return Calibration(projection, lidar_to_camera)
+
+
+def write_toy_kitti(root: Path, frames: int, val: int = 0, *, labels: bool = True) -> None:
+    """Frames 000000.. with one object per category, each a cloud of equally bright points."""
+    for folder in ("velodyne", "image_2", "calib", "label_2"):
+        (root / "training" / folder).mkdir(parents=True, exist_ok=True)
+    names = [f"{i:06d}" for i in range(frames)]
+    for i, name in enumerate(names):
+        _write_frame(root / "training", name, np.random.default_rng(i), labels=labels)
+    (root / "ImageSets").mkdir(exist_ok=True)
+    (root / "ImageSets" / "train.txt").write_text("\n".join(names[: frames - val]) + "\n")
+    (root / "ImageSets" / "val.txt").write_text("\n".join(names[frames - val :]) + "\n")
+
+
+def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: bool) -> None:
+    import cv2
+
+    categories = np.array(list(SIZES))
+    boxes = np.array([
+        [rng.uniform(8, 25), rng.uniform(-4, 4), -0.8, *SIZES[c], rng.uniform(-3, 3)]
+        for c in categories
+    ])  # fmt: skip
+    boxes[:, 1] += np.array([-6, 0, 6])
+    points = [np.column_stack([rng.uniform(2, 40, (400, 1)), rng.uniform(-20, 20, (400, 1)),
+                               np.full((400, 1), -1.7), rng.uniform(0, 0.5, (400, 1))])]  # fmt: skip
+    for box, category in zip(boxes, categories, strict=True):
+        inside = rng.uniform(-0.45, 0.45, (int(rng.integers(20, 60)), 3)) * box[3:6]
+        turn = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]])
+        inside[:, :2] = inside[:, :2] @ turn
+        points.append(np.column_stack([inside + box[:3], np.full(len(inside), INTENSITIES[category])]))
+    np.concatenate(points).astype(np.float32).tofile(folder / "velodyne" / f"{name}.bin")
+    image = rng.integers(0, 255, (IMAGE_SIZE[1], IMAGE_SIZE[0], 3), dtype=np.uint8)
+    cv2.imwrite(str(folder / "image_2" / f"{name}.png"), image)
+    write_calibration(folder / "calib" / f"{name}.txt", toy_calibration())
+    if labels:
+        nothing = np.zeros(3)
+        truth = Annotations(
+            boxes, categories, nothing, nothing.astype(np.int64), nothing,
+            np.tile([0.0, 0, 100, 39], (3, 1)),
+        )  # fmt: skip
+        write_objects(folder / "label_2" / f"{name}.txt", from_annotations(truth, toy_calibration()))
+
+
+class ToyDetector:
+    """Finds the bright clouds; its score is the share of 60 points that it saw.
+
+    Args:
+        path: a file; a frame whose name is written in it raises, "slow" makes every frame slow.
+    """
+
+    def __init__(self, path: Path) -> None:
+        words = Path(path).read_text().split()
+        self.poison = set(words) - {"slow"}
+        self.delay_s = 0.05 if "slow" in words else 0.0
+
+    def predict(self, frame: Frame) -> Detections:
+        """One box per category."""
+        time.sleep(self.delay_s)
+        if frame.frame_id in self.poison:
+            raise RuntimeError("CUDA error: an illegal memory access\nwas encountered")
+        found = []
+        for category, intensity in INTENSITIES.items():
+            cloud = frame.points[np.abs(frame.points[:, 3] - intensity) < 0.01, :3]
+            if len(cloud):
+                found.append((category, min(len(cloud) / 60, 1.0), cloud.mean(axis=0)))
+        boxes = [[*centre, *SIZES[category], 0.0] for category, _, centre in found]
+        return Detections(
+            np.array(boxes, dtype=np.float64).reshape(-1, 7),
+            np.array([score for _, score, _ in found], dtype=np.float64),
+            np.array([category for category, _, _ in found], dtype=np.str_),
+        )
+
+
+class ToySegmenter:
+    """Sees a car in every pixel of the left half, a person in the right half."""
+
+    needs_image = True
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def segment(self, frame: Frame) -> SemanticMap:
+        """The semantic map."""
+        width, height = frame.image_size
+        class_ids = np.ones((height, width), dtype=np.uint8)
+        class_ids[:, width // 2 :] = 2
+        return SemanticMap(class_ids, {"Car": (1,), "Pedestrian": (2,), "Cyclist": (1, 2)})
