@@ -6,7 +6,7 @@ and yaw in radians, counter-clockwise from the x axis in (-pi, pi], all in the L
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -43,6 +43,14 @@ class Detections:
     def select(self, index: np.ndarray) -> Self:
         """The detections at `index` (integers or a mask), in that order."""
         return type(self)(self.boxes[index], self.scores[index], self.categories[index])
+
+    @classmethod
+    def from_rows(cls, rows: Sequence[Sequence[Any]]) -> Self:
+        """From rows of category, score, and the seven numbers of the box."""
+        if not rows:
+            return cls.empty()
+        categories, scores, *box = zip(*rows, strict=True)
+        return cls(np.array(box, dtype=np.float64).T, np.array(scores), as_categories(categories))
 
     @classmethod
     def empty(cls) -> Self:

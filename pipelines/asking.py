@@ -48,7 +48,7 @@ def _ask_sqlite(path: Path, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any
     return [column[0] for column in cursor.description], iter(cursor)
 
 
-def _authorize(action: int, first: str | None, second: str | None, *_: str | None) -> int:
+def _authorize(action: int, _first: str | None, second: str | None, *_: str | None) -> int:
     """SQLite asks this before each thing that a statement would do."""
     if action == sqlite3.SQLITE_FUNCTION and second in FORBIDDEN_FUNCTIONS:
         return sqlite3.SQLITE_DENY

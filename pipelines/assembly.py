@@ -27,6 +27,7 @@ def open_detector(config: Config, path: Path) -> Detector:
         path,
         offered={
             "minimum_score": section.minimum_score,
+            "score_threshold": section.minimum_score,
             "device": device(config),
             "categories": config.dataset.categories,
             "threads": 1,

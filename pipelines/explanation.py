@@ -65,7 +65,7 @@ def _label(
             newest = select(func.max(weight.c.round)).where(weight.c.policy == policy)
             round_number = connection.execute(newest).scalar_one()
         query = text(
-            f"SELECT {', '.join(WEIGHTED_LABEL_COLUMNS)} FROM weighted_labels "  # noqa: S608 - fixed names
+            f"SELECT {', '.join(WEIGHTED_LABEL_COLUMNS)} FROM weighted_labels "  # noqa: S608
             "WHERE round = :round AND frame = :frame AND k = :k AND policy = :policy"
         )
         key = {"round": round_number, "frame": frame, "k": k, "policy": policy}
@@ -95,7 +95,7 @@ def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple
 
 
 def _weight(label: dict[str, Any]) -> float | None:
-    """v by Eqs. 7 and 11; None for policies that do not use them."""
+    """The weight by Eqs. 7 and 11; None for policies that do not use them."""
     if label["policy"] not in {"spsl", "pspsl"}:
         return None
     if label["loss"] is None or label["lambda_u"] is None:
@@ -122,8 +122,8 @@ def _lines(
     ]
     lines += [f"  {_view_line(view)}" for view in views]
     lines.append(
-        f"  consistency    L = {section.score_weight:g} (-ln s') + {section.box_weight:g} box loss, "
-        f"mean over matched views = {number['loss']}"
+        f"  consistency    L = {section.score_weight:g} (-ln s') + {section.box_weight:g} box loss"
+        f", mean over matched views = {number['loss']}"
     )
     if label["points"] is not None:
         lines.append(
@@ -151,8 +151,8 @@ def _lines(
 
 def _view_line(view: View) -> str:
     how = (
-        f"view {view.view}: {'flipped, ' if view.flip_y else ''}rotated {view.rotation_rad:+.3f} rad, "
-        f"scaled {view.scale:.3f}"
+        f"view {view.view}: {'flipped, ' if view.flip_y else ''}"
+        f"rotated {view.rotation_rad:+.3f} rad, scaled {view.scale:.3f}"
     )
     if view.score is None:
         return f"{how}: no match"

@@ -89,6 +89,16 @@ def find_teacher(workspace: Workspace, number: int) -> tuple[int, Teacher]:
     return key, Teacher(workspace.root / path, digest)
 
 
+def newest_checkpoint(workspace: Workspace) -> Path:
+    """The student of the last round under the configured policy, else the first teacher.
+
+    Raises:
+        WorkspaceError: there is no detector yet.
+    """
+    students = _students(workspace)
+    return find_teacher(workspace, max(students, default=0) + 1)[1].path
+
+
 def register_checkpoint(
     connection: Connection, workspace: Workspace, round_number: int, policy: str, path: Path
 ) -> None:

@@ -22,7 +22,7 @@ def run_all(workspace: Workspace, rounds: int | None, progress: Progress) -> Ite
     total = (rounds or workspace.config.run.rounds) if trainable else 1
     policy = workspace.config.solve.policy
     for number in range(1, total + 1):
-        context = open_round(workspace, number, total)
+        context = open_round(workspace, number, rounds)
         for stage in active(workspace.config.run.priors):
             if isinstance(stage, FrameStage):
                 yield run_frames(workspace, context, stage, progress, "unlabeled")

@@ -68,12 +68,10 @@ class Workspace:
             write_config(path, config)
         return cls(root, config, Database(_url(root, config)))
 
-    def with_run(self, **changes: Any) -> "Workspace":
-        """The same workspace with other settings of the section `run`, for this command only."""
-        if not changes:
-            return self
-        run = self.config.run.model_copy(update=changes)
-        return replace(self, config=self.config.model_copy(update={"run": run}))
+    def with_settings(self, section: str, **changes: Any) -> "Workspace":
+        """The same workspace with other settings in a section, for this command only."""
+        changed = getattr(self.config, section).model_copy(update=changes)
+        return replace(self, config=self.config.model_copy(update={section: changed}))
 
     @cached_property
     def dataset(self) -> Dataset:
@@ -122,7 +120,7 @@ class Workspace:
         with self.database.reading() as connection:
             for key, *row in bulk.select(connection, query):
                 found[key].append(tuple(row))
-        return {key: _detections(rows) for key, rows in found.items()}
+        return {key: Detections.from_rows(rows) for key, rows in found.items()}
 
 
 def open_dataset(config: Config) -> Dataset:
@@ -161,13 +159,6 @@ def _find(start: Path) -> Path:
 
 def _url(root: Path, config: Config) -> str:
     return config.run.database or f"sqlite:///{root / 'curate.db'}"
-
-
-def _detections(rows: Sequence[Sequence[Any]]) -> Detections:
-    if not rows:
-        return Detections.empty()
-    categories, scores, *box = zip(*rows, strict=True)
-    return Detections(np.array(box, dtype=np.float64).T, np.array(scores), np.array(categories))
 
 
 def _annotations(rows: Sequence[Sequence[Any]]) -> Annotations:

@@ -51,7 +51,9 @@ def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: b
         inside = rng.uniform(-0.45, 0.45, (int(rng.integers(20, 60)), 3)) * box[3:6]
         turn = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]])
         inside[:, :2] = inside[:, :2] @ turn
-        points.append(np.column_stack([inside + box[:3], np.full(len(inside), INTENSITIES[category])]))
+        points.append(
+            np.column_stack([inside + box[:3], np.full(len(inside), INTENSITIES[category])])
+        )
     np.concatenate(points).astype(np.float32).tofile(folder / "velodyne" / f"{name}.bin")
     image = rng.integers(0, 255, (IMAGE_SIZE[1], IMAGE_SIZE[0], 3), dtype=np.uint8)
     cv2.imwrite(str(folder / "image_2" / f"{name}.png"), image)
@@ -62,7 +64,9 @@ def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: b
             boxes, categories, nothing, nothing.astype(np.int64), nothing,
             np.tile([0.0, 0, 100, 39], (3, 1)),
         )  # fmt: skip
-        write_objects(folder / "label_2" / f"{name}.txt", from_annotations(truth, toy_calibration()))
+        write_objects(
+            folder / "label_2" / f"{name}.txt", from_annotations(truth, toy_calibration())
+        )
 
 
 class ToyDetector:

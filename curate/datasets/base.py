@@ -28,8 +28,8 @@ class Dataset(Protocol):
         """Where the frame's files lie; does not open them."""
         ...
 
-    def read(self, frame_id: str, *, image: bool = False) -> Frame:
-        """The frame's points and calibration, and its image where asked for."""
+    def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
+        """The frame's calibration, its points unless unwanted, and its image where asked for."""
         ...
 
     def annotations(self, frame_id: str) -> Annotations:

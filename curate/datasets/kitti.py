@@ -60,16 +60,15 @@ class KittiDataset:
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """The lists of ROOT/ImageSets, by file name; they may name frames that are not there.
 
-        KITTI's own test.txt names frames of ROOT/testing, which have the same numbers as other
-        frames of ROOT/training. It is therefore left out where ROOT/testing exists or where
-        ROOT/training is read.
+        KITTI's own test.txt names frames of ROOT/testing, whose numbers are those of other frames
+        of ROOT/training. It is therefore left out where ROOT/training is read.
 
         Raises:
             DataError: a list names something that is no frame id.
         """
         lists = {path.stem: path for path in sorted((self.root / "ImageSets").glob("*.txt"))}
-        if self._home != self.root and lists.pop("test", None):
-            _log.info("%s: ImageSets/test.txt is of testing/ and is left out", self.root)
+        if self._home != self.root and "test" in lists:
+            _log.info("%s: left out, it names frames of testing/", lists.pop("test"))
         return {name: _read_frame_list(path) for name, path in lists.items()}
 
     def files(self, frame_id: str) -> FrameFiles:
@@ -88,20 +87,20 @@ class KittiDataset:
             label=label if label.exists() else None,
         )
 
-    def read(self, frame_id: str, *, image: bool = False) -> Frame:
-        """The frame's points and calibration, and its image where asked for.
+    def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
+        """The frame's calibration, its points unless unwanted, and its image where asked for.
 
         Raises:
             DataError: a file is missing, damaged or malformed.
         """
         files = self.files(frame_id)
-        points = read_points(files.points)
+        sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
         calibration = read_calibration(files.calibration)
         if not image:
-            return Frame(frame_id, points, calibration, read_image_size(files.image))
+            return Frame(frame_id, sweep, calibration, read_image_size(files.image))
         pixels = read_image(files.image)
         height, width = pixels.shape[:2]
-        return Frame(frame_id, points, calibration, (width, height), pixels)
+        return Frame(frame_id, sweep, calibration, (width, height), pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
         """The frame's ground truth in the LiDAR frame, DontCare regions included.

@@ -21,6 +21,7 @@ from curate.atomic import replace_file
 from curate.detections import Annotations, Detections, as_categories
 from curate.errors import DataError
 from curate.frames import Calibration
+from curate.geometry.projection import image_rectangles
 from curate.geometry.similarity import wrap_angle
 
 DONT_CARE = "DontCare"
@@ -194,8 +195,6 @@ def from_detections(
         calibration: of the frame.
         image_size: (width, height) in pixels.
     """
-    from curate.geometry.projection import image_rectangles
-
     dimensions, locations, rotations_y = _boxes_camera(detections.boxes, calibration)
     boxes_2d = image_rectangles(detections.boxes, calibration, image_size)
     count = len(detections)
@@ -270,7 +269,7 @@ def _format(objects: KittiObjects, index: int) -> str:
 def _read_lines(path: Path) -> list[str]:
     """The lines of a text file; DataError where there is none."""
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return path.read_bytes().decode().splitlines()
     except FileNotFoundError:
         raise DataError(f"{path}: no such label file") from None
     except OSError as error:

@@ -241,7 +241,8 @@ def score_thresholds(scores: np.ndarray, count: int) -> np.ndarray:
 
 def _percent(precision: np.ndarray) -> np.ndarray:
     """Mean over the last axis, in percent; exactly 100 where all are 1."""
-    return np.divide(100 * np.sum(precision, axis=-1), precision.shape[-1])
+    means: np.ndarray = 100 * np.sum(precision, axis=-1) / precision.shape[-1]
+    return means
 
 
 def _best_from_here_on(values: np.ndarray) -> np.ndarray:

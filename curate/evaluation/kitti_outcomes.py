@@ -20,7 +20,6 @@ from curate.evaluation.kitti_matching import (
 )
 from curate.evaluation.kitti_rules import (
     ABSENT,
-    COUNTED,
     DIFFICULTIES,
     IGNORED,
     MIN_OVERLAPS,
@@ -185,7 +184,7 @@ def _with_ignored(
 ) -> np.ndarray:
     """(n,) bool, whether a row or its match is ignored."""
     matched = matches >= 0
-    ignored = states == IGNORED
+    ignored: np.ndarray = states == IGNORED
     ignored[matched] |= states_of_others[matches[matched]] == IGNORED
     return ignored
 

@@ -78,7 +78,10 @@ CREATE TABLE label (
 ) STRICT;
 """
 
-_VIEW = f"CREATE VIEW weighted_labels AS SELECT {', '.join(WEIGHTED_LABEL_COLUMNS)} FROM label;"
+_VIEW = (
+    "CREATE VIEW weighted_labels AS "  # noqa: S608
+    f"SELECT {', '.join(WEIGHTED_LABEL_COLUMNS)} FROM label;"
+)
 
 # An index that exists during the load makes it several times slower.
 _INDEXES = """

@@ -27,10 +27,13 @@ _Pair = tuple[float, float]
 def rectangle_table(boxes: np.ndarray) -> np.ndarray:
     """(n, 10) what the other kernels need of (n, 7) boxes, computed once per box.
 
-    A box with a side that is not positive gets an area of 0: it overlaps nothing.
+    A box with a side that is not positive gets an area of 0, and one with a number that is not
+    finite a row of zeros: they overlap nothing.
     """
-    table = np.empty((len(boxes), 10))
+    table = np.zeros((len(boxes), 10))
     for i in range(len(boxes)):
+        if not np.isfinite(boxes[i].sum()):
+            continue
         length, width, height = boxes[i, 3], boxes[i, 4], boxes[i, 5]
         table[i, _X], table[i, _Y], table[i, _Z] = boxes[i, 0], boxes[i, 1], boxes[i, 2]
         table[i, _HALF_LENGTH], table[i, _HALF_WIDTH] = length / 2, width / 2
@@ -43,8 +46,8 @@ def rectangle_table(boxes: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _common_length(offset: float, half_a: float, half_b: float) -> float:
-    """Length that two intervals share; b's centre lies at `offset` from a's."""
-    return max(0.0, min(half_a, offset + half_b) - max(-half_a, offset - half_b))
+    """Length that two intervals share whose centres lie `offset` apart; the same both ways."""
+    return max(0.0, min(2 * half_a, 2 * half_b, half_a + half_b - abs(offset)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -114,7 +117,7 @@ def _area_in_frame_of(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _near(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
-    """Whether the circles around a[i] and b[j] meet; no where a number is NaN."""
+    """Whether the circles around a[i] and b[j] meet."""
     reach = a[i, _RADIUS] + b[j, _RADIUS]
     away_x, away_y = b[j, _X] - a[i, _X], b[j, _Y] - a[i, _Y]
     return bool(away_x * away_x + away_y * away_y < reach * reach)
@@ -122,7 +125,7 @@ def _near(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _common_area(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
-    """Common area of rectangles a[i] and b[j]; 0 where a side is not positive or not finite."""
+    """Common area of rectangles a[i] and b[j]; 0 where one has no area."""
     smaller = min(a[i, _AREA], b[j, _AREA])
     if not smaller > 0:
         return 0.0
@@ -148,7 +151,6 @@ def _iou_3d(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
         return 0.0
     offset = b[j, _Z] - a[i, _Z]
     shared = _common_length(offset, a[i, _HALF_HEIGHT], b[j, _HALF_HEIGHT])
-    shared = min(shared, height_a, height_b)
     common = shared * _common_area(a, i, b, j) if shared > 0 else 0.0
     if common == 0:
         return 0.0

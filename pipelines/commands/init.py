@@ -37,7 +37,7 @@ def init(
 
     Ground truth of unlabeled frames is not read. Without a segmenter only the point prior is asked.
 
-    Example: curate init work --dataset kitti --root data/simulated --labeled 0.06 --segmenter simulated
+    Example: curate init work --root data/simulated --labeled 0.06 --segmenter simulated
     """
     from curate.errors import ConfigError
     from pipelines.config import make_config

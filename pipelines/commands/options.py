@@ -32,11 +32,19 @@ WorkersOption = Annotated[
     Optional[int],  # noqa: UP045
     typer.Option("--workers", min=1, help="Workers; more than one means --executor process."),
 ]
+UNLIMITED = 10_000
+ThreadsOption = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option("--threads", min=1, help="Threads; default: train.threads of curate.toml."),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 
 
 def open_workspace(
-    folder: Path | None, executor: str | None = None, workers: int | None = None
+    folder: Path | None,
+    executor: str | None = None,
+    workers: int | None = None,
+    threads: int | None = None,
 ) -> "Workspace":
     """The workspace, with what the command line changes for this run."""
     from pipelines.workspace import Workspace
@@ -47,7 +55,8 @@ def open_workspace(
         changes = {"workers": workers, "executor": "process" if workers > 1 else "serial"}
     if executor is not None:
         changes["executor"] = executor
-    return workspace.with_run(**changes)
+    workspace = workspace.with_settings("run", **changes)
+    return workspace.with_settings("train", **({"threads": threads} if threads else {}))
 
 
 def print_json(value: Any) -> None:
@@ -63,19 +72,23 @@ def _plain(value: Any) -> Any:
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], title: str = "") -> None:
     """Prints rows as a table; numbers are aligned to the right."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title or None, title_justify="left", header_style="bold")
+    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     cells = [[_cell(value) for value in row] for row in rows]
     numeric = [
         all(_is_number(row[i]) for row in cells) and bool(cells) for i in range(len(columns))
     ]
     for name, right in zip(columns, numeric, strict=True):
-        table.add_column(name, justify="right" if right else "left", overflow="fold")
+        table.add_column(name, justify="right" if right else "left", no_wrap=True)
     for row in cells:
         table.add_row(*row)
-    Console().print(table)
+    console = Console()
+    # In a file or a pipe nothing is cut off.
+    console.width = console.width if console.is_terminal else UNLIMITED
+    console.print(table, soft_wrap=not console.is_terminal)
 
 
 def print_report(report: "Report") -> None:

@@ -4,6 +4,7 @@ import typer
 
 from pipelines.commands.options import (
     JsonOption,
+    ThreadsOption,
     WorkspaceOption,
     end,
     open_workspace,
@@ -11,7 +12,11 @@ from pipelines.commands.options import (
 )
 
 
-def pretrain(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> None:
+def pretrain(
+    threads: ThreadsOption = None,
+    workspace: WorkspaceOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """Train the first teacher on the labeled frames alone.
 
     Example: curate pretrain
@@ -19,7 +24,7 @@ def pretrain(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> 
     from pipelines.progress import Bar
     from pipelines.stages.pretrain import pretrain as run
 
-    report = run(open_workspace(workspace), Bar())
+    report = run(open_workspace(workspace, threads=threads), Bar())
     if not as_json:
         print_report(report)
     end([report], as_json=as_json)

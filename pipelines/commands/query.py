@@ -18,7 +18,7 @@ def query(
 ) -> None:
     """Ask the database; the connection is read-only.
 
-    Example: curate query "SELECT frame, k, category, score, weight FROM weighted_labels ORDER BY weight DESC"
+    Example: curate query "SELECT frame, k, weight FROM weighted_labels WHERE weight > 0.5"
     """
     import csv
     import sys

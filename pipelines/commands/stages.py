@@ -53,6 +53,7 @@ def run_round_command(
     round_number: int | None,
     policy: str | None,
     *,
+    threads: int | None = None,
     as_json: bool,
 ) -> None:
     """Runs a round stage for a policy."""
@@ -62,7 +63,7 @@ def run_round_command(
     from pipelines.runner import run_round
     from pipelines.stage import RoundStage
 
-    workspace = open_workspace(folder)
+    workspace = open_workspace(folder, threads=threads)
     found = stage(name)
     if not isinstance(found, RoundStage):
         raise TypeError(name)

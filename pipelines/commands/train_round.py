@@ -2,13 +2,20 @@
 
 import typer
 
-from pipelines.commands.options import JsonOption, PolicyOption, RoundOption, WorkspaceOption
+from pipelines.commands.options import (
+    JsonOption,
+    PolicyOption,
+    RoundOption,
+    ThreadsOption,
+    WorkspaceOption,
+)
 from pipelines.commands.stages import run_round_command
 
 
 def train_round(
     policy: PolicyOption = None,
     round_number: RoundOption = None,
+    threads: ThreadsOption = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -18,7 +25,9 @@ def train_round(
 
     Example: curate train-round
     """
-    run_round_command("train-round", workspace, round_number, policy, as_json=as_json)
+    run_round_command(
+        "train-round", workspace, round_number, policy, threads=threads, as_json=as_json
+    )
 
 
 def register(app: typer.Typer) -> None:

@@ -29,14 +29,19 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
     if not labeled:
         raise WorkspaceError("no labeled frames to learn from; `curate init --labeled` takes some")
     settings = config.train.model_dump(mode="json", exclude={"round_steps", "threads", "start"})
-    key = [settings, sorted(labeled), config.run.seed, config.detector.device, config.dataset.categories]
+    key = [
+        settings,
+        sorted(labeled),
+        config.run.seed,
+        config.detector.device,
+        config.dataset.categories,
+    ]
     path = workspace.root / "checkpoints" / "round-00.safetensors"
 
     def make() -> Product:
         labels = workspace.root / "exports" / "labeled.sqlite"
         write_label_file(workspace, labels, 0, "")
         report = train_with_progress(
-            workspace,
             labels=labels,
             output=path,
             settings=training_settings(workspace, config.train.pretrain_steps, 0),

@@ -14,7 +14,7 @@ from pipelines.stages import export
 from pipelines.workspace import Workspace
 
 if TYPE_CHECKING:
-    from curate.training.trainer import TrainingReport, TrainingSettings
+    from curate.training.settings import TrainingReport, TrainingSettings
 
 
 def settings(workspace: Workspace, context: RoundContext, _policy: str) -> Settings:
@@ -44,7 +44,6 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
     section = workspace.config.train
     path = file(workspace, job.context, job.policy)
     report = train_with_progress(
-        workspace,
         labels=export.file(workspace, job.context, job.policy),
         output=path,
         settings=training_settings(workspace, section.round_steps, job.context.number),
@@ -60,7 +59,7 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
 
 def training_settings(workspace: Workspace, steps: int, round_number: int) -> "TrainingSettings":
     """The trainer's settings."""
-    from curate.training.trainer import TrainingSettings
+    from curate.training.settings import TrainingSettings
 
     section = workspace.config.train
     return TrainingSettings(
@@ -76,7 +75,6 @@ def training_settings(workspace: Workspace, steps: int, round_number: int) -> "T
 
 
 def train_with_progress(
-    workspace: Workspace,
     *,
     labels: Path,
     output: Path,

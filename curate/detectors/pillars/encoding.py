@@ -73,9 +73,7 @@ class Targets:
 def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
     """The pillar features of (n, 4) points in the LiDAR frame; points off the grid are left out."""
     x, y, z, intensity = (points[:, axis] for axis in range(4))
-    inside = (
-        _within(x, preset.x_range) & _within(y, preset.y_range) & _within(z, preset.z_range)
-    )
+    inside = _within(x, preset.x_range) & _within(y, preset.y_range) & _within(z, preset.z_range)
     x, y, z, intensity = x[inside], y[inside], z[inside], intensity[inside]
     column = ((x - preset.x_range[0]) / preset.pillar_m).astype(np.int64)
     row = ((y - preset.y_range[0]) / preset.pillar_m).astype(np.int64)
@@ -89,7 +87,7 @@ def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
     count = np.maximum(np.bincount(slots, minlength=slot_count), 1)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return (np.bincount(slots, values, slot_count) / count)[slots]
+        return np.asarray((np.bincount(slots, values, slot_count) / count)[slots])
 
     from_centre_x = x - (preset.x_range[0] + (column + 0.5) * preset.pillar_m)
     from_centre_y = y - (preset.y_range[0] + (row + 0.5) * preset.pillar_m)
@@ -210,7 +208,10 @@ def _draw(
     for k in range(len(boxes)):
         reach = int(np.ceil(_SPREADS * spreads[k].max()))
         window = tuple(
-            slice(max(0, cell[k, axis] - reach), min(background.shape[axis], cell[k, axis] + reach + 1))
+            slice(
+                max(0, cell[k, axis] - reach),
+                min(background.shape[axis], cell[k, axis] + reach + 1),
+            )
             for axis in (0, 1)
         )
         away_x = (np.arange(window[0].start, window[0].stop) - cell[k, 0])[:, None]

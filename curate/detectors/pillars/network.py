@@ -42,7 +42,9 @@ class PillarNetwork(nn.Module):
         self.side1 = _Pointwise(first, head)
         self.head = _convolution(head, head)
         self.answer = nn.Linear(head, categories + BOX_CODE)
-        self.to(memory_format=torch.channels_last)
+        for parameter in self.parameters():
+            if parameter.dim() == 4:
+                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
         with torch.no_grad():
             bias = self.answer.bias
             bias.zero_()
@@ -60,7 +62,9 @@ class PillarNetwork(nn.Module):
             (b, x cells, y cells, categories) logits and (b, x cells, y cells, BOX_CODE) codes.
         """
         cells_x, cells_y = self.preset.cells
-        canvas = _SlotMaximum.apply(self.points(features), slots, frames * cells_x * cells_y * 4)
+        canvas: Tensor = _SlotMaximum.apply(  # type: ignore[no-untyped-call]
+            self.points(features), slots, 4 * frames * cells_x * cells_y
+        )
         fine = self.scale1(self.stem(canvas.view(frames, cells_x, cells_y, -1).permute(0, 3, 1, 2)))
         middle = self.scale2(fine)
         coarse = self.scale3(middle)

@@ -5,6 +5,7 @@ needs neither, and folds each batch norm into the product or convolution before 
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from onnx import ModelProto, TensorProto, checker, helper, numpy_helper
@@ -62,7 +63,7 @@ class _Graph:
         self._nodes: list = []
         self._constants: list = []
 
-    def node(self, operator: str, inputs: list[str], **attributes: object) -> str:
+    def node(self, operator: str, inputs: list[str], **attributes: Any) -> str:
         """Adds an operator with one output."""
         name = f"value{len(self._nodes)}"
         self._nodes.append(helper.make_node(operator, inputs, [name], **attributes))

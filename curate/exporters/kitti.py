@@ -1,0 +1,140 @@
+"""Weighted labels as KITTI label files, for trainers that read that format.
+
+DIRECTORY/label_2/FRAME.txt holds one line per label in KITTI's format; by choice a 16th field holds
+the weight or the score. A label of weight 0 is to be ignored: its line is a DontCare region with
+the label's 2D box, so that KITTI's readers take it for neither object nor background.
+
+DIRECTORY/weight/FRAME.txt holds, line by line, what that format has no place for: category,
+weight, score, and the box in the LiDAR frame (x, y, z of its centre, length, width, height in
+metres, yaw in radians). Only there do ignored labels keep their category and their 3D box.
+
+DIRECTORY/export.json marks the folder as an export; nothing but a former export is overwritten.
+"""
+
+import json
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from curate.datasets.kitti_labels import DONT_CARE, from_detections, write_objects
+from curate.detections import Detections
+from curate.errors import ConfigError, DataError
+from curate.frames import Calibration
+
+LastField = Literal["weight", "score", "none"]
+
+_MARKER = "export.json"
+_FORMAT = "curate weighted labels, KITTI"
+
+
+@dataclass(frozen=True)
+class WeightedFrame:
+    """The weighted labels of one frame, with what it takes to write them in the camera's frame.
+
+    Attributes:
+        frame_id: name of the frame.
+        labels: boxes in the LiDAR frame, scores, categories.
+        weights: (n,) in [0, 1]; 0 means ignore.
+        calibration: of the frame.
+        image_size: (width, height) in pixels.
+    """
+
+    frame_id: str
+    labels: Detections
+    weights: np.ndarray
+    calibration: Calibration
+    image_size: tuple[int, int]
+
+
+def export_kitti(
+    directory: Path, frames: Iterable[WeightedFrame], *, last_field: LastField = "weight"
+) -> int:
+    """Writes an export folder, whole or not at all; a former export in its place is replaced.
+
+    Args:
+        directory: absent, empty, or a former export.
+        frames: those without labels get empty files.
+        last_field: what stands in the 16th field of each label line.
+
+    Returns:
+        How many labels were written.
+
+    Raises:
+        ConfigError: the directory holds something else, or `last_field` is unknown.
+        DataError: a weight is not in [0, 1], or a frame occurs twice.
+    """
+    if last_field not in get_args(LastField):
+        raise ConfigError(f"last field {last_field!r}: use one of {', '.join(get_args(LastField))}")
+    _refuse_foreign(directory)
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    partial = directory.with_name(f".{directory.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of an export that was killed
+    try:
+        count = _write_frames(partial, frames, last_field)
+        _take_place(partial, directory)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return count
+
+
+def _write_frames(folder: Path, frames: Iterable[WeightedFrame], last_field: LastField) -> int:
+    for part in ("label_2", "weight"):
+        (folder / part).mkdir(parents=True)
+    labels, seen = 0, set()
+    for frame in frames:
+        if frame.frame_id in seen:
+            raise DataError(f"frame {frame.frame_id} occurs twice in the labels to export")
+        seen.add(frame.frame_id)
+        _write_frame(folder, frame, last_field)
+        labels += len(frame.labels)
+    marker = {"format": _FORMAT, "last_field": last_field, "frames": len(seen), "labels": labels}
+    (folder / _MARKER).write_text(json.dumps(marker, indent=2) + "\n", encoding="utf-8")
+    return labels
+
+
+def _write_frame(folder: Path, frame: WeightedFrame, last_field: LastField) -> None:
+    weights, labels = frame.weights, frame.labels
+    possible = (weights >= 0) & (weights <= 1)
+    if weights.shape != (len(labels),) or not possible.all():
+        raise DataError(
+            f"frame {frame.frame_id}: needs one weight in [0, 1] for each of {len(labels)} labels"
+        )
+    name = f"{frame.frame_id}.txt"
+    objects = from_detections(labels, frame.calibration, frame.image_size)
+    shown = np.where(weights == 0, DONT_CARE, objects.categories)
+    last = {"weight": weights, "score": labels.scores, "none": np.full(len(labels), np.nan)}
+    objects = replace(objects, categories=shown, scores=last[last_field])
+    write_objects(folder / "label_2" / name, objects)
+    lines = [
+        f"{category} {weight:.6f} {score:.6f} {' '.join(f'{number:.6f}' for number in box)}\n"
+        for category, weight, score, box in zip(
+            labels.categories, weights, labels.scores, labels.boxes, strict=True
+        )
+    ]
+    (folder / "weight" / name).write_text("".join(lines), encoding="utf-8")
+
+
+def _refuse_foreign(directory: Path) -> None:
+    """ConfigError where something would be lost that is no former export."""
+    if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
+        return
+    try:
+        known = json.loads((directory / _MARKER).read_text(encoding="utf-8"))["format"] == _FORMAT
+    except (OSError, ValueError, TypeError, KeyError):
+        known = False
+    if not known:
+        raise ConfigError(f"{directory}: is there and is no former export; name another folder")
+
+
+def _take_place(partial: Path, directory: Path) -> None:
+    """Moves a finished folder to its place, and what was there out of the way first."""
+    former = partial.with_suffix(".former")
+    shutil.rmtree(former, ignore_errors=True)
+    if directory.exists():
+        directory.rename(former)
+    partial.rename(directory)
+    shutil.rmtree(former, ignore_errors=True)

@@ -1,0 +1,117 @@
+"""The batches of a training: which frames meet in a step, augmented and encoded."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from curate.detectors.pillars.encoding import encode_boxes, encode_points
+from curate.detectors.pillars.presets import preset_named
+from curate.errors import DataError
+from curate.training.labels import Sample, WeightedLabels
+from curate.training.loss import BatchTargets
+from curate.training.object_bank import ObjectBank
+from curate.training.settings import TrainingSettings
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The input of the network for b frames, and its targets.
+
+    Attributes:
+        features: (n, POINT_FEATURES) of the points of all frames.
+        slots: (n,) row of each point's pillar in the canvas of all frames.
+        frames: b.
+        targets: see `BatchTargets`.
+    """
+
+    features: Tensor
+    slots: Tensor
+    frames: int
+    targets: BatchTargets
+
+
+class Batches:
+    """Makes the batch of any step.
+
+    A batch depends on the labels, the settings and the number of the step only, so that a training
+    that was killed goes on with the batches it would have seen.
+
+    Args:
+        labels: the frames to learn from.
+        settings: of the training.
+
+    Raises:
+        DataError: no frame is labeled.
+    """
+
+    def __init__(self, labels: WeightedLabels, settings: TrainingSettings) -> None:
+        self._labels = labels
+        self._settings = settings
+        self._preset = preset_named(settings.preset)
+        self._augmentation = settings.augmentation()
+        self._cache: dict[int, Sample] = {}
+        self._room = settings.cache_bytes
+        self.labeled = np.flatnonzero(labels.labeled)
+        self.unlabeled = np.flatnonzero(~labels.labeled)
+        if len(self.labeled) == 0:
+            raise DataError("the label file holds no labeled frame; a training needs at least one")
+        labeled = [self._sample(int(index)) for index in self.labeled]
+        self.bank = ObjectBank.build(labeled, labels.categories, settings.fewest_points)
+        known = sum(np.count_nonzero(~sample.ignored) for sample in labeled)
+        self.objects_per_frame = max(known / len(labeled), 1.0)
+
+    def __getitem__(self, step: int) -> Batch:
+        """The batch of a step."""
+        pillars, targets = [], []
+        names = self._labels.categories
+        for place, index in enumerate(self._chosen(step)):
+            generator = np.random.default_rng([self._settings.seed, step, place])
+            sample = self._augmentation.apply(self._sample(index), self.bank, generator)
+            pillars.append(encode_points(sample.points, self._preset))
+            ids = np.array([names.index(name) for name in sample.categories], dtype=np.int64)
+            targets.append(
+                encode_boxes(sample.boxes, ids, sample.weights, len(names), self._preset)
+            )
+        slots_per_frame = 4 * self._preset.cells[0] * self._preset.cells[1]
+        slots = [frame.slots + i * slots_per_frame for i, frame in enumerate(pillars)]
+        device = self._settings.device
+        return Batch(
+            torch.from_numpy(np.concatenate([frame.features for frame in pillars])).to(device),
+            torch.from_numpy(np.concatenate(slots)).to(device),
+            len(pillars),
+            BatchTargets.stack(targets, device),
+        )
+
+    def _chosen(self, step: int) -> list[int]:
+        """The frames of a step: X_l and X_u each run through in an order new for every pass."""
+        size = self._settings.batch_size
+        of_labeled = size
+        if len(self.unlabeled):
+            of_labeled = min(size, max(1, round(size * self._settings.labeled_share)))
+        chosen = []
+        for pool, count in ((self.labeled, of_labeled), (self.unlabeled, size - of_labeled)):
+            for turn in range(step * count, (step + 1) * count):
+                seed = [self._settings.seed, turn // len(pool), int(pool is self.labeled)]
+                order = np.random.default_rng(seed).permutation(len(pool))
+                chosen.append(int(pool[order[turn % len(pool)]]))
+        return chosen
+
+    def _sample(self, index: int) -> Sample:
+        """The sample as read, from memory where there was room for it."""
+        if index in self._cache:
+            return self._cache[index]
+        sample = self._labels[index]
+        if not sample.labeled and self._settings.zero_weight == "background":
+            learned = ~sample.ignored
+            sample = replace(
+                sample,
+                boxes=sample.boxes[learned],
+                categories=sample.categories[learned],
+                weights=sample.weights[learned],
+            )
+        if sample.points.nbytes <= self._room:
+            self._room -= sample.points.nbytes
+            self._cache[index] = sample
+        return sample

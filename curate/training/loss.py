@@ -1,0 +1,111 @@
+"""The weighted loss of a batch (Eqs. 6 and 10 of An et al., Remote Sensing 15(3):627, 2023).
+
+    L = 1/n * sum over X_l of L_3d + 1/n * sum over X_u of v * L_3d
+
+L_3d is the penalty-reduced focal loss of the heatmap (Law and Deng, CornerNet, ECCV 2018) plus an
+L1 loss of the box code. v multiplies all that an object says: that its centre is a centre, what its
+box is, and that the cells around its centre are not centres. v = 0 leaves its region without
+gradient: it is neither object nor background. n is a constant of the training, never a sum of
+weights, which would cancel them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from curate.detectors.pillars.encoding import Targets
+
+# Weight of the box term against the classification term.
+BOX_WEIGHT = 1.0
+
+
+@dataclass(frozen=True)
+class BatchTargets:
+    """The targets of b frames as tensors; cells are flat over the batch.
+
+    Attributes:
+        heatmap: (b, x cells, y cells, categories).
+        background: (b, x cells, y cells, 1).
+        centres: (m,) cells, m the objects of all frames.
+        categories: (m,).
+        weights: (m,) v.
+        code_cells: (r,).
+        codes: (r, BOX_CODE).
+        code_weights: (r,).
+    """
+
+    heatmap: Tensor
+    background: Tensor
+    centres: Tensor
+    categories: Tensor
+    weights: Tensor
+    code_cells: Tensor
+    codes: Tensor
+    code_weights: Tensor
+
+    @classmethod
+    def stack(cls, targets: Sequence[Targets], device: str = "cpu") -> "BatchTargets":
+        """The targets of several frames."""
+        cells = targets[0].background.size
+
+        def joined(name: str, step: int = 0) -> Tensor:
+            parts = [getattr(target, name) + i * step for i, target in enumerate(targets)]
+            return torch.from_numpy(np.concatenate(parts)).to(device)
+
+        return cls(
+            torch.from_numpy(np.stack([target.heatmap for target in targets])).to(device),
+            torch.from_numpy(np.stack([target.background for target in targets]))
+            .to(device)
+            .unsqueeze(-1),
+            joined("centres", cells),
+            joined("categories"),
+            joined("weights"),
+            joined("code_cells", cells),
+            joined("codes"),
+            joined("code_weights"),
+        )
+
+
+def heatmap_loss(logits: Tensor, targets: BatchTargets) -> Tensor:
+    """Sum of the classification terms.
+
+    Args:
+        logits: (b, x cells, y cells, categories).
+        targets: of the same b frames.
+    """
+    log_object = functional.logsigmoid(logits)
+    log_background = log_object - logits
+    probability = log_object.exp()
+    doubt = (1 - targets.heatmap).square().square() * targets.background
+    negative = -(doubt * probability.square() * log_background).sum()
+    at = (targets.centres, targets.categories)
+    log_found = log_object.flatten(0, 2)[at]
+    missed = 1 - log_found.exp()
+    return negative - (targets.weights * missed.square() * log_found).sum()
+
+
+def box_loss(codes: Tensor, targets: BatchTargets) -> Tensor:
+    """Sum of the box terms.
+
+    Args:
+        codes: (b, x cells, y cells, BOX_CODE).
+        targets: of the same b frames.
+    """
+    answered = codes.flatten(0, 2)[targets.code_cells]
+    return (targets.code_weights[:, None] * (answered - targets.codes).abs()).sum()
+
+
+def weighted_loss(logits: Tensor, codes: Tensor, targets: BatchTargets, objects: float) -> Tensor:
+    """The loss of a batch.
+
+    Args:
+        logits: (b, x cells, y cells, categories).
+        codes: (b, x cells, y cells, BOX_CODE).
+        targets: of the same b frames.
+        objects: n, how many objects b fully labeled frames are expected to hold.
+    """
+    return (heatmap_loss(logits, targets) + BOX_WEIGHT * box_loss(codes, targets)) / objects

@@ -1,0 +1,110 @@
+"""The settings of a training and what it reports in the end."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from curate.detectors.pillars.presets import preset_named
+from curate.errors import ConfigError
+from curate.training.augmentation import Augmentation
+
+ZeroWeight = Literal["ignore", "background"]
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How to train; the defaults suit a training from scratch on a few dozen labeled frames.
+
+    Attributes:
+        preset: size of the detector, `small` or `kitti`.
+        steps: optimiser steps.
+        batch_size: frames per step.
+        learning_rate: peak of the one-cycle schedule; about half of it suits fine-tuning.
+        labeled_share: share of each batch that is drawn from X_l where there is an X_u.
+        flip_probability: see `Augmentation`.
+        rotation_limit_rad: see `Augmentation`.
+        scale_range: see `Augmentation`.
+        pasted: see `Augmentation`.
+        fewest_points: see `Augmentation`; also of the objects of the bank.
+        seed: of the first weights, the order of the frames and the augmentation.
+        threads: of torch, on CPU.
+        device: "cpu", or a torch device such as "cuda".
+        zero_weight: what a label of weight 0 is: a region to "ignore", or "background".
+        cache_bytes: of points kept in memory between the steps.
+        snapshot_seconds: between two snapshots from which a killed training goes on.
+    """
+
+    preset: str = "small"
+    steps: int = 600
+    batch_size: int = 4
+    learning_rate: float = 2e-3
+    labeled_share: float = 0.5
+    flip_probability: float = 0.5
+    rotation_limit_rad: float = math.pi / 4
+    scale_range: tuple[float, float] = (0.95, 1.05)
+    pasted: int = 4
+    fewest_points: int = 5
+    seed: int = 0
+    threads: int = 1
+    device: str = "cpu"
+    zero_weight: ZeroWeight = "ignore"
+    cache_bytes: int = 1 << 30
+    snapshot_seconds: float = 20.0
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for a setting that no training can use."""
+        preset_named(self.preset)
+        for name, least in (
+            ("steps", 1), ("batch_size", 1), ("threads", 1), ("pasted", 0), ("seed", 0),
+            ("fewest_points", 0),
+        ):  # fmt: skip
+            if getattr(self, name) < least:
+                raise ConfigError(f"training: {name} is {getattr(self, name)}, least is {least}")
+        if not self.learning_rate > 0:
+            raise ConfigError(f"training: learning_rate is {self.learning_rate}, must be above 0")
+        if not 0 < self.labeled_share <= 1:
+            raise ConfigError(
+                f"training: labeled_share is {self.labeled_share}, must be above 0 and at most 1"
+            )
+        if not 0 < self.scale_range[0] <= self.scale_range[1]:
+            raise ConfigError(f"training: scale_range {self.scale_range} is no range above 0")
+        if self.zero_weight not in get_args(ZeroWeight):
+            raise ConfigError(
+                f"training: unknown zero_weight {self.zero_weight!r}; choose ignore or background"
+            )
+
+    def augmentation(self) -> Augmentation:
+        """The augmentation that these settings describe."""
+        return Augmentation(
+            self.flip_probability,
+            self.rotation_limit_rad,
+            self.scale_range,
+            self.pasted,
+            self.fewest_points,
+        )
+
+
+@dataclass(frozen=True)
+class TrainingReport:
+    """What a training did.
+
+    Attributes:
+        checkpoint: the file that was written; its ONNX graph lies beside it.
+        steps: optimiser steps in all.
+        resumed_at: step at which it went on from an earlier, killed run; 0 where it began anew.
+        loss: mean of the last steps.
+        seconds: that this run took.
+        labeled_frames: of X_l.
+        unlabeled_frames: of X_u.
+        bank: objects in the bank by category.
+    """
+
+    checkpoint: Path
+    steps: int
+    resumed_at: int
+    loss: float
+    seconds: float
+    labeled_frames: int
+    unlabeled_frames: int
+    bank: dict[str, int]

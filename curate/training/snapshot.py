@@ -1,0 +1,85 @@
+"""Snapshots of a running training, from which a killed one goes on as if nothing had happened."""
+
+import hashlib
+import io
+import json
+import logging
+import pickle
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from curate.atomic import replace_file
+from curate.training.settings import TrainingSettings
+
+_log = logging.getLogger(__name__)
+
+# Settings that change where or how often, but not what is computed.
+_WITHOUT_EFFECT = ("cache_bytes", "snapshot_seconds")
+
+
+def fingerprint(labels: Path, settings: TrainingSettings, start: Path | None) -> str:
+    """What a training's result depends on, as SHA-256 in hexadecimal."""
+    relevant = {key: at for key, at in asdict(settings).items() if key not in _WITHOUT_EFFECT}
+    digest = hashlib.sha256(json.dumps([relevant, torch.__version__]).encode())
+    for path in (labels, start):
+        digest.update(path.read_bytes() if path else b"from scratch")
+    return digest.hexdigest()
+
+
+def snapshot_path(output: Path) -> Path:
+    """Where the snapshot of the training that will write `output` lies."""
+    return output.with_name(f".{output.name}.training")
+
+
+def save_snapshot(
+    output: Path,
+    mark: str,
+    network: torch.nn.Module,
+    optimizer: torch.optim.Optimizer,
+    progress: dict[str, Any],
+) -> None:
+    """Writes the state of a training after some step, whole or not at all.
+
+    Args:
+        output: checkpoint that the training will write.
+        mark: its `fingerprint`.
+        network: its present weights are kept.
+        optimizer: of the network.
+        progress: plain numbers and lists.
+    """
+    buffer = io.BytesIO()
+    state = {
+        "fingerprint": mark,
+        "network": network.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "progress": progress,
+    }
+    torch.save(state, buffer)
+    replace_file(snapshot_path(output), buffer.getvalue())
+
+
+def load_snapshot(
+    output: Path, mark: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer
+) -> dict[str, Any] | None:
+    """Takes up the snapshot of a killed training, and gives its progress.
+
+    None where there is no snapshot, it is damaged, or it is of a training on other labels, with
+    other settings or from another start. Only tensors and plain values are read from the file.
+    """
+    path = snapshot_path(output)
+    if not path.exists():
+        return None
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if state["fingerprint"] != mark:
+            _log.info("%s is of another training; starting anew", path)
+            return None
+        network.load_state_dict(state["network"])
+        optimizer.load_state_dict(state["optimizer"])
+        return dict(state["progress"])
+    except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError):
+        _log.warning("%s is damaged; starting anew", path)
+        return None

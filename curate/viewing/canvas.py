@@ -1,0 +1,129 @@
+"""A picture in the making: drawn at twice its size and reduced at the end, so that edges are smooth.
+
+Coordinates, line widths and text sizes are in pixels of the finished picture.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from curate.atomic import replace_file
+
+Colour = tuple[int, int, int]
+
+_SUPER = 2
+# OpenCV takes coordinates as integers with this many binary places.
+_SHIFT = 4
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+# Height of a capital letter at font scale 1, in pixels.
+_CAPITAL = 21.0
+
+
+class Canvas:
+    """An RGB picture of a given size.
+
+    Args:
+        width: of the finished picture.
+        height: of the finished picture.
+        colour: of the empty ground.
+    """
+
+    def __init__(self, width: int, height: int, colour: Colour) -> None:
+        self.width, self.height = width, height
+        self._pixels = np.full((height * _SUPER, width * _SUPER, 3), colour, np.uint8)
+
+    def image(self, left: int, top: int, width: int, height: int, image: np.ndarray) -> None:
+        """Places an RGB image, scaled to (width, height)."""
+        size = (width * _SUPER, height * _SUPER)
+        scaled = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC)
+        rows = slice(top * _SUPER, top * _SUPER + size[1])
+        self._pixels[rows, left * _SUPER : left * _SUPER + size[0]] = scaled
+
+    def dots(self, places: np.ndarray, colours: np.ndarray) -> None:
+        """A small square at each of (n, 2) places in its (n, 3) colour; later ones lie on top."""
+        at = np.floor(places * _SUPER).astype(int)
+        for offset in np.ndindex(2, 2):
+            column, row = (at + offset).T
+            inside = (column >= 0) & (row >= 0) & (column < self.width * _SUPER)
+            inside &= row < self.height * _SUPER
+            self._pixels[row[inside], column[inside]] = colours[inside]
+
+    def lines(
+        self, strokes: np.ndarray, colour: Colour, width: float, *, closed: bool = False
+    ) -> None:
+        """Polylines (n, points, 2) of one width."""
+        thickness = max(1, round(width * _SUPER))
+        cv2.polylines(
+            self._pixels, _fixed(strokes), closed, colour, thickness, cv2.LINE_AA, _SHIFT
+        )
+
+    def dashes(self, start: np.ndarray, end: np.ndarray, colour: Colour, width: float) -> None:
+        """A dashed line between two places."""
+        dash = 6.0
+        length = float(np.linalg.norm(end - start))
+        marks = np.arange(0, length, 2 * dash)
+        if len(marks):
+            ends = np.minimum(marks + dash, length)
+            shares = np.stack([marks, ends], axis=1) / length
+            self.lines(start + shares[..., None] * (end - start), colour, width)
+
+    def fill(self, outline: np.ndarray, colour: Colour, opacity: float) -> None:
+        """A convex polygon (points, 2), blended over what is there."""
+        shape = self._pixels.shape
+        low = np.clip(np.floor(outline.min(axis=0) * _SUPER).astype(int) - 1, 0, shape[1::-1])
+        high = np.clip(np.ceil(outline.max(axis=0) * _SUPER).astype(int) + 2, 0, shape[1::-1])
+        if (high <= low).any():
+            return
+        region = self._pixels[low[1] : high[1], low[0] : high[0]]
+        covered = region.copy()
+        cv2.fillConvexPoly(covered, _fixed(outline - low / _SUPER)[0], colour, cv2.LINE_AA, _SHIFT)
+        region[:] = cv2.addWeighted(covered, opacity, region, 1 - opacity, 0)
+
+    def circle(self, centre: tuple[float, float], radius: float, colour: Colour, width: float) -> None:
+        """A circle."""
+        x, y = (round(value * _SUPER * 2**_SHIFT) for value in centre)
+        thickness = max(1, round(width * _SUPER))
+        radius_fixed = round(radius * _SUPER * 2**_SHIFT)
+        cv2.circle(self._pixels, (x, y), radius_fixed, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+    def box(self, left: float, top: float, right: float, bottom: float, colour: Colour,
+            opacity: float = 1.0) -> None:  # fmt: skip
+        """A filled rectangle."""
+        corners = [[left, top], [right, top], [right, bottom], [left, bottom]]
+        self.fill(np.array(corners, dtype=np.float64), colour, opacity)
+
+    def text(
+        self, left: float, baseline: float, text: str, colour: Colour, size: float = 13.0
+    ) -> None:
+        """A line of text whose capitals are about 0.7 `size` high."""
+        at = (round(left * _SUPER), round(baseline * _SUPER))
+        cv2.putText(self._pixels, text, at, _FONT, *_text_style(colour, size), cv2.LINE_AA)
+
+    def finish(self) -> np.ndarray:
+        """The (height, width, 3) uint8 RGB picture."""
+        size = (self.width, self.height)
+        return np.asarray(cv2.resize(self._pixels, size, interpolation=cv2.INTER_AREA))
+
+
+def text_width(text: str, size: float = 13.0) -> float:
+    """Width in pixels of a line of text of a size."""
+    scale = _font_scale(size)
+    (width, _), _ = cv2.getTextSize(text, _FONT, scale, 1)
+    return float(width) / _SUPER
+
+
+def save_png(path: Path, rgb: np.ndarray) -> None:
+    """Writes an (h, w, 3) uint8 RGB picture as PNG, whole or not at all."""
+    _, content = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    replace_file(path, content.tobytes())
+
+
+def _font_scale(size: float) -> float:
+    return size * 0.7 * _SUPER / _CAPITAL
+
+
+def _fixed(outline: np.ndarray) -> np.ndarray:
+    """Places as OpenCV's fixed-point coordinates, (n, points, 2)."""
+    places = np.rint(np.clip(outline * _SUPER, -30000, 30000) * 2**_SHIFT).astype(np.int32)
+    return places.reshape(-1, *places.shape[-2:])

@@ -1,0 +1,224 @@
+"""The demo: the whole job on simulated data, and an honest account of what it was good for.
+
+The demo alone may look at the ground truth of X_u, because it simulated it: it reads the label
+files to say how good the labels are, after the fact, and stores nothing of them.
+"""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from curate.detections import CATEGORIES
+from curate.errors import CurateError
+from pipelines.commands.options import print_report, print_table
+from pipelines.config import Config, make_config
+from pipelines.evaluation import evaluate_checkpoint
+from pipelines.label_quality import label_quality
+from pipelines.progress import Bar
+from pipelines.round import stage
+from pipelines.rounds import open_round
+from pipelines.runner import run_round
+from pipelines.schedule import run_all
+from pipelines.setup import initialise
+from pipelines.stage import RoundStage
+from pipelines.stages import train_round
+from pipelines.workspace import Workspace
+
+Say = Callable[[str], None]
+
+# Policies whose students the demo compares with the one of the configured policy.
+OTHERS = {
+    "baseline": "as long again on X_l alone",
+    "uniform": "on all pseudo-labels, unweighted",
+}
+JUDGED = ("uniform", "threshold", "spsl", "pspsl")
+QUERY = (
+    "SELECT frame, k, category, score, loss, points, rho_det, weight FROM weighted_labels "
+    "WHERE policy = 'pspsl' ORDER BY weight DESC LIMIT 5"
+)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What to simulate and how long to train; see `curate demo --help`."""
+
+    directory: Path
+    frames: int
+    val: int
+    labeled: float
+    rounds: int
+    steps: int
+    seed: int
+    workers: int | None
+
+    @property
+    def data(self) -> Path:
+        """The simulated data set."""
+        return self.directory / "data"
+
+    @property
+    def processes(self) -> int:
+        """How many processes work."""
+        return self.workers or os.cpu_count() or 1
+
+    def config(self) -> Config:
+        """The workspace's settings."""
+        document = {
+            "dataset": {"root": self.data},
+            "segmenter": {"name": "simulated"},
+            "train": {
+                "pretrain_steps": self.steps,
+                "round_steps": self.steps,
+                "threads": min(self.processes, 2),
+            },
+            "run": {"rounds": self.rounds, "seed": self.seed},
+        }
+        return make_config(document, "curate demo")
+
+
+def run_demo(demo: Demo, say: Say) -> None:
+    """Simulates, trains, weighs, trains again, compares, draws; continues where it was killed."""
+    start = time.perf_counter()
+    _simulate(demo, say)
+    workspace = initialise(demo.directory, demo.config(), str(demo.labeled), "")
+    workspace = workspace.with_settings(
+        "run", workers=demo.processes, executor="process" if demo.processes > 1 else "serial"
+    )
+    counts = [len(workspace.frames(split)) for split in ("labeled", "unlabeled", "val")]
+    say("\n2. The teacher learns from few labels, guesses, and its guesses are weighed.")
+    say(
+        "   {} labeled, {} unlabeled, {} val frames; segmentation: the shipped ONNX".format(*counts)
+    )
+    say("   model, trained on other simulated images (never the renderer's truth).\n")
+    for report in run_all(workspace, demo.rounds, Bar()):
+        print_report(report)
+    _weigh_for_others(workspace)
+    say("\n   Ask for any weight in SQL:\n")
+    say(f'   curate query -w {_shown(demo.directory)} "{QUERY}"')
+    _print_query(workspace)
+    say("\n3. The same training, as long, without and with unweighted pseudo-labels.\n")
+    _train_others(workspace, demo, say)
+    say("\n4. How good are the labels? Judged by the truth that the simulation knows.\n")
+    _print_quality(workspace)
+    say("5. How good are the detectors, on val frames that nobody trained on?\n")
+    _print_detectors(workspace)
+    _draw(workspace, say)
+    say(f"\nThe demo took {(time.perf_counter() - start) / 60:.1f} minutes. Look around:")
+    for command in ("status", "explain FRAME K", "graph", "evaluate"):
+        say(
+            f"   curate {command}" + ("" if command == "graph" else f" -w {_shown(demo.directory)}")
+        )
+
+
+def _simulate(demo: Demo, say: Say) -> None:
+    from curate.datasets.synthetic import simulate
+
+    start = time.perf_counter()
+    total = demo.frames + demo.val
+    say(f"1. Simulate {total} LiDAR-camera frames in KITTI's format.\n")
+    with Bar().track("simulate", total) as advance:
+        done = 0
+
+        def progress(now: int, _total: int) -> None:
+            nonlocal done
+            advance(now - done, "")
+            done = now
+
+        simulate(
+            demo.data,
+            total,
+            demo.seed,
+            val_frames=demo.val,
+            workers=demo.processes,
+            progress=progress,
+        )
+    say(f"   {total} frames in {_shown(demo.data)} ({time.perf_counter() - start:.1f} s)")
+
+
+def _weigh_for_others(workspace: Workspace) -> None:
+    """Weights of other policies beside those of the configured one, for the first round."""
+    context = open_round(workspace, 1)
+    for name, policies in (("solve", (*JUDGED, *OTHERS)), ("export", tuple(OTHERS))):
+        for policy in dict.fromkeys(policies):
+            found = stage(name)
+            if isinstance(found, RoundStage) and policy != workspace.config.solve.policy:
+                run_round(workspace, context, found, policy, Bar())
+
+
+def _train_others(workspace: Workspace, demo: Demo, say: Say) -> None:
+    """One process per student, each on its share of the cores."""
+    threads = max(1, demo.processes // len(OTHERS))
+    with ThreadPoolExecutor(min(demo.processes, len(OTHERS))) as pool:
+        list(pool.map(lambda policy: _train_other(workspace, policy, threads), OTHERS))
+    for policy, how in OTHERS.items():
+        say(f"   {policy:<9} trained {how}")
+
+
+def _train_other(workspace: Workspace, policy: str, threads: int) -> None:
+    command = [
+        *(sys.executable, "-m", "pipelines", "train-round", "--round", "1", "--policy", policy),
+        *("--threads", str(threads), "--workspace", str(workspace.root)),
+    ]
+    ended = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)  # noqa: S603
+    if ended.returncode:
+        raise CurateError(f"training the student of {policy} failed; its message is above")
+
+
+def _print_query(workspace: Workspace) -> None:
+    from pipelines.asking import ask
+
+    columns, rows = ask(str(workspace.database.url), QUERY)
+    print_table(columns, rows)
+
+
+def _print_quality(workspace: Workspace) -> None:
+    rows = label_quality(workspace, 1, JUDGED)
+    print_table(("policy", "labels", "weight > 0", "weighted precision", "recall", "AUROC"), rows)
+
+
+def _print_detectors(workspace: Workspace) -> None:
+    rows = []
+    for name, path in _detectors(workspace):
+        found = evaluate_checkpoint(workspace, path, Bar())
+        bev, box = found.ap_r40[:, 2, 1], found.ap_r40[:, 3, 1]
+        rows.append((name, *map(float, box), float(box.mean()), float(bev.mean())))
+    columns = ("detector", *(f"3D {c}" for c in CATEGORIES), "3D mean", "BEV mean")
+    print_table(columns, rows, title="AP R40, moderate, percent")
+
+
+def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:
+    """The detectors to compare, with their checkpoints."""
+    rounds = workspace.config.run.rounds
+    first = open_round(workspace, 1)
+    policy = workspace.config.solve.policy
+    students = [
+        (f"{policy} student, round {number}", train_round.file(workspace, context, policy))
+        for number in range(1, rounds + 1)
+        for context in (open_round(workspace, number),)
+    ]
+    return [
+        ("teacher", first.teacher.path),
+        *(
+            (f"{other}: {how}", train_round.file(workspace, first, other))
+            for other, how in OTHERS.items()
+        ),
+        *students,
+    ]
+
+
+def _draw(workspace: Workspace, say: Say) -> None:
+    from pipelines.pictures import draw_frame, frame_to_show
+
+    frame = frame_to_show(workspace, 1)
+    for path in draw_frame(workspace, 1, frame):
+        say(f"   picture: {_shown(path)}")
+
+
+def _shown(path: Path) -> str:
+    """A path as a person in the current folder would type it."""
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)

@@ -1,0 +1,74 @@
+"""How good a detector is on the val split, whose ground truth no training has seen."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from curate.datasets.kitti_labels import KittiObjects, from_annotations, from_detections
+from curate.detections import Detections
+from curate.errors import FramesFailed, WorkspaceError
+from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
+from pipelines import plan
+from pipelines.executors.base import FrameJob
+from pipelines.progress import Progress
+from pipelines.round import stage
+from pipelines.rounds import peek_round
+from pipelines.runner import open_executor
+from pipelines.stage import FrameStage
+from pipelines.stages.predict import Predict
+from pipelines.workspace import Workspace
+
+
+def evaluate_checkpoint(workspace: Workspace, path: Path, progress: Progress) -> KittiEvaluation:
+    """The KITTI evaluation of a checkpoint on the val split.
+
+    Raises:
+        FramesFailed: the detector failed on some frames.
+    """
+    frames = workspace.frames("val")
+    predict = Predict(workspace.config, path)
+    jobs = [FrameJob(key, name) for name, key in frames.items()]
+    found: dict[str, Detections] = {}
+    with progress.track("evaluate", len(jobs)) as advance:
+        for outcome in open_executor(workspace).map(predict, jobs):
+            if outcome.error is not None:
+                raise FramesFailed(f"val frame {outcome.job.frame}: {outcome.error}")
+            rows = [row[1:] for row in outcome.rows["prediction"]]
+            found[outcome.job.frame] = Detections.from_rows(rows)
+            advance(1, "")
+    return evaluate_detections(workspace, found)
+
+
+def evaluate_round(workspace: Workspace, round_number: int) -> KittiEvaluation:
+    """The KITTI evaluation of a round's stored val predictions.
+
+    Raises:
+        WorkspaceError: the round has no predictions for some val frames.
+    """
+    keys = workspace.frames("val")
+    context = peek_round(workspace, round_number)
+    predict = stage("predict")
+    if context is None or not isinstance(predict, FrameStage):
+        raise WorkspaceError(f"round {round_number} has no teacher yet; run `curate run`")
+    states = plan.counts(workspace, context, predict, "val")
+    missing = states.waiting + states.failed
+    if missing:
+        raise WorkspaceError(
+            f"round {round_number} has no predictions for {missing} of {len(keys)} val frames; "
+            f"run `curate predict --split val --round {round_number}`"
+        )
+    stored = workspace.predictions(round_number, list(keys.values()))
+    return evaluate_detections(workspace, {name: stored[key] for name, key in keys.items()})
+
+
+def evaluate_detections(workspace: Workspace, found: Mapping[str, Detections]) -> KittiEvaluation:
+    """The KITTI evaluation of detections of val frames."""
+    truth = workspace.ground_truth("val")
+    if not truth:
+        raise WorkspaceError("no val frames; `curate init --val` takes some")
+    labels: list[KittiObjects] = []
+    results: list[KittiObjects] = []
+    for name, annotations in truth.items():
+        frame = workspace.dataset.read(name, points=False)
+        labels.append(from_annotations(annotations, frame.calibration))
+        results.append(from_detections(found[name], frame.calibration, frame.image_size))
+    return evaluate(labels, results)

@@ -1,0 +1,146 @@
+"""Projection into the image: by hand, on the near plane, and on real KITTI frames."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from strategies import box_arrays
+
+from curate.datasets.kitti import KittiDataset
+from curate.frames import Calibration
+from curate.geometry.boxes import box_corners
+from curate.geometry.projection import image_rectangles, in_view, project_points
+
+# A camera at the LiDAR's place that looks along x: focal length 100, centre (50, 40).
+CAMERA = Calibration(
+    np.array([[100.0, 0, 50, 0], [0, 100, 40, 0], [0, 0, 1, 0]]),
+    np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
+)
+SIZE = (101, 81)
+
+
+def test_points_appear_where_the_pinhole_puts_them():
+    """Left in the world is left in the image, up is up, and depth is along x."""
+    pixels, depth = project_points(np.array([[10.0, 0, 0], [10, 1, 0.5], [-5, 0, 0]]), CAMERA)
+    assert pixels[:2].tolist() == [[50, 40], [40, 35]]
+    assert depth.tolist() == [10, 10, -5]
+
+
+def test_only_points_before_the_camera_and_inside_the_image_are_in_view():
+    """Behind, beside, on the border, at the camera itself, NaN."""
+    points = np.array(
+        [[10.0, 0, 0], [-10, 0, 0], [10, 5, 0], [10, 5.001, 0], [0, 0, 0], [np.nan, 0, 0]]
+    )
+    with np.errstate(invalid="ignore"):
+        seen = in_view(points, CAMERA, SIZE)
+    assert seen.tolist() == [True, False, True, False, False, False]
+
+
+def test_a_cube_ahead_has_the_rectangle_of_its_near_face():
+    """Sides of 2 m at 9 m: plus and minus 100 / 9 pixels around the centre."""
+    rectangle = image_rectangles(np.array([[10.0, 0, 0, 2, 2, 2, 0]]), CAMERA, SIZE)
+    half = 100 / 9
+    assert rectangle[0] == pytest.approx([50 - half, 40 - half, 50 + half, 40 + half])
+
+
+def test_a_box_that_reaches_out_of_the_image_is_clipped():
+    """The rectangle ends at the last pixels."""
+    boxes = np.array([[10.0, 5, 0, 2, 2, 2, 0], [3.0, 0, 0, 1, 20, 20, 0]])
+    rectangles = image_rectangles(boxes, CAMERA, SIZE)
+    assert rectangles[0, 0] == 0
+    assert rectangles[1].tolist() == [0, 0, 100, 80]
+
+
+def test_boxes_behind_or_beside_the_image_have_none():
+    """All NaN, never a part."""
+    boxes = np.array([[-10.0, 0, 0, 2, 2, 2, 0], [10.0, 50, 0, 2, 2, 2, 0], [0, 9, 0, 2, 2, 2, 0]])
+    assert np.isnan(image_rectangles(boxes, CAMERA, SIZE)).all()
+    assert image_rectangles(boxes[:0], CAMERA, SIZE).shape == (0, 4)
+
+
+def test_a_box_around_the_camera_plane_is_cut_at_the_near_plane():
+    """A long box on the left that passes the camera fills the left border and stays left."""
+    box = np.array([[0.0, 2.0, 0, 20.0, 1.0, 1.0, 0]])
+    left, top, right, bottom = image_rectangles(box, CAMERA, SIZE)[0]
+    assert (left, top, bottom) == (0, 0, 80)
+    assert right == pytest.approx(50 - 100 * 1.5 / 10)
+
+
+def by_surface_points(box, size):
+    """Rectangle of many points on the box that lie before the near plane, clipped."""
+    corners = box_corners(box[None])[0]
+    shares = np.stack(np.meshgrid(*[np.linspace(0, 1, 41)] * 3), axis=-1).reshape(-1, 3)
+    points = (
+        corners[0]
+        + shares[:, :1] * (corners[1] - corners[0])
+        + shares[:, 1:2] * (corners[3] - corners[0])
+        + shares[:, 2:] * (corners[4] - corners[0])
+    )
+    pixels, depth = project_points(points, CAMERA)
+    pixels = pixels[depth >= 0.1]
+    return pixels.min(axis=0), pixels.max(axis=0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(box_arrays(min_size=1, max_size=3))
+def test_rectangles_hold_all_that_is_seen_of_the_box(boxes):
+    """No point of the box before the near plane appears outside the rectangle."""
+    boxes = boxes + [[1.0, 0, 0, 0.1, 0.1, 0.1, 0]]
+    last = np.array(SIZE) - 1
+    for box, rectangle in zip(boxes, image_rectangles(boxes, CAMERA, SIZE), strict=True):
+        if not (box_corners(box[None])[0, :, 0] >= 0.1).any():
+            assert np.isnan(rectangle).all()
+            continue
+        low, high = by_surface_points(box, SIZE)
+        if np.isnan(rectangle).any():
+            assert (high <= 1e-6).any() or (low >= last - 1e-6).any()
+        else:
+            assert np.all(rectangle[:2] <= np.clip(low, 0, last) + 1e-6)
+            assert np.all(rectangle[2:] >= np.clip(high, 0, last) - 1e-6)
+            assert np.all((rectangle >= 0) & (rectangle <= np.tile(last, 2)))
+
+
+@pytest.mark.kitti
+def test_projected_label_boxes_are_the_labels_of_real_frames(kitti_root):
+    """3D labels that lie whole in the image project onto their 2D labels."""
+    data = KittiDataset(kitti_root)
+    overlaps = []
+    for frame_id in data.frame_ids():
+        frame, labels = data.read(frame_id), data.annotations(frame_id)
+        whole = (labels.truncated == 0) & (labels.categories != "DontCare")
+        rectangles = image_rectangles(
+            labels.boxes[whole], frame.calibration, frame.image_size
+        )
+        overlaps.extend(map(rectangle_iou, rectangles, labels.boxes_2d[whole]))
+    assert len(overlaps) > 50
+    assert np.median(overlaps) > 0.85
+    assert np.mean(np.array(overlaps) > 0.7) > 0.9
+
+
+@pytest.mark.kitti
+def test_points_of_real_objects_appear_inside_their_labels(kitti_root):
+    """LiDAR points inside a 3D label box are seen inside its 2D label, give or take pixels."""
+    from curate.geometry.points_in_boxes import box_of_points
+
+    data = KittiDataset(kitti_root)
+    inside = total = 0
+    for frame_id in data.frame_ids()[:8]:
+        frame, labels = data.read(frame_id), data.annotations(frame_id)
+        labels = labels.select((labels.truncated == 0) & (labels.categories != "DontCare"))
+        points = frame.points[in_view(frame.points, frame.calibration, frame.image_size)]
+        owners = box_of_points(points, labels.boxes)
+        pixels, _ = project_points(points[owners >= 0], frame.calibration)
+        rectangles = labels.boxes_2d[owners[owners >= 0]]
+        within = (pixels >= rectangles[:, :2] - 5) & (pixels <= rectangles[:, 2:] + 5)
+        inside, total = inside + np.sum(within.all(axis=1)), total + len(pixels)
+    assert total > 1000
+    assert inside / total > 0.95
+
+
+def rectangle_iou(a, b):
+    """IoU of two rectangles; 0 where one is NaN."""
+    width = min(a[2], b[2]) - max(a[0], b[0])
+    height = min(a[3], b[3]) - max(a[1], b[1])
+    if not (width > 0 and height > 0):
+        return 0.0
+    common = width * height
+    return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
