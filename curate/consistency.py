@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from curate.detections import Detections
 from curate.errors import ConfigError, ModelError
@@ -130,6 +129,8 @@ def match(
     Returns:
         (n,) int64 index of the matched reprediction or -1, and (n,) its BEV IoU or NaN.
     """
+    from scipy.optimize import linear_sum_assignment
+
     matched = np.full(len(predictions), -1, dtype=np.int64)
     iou = np.full(len(predictions), np.nan)
     for category in np.intersect1d(predictions.categories, repredictions.categories):

@@ -26,11 +26,11 @@ def open_detector(config: Config, path: Path) -> Detector:
         section.name,
         path,
         offered={
-            "minimum_score": section.minimum_score,
-            "score_threshold": section.minimum_score,
-            "device": device(config),
-            "categories": config.dataset.categories,
-            "threads": 1,
+            "minimum_score": lambda: section.minimum_score,
+            "score_threshold": lambda: section.minimum_score,
+            "device": lambda: device(config),
+            "categories": lambda: config.dataset.categories,
+            "threads": lambda: 1,
         },
         options=section.options,
     )
@@ -67,7 +67,7 @@ def open_segmenter(config: Config) -> Segmenter:
     segmenter: Segmenter = registry.SEGMENTERS.build(
         name,
         path,
-        offered={"classes": class_map(classes), "seed": config.run.seed},
+        offered={"classes": lambda: class_map(classes), "seed": lambda: config.run.seed},
         options=section.options,
     )
     return segmenter
@@ -83,7 +83,7 @@ def open_policy(config: Config, name: str) -> Policy:
     section = config.solve
     policy: Policy = registry.POLICIES.build(
         name,
-        offered={"scope": section.scope, "quantile": section.quantile},
+        offered={"scope": lambda: section.scope, "quantile": lambda: section.quantile},
         options=section.options.get(name, {}),
     )
     return policy

@@ -28,8 +28,8 @@ def evaluate_checkpoint(workspace: Workspace, path: Path, progress: Progress) ->
     predict = Predict(workspace.config, path)
     jobs = [FrameJob(key, name) for name, key in frames.items()]
     found: dict[str, Detections] = {}
-    with progress.track("evaluate", len(jobs)) as advance:
-        for outcome in open_executor(workspace).map(predict, jobs):
+    with progress.track("evaluate", len(jobs)) as advance, open_executor(workspace) as executor:
+        for outcome in executor.map(predict, jobs):
             if outcome.error is not None:
                 raise FramesFailed(f"val frame {outcome.job.frame}: {outcome.error}")
             rows = [row[1:] for row in outcome.rows["prediction"]]

@@ -5,7 +5,7 @@ A class from outside is named as `package.module:Class`.
 
 import importlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,14 +36,18 @@ class Registry:
             raise ConfigError(f"{self.kind} '{name}' cannot be imported: {error}") from error
 
     def build(
-        self, name: str, *given: Any, offered: Mapping[str, Any], options: Mapping[str, Any]
+        self,
+        name: str,
+        *given: Any,
+        offered: Mapping[str, Callable[[], Any]],
+        options: Mapping[str, Any],
     ) -> Any:
         """An instance.
 
         Args:
             name: a registered name or `package.module:Class`.
             given: positional arguments, passed as they are.
-            offered: keyword arguments of which the constructor gets those that it names.
+            offered: keyword arguments, of which those are made that the constructor names.
             options: the user's keyword arguments, all of which the constructor must know.
 
         Raises:
@@ -51,7 +55,7 @@ class Registry:
         """
         factory = self.load(name)
         signature = inspect.signature(factory)
-        keywords = {key: value for key, value in offered.items() if key in signature.parameters}
+        keywords = {key: make() for key, make in offered.items() if key in signature.parameters}
         try:
             signature.bind(*given, **(keywords := keywords | dict(options)))
         except TypeError as error:

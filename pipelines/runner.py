@@ -6,6 +6,7 @@ whole or untouched.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -53,17 +54,27 @@ class Report:
     errors: tuple[tuple[str, str], ...] = ()
 
 
-def open_executor(workspace: Workspace) -> Executor:
-    """The configured executor."""
+@contextmanager
+def open_executor(workspace: Workspace) -> Iterator[Executor]:
+    """The configured executor, whose workers serve several stages."""
     section = workspace.config.run
     executor: Executor = registry.EXECUTORS.build(
-        section.executor, offered={"workers": section.workers}, options={}
+        section.executor, offered={"workers": lambda: section.workers}, options={}
     )
-    return executor
+    try:
+        yield executor
+    finally:
+        executor.close()
 
 
 def run_frames(
-    workspace: Workspace, context: RoundContext, stage: FrameStage, progress: Progress, split: str
+    workspace: Workspace,
+    context: RoundContext,
+    stage: FrameStage,
+    executor: Executor,
+    progress: Progress,
+    *,
+    split: str = "unlabeled",
 ) -> Report:
     """Brings a stage up to date for every frame of a split that can be worked on."""
     start = time.perf_counter()
@@ -77,7 +88,7 @@ def run_frames(
         if jobs:
             function = stage.function(workspace, context)
             needs = "prediction" in stage.reads
-            outcomes = open_executor(workspace).map(
+            outcomes = executor.map(
                 function, _jobs(workspace, context, jobs, with_predictions=needs)
             )
             for outcome in outcomes:

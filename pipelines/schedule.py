@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pipelines.progress import Progress
 from pipelines.round import active
 from pipelines.rounds import is_trainable, open_round
-from pipelines.runner import Report, run_frames, run_round
+from pipelines.runner import Report, open_executor, run_frames, run_round
 from pipelines.stage import FrameStage
 from pipelines.stages.pretrain import pretrain
 from pipelines.workspace import Workspace
@@ -21,10 +21,11 @@ def run_all(workspace: Workspace, rounds: int | None, progress: Progress) -> Ite
         yield pretrain(workspace, progress)
     total = (rounds or workspace.config.run.rounds) if trainable else 1
     policy = workspace.config.solve.policy
-    for number in range(1, total + 1):
-        context = open_round(workspace, number, rounds)
-        for stage in active(workspace.config.run.priors):
-            if isinstance(stage, FrameStage):
-                yield run_frames(workspace, context, stage, progress, "unlabeled")
-            elif trainable or stage.name != "train-round":
-                yield run_round(workspace, context, stage, policy, progress)
+    with open_executor(workspace) as executor:
+        for number in range(1, total + 1):
+            context = open_round(workspace, number, rounds)
+            for stage in active(workspace.config.run.priors):
+                if isinstance(stage, FrameStage):
+                    yield run_frames(workspace, context, stage, executor, progress)
+                elif trainable or stage.name != "train-round":
+                    yield run_round(workspace, context, stage, policy, progress)

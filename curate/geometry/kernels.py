@@ -158,14 +158,18 @@ def _iou_3d(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def iou_matrix(a: np.ndarray, b: np.ndarray, with_height: bool) -> np.ndarray:
+def iou_matrix(a: np.ndarray, b: np.ndarray, order: np.ndarray, with_height: bool) -> np.ndarray:
     """(n, m) IoU of the rectangle tables a and b, of cuboids or of footprints.
 
-    Only pairs whose x ranges can meet are looked at: b is visited in the order of x.
+    Only pairs whose x ranges can meet are looked at.
+
+    Args:
+        a: (n, 10) rectangle table.
+        b: (m, 10) rectangle table, sorted by x.
+        order: (m,) int64 column of the result for each row of b.
+        with_height: volumes, not footprints.
     """
     matrix = np.zeros((len(a), len(b)))
-    order = np.argsort(b[:, _X])
-    b = b[order]
     largest_radius = 0.0
     for j in range(len(b)):
         largest_radius = max(largest_radius, b[j, _RADIUS])

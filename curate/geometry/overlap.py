@@ -13,12 +13,12 @@ from curate.geometry.kernels import grouped_iou, iou_matrix, rectangle_table
 
 def bev_iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     """(n, m) bird's eye view IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
-    return iou_matrix(_table(boxes_a), _table(boxes_b), False)
+    return _iou(boxes_a, boxes_b, with_height=False)
 
 
 def iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     """(n, m) volume IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
-    return iou_matrix(_table(boxes_a), _table(boxes_b), True)
+    return _iou(boxes_a, boxes_b, with_height=True)
 
 
 def overlapping_pairs(
@@ -38,6 +38,12 @@ def overlapping_pairs(
     groups_a = np.ascontiguousarray(starts_a, dtype=np.int64)
     groups_b = np.ascontiguousarray(starts_b, dtype=np.int64)
     return grouped_iou(_table(boxes_a), groups_a, _table(boxes_b), groups_b)
+
+
+def _iou(boxes_a: np.ndarray, boxes_b: np.ndarray, *, with_height: bool) -> np.ndarray:
+    table_b = _table(boxes_b)
+    order = np.argsort(table_b[:, 0])
+    return iou_matrix(_table(boxes_a), table_b[order], order, with_height)
 
 
 def _table(boxes: np.ndarray) -> np.ndarray:

@@ -4,6 +4,8 @@ The footprints are entered into a bird's eye view grid once, then each point tes
 its cell: one pass over the points, whatever the number of boxes.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -14,9 +16,6 @@ _MOST_CELLS = 256
 # The grid must never lose a point that the exact test would accept: boxes are entered wider.
 _MARGIN_METRES = 1e-3
 
-# Lowest x and y, highest x and y of the grid.
-_Bounds = tuple[float, float, float, float]
-
 
 def count_points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """(n,) int64 number of points in each of (n, 7) boxes.
@@ -25,18 +24,31 @@ def count_points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
         points: (p, >=3) x, y, z in metres in the frame of the boxes; NaN is in no box.
         boxes: (n, 7); a point in several boxes counts in each; NaN contains nothing.
     """
-    return _count(_as_points(points), _placed(as_boxes(boxes)))
+    placed = _placed(as_boxes(boxes))
+    return _count(_as_points(points), placed, *_grid(placed))
 
 
 def box_of_points(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """(p,) int64 index of the first of (n, 7) boxes that contains each point, -1 where none."""
-    return _first_box(_as_points(points), _placed(as_boxes(boxes)))
+    placed = _placed(as_boxes(boxes))
+    return _first_box(_as_points(points), placed, *_grid(placed))
 
 
 def points_in_box_mask(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     """(p,) bool, whether each point lies in the (7,) box."""
     inside: np.ndarray = box_of_points(points, np.reshape(box, (1, 7))) == 0
     return inside
+
+
+class _Axes(NamedTuple):
+    """Where the grid lies: bounds in metres, cells per metre, and the number of cells along y."""
+
+    low_x: float
+    low_y: float
+    high_x: float
+    high_y: float
+    cells_per_metre: float
+    rows: int
 
 
 def _as_points(points: np.ndarray) -> np.ndarray:
@@ -48,9 +60,31 @@ def _as_points(points: np.ndarray) -> np.ndarray:
 
 
 def _placed(boxes: np.ndarray) -> np.ndarray:
-    """(n, 8) centre, half sides, cosine and sine of the yaw."""
-    turns = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=1)
-    return np.concatenate([boxes[:, :3], boxes[:, 3:6] / 2, turns], axis=1)
+    """(n, 8) centre, half sides, cosine and sine of the yaw; NaN where one is not finite."""
+    placed = np.empty((len(boxes), 8))
+    placed[:, :3], placed[:, 3:6] = boxes[:, :3], boxes[:, 3:6] / 2
+    finite = np.isfinite(boxes).all(axis=1)
+    yaw = np.where(finite, boxes[:, 6], 0)
+    placed[:, 6], placed[:, 7] = np.cos(yaw), np.sin(yaw)
+    placed[~finite] = np.nan
+    return placed
+
+
+def _grid(placed: np.ndarray) -> tuple[_Axes, np.ndarray, np.ndarray]:
+    """The grid around all boxes, and what `_enter` returns."""
+    indices = np.flatnonzero(np.isfinite(placed[:, 0]))
+    if len(indices) == 0:
+        return _Axes(0.0, 0.0, -1.0, -1.0, 1.0, 1), np.zeros(2, np.int32), indices
+    centres, halves = placed[indices, :2], np.abs(placed[indices, 3:5])
+    cos, sin = np.abs(placed[indices, 6:7]), np.abs(placed[indices, 7:8])
+    reach = cos * halves + sin * halves[:, ::-1] + _MARGIN_METRES
+    lows, highs = centres - reach, centres + reach
+    (low_x, low_y), (high_x, high_y) = lows.min(axis=0).tolist(), highs.max(axis=0).tolist()
+    widest = max(high_x - low_x, high_y - low_y)
+    cells_per_metre = 1 / max(_CELL_METRES, widest / _MOST_CELLS)
+    rows = int((high_y - low_y) * cells_per_metre) + 1
+    axes = _Axes(low_x, low_y, high_x, high_y, cells_per_metre, rows)
+    return axes, *_enter(lows, highs, indices, axes)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -64,92 +98,69 @@ def _contains(placed: np.ndarray, i: int, x: float, y: float, z: float) -> bool:
     return bool(abs(along) <= placed[i, 3] and abs(across) <= placed[i, 4])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _extents(placed: np.ndarray) -> np.ndarray:
-    """(k, 5) lowest x and y, highest x and y of each finite footprint, with the margin; its box."""
-    extents = np.empty((len(placed), 5))
-    number = 0
-    for i in range(len(placed)):
-        if np.isfinite(placed[i]).all():
-            cos, sin = abs(placed[i, 6]), abs(placed[i, 7])
-            reach_x = cos * abs(placed[i, 3]) + sin * abs(placed[i, 4]) + _MARGIN_METRES
-            reach_y = sin * abs(placed[i, 3]) + cos * abs(placed[i, 4]) + _MARGIN_METRES
-            extents[number, 0], extents[number, 2] = placed[i, 0] - reach_x, placed[i, 0] + reach_x
-            extents[number, 1], extents[number, 3] = placed[i, 1] - reach_y, placed[i, 1] + reach_y
-            extents[number, 4] = i
-            number += 1
-    return extents[:number]
-
-
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cell(value: float, low: float, cells_per_metre: float) -> int:
     """Index along one axis of the grid cell of a coordinate that is not below `low`."""
     return int((value - low) * cells_per_metre)
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _cell_of_point(x: float, y: float, axes: _Axes) -> int:
+    """The cell of a point, -1 outside the grid."""
+    if not (axes.low_x <= x <= axes.high_x and axes.low_y <= y <= axes.high_y):
+        return -1
+    column = _cell(x, axes.low_x, axes.cells_per_metre)
+    return column * axes.rows + _cell(y, axes.low_y, axes.cells_per_metre)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _enter(
-    extents: np.ndarray, bounds: _Bounds, cells_per_metre: float
-) -> tuple[int, np.ndarray, np.ndarray]:
+    lows: np.ndarray, highs: np.ndarray, indices: np.ndarray, axes: _Axes
+) -> tuple[np.ndarray, np.ndarray]:
     """The boxes of every grid cell.
 
+    Args:
+        lows: (k, 2) lowest x and y of each footprint.
+        highs: (k, 2) highest x and y.
+        indices: (k,) int64 the boxes' own numbers, ascending.
+        axes: of a grid that holds all of them.
+
     Returns:
-        The number of cells along y, starts (cells + 1,) and boxes: cell c = column * number + row
-        holds boxes[starts[c]:starts[c + 1]], ascending.
+        starts (cells + 1,) and boxes: cell c holds boxes[starts[c]:starts[c + 1]], ascending.
     """
-    columns = _cell(bounds[2], bounds[0], cells_per_metre) + 1
-    rows = _cell(bounds[3], bounds[1], cells_per_metre) + 1
-    ranges = np.empty((len(extents), 4), np.int64)
-    starts = np.zeros(columns * rows + 1, np.int32)  # half the cache of int64
-    for i in range(len(extents)):
-        for side in range(4):
-            low = bounds[1] if side % 2 else bounds[0]
-            ranges[i, side] = _cell(extents[i, side], low, cells_per_metre)
-        for column in range(ranges[i, 0], ranges[i, 2] + 1):
-            for index in range(column * rows + ranges[i, 1], column * rows + ranges[i, 3] + 1):
-                starts[index + 1] += 1
-    starts = np.cumsum(starts).astype(np.int32)
-    fill = starts[:-1].copy()
-    entered = np.empty(starts[-1], np.int64)
-    for i in range(len(extents)):
-        for column in range(ranges[i, 0], ranges[i, 2] + 1):
-            for index in range(column * rows + ranges[i, 1], column * rows + ranges[i, 3] + 1):
-                entered[fill[index]] = int(extents[i, 4])
-                fill[index] += 1
-    return rows, starts, entered
+    cells, boxes = [0 for _ in range(0)], [0 for _ in range(0)]  # typed by their elements
+    for i in range(len(indices)):
+        first = _cell_of_point(lows[i, 0], lows[i, 1], axes)
+        last_in_column = _cell_of_point(lows[i, 0], highs[i, 1], axes)
+        first_of_last_column = _cell_of_point(highs[i, 0], lows[i, 1], axes)
+        for shift in range(0, first_of_last_column - first + 1, axes.rows):
+            for cell in range(first + shift, last_in_column + shift + 1):
+                cells.append(cell)
+                boxes.append(indices[i])
+    columns = _cell(axes.high_x, axes.low_x, axes.cells_per_metre) + 1
+    starts = np.zeros(columns * axes.rows + 1, np.int32)  # half the cache lines of int64
+    for cell in cells:
+        starts[cell + 1] += 1
+    for cell in range(1, len(starts)):
+        starts[cell] += starts[cell - 1]
+    free = starts.copy()
+    entered = np.empty(len(cells), np.int64)
+    for position in range(len(cells)):
+        cell = cells[position]
+        entered[free[cell]] = boxes[position]
+        free[cell] += 1
+    return starts, entered
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _grid(placed: np.ndarray) -> tuple[_Bounds, float, int, np.ndarray, np.ndarray]:
-    """Bounds (low x, low y, high x, high y), cells per metre, and what `_enter` returns."""
-    extents = _extents(placed)
-    if len(extents) == 0:
-        nowhere = (0.0, 0.0, -1.0, -1.0)
-        return nowhere, 1.0, 1, np.zeros(2, np.int32), np.empty(0, np.int64)
-    bounds = (extents[:, 0].min(), extents[:, 1].min(), extents[:, 2].max(), extents[:, 3].max())
-    widest = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
-    cells_per_metre = 1 / max(_CELL_METRES, widest / _MOST_CELLS)
-    rows, starts, entered = _enter(extents, bounds, cells_per_metre)
-    return bounds, cells_per_metre, rows, starts, entered
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _cell_of_point(x: float, y: float, bounds: _Bounds, cells_per_metre: float, rows: int) -> int:
-    """The cell of a point, -1 outside the grid."""
-    if not (bounds[0] <= x <= bounds[2] and bounds[1] <= y <= bounds[3]):
-        return -1
-    column = _cell(x, bounds[0], cells_per_metre)
-    return column * rows + _cell(y, bounds[1], cells_per_metre)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _count(points: np.ndarray, placed: np.ndarray) -> np.ndarray:
+def _count(
+    points: np.ndarray, placed: np.ndarray, axes: _Axes, starts: np.ndarray, entered: np.ndarray
+) -> np.ndarray:
     """The kernel of `count_points_in_boxes`."""
-    bounds, cells_per_metre, rows, starts, entered = _grid(placed)
     counts = np.zeros(len(placed), np.int64)
     for p in range(len(points)):
         x, y = np.float64(points[p, 0]), np.float64(points[p, 1])
-        cell = _cell_of_point(x, y, bounds, cells_per_metre, rows)
+        cell = _cell_of_point(x, y, axes)
         if cell >= 0:
             for position in range(starts[cell], starts[cell + 1]):
                 i = entered[position]
@@ -159,13 +170,14 @@ def _count(points: np.ndarray, placed: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _first_box(points: np.ndarray, placed: np.ndarray) -> np.ndarray:
+def _first_box(
+    points: np.ndarray, placed: np.ndarray, axes: _Axes, starts: np.ndarray, entered: np.ndarray
+) -> np.ndarray:
     """The kernel of `box_of_points`."""
-    bounds, cells_per_metre, rows, starts, entered = _grid(placed)
     owners = np.full(len(points), -1)
     for p in range(len(points)):
         x, y = np.float64(points[p, 0]), np.float64(points[p, 1])
-        cell = _cell_of_point(x, y, bounds, cells_per_metre, rows)
+        cell = _cell_of_point(x, y, axes)
         if cell >= 0:
             for position in range(starts[cell], starts[cell + 1]):
                 if _contains(placed, entered[position], x, y, np.float64(points[p, 2])):

@@ -84,33 +84,64 @@ def paste_objects(
     sample: Sample, bank: ObjectBank, count: int, generator: np.random.Generator
 ) -> Sample:
     """The sample with up to `count` more objects of each category, each with weight 1."""
-    if count == 0 or len(sample.points) == 0:
+    drawn = bank.draw(_TRIES * count, generator)
+    if not drawn or len(sample.points) == 0:
         return sample
     scene = _Scene(sample.points)
-    placed = [
-        _turned(found, scene.azimuths, generator) for found in bank.draw(_TRIES * count, generator)
-    ]
-    free = _free(placed, sample.boxes)
+    turns = _turns(drawn, scene.azimuths, generator)
+    boxes = np.concatenate(
+        [turn.apply_to_boxes(found.box[None]) for turn, found in zip(turns, drawn, strict=True)]
+    )
+    outlines = _Outlines.of(boxes)
+    blocked = np.any(bev_iou(boxes, sample.boxes) > 0, axis=1)
+    meets = np.greater(bev_iou(boxes, boxes), 0)
     wanted = dict.fromkeys(bank.objects, count)
-    accepted: list[BankObject] = []
-    for k in free:
-        candidate = placed[k]
-        if not wanted[candidate.category] or _overlaps(candidate, accepted):
+    accepted: list[int] = []
+    for k, found in enumerate(drawn):
+        if blocked[k] or not wanted[found.category]:
             continue
-        if scene.insert(candidate):
-            accepted.append(candidate)
-            wanted[candidate.category] -= 1
-    if not accepted:
-        return sample
+        if scene.insert(outlines, k, len(found.points)):
+            accepted.append(k)
+            blocked |= meets[k]
+            wanted[found.category] -= 1
+    pasted = [turns[k].apply_to_points(drawn[k].points) for k in accepted]
+    names = [drawn[k].category for k in accepted]
     return replace(
         sample,
-        points=np.concatenate([scene.left(), *(found.points for found in accepted)]),
-        boxes=np.concatenate([sample.boxes, np.stack([found.box for found in accepted])]),
-        categories=as_categories(
-            [*sample.categories.tolist(), *(found.category for found in accepted)]
-        ),
+        points=np.concatenate([scene.left(), *pasted]),
+        boxes=np.concatenate([sample.boxes, boxes[accepted]]),
+        categories=as_categories([*sample.categories.tolist(), *names]),
         weights=np.concatenate([sample.weights, np.ones(len(accepted))]),
     )
+
+
+@dataclass(frozen=True)
+class _Outlines:
+    """Where boxes appear to the sensor: n intervals of azimuth and slope, and their distance.
+
+    Slope is height over distance. `above_ground` is the slope above which the ground before the
+    object does not reach.
+    """
+
+    azimuth: np.ndarray
+    slope: np.ndarray
+    distance: np.ndarray
+    above_ground: np.ndarray
+
+    @classmethod
+    def of(cls, boxes: np.ndarray) -> Self:
+        """The outlines of (n, 7) boxes in front of the sensor."""
+        corners = box_corners(boxes)
+        azimuth = np.arctan2(corners[..., 1], corners[..., 0])
+        distance = np.maximum(np.hypot(corners[..., 0], corners[..., 1]), 1e-3)
+        slope = corners[..., 2] / distance
+        nearest = distance.min(axis=1)
+        return cls(
+            np.stack([azimuth.min(axis=1), azimuth.max(axis=1)], axis=1),
+            np.stack([slope.min(axis=1), slope.max(axis=1)], axis=1),
+            nearest,
+            (boxes[:, 2] - boxes[:, 5] / 2 + _GROUND_METRES) / nearest,
+        )
 
 
 class _Scene:
@@ -124,28 +155,19 @@ class _Scene:
         self._kept = np.ones(len(points), dtype=bool)
         self.azimuths = (float(self._azimuth.min()), float(self._azimuth.max()))
 
-    def insert(self, candidate: BankObject) -> bool:
-        """Makes room for the object, unless its place is hidden from the sensor."""
-        corners = box_corners(candidate.box[None])[0]
-        azimuth = np.arctan2(corners[:, 1], corners[:, 0])
-        distance = np.hypot(corners[:, 0], corners[:, 1])
-        slope = corners[:, 2] / np.maximum(distance, 1e-3)
-        low, high = azimuth.min(), azimuth.max()
+    def insert(self, outlines: _Outlines, k: int, points: int) -> bool:
+        """Makes room for object k with so many points, unless it would be hidden or cut off."""
+        low, high = outlines.azimuth[k]
         if low < self.azimuths[0] or high > self.azimuths[1]:
             return False
-        behind_its_outline = np.flatnonzero(
-            (self._azimuth >= low)
-            & (self._azimuth <= high)
-            & (self._slope >= slope.min())
-            & (self._slope <= slope.max())
-            & self._kept
-        )
-        before = self._distance[behind_its_outline] < distance.min()
-        above_ground = (candidate.box[2] - candidate.box[5] / 2 + _GROUND_METRES) / distance.min()
-        hiding = before & (self._slope[behind_its_outline] > above_ground)
-        if np.count_nonzero(hiding) > _HIDDEN_SHARE * len(candidate.points):
+        in_sector = np.flatnonzero((self._azimuth >= low) & (self._azimuth <= high) & self._kept)
+        slope, distance = self._slope[in_sector], self._distance[in_sector]
+        covered = (slope >= outlines.slope[k, 0]) & (slope <= outlines.slope[k, 1])
+        before = distance < outlines.distance[k]
+        hiding = covered & before & (slope > outlines.above_ground[k])
+        if np.count_nonzero(hiding) > _HIDDEN_SHARE * points:
             return False
-        self._kept[behind_its_outline[~before]] = False
+        self._kept[in_sector[covered & ~before]] = False
         return True
 
     def left(self) -> np.ndarray:
@@ -153,30 +175,14 @@ class _Scene:
         return self._points[self._kept]
 
 
-def _turned(
-    found: BankObject, azimuths: tuple[float, float], generator: np.random.Generator
-) -> BankObject:
-    """The object at a random azimuth of the view, mirrored or not."""
-    mirror = bool(generator.random() < 0.5)
-    now = np.arctan2(found.box[1], found.box[0]) * (-1 if mirror else 1)
-    turn = Similarity(mirror, float(generator.uniform(*azimuths) - now))
-    return replace(
-        found,
-        box=turn.apply_to_boxes(found.box[None])[0],
-        points=turn.apply_to_points(found.points),
-    )
-
-
-def _free(placed: list[BankObject], boxes: np.ndarray) -> np.ndarray:
-    """Indices of the objects that overlap none of the boxes."""
-    if not placed:
-        return np.zeros(0, dtype=np.int64)
-    overlap = bev_iou(np.stack([found.box for found in placed]), boxes)
-    return np.flatnonzero(~(overlap > 0).any(axis=1))
-
-
-def _overlaps(candidate: BankObject, accepted: list[BankObject]) -> bool:
-    if not accepted:
-        return False
-    others = np.stack([found.box for found in accepted])
-    return bool((bev_iou(candidate.box[None], others) > 0).any())
+def _turns(
+    drawn: list[BankObject], azimuths: tuple[float, float], generator: np.random.Generator
+) -> list[Similarity]:
+    """What brings each object to a random azimuth of the view, mirrored or not."""
+    mirrors = generator.random(len(drawn)) < 0.5
+    goals = generator.uniform(*azimuths, len(drawn))
+    now = [np.arctan2(found.box[1], found.box[0]) for found in drawn]
+    return [
+        Similarity(bool(mirror), float(goal + azimuth if mirror else goal - azimuth))
+        for mirror, goal, azimuth in zip(mirrors, goals, now, strict=True)
+    ]

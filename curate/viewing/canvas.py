@@ -1,4 +1,4 @@
-"""A picture in the making: drawn at twice its size and reduced at the end, so that edges are smooth.
+"""A picture in the making: drawn at twice its size and reduced at the end, for smooth edges.
 
 Coordinates, line widths and text sizes are in pixels of the finished picture.
 """
@@ -55,18 +55,8 @@ class Canvas:
         """Polylines (n, points, 2) of one width."""
         thickness = max(1, round(width * _SUPER))
         cv2.polylines(
-            self._pixels, _fixed(strokes), closed, colour, thickness, cv2.LINE_AA, _SHIFT
+            self._pixels, list(_fixed(strokes)), closed, colour, thickness, cv2.LINE_AA, _SHIFT
         )
-
-    def dashes(self, start: np.ndarray, end: np.ndarray, colour: Colour, width: float) -> None:
-        """A dashed line between two places."""
-        dash = 6.0
-        length = float(np.linalg.norm(end - start))
-        marks = np.arange(0, length, 2 * dash)
-        if len(marks):
-            ends = np.minimum(marks + dash, length)
-            shares = np.stack([marks, ends], axis=1) / length
-            self.lines(start + shares[..., None] * (end - start), colour, width)
 
     def fill(self, outline: np.ndarray, colour: Colour, opacity: float) -> None:
         """A convex polygon (points, 2), blended over what is there."""
@@ -80,12 +70,11 @@ class Canvas:
         cv2.fillConvexPoly(covered, _fixed(outline - low / _SUPER)[0], colour, cv2.LINE_AA, _SHIFT)
         region[:] = cv2.addWeighted(covered, opacity, region, 1 - opacity, 0)
 
-    def circle(self, centre: tuple[float, float], radius: float, colour: Colour, width: float) -> None:
-        """A circle."""
-        x, y = (round(value * _SUPER * 2**_SHIFT) for value in centre)
-        thickness = max(1, round(width * _SUPER))
-        radius_fixed = round(radius * _SUPER * 2**_SHIFT)
-        cv2.circle(self._pixels, (x, y), radius_fixed, colour, thickness, cv2.LINE_AA, _SHIFT)
+    def circle(self, centre: np.ndarray, radius: float, colour: Colour, width: float) -> None:
+        """A circle around a (2,) place, as a polygon fine enough to look round."""
+        turn = np.linspace(0, 2 * np.pi, 361)[:-1]
+        outline = centre + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        self.lines(outline, colour, width, closed=True)
 
     def box(self, left: float, top: float, right: float, bottom: float, colour: Colour,
             opacity: float = 1.0) -> None:  # fmt: skip
@@ -98,7 +87,7 @@ class Canvas:
     ) -> None:
         """A line of text whose capitals are about 0.7 `size` high."""
         at = (round(left * _SUPER), round(baseline * _SUPER))
-        cv2.putText(self._pixels, text, at, _FONT, *_text_style(colour, size), cv2.LINE_AA)
+        cv2.putText(self._pixels, text, at, _FONT, _font_scale(size), colour, 1, cv2.LINE_AA)
 
     def finish(self) -> np.ndarray:
         """The (height, width, 3) uint8 RGB picture."""
@@ -126,4 +115,5 @@ def _font_scale(size: float) -> float:
 def _fixed(outline: np.ndarray) -> np.ndarray:
     """Places as OpenCV's fixed-point coordinates, (n, points, 2)."""
     places = np.rint(np.clip(outline * _SUPER, -30000, 30000) * 2**_SHIFT).astype(np.int32)
-    return places.reshape(-1, *places.shape[-2:])
+    polylines: np.ndarray = places.reshape(-1, *places.shape[-2:])
+    return polylines

@@ -24,7 +24,7 @@ def weight_colours(weights: np.ndarray) -> np.ndarray:
     """(n, 3) uint8 RGB of (n,) weights in [0, 1]; weight 0 means ignore and is grey."""
     place = np.clip(weights, 0, 1) * (len(_ANCHORS) - 1)
     channels = [np.interp(place, np.arange(len(_ANCHORS)), channel) for channel in _ANCHORS.T]
-    colours = np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
+    colours: np.ndarray = np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
     colours[np.asarray(weights) <= 0] = IGNORED
     return colours
 
@@ -32,5 +32,6 @@ def weight_colours(weights: np.ndarray) -> np.ndarray:
 def height_shades(heights: np.ndarray) -> np.ndarray:
     """(n, 3) uint8 RGB of LiDAR points by their z in metres: dim ground, lighter above it."""
     share = np.clip((np.asarray(heights) + 2.0) / 4.0, 0, 1)[:, None]
-    low, high = np.array([52, 62, 78]), np.array([158, 172, 190])
-    return np.rint(low + share * (high - low)).astype(np.uint8)
+    low, high = np.array([74, 88, 108]), np.array([186, 199, 215])
+    shades: np.ndarray = np.rint(low + share * (high - low)).astype(np.uint8)
+    return shades

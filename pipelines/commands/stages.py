@@ -19,9 +19,9 @@ def run_frame_command(
     """Runs frame stages for a split; None stands for the configured priors."""
     from curate.errors import ConfigError
     from pipelines.progress import Bar
-    from pipelines.round import PRIORS, stage
+    from pipelines.round import stage
     from pipelines.rounds import open_round
-    from pipelines.runner import run_frames
+    from pipelines.runner import open_executor, run_frames
     from pipelines.stage import FrameStage
     from pipelines.workspace import SPLITS
 
@@ -30,20 +30,18 @@ def run_frame_command(
     if split not in SPLITS:
         raise ConfigError(f"--split {split}: use one of {', '.join(SPLITS)}")
     names = priors if stages is None else stages
-    for name in names:
-        if stages is not None and name in PRIORS and name not in priors:
-            raise ConfigError(f"--prior {name}: not in run.priors of curate.toml; add it there")
+    unknown = [name for name in names if name not in (*priors, "predict", "repredict")]
+    if unknown:
+        raise ConfigError(f"--prior {unknown[0]}: not among run.priors {list(priors)}")
     context = open_round(workspace, round_number)
     reports = []
-    for name in names:
-        try:
+    with open_executor(workspace) as work:
+        for name in names:
             found = stage(name)
-        except StopIteration:
-            raise ConfigError(f"--prior {name}: use one of {', '.join(PRIORS)}") from None
-        if isinstance(found, FrameStage):
-            reports.append(run_frames(workspace, context, found, Bar(), split))
-            if not as_json:
-                print_report(reports[-1])
+            if isinstance(found, FrameStage):
+                reports.append(run_frames(workspace, context, found, work, Bar(), split=split))
+                if not as_json:
+                    print_report(reports[-1])
     end(reports, as_json=as_json)
 
 

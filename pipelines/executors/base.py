@@ -53,6 +53,10 @@ class Executor(Protocol):
         """One outcome per job."""
         ...
 
+    def close(self) -> None:
+        """Ends its workers."""
+        ...
+
 
 def attempt(function: FrameFunction, job: FrameJob) -> Outcome:
     """Works on one frame and turns whatever goes wrong into its recorded failure."""

@@ -13,3 +13,6 @@ class SerialExecutor:
         function.open()
         for job in jobs:
             yield attempt(function, job)
+
+    def close(self) -> None:
+        """Nothing to end."""

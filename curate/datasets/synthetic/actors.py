@@ -103,7 +103,13 @@ def _car(generator: np.random.Generator) -> Mesh:
 
 
 def _car_cabin(
-    length: float, width: float, height: float, belt_z: float, bonnet: float, boot: float, top: float
+    length: float,
+    width: float,
+    height: float,
+    belt_z: float,
+    bonnet: float,
+    boot: float,
+    top: float,
 ) -> list[Mesh]:
     """The glazed part from the belt line to the roof, and the roof."""
     front, rear = length * (0.5 - bonnet), length * (boot - 0.5)
@@ -232,7 +238,9 @@ def bicycle(generator: np.random.Generator) -> Mesh:
         for angle in np.arange(4) * np.pi / 4:
             reach = np.array([np.cos(angle), 0, np.sin(angle)]) * (wheel - 0.04)
             parts.append(
-                cylinder(np.array(hub) - reach, np.array(hub) + reach, 0.006, Material.METAL, sides=3)
+                cylinder(
+                    np.array(hub) - reach, np.array(hub) + reach, 0.006, Material.METAL, sides=3
+                )
             )
     bar = generator.uniform(0.22, 0.31)
     parts += [

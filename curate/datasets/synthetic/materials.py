@@ -63,6 +63,35 @@ _LIDAR = np.array(
 )
 REFLECTIVITY, LOSS, ROUGHNESS_M, COLOUR_SHARE = _LIDAR.T.astype(np.float32)
 
+# (m, 2): strength of the texture in the image, and its pixels per metre.
+TEXTURE = np.array(
+    [
+        (0.10, 24),  # ASPHALT
+        (0.10, 12),  # PAVEMENT
+        (0.30, 16),  # GRASS
+        (0.03, 10),  # PAINT
+        (0.12, 8),  # GLASS
+        (0.10, 20),  # RUBBER
+        (0.08, 20),  # TRIM
+        (0.05, 20),  # HEADLIGHT
+        (0.05, 20),  # TAILLIGHT
+        (0.10, 30),  # RETROREFLECTOR
+        (0.06, 30),  # SKIN
+        (0.15, 40),  # HAIR
+        (0.16, 25),  # UPPER_CLOTH
+        (0.10, 25),  # LOWER_CLOTH
+        (0.10, 30),  # SHOE
+        (0.10, 8),  # METAL
+        (0.25, 20),  # BARK
+        (0.42, 14),  # FOLIAGE
+        (0.08, 10),  # WALL
+        (0.15, 12),  # ROOF
+        (0.10, 14),  # CONCRETE
+        (0.20, 14),  # WOOD
+    ],
+    dtype=np.float32,
+)
+
 # (m, 3): linear RGB, 0 to 1.
 _COLOURS = np.array(
     [

@@ -193,7 +193,11 @@ def _unit_sphere(sides: int) -> tuple[np.ndarray, np.ndarray]:
     angles = np.arange(sides) * 2 * np.pi / sides
     rows = [
         np.column_stack(
-            [np.cos(lat) * np.cos(angles), np.cos(lat) * np.sin(angles), np.full(sides, np.sin(lat))]
+            [
+                np.cos(lat) * np.cos(angles),
+                np.cos(lat) * np.sin(angles),
+                np.full(sides, np.sin(lat)),
+            ]
         )
         for lat in latitudes
     ]

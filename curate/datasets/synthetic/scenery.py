@@ -60,13 +60,13 @@ def _tree(generator: np.random.Generator) -> Mesh:
     """A trunk and a crown of several clumps."""
     trunk, radius = generator.uniform(1.8, 3.2), generator.uniform(0.10, 0.26)
     parts = [
-        cylinder(
-            (0, 0, -0.3), (0, 0, trunk + 1.0), radius, Material.BARK, end_radius=radius * 0.7
-        )
+        cylinder((0, 0, -0.3), (0, 0, trunk + 1.0), radius, Material.BARK, end_radius=radius * 0.7)
     ]
     spread = generator.uniform(1.0, 2.0)
     for _ in range(generator.integers(3, 6)):
-        centre = generator.normal((0, 0, trunk + spread), (0.5 * spread, 0.5 * spread, 0.4 * spread))
+        centre = generator.normal(
+            (0, 0, trunk + spread), (0.5 * spread, 0.5 * spread, 0.4 * spread)
+        )
         parts.append(_clump(generator, centre, spread * generator.uniform(0.6, 1.0, size=3)))
     return merge(parts)
 
@@ -77,9 +77,7 @@ def _clump(
     """An ellipsoid of leaves with a ragged surface."""
     smooth = ellipsoid((0, 0, 0), radii, Material.FOLIAGE, sides=sides)
     ragged = smooth.vertices * generator.uniform(0.8, 1.12, size=(len(smooth.vertices), 1))
-    return Mesh(
-        (ragged + centre).astype(np.float32), smooth.triangles, smooth.materials
-    )
+    return Mesh((ragged + centre).astype(np.float32), smooth.triangles, smooth.materials)
 
 
 def _pole(generator: np.random.Generator) -> Mesh:
@@ -133,8 +131,12 @@ def _hedge(generator: np.random.Generator) -> Mesh:
     """A dense, clipped hedge of the outline of a car."""
     length, width, height = generator.normal((3.9, 1.65, 1.5), (0.5, 0.15, 0.15))
     parts = [
-        frustum((0, 0, 0.45 * height - 0.15), (length, width, 0.9 * height + 0.3), (0.95, 0.9),
-                Material.FOLIAGE)
+        frustum(
+            (0, 0, 0.45 * height - 0.15),
+            (length, width, 0.9 * height + 0.3),
+            (0.95, 0.9),
+            Material.FOLIAGE,
+        )
     ]
     for share in generator.uniform(-0.42, 0.42, size=5):
         radii = np.array([0.7, 0.5 * width, 0.3])
@@ -234,8 +236,12 @@ def _cabinet(generator: np.random.Generator) -> Mesh:
     return merge(
         [
             box((0, 0, size[2] / 2), size, Material.METAL),
-            frustum((0, 0, size[2] + 0.04), (size[0] + 0.1, size[1] + 0.1, 0.1), (0.6, 0.6),
-                    Material.TRIM),
+            frustum(
+                (0, 0, size[2] + 0.04),
+                (size[0] + 0.1, size[1] + 0.1, 0.1),
+                (0.6, 0.6),
+                Material.TRIM,
+            ),
         ]
     )
 
@@ -257,8 +263,12 @@ def _scooter(generator: np.random.Generator) -> Mesh:
     return merge(
         [
             frustum((0, 0, 0.4), (1.7, 0.55, 0.8), (0.8, 0.7), Material.METAL),
-            frustum((-0.05, 0, 0.78 + (height - 0.8) / 2), (0.9, 0.45, height - 0.78), (0.4, 0.6),
-                    Material.METAL),
+            frustum(
+                (-0.05, 0, 0.78 + (height - 0.8) / 2),
+                (0.9, 0.45, height - 0.78),
+                (0.4, 0.6),
+                Material.METAL,
+            ),
             *(_tyre(x) for x in (-0.6, 0.6)),
         ]
     )

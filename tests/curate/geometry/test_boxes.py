@@ -23,7 +23,7 @@ def test_yaw_turns_counter_clockwise():
 
 @given(box_arrays())
 def test_the_cuboid_stands_on_the_footprint(boxes):
-    """Bottom and top are the footprint; the corners' mean is the centre; sides keep their length."""
+    """Bottom and top are the footprint, the corners' mean the centre; sides keep their length."""
     corners, footprints = box_corners(boxes), bev_corners(boxes)
     assert corners.shape == (len(boxes), 8, 3)
     assert np.array_equal(corners[:, :4, :2], footprints)

@@ -52,6 +52,6 @@ def test_no_boxes_stay_no_boxes():
 def test_boxes_far_apart_or_not_finite_are_kept():
     """An outlier kilometres away or a NaN neither breaks the grid nor hides a duplicate."""
     box = np.array([0, 0, 0, 4.0, 2.0, 1.5, 0.5])
-    boxes = np.stack([box, box + [1e7, -1e9, 0, 0, 0, 0, 0], box * np.nan, box])
+    boxes = np.stack([box, np.add(box, [1e7, -1e9, 0, 0, 0, 0, 0]), box * np.nan, box])
     with np.errstate(invalid="ignore"):
         assert nms_bev(boxes, np.array([0.9, 0.8, 0.7, 0.6]), 0.5).tolist() == [0, 1, 2]

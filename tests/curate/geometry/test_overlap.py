@@ -64,7 +64,7 @@ def test_a_box_has_iou_exactly_1_with_itself(centre, sides, yaw):
 def test_random_points_see_the_same_overlap():
     """A third opinion that knows nothing of polygons."""
     generator = np.random.default_rng(0)
-    other = CAR + [0.6, 0.4, 0, 0.5, -0.2, 0, 0.7]
+    other = np.add(CAR, [0.6, 0.4, 0, 0.5, -0.2, 0, 0.7])
     expected = clipping.bev_iou_by_sampling(CAR, other, generator, 200_000)
     assert bev_iou(CAR[None], other[None])[0, 0] == pytest.approx(expected, abs=0.01)
 
@@ -72,16 +72,16 @@ def test_random_points_see_the_same_overlap():
 @pytest.mark.parametrize("turn", [0.0, 1e-15, 1e-13, 1e-11, 1e-9, 1e-6, 1e-3])
 def test_nearly_parallel_edges_do_not_jump(turn):
     """IoU changes no faster than the angle, also where the aligned case takes over."""
-    copies = np.stack([CAR, CAR + [0, 0, 0, 0, 0, 0, turn]])
+    copies = np.stack([CAR, np.add(CAR, [0, 0, 0, 0, 0, 0, turn])])
     assert bev_iou(copies, copies)[0, 1] == pytest.approx(1, abs=4 * turn + 1e-12)
 
 
 def test_boxes_that_touch_do_not_overlap():
     """A shared side, a shared corner and a shared end face are no common area or volume."""
     box = np.array([[0, 0, 0, 2.0, 2.0, 2.0, 0]])
-    beside = box + [[2.0, 0, 0, 0, 0, 0, 0]]
-    corner = box + [[2.0, 2.0, 0, 0, 0, 0, 0]]
-    above = box + [[0, 0, 2.0, 0, 0, 0, 0]]
+    beside = np.add(box, [2.0, 0, 0, 0, 0, 0, 0])
+    corner = np.add(box, [2.0, 2.0, 0, 0, 0, 0, 0])
+    above = np.add(box, [0, 0, 2.0, 0, 0, 0, 0])
     assert bev_iou(box, np.vstack([beside, corner])).tolist() == [[0, 0]]
     assert iou_3d(box, above).tolist() == [[0]]
     assert bev_iou(box, above).tolist() == [[1]]

@@ -65,8 +65,8 @@ def test_a_box_around_the_camera_plane_is_cut_at_the_near_plane():
     assert right == pytest.approx(50 - 100 * 1.5 / 10)
 
 
-def by_surface_points(box, size):
-    """Rectangle of many points on the box that lie before the near plane, clipped."""
+def by_sampling(box):
+    """Rectangle around many points of the box that lie before the near plane."""
     corners = box_corners(box[None])[0]
     shares = np.stack(np.meshgrid(*[np.linspace(0, 1, 41)] * 3), axis=-1).reshape(-1, 3)
     points = (
@@ -84,13 +84,13 @@ def by_surface_points(box, size):
 @given(box_arrays(min_size=1, max_size=3))
 def test_rectangles_hold_all_that_is_seen_of_the_box(boxes):
     """No point of the box before the near plane appears outside the rectangle."""
-    boxes = boxes + [[1.0, 0, 0, 0.1, 0.1, 0.1, 0]]
+    boxes = np.add(boxes, [1.0, 0, 0, 0.1, 0.1, 0.1, 0])
     last = np.array(SIZE) - 1
     for box, rectangle in zip(boxes, image_rectangles(boxes, CAMERA, SIZE), strict=True):
         if not (box_corners(box[None])[0, :, 0] >= 0.1).any():
             assert np.isnan(rectangle).all()
             continue
-        low, high = by_surface_points(box, SIZE)
+        low, high = by_sampling(box)
         if np.isnan(rectangle).any():
             assert (high <= 1e-6).any() or (low >= last - 1e-6).any()
         else:
@@ -107,9 +107,7 @@ def test_projected_label_boxes_are_the_labels_of_real_frames(kitti_root):
     for frame_id in data.frame_ids():
         frame, labels = data.read(frame_id), data.annotations(frame_id)
         whole = (labels.truncated == 0) & (labels.categories != "DontCare")
-        rectangles = image_rectangles(
-            labels.boxes[whole], frame.calibration, frame.image_size
-        )
+        rectangles = image_rectangles(labels.boxes[whole], frame.calibration, frame.image_size)
         overlaps.extend(map(rectangle_iou, rectangles, labels.boxes_2d[whole]))
     assert len(overlaps) > 50
     assert np.median(overlaps) > 0.85

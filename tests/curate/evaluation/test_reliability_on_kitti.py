@@ -1,0 +1,100 @@
+"""The whole chain from recorded detections to judged weights, on real frames of KITTI."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from curate.consistency import consistency
+from curate.datasets.kitti import KittiDataset
+from curate.detections import Detections
+from curate.detectors.recorded import RecordedDetector
+from curate.evaluation.reliability import JudgeSettings, auroc, judge, weighted_precision
+from curate.priors.points import PointPrior, learn_thresholds
+from curate.priors.semantic import SemanticPrior
+from curate.segmenters.classes import class_map
+from curate.segmenters.onnx import OnnxSegmenter
+from curate.weighting.base import Age, Evidence
+from curate.weighting.self_paced import PSPSL, SPSL
+
+pytestmark = pytest.mark.kitti
+
+AGES = [Age(1, 10), Age(5, 10), Age(10, 10)]
+# Of the 24 frames these are in KITTI's official val split; the point prior learns from the others.
+VAL = {f"{number:06d}" for number in (1, 4, 5, 8, 20, 23, 25, 28, 35)}
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Evidence of all labels of the weak teacher, and which of them are right."""
+
+    evidence: Evidence
+    right: np.ndarray
+    labels: int
+    rights: int
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(("val", 134, 18), id="val"),
+        pytest.param(("all", 341, 36), id="all", marks=pytest.mark.slow),
+    ],
+)
+def judged(request, kitti_root):
+    """Cars of the weak teacher on labeled frames; right = BEV IoU > 0.7 with a Car or a Van."""
+    split, labels, rights = request.param
+    dataset = KittiDataset(kitti_root)
+    detector = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv")
+    segmenter = OnnxSegmenter(
+        kitti_root / "segmenter" / "deeplabv3_mnv2_pascal_quant.onnx", class_map("voc")
+    )
+    labeled = [frame_id for frame_id in dataset.frame_ids() if frame_id not in VAL]
+    thresholds = learn_thresholds(
+        ((dataset.read(name), dataset.annotations(name)) for name in labeled), ("Car",)
+    )
+    priors = [PointPrior(thresholds.values), SemanticPrior(segmenter)]
+    rows = []
+    for index, frame_id in enumerate(sorted(VAL) if split == "val" else dataset.frame_ids()):
+        frame = dataset.read(frame_id, image=True)
+        found = detector.predict(frame)
+        ((similarity, answered),) = detector.views(frame_id)
+        back = Detections(
+            similarity.invert_boxes(answered.boxes), answered.scores, answered.categories
+        )
+        verdict = judge(found, dataset.annotations(frame_id), JudgeSettings(neighbors_are="right"))
+        rows.append((
+            np.full(len(found), index), found.categories, found.scores,
+            consistency(found, back).loss, *(prior.score(frame, found).rho for prior in priors),
+            verdict.right,
+        ))  # fmt: skip
+    *columns, diff, anno, right = (np.concatenate(column) for column in zip(*rows, strict=True))
+    evidence = Evidence(*columns, {"rho_diff": diff, "rho_anno": anno})
+    return Judged(evidence, right, labels, rights)
+
+
+def test_a_few_labels_are_right_and_most_have_evidence(judged):
+    """Counts that a change of matching, judging or reading would move."""
+    assert len(judged.evidence) == judged.labels
+    assert judged.right.sum() == judged.rights
+    assert judged.evidence.matched.mean() == pytest.approx(0.775, abs=0.02)
+
+
+def test_right_labels_have_smaller_losses(judged):
+    """Score and consistency loss each tell right from wrong well on their own."""
+    trust = -np.nan_to_num(judged.evidence.loss, nan=np.inf)
+    assert 0.95 < auroc(judged.evidence.score, judged.right) < 0.98
+    assert 0.95 < auroc(trust, judged.right) < 0.98
+
+
+@pytest.mark.parametrize("age", AGES)
+def test_the_prior_is_what_makes_the_weights_precise(judged, age):
+    """PSPSL puts over twice as much of its weight on right labels as the score does."""
+    evidence, right = judged.evidence, judged.right
+    by_score = weighted_precision(evidence.score, right)
+    spsl = weighted_precision(SPSL().weigh(evidence, age).v, right)
+    weights = PSPSL().weigh(evidence, age).v
+    assert 0.25 < by_score < 0.35
+    assert 0.15 < spsl < 0.52
+    assert weighted_precision(weights, right) > max(2 * by_score, 1.5 * spsl)
+    assert 0.96 < auroc(weights, right) < 0.99

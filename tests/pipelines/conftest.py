@@ -1,0 +1,33 @@
+"""A toy workspace."""
+
+from pathlib import Path
+
+import pytest
+
+from pipelines.config import make_config
+from pipelines.setup import initialise
+from pipelines.workspace import Workspace
+
+
+@pytest.fixture
+def weights_file(tmp_path: Path) -> Path:
+    """What the toy detector takes for its checkpoint."""
+    path = tmp_path / "detector.txt"
+    path.write_text("")
+    return path
+
+
+def toy_document(root: Path, weights_file: Path) -> dict:
+    """The settings of a toy workspace."""
+    return {
+        "dataset": {"root": root},
+        "detector": {"name": "toys:ToyDetector", "path": weights_file},
+        "segmenter": {"name": "toys:ToySegmenter", "path": weights_file},
+    }
+
+
+@pytest.fixture
+def workspace(tmp_path: Path, toy_kitti: Path, weights_file: Path) -> Workspace:
+    """Two labeled, six unlabeled and four val frames."""
+    config = make_config(toy_document(toy_kitti, weights_file), "test")
+    return initialise(tmp_path / "work", config, "0.25", "")

@@ -1,0 +1,211 @@
+"""The runner: what is done once, what becomes stale, and what a failure costs."""
+
+from pathlib import Path
+
+import pytest
+
+from curate.errors import WorkspaceError
+from pipelines import plan
+from pipelines.executors.serial import SerialExecutor
+from pipelines.progress import Silent
+from pipelines.round import ROUND, stage
+from pipelines.rounds import open_round
+from pipelines.runner import run_frames, run_round
+from pipelines.schedule import run_all
+from pipelines.workspace import Workspace
+
+FRAME_STAGES = ("predict", "repredict", "points", "semantic")
+
+
+def dump(workspace: Workspace) -> list[tuple]:
+    """All rows that a run makes, without keys and times that may differ."""
+    tables = {
+        "prediction": "*", "reprediction_view": "*", "reprediction": "*", "consistency": "*",
+        "point_prior": "*", "semantic_prior": "*", "weight": "*",
+        "task": "round, stage, variant, frame_id, fingerprint, state, error",
+    }  # fmt: skip
+    with workspace.database.reading() as connection:
+        return [
+            (table, *row)
+            for table, columns in tables.items()
+            for row in sorted(
+                map(tuple, connection.exec_driver_sql(f"SELECT {columns} FROM {table}")), key=str
+            )
+        ]
+
+
+def count(workspace: Workspace, table: str) -> int:
+    """Rows of a table."""
+    with workspace.database.reading() as connection:
+        return connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar_one()
+
+
+def run(workspace: Workspace) -> dict[str, int]:
+    """Runs everything; frames (or round stages) done anew, by stage."""
+    return {report.stage: report.done for report in run_all(workspace, None, Silent())}
+
+
+def with_setting(workspace: Workspace, section: str, **changes: object) -> Workspace:
+    """The workspace after an edit of curate.toml."""
+    return workspace.with_settings(section, **changes)
+
+
+def test_a_run_fills_every_table(workspace: Workspace) -> None:
+    """Three labels per unlabeled frame go through all stages."""
+    assert run(workspace) == dict.fromkeys(FRAME_STAGES, 6) | {"solve": 1, "export": 1}
+    for table in ("prediction", "consistency", "point_prior", "semantic_prior", "weight"):
+        assert count(workspace, table) == 18
+    assert count(workspace, "weighted_labels") == 18
+
+
+def test_a_second_run_does_nothing(workspace: Workspace) -> None:
+    """What is up to date is not done again."""
+    run(workspace)
+    before = dump(workspace)
+    assert set(run(workspace).values()) == {0}
+    assert dump(workspace) == before
+
+
+@pytest.mark.parametrize(
+    ("section", "changes", "redone"),
+    [
+        ("points", {"statistic": "mean"}, {"points", "solve", "export"}),
+        ("semantic", {"mean": "product"}, {"semantic", "solve", "export"}),
+        ("solve", {"scope": "frame"}, {"solve", "export"}),
+        ("repredict", {"views": 2}, {"repredict", "solve", "export"}),
+        ("detector", {"minimum_score": 0.5}, {*FRAME_STAGES, "solve", "export"}),
+        ("run", {"workers": 2}, set()),
+    ],
+)
+def test_a_changed_setting_redoes_its_stage_and_what_follows(
+    workspace: Workspace, section: str, changes: dict, redone: set
+) -> None:
+    """And nothing else: a changed prior does not run the detector."""
+    run(workspace)
+    done = run(with_setting(workspace, section, **changes))
+    assert {name for name, frames in done.items() if frames} == redone
+
+
+def test_another_detector_makes_everything_stale(workspace: Workspace, weights_file: Path) -> None:
+    """The teacher's hash is part of every fingerprint."""
+    run(workspace)
+    weights_file.write_text("# another")
+    assert all(run(workspace).values())
+
+
+def test_a_frame_whose_model_raises_is_recorded_and_costs_no_other_frame(
+    workspace: Workspace, weights_file: Path
+) -> None:
+    """One line in its task; the others go on to the end, and it is tried again next time."""
+    poisoned = next(iter(workspace.frames("unlabeled")))
+    weights_file.write_text(poisoned)
+    reports = {report.stage: report for report in run_all(workspace, None, Silent())}
+    assert reports["predict"].failed == 1
+    assert reports["predict"].done == 5
+    [(frame, error)] = reports["predict"].errors
+    assert frame == poisoned
+    assert error == (
+        f"frame {poisoned}: RuntimeError: CUDA error: an illegal memory access was encountered"
+    )
+    assert count(workspace, "weight") == 15
+    context = open_round(workspace, 1)
+    again = run_frames(workspace, context, stage("predict"), SerialExecutor(), Silent())
+    assert (again.failed, again.kept) == (1, 5)
+
+
+def test_a_mended_frame_joins_the_others(workspace: Workspace, toy_kitti: Path) -> None:
+    """A damaged file fails its frame; after it is mended only that frame is worked on."""
+    name = next(iter(workspace.frames("unlabeled")))
+    path = toy_kitti / "training" / "velodyne" / f"{name}.bin"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-3])
+    reports = {report.stage: report for report in run_all(workspace, None, Silent())}
+    assert "truncated" in reports["predict"].errors[0][1]
+    path.write_bytes(whole)
+    assert run(workspace) == dict.fromkeys(FRAME_STAGES, 1) | {"solve": 1, "export": 1}
+    assert count(workspace, "weight") == 18
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda home, name: (home / "calib" / f"{name}.txt").unlink(), "calib"),
+        (lambda home, name: (home / "image_2" / f"{name}.png").write_bytes(b"no png"), "image_2"),
+        (lambda home, name: (home / "velodyne" / f"{name}.bin").write_bytes(b"\x00" * 17), "velo"),
+        (
+            lambda home, name: (home / "velodyne" / f"{name}.bin").write_bytes(
+                b"\x00\x00\xc0\x7f" * 4
+            ),
+            "NaN",
+        ),
+    ],
+)
+def test_a_damaged_file_fails_its_frame_with_one_line(
+    workspace: Workspace, toy_kitti: Path, damage, message: str
+) -> None:
+    """The line names the file; no other frame is lost."""
+    name = next(iter(workspace.frames("unlabeled")))
+    damage(toy_kitti / "training", name)
+    reports = list(run_all(workspace, None, Silent()))
+    [error] = {error for report in reports for _, error in report.errors}
+    assert message in error
+    assert name in error
+    assert "\n" not in error
+    assert count(workspace, "weight") == 15
+
+
+def test_an_empty_sweep_is_empty_in_every_stage(workspace: Workspace, toy_kitti: Path) -> None:
+    """No points, no labels, no failure."""
+    name = next(iter(workspace.frames("unlabeled")))
+    (toy_kitti / "training" / "velodyne" / f"{name}.bin").write_bytes(b"")
+    reports = {report.stage: report for report in run_all(workspace, None, Silent())}
+    assert [reports[name].empty for name in FRAME_STAGES] == [1] * 4
+    assert count(workspace, "weight") == 15
+
+
+def test_solve_refuses_to_weigh_half_a_round(workspace: Workspace) -> None:
+    """It says which command is missing."""
+    context = open_round(workspace, 1)
+    run_frames(workspace, context, stage("predict"), SerialExecutor(), Silent())
+    with pytest.raises(WorkspaceError, match="repredict: 6 frames.*curate repredict"):
+        run_round(workspace, context, stage("solve"), "pspsl", Silent())
+
+
+def test_policies_stand_side_by_side(workspace: Workspace) -> None:
+    """Solving for another policy leaves the first one's weights as they are."""
+    run(workspace)
+    context = open_round(workspace, 1)
+    before = [row for row in dump(workspace) if row[0] == "weight"]
+    run_round(workspace, context, stage("solve"), "uniform", Silent())
+    after = [row for row in dump(workspace) if row[0] == "weight"]
+    assert set(before) < set(after)
+    assert len(after) == 36
+
+
+def test_the_rows_do_not_depend_on_the_executor(
+    workspace: Workspace, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """Two worker processes write what one serial run writes, to the last bit."""
+    from pipelines.setup import initialise
+
+    run(workspace)
+    other = initialise(tmp_path / "other", workspace.config, "0.25", "")
+    run(with_setting(other, "run", executor="process", workers=2))
+    assert dump(other) == dump(workspace)
+
+
+def test_every_stage_reads_what_exists_before_it(workspace: Workspace) -> None:
+    """The DAG's edges go one way: inputs are sources or written by an earlier stage."""
+    known = {"frame", "ground_truth", "teacher"}
+    for each in ROUND:
+        assert set(each.reads) <= known
+        known |= set(each.writes)
+
+
+def test_fingerprints_do_not_depend_on_where_the_data_lies(workspace: Workspace) -> None:
+    """A data set that moved is not worked on again."""
+    context = open_round(workspace, 1)
+    moved = with_setting(workspace, "dataset", root=Path("/elsewhere"))
+    assert plan.fingerprints(moved, context, "pspsl") == plan.fingerprints(
+        workspace, context, "pspsl"
+    )
