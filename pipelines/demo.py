@@ -212,10 +212,9 @@ def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:
 
 
 def _draw(workspace: Workspace, say: Say) -> None:
-    from pipelines.pictures import draw_frame, frame_to_show
+    from pipelines.pictures import draw_telling_frame
 
-    frame = frame_to_show(workspace, 1)
-    for path in draw_frame(workspace, 1, frame):
+    for path in draw_telling_frame(workspace, 1):
         say(f"   picture: {_shown(path)}")
 
 

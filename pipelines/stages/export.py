@@ -8,10 +8,12 @@ from typing import Any
 from sqlalchemy import Connection, select, text
 
 import curate
+from curate.exporters.kitti import WeightedFrame, export_kitti
 from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS, LabelFileDescription, write_labels
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.assembly import open_policy
+from pipelines.labels import read_labels
 from pipelines.progress import Progress
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.workspace import Workspace
@@ -96,3 +98,16 @@ def _ground_truth(connection: Connection) -> list[bulk.Row]:
         .order_by(frame.c.frame, truth.c.k)
     )
     return list(bulk.select(connection, query))
+
+
+def export_kitti_files(workspace: Workspace, round_number: int, policy: str, folder: Path) -> int:
+    """Writes a policy's labels as KITTI label files; returns how many."""
+
+    def frames() -> Iterator[WeightedFrame]:
+        for found in read_labels(workspace, round_number, policy):
+            frame = workspace.dataset.read(found.frame, points=False)
+            yield WeightedFrame(
+                found.frame, found.labels, found.weights, frame.calibration, frame.image_size
+            )
+
+    return export_kitti(folder, frames())

@@ -22,7 +22,7 @@ def by_clipping(overlap, boxes_a, boxes_b):
 @settings(max_examples=150, deadline=None)
 @given(box_arrays(), box_arrays())
 def test_iou_equals_polygon_clipping(boxes_a, boxes_b):
-    """Random and degenerate boxes agree with shapely, seen from above and in space."""
+    """Random and degenerate boxes, seen from above and in space."""
     expected = by_clipping(clipping.bev_iou, boxes_a, boxes_b)
     assert np.allclose(bev_iou(boxes_a, boxes_b), expected, rtol=0, atol=1e-6)
     expected = by_clipping(clipping.iou_3d, boxes_a, boxes_b)

@@ -1,0 +1,107 @@
+"""Checkpoints: what is written can be read back, and nothing else is taken for one."""
+
+import pickle
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from curate.detectors.pillars import PillarDetector
+from curate.detectors.pillars.checkpoint import load_checkpoint, save_checkpoint
+from curate.detectors.pillars.network import PillarNetwork, checkpoint_of, network_of
+from curate.detectors.pillars.presets import PRESETS
+from curate.errors import ModelError
+
+META = {"format": "curate-pillars", "format_version": "1", "preset": "small"}
+
+
+@pytest.fixture(scope="module")
+def checkpoint():
+    """An untrained network of two categories."""
+    return checkpoint_of(PillarNetwork(PRESETS["small"], 2), ("Car", "Tram"))
+
+
+def test_a_checkpoint_comes_back_as_it_was(tmp_path, checkpoint):
+    """Preset, categories and every tensor survive, and the graph lies beside the file."""
+    path = tmp_path / "new" / "teacher.safetensors"
+    save_checkpoint(path, checkpoint)
+    loaded = load_checkpoint(path)
+    assert loaded.preset == PRESETS["small"]
+    assert loaded.categories == ("Car", "Tram")
+    assert loaded.weights.keys() == checkpoint.weights.keys()
+    for name, array in checkpoint.weights.items():
+        np.testing.assert_array_equal(loaded.weights[name], array)
+    assert sorted(file.name for file in path.parent.iterdir()) == [
+        "teacher.onnx",
+        "teacher.safetensors",
+    ]
+
+
+class Bomb:
+    """Executes code when it is unpickled."""
+
+    def __reduce__(self):
+        return (pytest.fail, ("a pickle was executed",))
+
+
+def test_a_pickle_is_refused_and_never_executed(tmp_path):
+    """A pickle named like a checkpoint is an error of one line."""
+    path = tmp_path / "foreign.safetensors"
+    path.write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(ModelError, match="foreign.safetensors: not a readable safetensors") as info:
+        PillarDetector(path)
+    assert "\n" not in str(info.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"", "not a readable safetensors"), (b"\x00" * 100, "not a readable safetensors")],
+)
+def test_garbage_is_refused(tmp_path, content, message):
+    """Files that are no safetensors are named."""
+    path = tmp_path / "bad.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=message):
+        load_checkpoint(path)
+
+
+def test_a_truncated_checkpoint_is_refused(tmp_path, checkpoint):
+    """Half a download is not taken for a model."""
+    path = tmp_path / "half.safetensors"
+    save_checkpoint(path, checkpoint)
+    path.write_bytes(path.read_bytes()[:-1000])
+    with pytest.raises(ModelError, match=r"half\.safetensors"):
+        load_checkpoint(path)
+
+
+def test_a_missing_checkpoint_says_what_to_do(tmp_path):
+    """The error for a file that is not there names it and the remedy."""
+    with pytest.raises(ModelError, match=r"nowhere\.safetensors: no such checkpoint; train"):
+        PillarDetector(tmp_path / "nowhere.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({}, "not a checkpoint of the pillars detector"),
+        ({**META, "format_version": "9", "categories": "[]"}, "checkpoint format 9"),
+        ({**META, "preset": "huge", "categories": '["Car"]'}, "damaged metadata"),
+        ({**META, "categories": "Car"}, "damaged metadata"),
+        (META, "damaged metadata"),
+        ({**META, "categories": '["Car"]'}, "damaged checkpoint"),
+    ],
+)
+def test_foreign_tensors_are_refused(tmp_path, metadata, message):
+    """Safetensors of something else, or of another version, are told apart in one line."""
+    path = tmp_path / "foreign.safetensors"
+    save_file({"weight": np.zeros(3, dtype=np.float32)}, path, metadata)
+    with pytest.raises(ModelError, match=f"foreign.safetensors: {message}") as info:
+        PillarDetector(path)
+    assert "\n" not in str(info.value)
+
+
+def test_tensors_of_another_size_are_refused(checkpoint):
+    """A network is not built from tensors that do not fit it."""
+    weights = {**checkpoint.weights, "answer.bias": np.zeros(99, dtype=np.float32)}
+    with pytest.raises(ModelError, match="answer.bias"):
+        network_of(type(checkpoint)(checkpoint.preset, checkpoint.categories, weights))

@@ -1,0 +1,138 @@
+"""The detector: ONNX Runtime and torch answer alike, and odd frames do no harm."""
+
+import numpy as np
+import pytest
+import torch
+
+from curate.detectors.pillars import PillarDetector
+from curate.detectors.pillars.checkpoint import graph_path, save_checkpoint
+from curate.detectors.pillars.detector import _onnx_answers, _torch_answers
+from curate.detectors.pillars.encoding import encode_points
+from curate.detectors.pillars.network import PillarNetwork, _SlotMaximum, checkpoint_of
+from curate.detectors.pillars.presets import PRESETS
+from curate.errors import ConfigError
+from curate.frames import Calibration, Frame
+from curate.geometry.overlap import bev_iou
+
+NAMES = ("Car", "Pedestrian", "Cyclist")
+
+
+def lively(name):
+    """A checkpoint whose batch norms and answers are far from their first values."""
+    generator = torch.Generator().manual_seed(0)
+    network = PillarNetwork(PRESETS[name], len(NAMES))
+    with torch.no_grad():
+        for module in network.modules():
+            if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
+                module.running_mean.uniform_(-0.1, 0.1, generator=generator)
+                module.running_var.uniform_(0.2, 1.0, generator=generator)
+                module.weight.uniform_(0.5, 1.5, generator=generator)
+                module.bias.uniform_(-0.2, 0.2, generator=generator)
+        for tensor in network.parameters():
+            if tensor.dim() > 1:
+                tensor.normal_(0, (2 / tensor[0].numel()) ** 0.5, generator=generator)
+        network.answer.weight.mul_(0.1)
+    return checkpoint_of(network, NAMES)
+
+
+def frame_of(points):
+    """A frame with these points and a camera that nobody looks through."""
+    return Frame("000000", points, Calibration(np.eye(3, 4), np.eye(4)), (100, 100))
+
+
+def cloud(count, seed=0):
+    """(count, 4) points all over the small grid."""
+    rng = np.random.default_rng(seed)
+    low, high = [0, -32, -2, 0], [64, 32, 1, 1]
+    return rng.uniform(low, high, (count, 4)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """The file of a lively small checkpoint."""
+    path = tmp_path_factory.mktemp("checkpoints") / "small.safetensors"
+    save_checkpoint(path, lively("small"))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("preset", "count"), [("small", 1), ("small", 3), ("small", 4000), ("kitti", 4000)]
+)
+def test_onnx_runtime_and_torch_agree(tmp_path, preset, count):
+    """Scores and codes of the two agree to 1e-4, for any number of points."""
+    path, checkpoint = tmp_path / "net.safetensors", lively(preset)
+    save_checkpoint(path, checkpoint)
+    pillars = encode_points(cloud(count), PRESETS[preset])
+    onnx_scores, onnx_codes = _onnx_answers(path, checkpoint, 1)(pillars)
+    torch_scores, torch_codes = _torch_answers(path, checkpoint, "cpu")(pillars)
+    assert onnx_scores.shape == (*PRESETS[preset].cells, 3)
+    assert np.ptp(torch_codes) > 0.1
+    np.testing.assert_allclose(onnx_codes, torch_codes, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(onnx_scores, torch_scores, rtol=1e-4, atol=1e-4)
+
+
+def test_an_empty_frame_has_no_detections(small):
+    """No points, or none on the grid, is an empty answer."""
+    detector = PillarDetector(small)
+    assert len(detector.predict(frame_of(np.zeros((0, 4), dtype=np.float32)))) == 0
+    behind = np.array([[-5, 0, 0, 0]], dtype=np.float32)
+    assert len(detector.predict(frame_of(behind))) == 0
+
+
+def test_detections_are_sorted_and_do_not_overlap_within_a_category(small):
+    """After suppression, boxes of a category overlap at most by the threshold."""
+    detector = PillarDetector(small, score_threshold=0.0, nms_iou=0.3)
+    found = detector.predict(frame_of(cloud(3000)))
+    assert len(found) > 10
+    assert (np.diff(found.scores) <= 0).all()
+    for name in NAMES:
+        boxes = found.boxes[found.categories == name]
+        overlap = bev_iou(boxes, boxes)
+        np.fill_diagonal(overlap, 0)
+        assert overlap.max(initial=0) <= 0.3
+
+
+def test_the_score_threshold_cuts(small):
+    """A higher threshold keeps the better part of the same detections."""
+    frame = frame_of(cloud(3000))
+    everything = PillarDetector(small, score_threshold=0.0).predict(frame)
+    middle = float(np.median(everything.scores))
+    better = PillarDetector(small, score_threshold=middle).predict(frame)
+    assert 0 < len(better) < len(everything)
+    assert better.scores.min() >= middle
+
+
+def test_a_missing_or_outdated_graph_is_made_again(small):
+    """The checkpoint is what counts: its graph is replaced where it is not there or another's."""
+    frame = frame_of(cloud(500))
+    expected = PillarDetector(small, score_threshold=0.0).predict(frame)
+    graph = graph_path(small)
+    for spoil in (graph.unlink, lambda: graph.write_bytes(b"no graph")):
+        spoil()
+        again = PillarDetector(small, score_threshold=0.0).predict(frame)
+        np.testing.assert_array_equal(again.boxes, expected.boxes)
+    save_checkpoint(small.with_name("other.safetensors"), lively("kitti"))
+    small.with_name("other.onnx").replace(graph)
+    again = PillarDetector(small, score_threshold=0.0).predict(frame)
+    np.testing.assert_array_equal(again.boxes, expected.boxes)
+
+
+def test_an_unknown_device_is_a_configuration_error(small):
+    """A device that torch does not know, or does not have, is named."""
+    for device in ("toaster", "cuda:99"):
+        with pytest.raises(ConfigError, match=device):
+            PillarDetector(small, device=device)
+
+
+def test_the_slot_maximum_has_the_gradient_of_scatter_reduce():
+    """Without ties the gradient is autograd's own, for slots with no, one and several points."""
+    generator = torch.Generator().manual_seed(0)
+    values = torch.rand(20, 3, generator=generator, requires_grad=True)
+    slots = torch.randint(0, 6, (20,), generator=generator)
+    weights = torch.rand(8, 3, generator=generator)
+    (_SlotMaximum.apply(values, slots, 8) * weights).sum().backward()
+    ours = values.grad.clone()
+    values.grad = None
+    index = slots[:, None].expand(-1, 3)
+    (torch.zeros(8, 3).scatter_reduce(0, index, values, "amax") * weights).sum().backward()
+    torch.testing.assert_close(ours, values.grad)

@@ -1,0 +1,78 @@
+"""Folders of label and result files."""
+
+import pytest
+from kitti_scenes import car, to_objects
+
+from curate.datasets.kitti_labels import write_objects
+from curate.errors import DataError
+from curate.evaluation.kitti_folders import read_folders
+
+LINE = "Car 0.00 0 0.50 100 100 180 160 1.5 1.6 4.0 0.0 1.7 20.0 0.3"
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Labels and results of three frames, the second without objects."""
+    labels, results = tmp_path / "label_2", tmp_path / "results"
+    for folder, score in ((labels, float("nan")), (results, 0.5)):
+        folder.mkdir()
+        for frame_id, items in (("000002", [car(score=score)]), ("000001", []), ("000007", [])):
+            write_objects(folder / f"{frame_id}.txt", to_objects(items))
+    return labels, results
+
+
+def test_frames_are_read_in_order(folders):
+    """Sorted ids, and as many labels as results."""
+    frame_ids, labels, results = read_folders(*folders)
+    assert frame_ids == ("000001", "000002", "000007")
+    assert [len(frame) for frame in labels] == [len(frame) for frame in results] == [0, 1, 0]
+    assert results[1].scores.tolist() == [0.5]
+
+
+def test_only_the_named_frames_are_read(folders):
+    """Other frames may lack files then."""
+    (folders[1] / "000007.txt").unlink()
+    assert read_folders(*folders, ["000002"])[0] == ("000002",)
+
+
+def test_a_missing_result_file_is_an_error(folders):
+    """It names the first file and the remedy; a partial run is not scored as a whole one."""
+    (folders[1] / "000002.txt").unlink()
+    (folders[1] / "000007.txt").unlink()
+    with pytest.raises(DataError, match=r"results/000002\.txt.*and 1 other frames.*empty one"):
+        read_folders(*folders)
+
+
+def test_results_without_labels_are_an_error(folders):
+    """Also where the frame was asked for by name."""
+    write_objects(folders[1] / "000009.txt", to_objects([car()]))
+    with pytest.raises(DataError, match=r"label_2/000009\.txt: no label file"):
+        read_folders(*folders)
+    with pytest.raises(DataError, match=r"label_2/000009\.txt: no label file"):
+        read_folders(*folders, ["000009"])
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        (LINE, "15 fields"),
+        (f"{LINE} 0.5 1", "17 fields"),
+        (f"{LINE} nan", "nan"),
+        (f"{LINE.replace('1.5 1.6', '-1.5 1.6')} 0.5", "negative"),
+    ],
+)
+def test_bad_result_lines_are_named(folders, line, fault):
+    """File, line and fault."""
+    path = folders[1] / "000002.txt"
+    path.write_text(f"{LINE} 0.5\n{line}\n")
+    with pytest.raises(DataError, match=rf"000002\.txt:2: .*{fault}"):
+        read_folders(*folders)
+
+
+def test_folders_without_text_files_are_refused(folders, tmp_path):
+    """A wrong path is told from an empty folder."""
+    with pytest.raises(DataError, match="no such folder"):
+        read_folders(tmp_path / "absent", folders[1])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"holds no \.txt files"):
+        read_folders(folders[0], tmp_path / "empty")
