@@ -22,7 +22,7 @@ from pipelines.workspace import Workspace
 
 READ_AHEAD = 256  # frames whose earlier rows are read at once
 FLUSH_FRAMES = 64
-FLUSH_S = 2.0
+FLUSH_S = 1.0
 
 Item = TypeVar("Item")
 

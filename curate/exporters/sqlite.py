@@ -8,7 +8,7 @@ splits cannot be written at all.
 import json
 import os
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +46,9 @@ CREATE TABLE ground_truth (
     k INTEGER NOT NULL,
     category TEXT NOT NULL,
     x REAL NOT NULL, y REAL NOT NULL, z REAL NOT NULL,  -- box centre, metres, LiDAR frame
-    length REAL NOT NULL, width REAL NOT NULL, height REAL NOT NULL,
+    length REAL NOT NULL CHECK (length > 0),
+    width REAL NOT NULL CHECK (width > 0),
+    height REAL NOT NULL CHECK (height > 0),
     yaw REAL NOT NULL,          -- radians, counter-clockwise from x
     truncated REAL NOT NULL,    -- share outside the image
     occluded INTEGER NOT NULL,  -- KITTI's levels 0 to 3
@@ -59,7 +61,9 @@ CREATE TABLE label (
     k INTEGER NOT NULL,
     category TEXT NOT NULL,
     x REAL NOT NULL, y REAL NOT NULL, z REAL NOT NULL,  -- box centre, metres, LiDAR frame
-    length REAL NOT NULL, width REAL NOT NULL, height REAL NOT NULL,
+    length REAL NOT NULL CHECK (length > 0),
+    width REAL NOT NULL CHECK (width > 0),
+    height REAL NOT NULL CHECK (height > 0),
     yaw REAL NOT NULL,          -- radians, counter-clockwise from x
     score REAL NOT NULL,
     loss REAL,                  -- consistency loss L; NULL without a matched reprediction
@@ -179,6 +183,7 @@ def _fill(
     connection.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;" + _TABLES)
     connection.execute("BEGIN")
     columns = (FRAME_COLUMNS, GROUND_TRUTH_COLUMNS, WEIGHTED_LABEL_COLUMNS)
+    last: list[tuple] = [()]
     try:
         connection.executemany("INSERT INTO meta VALUES (?, ?)", description.as_meta().items())
         for table, names, table_rows in zip(
@@ -186,21 +191,29 @@ def _fill(
         ):
             marks = ", ".join("?" * len(names))
             insert = f"INSERT INTO {table} ({', '.join(names)}) VALUES ({marks})"  # noqa: S608
-            connection.executemany(insert, table_rows)
+            connection.executemany(insert, _remembered(table_rows, last))
         refuse_leakage(connection, path)
         _refuse_stray_labels(connection, path)
         connection.executescript(_VIEW + _INDEXES)
     except sqlite3.IntegrityError as error:
         if "split IN" in str(error):
             raise LeakageError(
-                f"{path}: a frame's split is neither labeled nor unlabeled; "
-                "frames of other splits (val) are never trained on"
+                f"{path}: frame {last[0][0]} is of split {last[0][1]!r}; "
+                "only labeled and unlabeled frames are trained on"
             ) from None
-        raise DataError(f"{path}: a row was refused: {error}") from None
+        raise DataError(f"{path}: a row was refused: {error}; the last was {last[0]}") from None
     except (sqlite3.ProgrammingError, sqlite3.InterfaceError) as error:
-        raise DataError(f"{path}: a row does not fit its table: {error}") from None
+        reason = f"{error}; it was {last[0]}"
+        raise DataError(f"{path}: a row does not fit its table: {reason}") from None
     except sqlite3.OperationalError as error:
         raise DataError(f"{path}: cannot be written: {error}") from None
+
+
+def _remembered(rows: Iterable[tuple], last: list[tuple]) -> Iterator[tuple]:
+    """The rows; `last[0]` is the one that was taken last, for the message where it is refused."""
+    for row in rows:
+        last[0] = row
+        yield row
 
 
 def _refuse_stray_labels(connection: sqlite3.Connection, path: Path) -> None:

@@ -1,6 +1,6 @@
 """Tests of files that are either whole or absent."""
 
-import os
+
 
 import pytest
 
@@ -12,7 +12,7 @@ def test_writes_content_and_makes_missing_folders(tmp_path):
     path = tmp_path / "deep" / "er" / "file.txt"
     replace_file(path, b"content")
     assert path.read_bytes() == b"content"
-    assert os.listdir(path.parent) == ["file.txt"]
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_replaces_an_existing_file(tmp_path):
@@ -35,4 +35,4 @@ def test_a_failed_write_keeps_the_former_file(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no space left"):
         replace_file(path, b"later")
     assert path.read_bytes() == b"former"
-    assert os.listdir(tmp_path) == ["file.txt"]
+    assert list(tmp_path.iterdir()) == [path]

@@ -7,14 +7,14 @@ from typing import Self
 import cv2
 import numpy as np
 
-from curate.datasets.synthetic.materials import TEXTURE, Material
+from curate.datasets.synthetic.materials import TEXTURE
 from curate.datasets.synthetic.rig import IMAGE_SIZE, CameraRig
 from curate.datasets.synthetic.scene import Caster, Scene
+from curate.datasets.synthetic.shading import TILE, Air, Markings, Surfaces, shade
+from curate.datasets.synthetic.street import Street
 
-_TILE = 256  # pixels of the repeating texture
-_HAZE_M = 420.0
-_WINDOW = np.array([0.11, 0.13, 0.16], dtype=np.float32)
-_MARKING = np.array([0.78, 0.78, 0.76], dtype=np.float32)
+_WINDOW = np.array([0.11, 0.13, 0.16])
+_LINE_PAINT = np.array([0.78, 0.78, 0.76])
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ class Light:
         ambient: strength of the sky.
         tint: (3,) colour balance.
         sky: (2, 3) RGB at the horizon and overhead.
-        noise: standard deviation of the pixel noise, grey levels.
+        grain: noise of the pixels, grey levels.
+        grain_offset: where in the repeating noise the image begins.
     """
 
     sun: np.ndarray
@@ -50,7 +51,8 @@ class Light:
     ambient: float
     tint: np.ndarray
     sky: np.ndarray
-    noise: float
+    grain: float
+    grain_offset: tuple[int, int]
 
     @classmethod
     def draw(cls, generator: np.random.Generator) -> Self:
@@ -59,13 +61,15 @@ class Light:
         sun = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
         overcast, exposure = generator.random(), np.exp(generator.normal(0, 0.22))
         blue, grey = np.array([[0.8, 0.86, 0.92], [0.38, 0.55, 0.82]]), np.full((2, 3), 0.82)
+        row, column = generator.integers(TILE, size=2)
         return cls(
             sun / np.linalg.norm(sun),
             direct=float(0.95 * exposure * (1 - 0.85 * overcast)),
             ambient=float(exposure * (0.5 + 0.4 * overcast)),
             tint=generator.normal(1, 0.04, size=3),
             sky=(blue + (grey - blue) * overcast) * exposure,
-            noise=float(generator.uniform(1.5, 4.5)),
+            grain=float(generator.uniform(2, 6)),
+            grain_offset=(int(row), int(column)),
         )
 
     def shade(self, normals: np.ndarray, colours: np.ndarray) -> np.ndarray:
@@ -75,6 +79,13 @@ class Light:
         strength = self.ambient * upward + self.direct * facing
         return np.asarray(colours * strength[:, None] * self.tint, dtype=np.float32)
 
+    def air(self) -> Air:
+        """Sky, windows and grain for the kernel."""
+        window = _WINDOW * (0.6 + self.ambient)
+        return Air(
+            self.sky.astype(np.float32), window.astype(np.float32), self.grain, self.grain_offset
+        )
+
 
 def render(scene: Scene, caster: Caster, rig: CameraRig, generator: np.random.Generator) -> View:
     """The camera's view of a scene."""
@@ -82,87 +93,46 @@ def render(scene: Scene, caster: Caster, rig: CameraRig, generator: np.random.Ge
     rays = rig.rays()
     hits = caster.first_hits(rays)
     light = Light.draw(generator)
-    colours = np.empty((len(rays), 3), dtype=np.float32)
-    seen = hits.triangle >= 0
-    colours[~seen] = _sky(light, rays[~seen, 5])
-    colours[seen] = _surfaces(scene, light, rays[seen], hits.distance[seen], hits.triangle[seen])
-    things = np.full(len(rays), -1, dtype=np.int32)
-    things[seen] = scene.things[hits.triangle[seen]]
-    semantic = np.append(scene.thing_classes(), np.uint8(0))[things]  # the sky takes the last
+    surfaces = Surfaces(
+        light.shade(scene.normals, scene.colours),
+        scene.normals,
+        scene.materials,
+        TEXTURE,
+        _noise_tile(),
+    )
+    markings = _markings(scene.street, light)
+    sharp = shade(rays, hits.distance, hits.triangle, width, surfaces, markings, light.air())
+    # The sky has triangle -1, which is the last entry of these tables.
+    things = np.append(scene.things, np.int32(-1))[hits.triangle]
+    semantic = np.append(scene.thing_classes(), np.uint8(0))[things]
     return View(
-        _expose(colours.reshape(height, width, 3), light.noise, generator),
+        cv2.GaussianBlur(sharp, (3, 3), 0.55),  # the lens
         semantic.reshape(height, width),
         things.reshape(height, width),
     )
 
 
-def _sky(light: Light, upward: np.ndarray) -> np.ndarray:
-    """(n, 3) colour of the sky by the z of the direction."""
-    share = np.clip(upward * 3, 0, 1)[:, None]
-    return np.asarray(light.sky[0] + (light.sky[1] - light.sky[0]) * share, dtype=np.float32)
-
-
-def _surfaces(
-    scene: Scene, light: Light, rays: np.ndarray, distance: np.ndarray, triangle: np.ndarray
-) -> np.ndarray:
-    """(n, 3) colours of the surfaces that rays hit."""
-    colours = light.shade(scene.normals, scene.colours)[triangle]
-    points = rays[:, :3] + rays[:, 3:] * distance[:, None]
-    material, normal = scene.materials[triangle], scene.normals[triangle]
-    flat = np.abs(normal[:, 2]) > 0.7
-    across = np.where(flat, points[:, 0], normal[:, 0] * points[:, 1] - normal[:, 1] * points[:, 0])
-    along = np.where(flat, points[:, 1], points[:, 2])
-    _paint_markings(scene, light, colours, points, material)
-    _paint_windows(light, colours, across, along, (material == Material.WALL) & ~flat)
-    amplitude, scale = TEXTURE[material].T
-    column = (across * scale).astype(np.int32) & (_TILE - 1)
-    row = (along * scale).astype(np.int32) & (_TILE - 1)
-    amplitude = amplitude * np.exp(distance * np.float32(-1 / 40))
-    colours *= (1 + amplitude * _texture_tile()[row, column])[:, None]
-    haze = np.exp(distance * np.float32(-1 / _HAZE_M))[:, None]
-    return np.asarray(light.sky[0] * (1 - haze) + colours * haze, dtype=np.float32)
-
-
-def _paint_markings(
-    scene: Scene, light: Light, colours: np.ndarray, points: np.ndarray, material: np.ndarray
-) -> None:
-    """Dashed lines between lanes, a line along the parking strips."""
-    street = scene.street
-    road = np.flatnonzero((material == Material.ASPHALT) & (points[:, 2] < 0))
-    s, d = street.to_road(points[road, 0], points[road, 1])
-    edges = street.axis_d + street.lane_m * np.arange(-street.lanes, street.lanes + 1)
-    nearest = np.abs(d[:, None] - edges.astype(np.float32)).argmin(axis=1)
-    on_line = np.abs(d - edges[nearest]) < 0.08
-    inner = (nearest > 0) & (nearest < len(edges) - 1)
-    dashed = np.mod(s, 9.0) < 4.0
-    painted = road[on_line & (dashed | ~inner) & ~street.in_crossing(s, 1.5)]
-    colours[painted] = _MARKING * (light.ambient + 0.6 * light.direct)
-
-
-def _paint_windows(
-    light: Light, colours: np.ndarray, across: np.ndarray, along: np.ndarray, wall: np.ndarray
-) -> None:
-    """Dark windows in rows on the walls of buildings."""
-    rows = np.flatnonzero(wall)
-    column, storey = np.mod(across[rows], 2.7), np.mod(along[rows] + 1.7, 2.9)
-    window = (column > 0.8) & (column < 1.95) & (storey > 0.9) & (storey < 2.3)
-    colours[rows[window]] = _WINDOW * (0.6 + light.ambient)
-
-
-def _expose(colours: np.ndarray, noise: float, generator: np.random.Generator) -> np.ndarray:
-    """Blur of the lens, gamma, pixel noise, and rounding to uint8."""
-    softened = cv2.GaussianBlur(colours, (3, 3), 0.55)
-    levels = 255 * np.sqrt(np.clip(softened, 0, 1))  # gamma 2
-    grain = generator.standard_normal(levels.shape[:2], dtype=np.float32) * np.float32(noise)
-    return np.clip(levels + grain[..., None], 0, 255).astype(np.uint8)
+def _markings(street: Street, light: Light) -> Markings:
+    """The lines of a street, interrupted where another crosses."""
+    lines = street.axis_d + street.lane_m * np.arange(-street.lanes, street.lanes + 1)
+    crossing = np.full(2, np.nan if street.crossing_s is None else street.crossing_s)
+    crossing += (street.crossing_half_m + 1.5) * np.array([-1, 1])
+    paint = _LINE_PAINT * (light.ambient + 0.6 * light.direct)
+    return Markings(
+        float(np.cos(street.heading_rad)),
+        float(np.sin(street.heading_rad)),
+        lines.astype(np.float32),
+        crossing.astype(np.float32),
+        paint.astype(np.float32),
+    )
 
 
 @cache
-def _texture_tile() -> np.ndarray:
+def _noise_tile() -> np.ndarray:
     """(256, 256) float32 noise of mean 0 and deviation 1 that repeats without a seam."""
     generator = np.random.default_rng(0)
-    tile = np.zeros((_TILE, _TILE))
-    for cells, weight in ((256, 1.0), (64, 0.8), (16, 0.7)):
+    tile = np.zeros((TILE, TILE))
+    for cells, weight in ((256, 1.0), (64, 0.6), (16, 0.5)):
         coarse = generator.normal(size=(cells, cells))
-        tile += weight * np.kron(coarse, np.ones((_TILE // cells, _TILE // cells)))
+        tile += weight * np.kron(coarse, np.ones((TILE // cells, TILE // cells)))
     return np.asarray((tile - tile.mean()) / tile.std(), dtype=np.float32)

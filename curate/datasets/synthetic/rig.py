@@ -1,12 +1,12 @@
 """How the camera is mounted: calibration in KITTI's form, a little different in every scene."""
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Self
 
 import cv2
 import numpy as np
 
+from curate.datasets.synthetic.shading import pixel_rays
 from curate.frames import Calibration
 
 IMAGE_SIZE = (1242, 375)
@@ -70,23 +70,20 @@ class CameraRig:
             for key, matrix in matrices.items()
         )
 
-    def rays(self) -> np.ndarray:
-        """(height * width, 6) float32 origin and unit direction through each pixel's centre."""
+    def rays(self, pixels: np.ndarray | None = None) -> np.ndarray:
+        """Rays through pixel centres, LiDAR frame.
+
+        Args:
+            pixels: (n,) row * width + column; default every pixel, row by row.
+
+        Returns:
+            (n, 6) float32 origin and unit direction.
+        """
+        width, height = IMAGE_SIZE
         matrix = self.calibration.lidar_to_image
         inverse = np.linalg.inv(matrix[:, :3])
-        rays = np.empty((IMAGE_SIZE[0] * IMAGE_SIZE[1], 6), dtype=np.float32)
-        rays[:, :3] = -inverse @ matrix[:, 3]
-        directions = _pixel_grid() @ inverse.T.astype(np.float32)
-        rays[:, 3:] = directions / np.sqrt(np.einsum("ij,ij->i", directions, directions))[:, None]
-        return rays
-
-
-@cache
-def _pixel_grid() -> np.ndarray:
-    """(height * width, 3) float32 homogeneous pixel coordinates; integers are pixel centres."""
-    width, height = IMAGE_SIZE
-    rows, columns = np.divmod(np.arange(width * height, dtype=np.float32), np.float32(width))
-    return np.stack([columns, rows, np.ones_like(rows)], axis=1)
+        chosen = np.arange(width * height) if pixels is None else pixels
+        return np.asarray(pixel_rays(inverse, -inverse @ matrix[:, 3], chosen, width))
 
 
 def _rotation(vector_rad: np.ndarray) -> np.ndarray:

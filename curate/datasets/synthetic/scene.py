@@ -19,8 +19,6 @@ SEMANTIC_CLASSES = {"Car": 1, "Pedestrian": 2, "Cyclist": 3}
 GROUND = 0
 """The number of the ground among the things of a scene; placements count from 1."""
 
-_NO_HIT = np.iinfo(np.uint32).max
-
 
 @dataclass(frozen=True)
 class Hits:
@@ -28,7 +26,7 @@ class Hits:
 
     Attributes:
         distance: (n,) float32 in units of the ray's direction, inf without a hit.
-        triangle: (n,) int64 rows of the scene's triangles, -1 without a hit.
+        triangle: (n,) int32 rows of the scene's triangles, -1 without a hit.
     """
 
     distance: np.ndarray
@@ -114,8 +112,8 @@ class Caster:
     def first_hits(self, rays: np.ndarray) -> Hits:
         """The first hit of (n, 6) float32 rays: origin and direction in the LiDAR frame."""
         found = self._scene.cast_rays(self._tensor(rays), nthreads=1)
-        triangle = found["primitive_ids"].numpy().astype(np.int64)
-        triangle[triangle == _NO_HIT] = -1
+        # "No hit" is the highest uint32, which is -1 when read as int32.
+        triangle = found["primitive_ids"].numpy().view(np.int32)
         return Hits(found["t_hit"].numpy(), triangle)
 
     def all_hits(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -152,17 +152,17 @@ def _simulate_frame(home: Path, seed: int, index: int) -> None:
     view = render(scene, caster, rig, lens)
     annotations = annotate(scene, view, rig)
     replace_file(_frame_file(home, "velodyne", index), points.astype("<f4").tobytes())
-    replace_file(_frame_file(home, "image_2", index), _png(view.image[..., ::-1], 1))
-    replace_file(_frame_file(home, SEMANTIC_FOLDER, index), _png(view.semantic, 3))
+    replace_file(_frame_file(home, "image_2", index), _png(view.image[..., ::-1]))
+    replace_file(_frame_file(home, SEMANTIC_FOLDER, index), _png(view.semantic))
     replace_file(_frame_file(home, "calib", index), rig.kitti_text().encode())
     write_objects(
         _frame_file(home, "label_2", index), from_annotations(annotations, rig.calibration)
     )
 
 
-def _png(pixels: np.ndarray, level: int) -> bytes:
-    """A PNG file of grey or BGR pixels."""
-    _, encoded = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, level])
+def _png(pixels: np.ndarray) -> bytes:
+    """A PNG file of grey or BGR pixels; OpenCV's default compression is its fast one."""
+    _, encoded = cv2.imencode(".png", pixels)
     return bytes(encoded)
 
 

@@ -46,7 +46,7 @@ def test_grids_can_be_halved_twice(preset):
 
 def test_an_unknown_preset_names_the_known_ones():
     """The error for a misspelt preset lists what there is."""
-    with pytest.raises(ConfigError, match="tiny.*small, kitti"):
+    with pytest.raises(ConfigError, match=r"tiny.*small, kitti"):
         preset_named("tiny")
 
 

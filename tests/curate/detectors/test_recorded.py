@@ -1,0 +1,172 @@
+"""Tests of the detector that answers from a file."""
+
+import pickle
+
+import numpy as np
+import pytest
+from toys import toy_calibration
+
+from curate.detectors.base import RecordedViews
+from curate.detectors.recorded import RecordedDetector
+from curate.errors import DataError
+from curate.frames import Frame
+from curate.geometry.similarity import Similarity
+
+HEADER = "frame,view,flip_y,rotation_rad,scale,category,score,merged,x,y,z,length,width,height,yaw"
+BOX = "12.0,4.2,-0.8,3.9,1.6,1.5,-3.0"
+PLAIN = f"000001,0,0,0.0,1.0,Car,0.9,64,{BOX}"
+MOVED = f"000001,1,1,0.25,1.04,Car,0.8,3,{BOX}"
+
+
+def write(path, *rows, header=HEADER):
+    """A record with a header."""
+    path.write_text("".join(f"{row}\n" for row in (header, *rows)))
+    return path
+
+
+def frame(frame_id):
+    """A frame of which only the name matters."""
+    return Frame(frame_id, np.zeros((0, 4), np.float32), toy_calibration(), (120, 40))
+
+
+def test_answers_what_was_recorded(tmp_path):
+    """View 0 is the prediction, the others are augmented copies with their similarity."""
+    detector = RecordedDetector(write(tmp_path / "a.csv", PLAIN, MOVED))
+    found = detector.predict(frame("000001"))
+    assert found.boxes.tolist() == [[12.0, 4.2, -0.8, 3.9, 1.6, 1.5, -3.0]]
+    assert found.scores.tolist() == [0.9]
+    assert found.categories.tolist() == ["Car"]
+    [(similarity, moved)] = detector.views("000001")
+    assert similarity == Similarity(flip_y=True, rotation_rad=0.25, scale=1.04)
+    assert moved.scores.tolist() == [0.8]
+    assert isinstance(detector, RecordedViews)
+
+
+def test_low_scores_are_left_out_of_every_view(tmp_path):
+    """`minimum_score` includes its own value."""
+    low = PLAIN.replace("0.9", "0.1")
+    path = write(tmp_path / "a.csv", PLAIN, low, MOVED, MOVED.replace("0.8", "0.09"))
+    detector = RecordedDetector(path, minimum_score=0.1)
+    assert detector.predict(frame("000001")).scores.tolist() == [0.9, 0.1]
+    assert detector.views("000001")[0][1].scores.tolist() == [0.8]
+    assert len(RecordedDetector(path, minimum_score=0.95).predict(frame("000001"))) == 0
+
+
+def test_views_come_in_the_order_of_their_numbers(tmp_path):
+    """Rows of frames and views may be mixed; there may be several views."""
+    second = MOVED.replace("000001,1", "000001,2").replace("0.25", "-0.5")
+    other = PLAIN.replace("000001", "000002")
+    detector = RecordedDetector(write(tmp_path / "a.csv", second, other, MOVED, PLAIN, second))
+    views = detector.views("000001")
+    assert [similarity.rotation_rad for similarity, _ in views] == [0.25, -0.5]
+    assert [len(found) for _, found in views] == [1, 2]
+    assert detector.frame_ids() == ("000001", "000002")
+    assert list(detector.views("000002")) == []
+
+
+def test_a_frame_with_other_views_only_has_no_detections(tmp_path):
+    """It was recorded, and the detector found nothing in it."""
+    detector = RecordedDetector(write(tmp_path / "a.csv", MOVED))
+    assert detector.predict(frame("000001")).boxes.shape == (0, 7)
+
+
+@pytest.mark.parametrize("rows", [(), (PLAIN,)])
+def test_a_frame_that_was_never_recorded_is_an_error(tmp_path, rows):
+    """It becomes a failed frame instead of an empty one."""
+    path = write(tmp_path / "a.csv", *rows)
+    detector = RecordedDetector(path)
+    message = f"no recorded detections for frame 000007 in {path}"
+    with pytest.raises(DataError) as caught:
+        detector.predict(frame("000007"))
+    assert str(caught.value) == message
+    with pytest.raises(DataError) as caught:
+        detector.views("000007")
+    assert str(caught.value) == message
+
+
+def test_other_columns_and_their_order_do_not_matter(tmp_path):
+    """Columns are found by name; `merged` is optional."""
+    header = "yaw,height,width,length,z,y,x,score,category,scale,rotation_rad,flip_y,view,frame"
+    row = "4.0,1.5,1.6,3.9,-0.8,4.2,12.0,0.9,Car,1,0,0,0,000001"
+    detector = RecordedDetector(write(tmp_path / "a.csv", row, header=header))
+    box = detector.predict(frame("000001")).boxes[0]
+    assert box[:6].tolist() == [12.0, 4.2, -0.8, 3.9, 1.6, 1.5]
+    assert box[6] == pytest.approx(4.0 - 2 * np.pi)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        (PLAIN.rsplit(",", 1)[0], "14 fields, the header has 15"),
+        (f"{PLAIN},1", "16 fields, the header has 15"),
+        (PLAIN.replace("12.0", "far"), "could not convert string to float: 'far'"),
+        (PLAIN.replace("12.0", "nan"), "a number is NaN or infinite"),
+        (PLAIN.replace("0.9", "inf"), "a number is NaN or infinite"),
+        (PLAIN.replace("0.9", "1.2"), "score is not in [0, 1]"),
+        (PLAIN.replace("0.9", "-0.1"), "score is not in [0, 1]"),
+        (PLAIN.replace("1.6,1.5", "1.6,-1.5"), "length, width or height is not positive"),
+        (PLAIN.replace("000001,0", "000001,0.5"), "view is not 0, 1, 2, ..."),
+        (PLAIN.replace("000001,0", "000001,-1"), "view is not 0, 1, 2, ..."),
+        (MOVED.replace("1,1,0.25", "1,2,0.25"), "flip_y is neither 0 nor 1"),
+        (MOVED.replace("1.04", "0"), "scale is not positive"),
+        (PLAIN.replace("0.0,1.0", "0.3,1.0"), "view 0 is the frame as it is"),
+        (MOVED.replace("0.25", "0.26"), "differ from line 3, which is of the same frame and view"),
+    ],
+)
+def test_a_bad_row_is_one_line_of_error_with_its_place(tmp_path, row, message):
+    """The error names file and line, and says what is wrong there."""
+    path = write(tmp_path / "a.csv", PLAIN, MOVED, row)
+    with pytest.raises(DataError) as caught:
+        RecordedDetector(path)
+    assert str(caught.value).startswith(f"{path}:4: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_columns_and_files_are_named(tmp_path):
+    """An empty file has no columns at all."""
+    path = write(tmp_path / "a.csv", header=HEADER.replace("score,", "").replace(",yaw", ""))
+    with pytest.raises(DataError, match=r"a\.csv:1: no column score, yaw in the header"):
+        RecordedDetector(path)
+    path.write_text("")
+    with pytest.raises(DataError, match=r"a\.csv:1: no column frame, category, view,"):
+        RecordedDetector(path)
+    with pytest.raises(DataError, match=r"b\.csv: no such file of recorded detections"):
+        RecordedDetector(tmp_path / "b.csv")
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(DataError, match=r"a\.csv: cannot be read as CSV"):
+        RecordedDetector(path)
+
+
+def test_workers_can_have_a_copy(tmp_path):
+    """It answers the same after a trip to another process."""
+    detector = RecordedDetector(write(tmp_path / "a.csv", PLAIN, MOVED))
+    copy = pickle.loads(pickle.dumps(detector))  # noqa: S301 - our own bytes
+    np.testing.assert_array_equal(
+        copy.predict(frame("000001")).boxes, detector.predict(frame("000001")).boxes
+    )
+
+
+def test_real_records(kitti_root):
+    """Both teachers answer for all 24 frames and one augmented copy of each."""
+    for name in ("pointgnn_T0.csv", "pointgnn_T1.csv"):
+        detector = RecordedDetector(kitti_root / "recorded" / name)
+        assert len(detector.frame_ids()) == 24
+        views = [detector.views(frame_id) for frame_id in detector.frame_ids()]
+        assert [len(view) for view in views] == [1] * 24
+
+
+def test_real_views_fit_the_frame_after_the_inverse(kitti_root):
+    """What a sure detector found in A(x) lies, mapped back by A^-1, on what it found in x."""
+    from curate.geometry.overlap import bev_iou
+
+    detector = RecordedDetector(kitti_root / "recorded" / "pointgnn_T1.csv", minimum_score=0.9)
+    sure = close = 0
+    for frame_id in detector.frame_ids():
+        found = detector.predict(frame(frame_id))
+        [(similarity, moved)] = detector.views(frame_id)
+        if len(found) and len(moved):
+            best = bev_iou(found.boxes, similarity.invert_boxes(moved.boxes)).max(axis=1)
+            sure, close = sure + len(best), close + int((best > 0.6).sum())
+    assert sure > 20
+    assert close > 0.8 * sure

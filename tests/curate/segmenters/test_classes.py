@@ -1,0 +1,41 @@
+"""Tests of the tables of semantic classes."""
+
+import pytest
+
+from curate.datasets.synthetic.scene import SEMANTIC_CLASSES
+from curate.detections import CATEGORIES
+from curate.errors import ConfigError
+from curate.segmenters.classes import CLASS_MAPS, checked_classes, class_map
+
+
+@pytest.mark.parametrize("name", sorted(CLASS_MAPS))
+def test_every_table_has_classes_for_every_category(name):
+    """No category of the project is left without pixels."""
+    assert set(class_map(name)) == set(CATEGORIES)
+    assert checked_classes(class_map(name)) == class_map(name)
+
+
+def test_the_simulated_classes_are_those_of_the_simulator():
+    """The table and the simulator's semantic maps use the same ids."""
+    assert class_map("simulated") == {name: (one,) for name, one in SEMANTIC_CLASSES.items()}
+
+
+def test_people_on_bicycles_are_no_pedestrians_where_the_classes_tell_them_apart():
+    """Cityscapes has riders; VOC and COCO only persons, who count for both."""
+    riders = class_map("cityscapes")
+    assert not set(riders["Cyclist"]) & set(riders["Pedestrian"])
+    for name in ("voc", "coco"):
+        assert set(class_map(name)["Pedestrian"]) < set(class_map(name)["Cyclist"])
+
+
+def test_an_unknown_table_is_named_with_the_known_ones():
+    """The error lists what can be used."""
+    with pytest.raises(ConfigError, match="unknown class set 'ade': use one of cityscapes, coco"):
+        class_map("ade")
+
+
+@pytest.mark.parametrize("one", [-1, 256, 1.5, "7"])
+def test_ids_that_no_map_can_hold_are_refused(one):
+    """A semantic map has 8 bits per pixel."""
+    with pytest.raises(ConfigError, match="of Car: an id is 0 to 255"):
+        checked_classes({"Car": [one]})

@@ -1,0 +1,280 @@
+"""Tests of the ONNX segmenter with models made by hand, and DeepLab v3 on one real frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from toys import toy_calibration
+
+from curate.errors import ConfigError, ModelError
+from curate.frames import Frame
+from curate.segmenters.classes import class_map
+from curate.segmenters.onnx import OnnxSegmenter, cut_along
+
+CLASSES = {"Car": (7,), "Pedestrian": (15,)}
+
+
+def model(path, nodes, shape, kind, constants=(), *, answer=TensorProto.INT64, rank=3, more=()):
+    """Saves a model from `image` to `answer`."""
+    inputs = [helper.make_tensor_value_info("image", kind, shape), *more]
+    output = helper.make_tensor_value_info("answer", answer, [None] * rank)
+    graph = helper.make_graph(
+        nodes, "toy", inputs, [output], [numpy_helper.from_array(v, n) for n, v in constants]
+    )
+    opsets = [helper.make_opsetid("", 18)]
+    onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=10), path)
+    return path
+
+
+def red_channel_model(path, shape):
+    """uint8 NHWC; the class id of a pixel is its red channel."""
+    nodes = [
+        helper.make_node("Gather", ["image", "zero"], ["red"], axis=3),
+        helper.make_node("Cast", ["red"], ["answer"], to=TensorProto.INT64),
+    ]
+    return model(path, nodes, shape, TensorProto.UINT8, [("zero", np.array(0))])
+
+
+def brightest_channel_model(path, shape, *, channels_last=False):
+    """float NCHW; scores of three classes are the channels as the model sees them."""
+    if channels_last:
+        nodes = [helper.make_node("Transpose", ["image"], ["answer"], perm=[0, 2, 3, 1])]
+    else:
+        nodes = [helper.make_node("Identity", ["image"], ["answer"])]
+    return model(path, nodes, shape, TensorProto.FLOAT, answer=TensorProto.FLOAT, rank=4)
+
+
+def constant_model(path, class_ids):
+    """uint8 NHWC; the same class ids whatever the image."""
+    height, width = class_ids.shape
+    nodes = [
+        helper.make_node("ReduceMax", ["image", "axes"], ["most"], keepdims=1),
+        helper.make_node("Cast", ["most"], ["number"], to=TensorProto.INT64),
+        helper.make_node("Mul", ["number", "zero"], ["nothing"]),
+        helper.make_node("Squeeze", ["nothing", "last"], ["flat"]),
+        helper.make_node("Add", ["flat", "ids"], ["answer"]),
+    ]
+    constants = [
+        ("axes", np.array([1, 2, 3])), ("zero", np.array(0)), ("last", np.array([3])),
+        ("ids", class_ids[None].astype(np.int64)),
+    ]  # fmt: skip
+    return model(path, nodes, [1, height, width, 3], TensorProto.UINT8, constants)
+
+
+def frame(image):
+    """A frame of which only the image matters."""
+    size = (image.shape[1], image.shape[0])
+    return Frame("000001", np.zeros((0, 4), np.float32), toy_calibration(), size, image)
+
+
+def banded(height, width, bands):
+    """An image whose red channel is constant in vertical bands of equal width."""
+    image = np.zeros((height, width, 3), np.uint8)
+    image[..., 0] = np.repeat(bands, -(-width // len(bands)))[:width]
+    return image
+
+
+@pytest.mark.parametrize("shape", [[1, 20, 60, 3], [1, None, None, 3], ["n", "h", "w", 3]])
+@pytest.mark.parametrize("size", [(40, 120), (20, 60), (13, 31)])
+def test_whole_images_in_a_fixed_or_free_size(tmp_path, shape, size):
+    """The map has the size of the image, with each class where the image shows it."""
+    segmenter = OnnxSegmenter(red_channel_model(tmp_path / "a.onnx", shape), CLASSES)
+    image = banded(*size, [7, 0, 15])
+    found = segmenter.segment(frame(image))
+    assert found.class_ids.shape == size
+    assert found.class_ids.dtype == np.uint8
+    assert found.category_classes == CLASSES
+    for share, one in ((0.15, 7), (0.5, 0), (0.85, 15)):
+        assert (found.class_ids[:, int(share * size[1])] == one).all()
+
+
+def test_a_square_model_sees_a_wide_image_in_crops(tmp_path):
+    """Bands that one squeezed pass would blur come out at full resolution."""
+    path = red_channel_model(tmp_path / "a.onnx", [1, 32, 32, 3])
+    image = banded(32, 160, [7, 0] * 40)
+    cropped = OnnxSegmenter(path, CLASSES).segment(frame(image)).class_ids
+    np.testing.assert_array_equal(cropped, image[..., 0])
+    squeezed = OnnxSegmenter(path, CLASSES, tiles=1).segment(frame(image)).class_ids
+    assert (squeezed != image[..., 0]).mean() > 0.2
+
+
+def test_crops_cover_the_image_and_own_what_is_nearest():
+    """Owned columns are a partition; each belongs to the crop whose centre is nearest."""
+    crops = cut_along(1242, 375, 5)
+    assert crops[0].own_left == crops[0].left == 0
+    assert crops[-1].own_right == crops[-1].right == 1242
+    centres = np.array([(crop.left + crop.right) / 2 for crop in crops])
+    for index, crop in enumerate(crops):
+        assert crop.left <= crop.own_left < crop.own_right <= crop.right
+        assert crop.right - crop.left == 375
+        for column in (crop.own_left, crop.own_right - 1):
+            distance = np.abs(centres - (column + 0.5))
+            assert distance[index] <= distance.min() + 1
+    assert [crop.own_right for crop in crops[:-1]] == [crop.own_left for crop in crops[1:]]
+
+
+def test_more_crops_where_five_do_not_cover(tmp_path):
+    """An image of 10 : 1 is covered by ten square crops."""
+    path = red_channel_model(tmp_path / "a.onnx", [1, 16, 16, 3])
+    image = banded(16, 160, [7, 15] * 10)
+    found = OnnxSegmenter(path, CLASSES, tiles=2).segment(frame(image)).class_ids
+    np.testing.assert_array_equal(found, image[..., 0])
+
+
+def test_a_class_that_counts_wins_where_crops_overlap(tmp_path):
+    """The nearest crop says nothing, the other one car: car. Other classes do not win so."""
+    class_ids = np.zeros((16, 16), np.uint8)
+    class_ids[:8, :4] = 7
+    class_ids[8:, :4] = 3
+    segmenter = OnnxSegmenter(constant_model(tmp_path / "a.onnx", class_ids), CLASSES)
+    found = segmenter.segment(frame(np.zeros((16, 40, 3), np.uint8))).class_ids
+    crops = cut_along(40, 16, 5)
+    cars, others = np.zeros(40, bool), np.zeros(40, bool)
+    for crop in crops:
+        cars[crop.left : crop.left + 4] = True
+        others[max(crop.left, crop.own_left) : max(crop.left + 4, crop.own_left)] = True
+    np.testing.assert_array_equal(found[:8] == 7, np.tile(cars, (8, 1)))
+    np.testing.assert_array_equal(found[8:] == 3, np.tile(others, (8, 1)))
+    assert cars.sum() > others.sum()
+
+
+@pytest.mark.parametrize("channels_last", [False, True])
+def test_scores_of_classes_in_either_order(tmp_path, channels_last):
+    """The class with the highest score wins, wherever the model puts the classes."""
+    path = brightest_channel_model(
+        tmp_path / "a.onnx", [1, 3, 20, 60], channels_last=channels_last
+    )
+    image = np.zeros((20, 60, 3), np.uint8)
+    image[:, :20, 0] = image[:, 20:40, 1] = image[:, 40:, 2] = 200
+    found = OnnxSegmenter(path, CLASSES, scaling="unit").segment(frame(image)).class_ids
+    np.testing.assert_array_equal(found, np.tile(np.repeat([0, 1, 2], 20), (20, 1)))
+
+
+@pytest.mark.parametrize(
+    ("scaling", "expected"),
+    [("none", (150, 130, 120)), ("unit", (150 / 255, 130 / 255, 120 / 255)),
+     ("imagenet", (0.4508, 0.2402, 0.2871))],
+)  # fmt: skip
+def test_float_models_get_the_scaling_they_want(tmp_path, monkeypatch, scaling, expected):
+    """The pixels that reach the model are 0 to 255, 0 to 1, or normalised as for ImageNet."""
+    path = brightest_channel_model(tmp_path / "a.onnx", [1, 3, 4, 6])
+    segmenter = OnnxSegmenter(path, CLASSES, scaling=scaling)
+    seen = {}
+    run = segmenter._session.run
+
+    class Spy:
+        """Keeps what the model is asked."""
+
+        def run(self, names, feeds):
+            seen.update(feeds)
+            return run(names, feeds)
+
+    monkeypatch.setattr(segmenter, "_session", Spy())
+    segmenter.segment(frame(np.tile(np.array([150, 130, 120], np.uint8), (4, 6, 1))))
+    assert seen["image"].dtype == np.float32
+    assert seen["image"][0, :, 2, 3] == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "more"),
+    [
+        ([1, 8, 3], TensorProto.UINT8, ()),
+        ([1, 8, 8, 4], TensorProto.UINT8, ()),
+        ([2, 8, 8, 3], TensorProto.UINT8, ()),
+        ([1, 8, 8, 3], TensorProto.INT64, ()),
+        ([1, 8, 8, 3], TensorProto.UINT8,
+         (helper.make_tensor_value_info("second", TensorProto.FLOAT, [1]),)),
+    ],
+)  # fmt: skip
+def test_an_unexpected_input_is_named_with_what_was_expected(tmp_path, shape, kind, more):
+    """Wrong rank, channels, batch, type, or a second input: one line at the start."""
+    nodes = [helper.make_node("Cast", ["image"], ["answer"], to=TensorProto.INT64)]
+    path = model(tmp_path / "a.onnx", nodes, shape, kind, rank=len(shape), more=more)
+    with pytest.raises(ModelError, match="expected one image") as caught:
+        OnnxSegmenter(path, CLASSES)
+    assert str(caught.value).startswith(f"{path}: takes image")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_answer_that_is_no_map_is_refused(tmp_path):
+    """A wrong rank is seen at the start, a wrong content with the first frame."""
+    nodes = [helper.make_node("ReduceMax", ["image", "axes"], ["answer"], keepdims=0)]
+    constants = [("axes", np.array([1, 2]))]
+    path = model(
+        tmp_path / "a.onnx", nodes, [1, 8, 8, 3], TensorProto.UINT8, constants,
+        answer=TensorProto.UINT8, rank=2,
+    )  # fmt: skip
+    with pytest.raises(ModelError, match="expected class ids"):
+        OnnxSegmenter(path, CLASSES)
+    nodes = [helper.make_node("Gather", ["image", "zero"], ["answer"], axis=1)]
+    path = model(
+        tmp_path / "b.onnx", nodes, [1, 3, 8, 8], TensorProto.FLOAT, [("zero", np.array(0))],
+        answer=TensorProto.FLOAT,
+    )  # fmt: skip
+    with pytest.raises(ModelError, match=r"answers float32 \[1, 8, 8\]; expected class ids"):
+        OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
+
+
+def test_ids_beyond_a_map_are_refused(tmp_path):
+    """Class 300 does not fit into 8 bits and is not silently another class."""
+    path = constant_model(tmp_path / "a.onnx", np.full((8, 8), 300))
+    with pytest.raises(ModelError, match="expected class ids"):
+        OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
+
+
+@pytest.mark.parametrize("content", [b"", b"no model"])
+def test_a_file_that_is_no_model_is_named(tmp_path, content):
+    """ONNX Runtime's own errors do not leak."""
+    path = tmp_path / "a.onnx"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match="no usable ONNX model") as caught:
+        OnnxSegmenter(path, CLASSES)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_model_is_named(tmp_path):
+    """The error says what to set."""
+    with pytest.raises(ModelError, match=r"a\.onnx: no such ONNX model; set segmenter\.path"):
+        OnnxSegmenter(tmp_path / "a.onnx", CLASSES)
+
+
+def test_a_frame_without_its_image_is_refused(tmp_path):
+    """The segmenter says that it needs the image."""
+    segmenter = OnnxSegmenter(red_channel_model(tmp_path / "a.onnx", [1, 8, 8, 3]), CLASSES)
+    assert segmenter.needs_image
+    bare = replace(frame(np.zeros((8, 8, 3), np.uint8)), image=None)
+    with pytest.raises(ModelError, match="frame 000001 was read without the image"):
+        segmenter.segment(bare)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"scaling": "caffe"}, "use one of imagenet, unit, none"), ({"tiles": 0}, "at least 1")],
+)
+def test_options_out_of_range_are_refused(tmp_path, options, message):
+    """The error names what can be used."""
+    path = red_channel_model(tmp_path / "a.onnx", [1, 8, 8, 3])
+    with pytest.raises(ConfigError, match=message):
+        OnnxSegmenter(path, CLASSES, **options)
+
+
+def test_deeplab_finds_the_cars_of_a_real_frame(kitti_root):
+    """Most pixels of each well visible labelled car are cars; the sky and the road are not."""
+    from curate.datasets.kitti import KittiDataset
+
+    dataset = KittiDataset(kitti_root)
+    real, truth = dataset.read("000008", image=True), dataset.annotations("000008")
+    path = kitti_root / "segmenter" / "deeplabv3_mnv2_pascal_quant.onnx"
+    class_ids = OnnxSegmenter(path, class_map("voc")).segment(real).class_ids
+    assert class_ids.shape == (375, 1242)
+    shares = []
+    for rectangle in truth.select(truth.categories == "Car").boxes_2d.astype(int):
+        left, top, right, bottom = rectangle
+        shares.append((class_ids[top:bottom, left:right] == 7).mean())
+    assert len(shares) == 6
+    assert np.median(shares) > 0.6
+    assert min(shares) > 0.2
+    assert (class_ids[:120] == 7).mean() < 0.01

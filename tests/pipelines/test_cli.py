@@ -1,0 +1,320 @@
+"""The command line as a person uses it: what it prints, how it ends, what it refuses."""
+
+import csv
+import io
+import json
+import os
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from curate.errors import ConfigError, DataError, FramesFailed, WorkspaceError
+from pipelines.cli import main
+
+LABELS = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
+Curate = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def curate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Curate:
+    """Runs the command line in this process: exit code, standard output, standard error."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["curate", *map(str, arguments)])
+        capsys.readouterr()
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        else:
+            code = 0
+        output = capsys.readouterr()
+        return code, output.out, output.err
+
+    return run
+
+
+@pytest.fixture
+def made(curate: Curate, tmp_path: Path, toy_kitti: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A toy workspace made by `curate init`, and the current folder."""
+    weights = tmp_path / "detector.txt"
+    weights.write_text("")
+    folder = tmp_path / "work"
+    code, out, err = curate(
+        "init", folder, "--root", toy_kitti, "--labeled", "0.25",
+        "--detector", "toys:ToyDetector", "--detector-path", weights,
+        "--segmenter", "toys:ToySegmenter", "--segmenter-path", weights,
+    )  # fmt: skip
+    assert code == 0, err
+    assert "2 labeled, 6 unlabeled and 4 val frames" in out
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def test_help_answers_without_heavy_imports() -> None:
+    """`curate --help` imports neither numpy nor torch nor a database."""
+    code = (
+        "import sys; sys.argv = ['curate', '--help']\n"
+        "from pipelines.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'torch', 'open3d', 'cv2', 'sqlalchemy', 'numba', 'onnxruntime',\n"
+        "         'pydantic', 'scipy'}\n"
+        "print('heavy:', sorted(heavy & set(sys.modules)))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "heavy: []" in ended.stdout
+
+
+def test_the_stages_run_one_by_one_and_the_weights_are_in_sql(curate: Curate, made: Path) -> None:
+    """Every stage is a command; the last one leaves the weights in the exported file."""
+    for command in ("predict", "repredict", "score", "solve", "export"):
+        code, out, err = curate(command)
+        assert (code, err) == (0, ""), command
+    with sqlite3.connect(made / "exports" / "labels.sqlite") as file:
+        exported = file.execute(LABELS).fetchall()
+    code, out, _ = curate("query", LABELS, "--json")
+    assert [tuple(row.values()) for row in json.loads(out)] == exported
+    assert len(exported) == 18
+
+
+def test_run_does_all_stages_and_says_what_each_did(curate: Curate, made: Path) -> None:
+    """And the second time that there was nothing to do."""
+    code, out, _ = curate("run")
+    assert code == 0
+    assert [line.split()[2] for line in out.splitlines()] == [
+        "predict", "repredict", "points", "semantic", "solve", "export",
+    ]  # fmt: skip
+    code, out, _ = curate("run", "--json")
+    assert {report["done"] for report in json.loads(out)} == {0}
+
+
+def test_status_shows_every_stage(curate: Curate, made: Path) -> None:
+    """Waiting before the run, done after it, stale after a changed setting."""
+    curate("predict")
+    _, out, _ = curate("status", "--json")
+    states = {row["stage"]: row["state"] for row in json.loads(out)}
+    assert states["predict"] == "done"
+    assert states["repredict"] == states["solve"] == "waiting"
+    curate("run")
+    path = made / "curate.toml"
+    path.write_text(path.read_text().replace('scope = "round"', 'scope = "frame"'))
+    _, out, _ = curate("status", "--json")
+    states = {row["stage"]: row["state"] for row in json.loads(out)}
+    assert states["semantic"] == "done"
+    assert states["solve"] == states["export"] == "stale"
+
+
+def test_a_failed_frame_ends_in_a_count_and_a_non_zero_exit(
+    curate: Curate, made: Path, toy_kitti: Path
+) -> None:
+    """`status --failed` lists it with its error."""
+    _, out, _ = curate("query", "SELECT frame FROM frame WHERE split = 'unlabeled'", "--json")
+    frame = json.loads(out)[0]["frame"]
+    (toy_kitti / "training" / "calib" / f"{frame}.txt").unlink()
+    code, out, err = curate("predict")
+    assert code == FramesFailed.exit_code
+    assert "5 frames done" in out
+    assert f"calib/{frame}.txt" in err
+    assert "1 frame results failed" in err
+    _, out, _ = curate("status", "--failed")
+    assert f"calib/{frame}.txt" in out
+
+
+def test_explain_recomputes_the_weight(curate: Curate, made: Path) -> None:
+    """From the stored numbers alone."""
+    curate("run")
+    _, out, _ = curate(
+        "query", "SELECT frame, k, weight FROM weighted_labels ORDER BY weight DESC", "--json"
+    )
+    best = json.loads(out)[0]
+    code, out, _ = curate("explain", best["frame"], best["k"], "--json")
+    assert code == 0
+    assert json.loads(out)["recomputed"] == pytest.approx(best["weight"])
+    code, out, _ = curate("explain", best["frame"], best["k"])
+    assert "Eq. 8" in out
+    assert "Eq. 11" in out
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "DELETE FROM weight",
+        "UPDATE frame SET split = 'val'",
+        "DROP VIEW weighted_labels",
+        "ATTACH '/tmp/other.db' AS other",
+        "PRAGMA query_only = OFF",
+        "CREATE TABLE x (a)",
+        "SELECT 1; SELECT 2",
+        "SELECT nonsense FROM nowhere",
+        "",
+    ],
+)
+def test_a_query_can_only_read(curate: Curate, made: Path, sql: str) -> None:
+    """Anything else is a one-line error."""
+    code, out, err = curate("query", sql)
+    assert (code, out) == (ConfigError.exit_code, "")
+    assert err.startswith("error: query: ")
+    assert err.count("\n") == 1
+
+
+def test_a_query_prints_csv(curate: Curate, made: Path) -> None:
+    """With a header."""
+    _, out, _ = curate("query", "SELECT frame, split FROM frame ORDER BY 1", "--csv")
+    rows = list(csv.reader(io.StringIO(out)))
+    assert rows[0] == ["frame", "split"]
+    assert len(rows) == 13
+
+
+def test_outside_a_workspace_the_remedy_is_named(
+    curate: Curate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line and the exit code of its kind."""
+    monkeypatch.chdir(tmp_path)
+    code, _, err = curate("status")
+    assert code == WorkspaceError.exit_code
+    assert "curate init" in err
+
+
+def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> None:
+    """A misspelt key and a value out of range."""
+    path = made / "curate.toml"
+    text = path.read_text().replace("minimum_score = 0.1", "minimum_score = 7.0")
+    path.write_text(text.replace("[semantic]", "[semantic]\nmeen = 1"))
+    code, _, err = curate("predict")
+    assert code == ConfigError.exit_code
+    assert "detector.minimum_score" in err
+    assert "semantic.meen" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("Car 0.00 0 1.0 1 2 3 4", "label_2"),
+        ("Spaceship 0 0 0 1 2 3 4 1 1 1 1 1 9 0", "Spaceship"),
+    ],
+)
+def test_a_damaged_label_of_a_val_frame_stops_init(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, line: str, message: str
+) -> None:
+    """File and line are named, and no half workspace is left."""
+    path = toy_kitti / "training" / "label_2" / "000010.txt"
+    path.write_text(path.read_text() + line + "\n")
+    code, _, err = curate("init", tmp_path / "w", "--root", toy_kitti)
+    assert code == DataError.exit_code
+    assert "000010.txt:4" in err
+    assert message in err
+    assert not (tmp_path / "w").exists()
+
+
+def test_the_label_of_an_unlabeled_frame_is_never_opened(
+    curate: Curate, made: Path, toy_kitti: Path
+) -> None:
+    """Garbage in it disturbs nobody, because nobody looks."""
+    _, out, _ = curate("query", "SELECT frame FROM frame WHERE split = 'unlabeled'", "--json")
+    for row in json.loads(out):
+        path = toy_kitti / "training" / "label_2" / f"{row['frame']}.txt"
+        path.unlink()
+        path.mkdir()
+    code, _, err = curate("run")
+    assert (code, err) == (0, "")
+
+
+def test_init_again_keeps_the_workspace_and_refuses_another_split(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """The same call is harmless; another share would mix the splits."""
+    arguments = ("init", tmp_path / "w", "--root", toy_kitti, "--labeled")
+    assert curate(*arguments, "0.25")[0] == 0
+    assert curate(*arguments, "0.25")[0] == 0
+    code, _, err = curate(*arguments, "0.5")
+    assert code == WorkspaceError.exit_code
+    assert "another split" in err
+
+
+def test_a_category_without_ground_truth_warns_and_uses_the_fallback(
+    curate: Curate, made: Path, toy_kitti: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The configured number of points stands in for m_th."""
+    for path in (toy_kitti / "training" / "label_2").glob("*.txt"):
+        lines = [line for line in path.read_text().splitlines() if "Cyclist" not in line]
+        path.write_text("\n".join(lines) + "\n")
+    weights = tmp_path / "detector.txt"
+    folder = tmp_path / "fewer"
+    curate(
+        "init", folder, "--root", toy_kitti, "--labeled", "0.25",
+        "--detector", "toys:ToyDetector", "--detector-path", weights,
+    )  # fmt: skip
+    code, _, _ = curate("run", "-w", folder)
+    assert code == 0
+    assert "no ground truth of Cyclist" in caplog.text
+    sql = "SELECT DISTINCT points_threshold FROM weighted_labels WHERE category = 'Cyclist'"
+    _, out, _ = curate("query", sql, "--json", "-w", folder)
+    assert json.loads(out) == [{"points_threshold": 5.0}]
+
+
+@pytest.mark.parametrize("command", ["predict", "repredict", "score", "run"])
+def test_a_killed_command_continues_and_loses_nothing(
+    curate: Curate, made: Path, tmp_path: Path, command: str
+) -> None:
+    """SIGKILL in the middle, then the same command: the rows of an uninterrupted run."""
+    curate("init", tmp_path / "whole", *_settings(tmp_path))
+    for earlier in ("predict", "repredict", "score"):
+        if earlier == command:
+            break
+        if command != "run":
+            curate(earlier)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pipelines", command, "-w", str(made)],
+        env=_environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    _wait_for_rows(made / "curate.db", process)
+    process.kill()
+    process.wait()
+    with sqlite3.connect(made / "curate.db") as database:
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        torn = database.execute(
+            "SELECT count(*) FROM prediction AS p WHERE NOT EXISTS (SELECT 1 FROM task AS t "
+            "WHERE t.stage = 'predict' AND t.frame_id = p.frame_id)"
+        ).fetchone()
+    assert torn == (0,)
+    assert curate("run")[0] == 0
+    assert curate("run", "-w", tmp_path / "whole")[0] == 0
+    dump = "SELECT * FROM weighted_labels ORDER BY frame, k"
+    killed, whole = curate("query", dump, "--csv"), curate(
+        "query", dump, "--csv", "-w", tmp_path / "whole"
+    )
+    assert killed == whole
+    assert killed[1].count("\n") == 19
+
+
+def _settings(tmp_path: Path) -> tuple[object, ...]:
+    weights = tmp_path / "detector.txt"
+    return (
+        "--root", tmp_path / "kitti", "--labeled", "0.25",
+        "--detector", "toys:ToyDetector", "--detector-path", weights,
+        "--segmenter", "toys:ToySegmenter", "--segmenter-path", weights,
+    )  # fmt: skip
+
+
+def _environment() -> dict[str, str]:
+    root = Path(__file__).parent.parent
+    return os.environ | {"PYTHONPATH": f"{root}:{root.parent}", "TOY_DELAY_S": "0.4"}
+
+
+def _wait_for_rows(path: Path, process: subprocess.Popen) -> None:
+    """Returns once the process has stored something but, if possible, not everything."""
+    with sqlite3.connect(path, timeout=30) as database:
+        before = database.execute("SELECT count(*) FROM task").fetchone()
+        while process.poll() is None:
+            if database.execute("SELECT count(*) FROM task").fetchone() != before:
+                return
+            time.sleep(0.01)
