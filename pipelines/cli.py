@@ -1,6 +1,7 @@
 """The command `curate`: its commands, and errors as one line with their exit code."""
 
 import logging
+import os
 import sys
 
 import typer
@@ -56,6 +57,8 @@ for command in (
 
 def main() -> None:
     """Runs the command line; a wrong input ends in one line and its own exit code."""
+    # Idle threads of torch's pool sleep instead of spinning on the core of another process.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
         app()

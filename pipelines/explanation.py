@@ -64,9 +64,10 @@ def _label(
         if round_number is None:
             newest = select(func.max(weight.c.round)).where(weight.c.policy == policy)
             round_number = connection.execute(newest).scalar_one()
+        columns = ", ".join(WEIGHTED_LABEL_COLUMNS)
         query = text(
-            f"SELECT {', '.join(WEIGHTED_LABEL_COLUMNS)} FROM weighted_labels "  # noqa: S608
-            "WHERE round = :round AND frame = :frame AND k = :k AND policy = :policy"
+            f"SELECT {columns} FROM weighted_labels WHERE round = :round "
+            "AND frame = :frame AND k = :k AND policy = :policy"  # noqa: S608
         )
         key = {"round": round_number, "frame": frame, "k": k, "policy": policy}
         row = connection.execute(query, key).fetchone()

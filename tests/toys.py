@@ -52,9 +52,8 @@ def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: b
         inside = rng.uniform(-0.45, 0.45, (int(rng.integers(20, 60)), 3)) * box[3:6]
         turn = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]])
         inside[:, :2] = inside[:, :2] @ turn
-        points.append(
-            np.column_stack([inside + box[:3], np.full(len(inside), INTENSITIES[category])])
-        )
+        brightness = np.full(len(inside), INTENSITIES[category])
+        points.append(np.column_stack([inside + box[:3], brightness]))
     np.concatenate(points).astype(np.float32).tofile(folder / "velodyne" / f"{name}.bin")
     image = rng.integers(0, 255, (IMAGE_SIZE[1], IMAGE_SIZE[0], 3), dtype=np.uint8)
     cv2.imwrite(str(folder / "image_2" / f"{name}.png"), image)

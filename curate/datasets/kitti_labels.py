@@ -104,15 +104,15 @@ def read_objects(
     rows = [row for row in map(str.split, lines) if row]
     categories = [row[0] for row in rows]
     try:
-        values = np.array([[float(field) for field in row[1:]] for row in rows])
+        values = np.array([float(field) for row in rows for field in row[1:]])
         values = values.reshape(len(rows), fields - 1)
-    except ValueError:  # not a number, or rows of a wrong length
+    except ValueError:  # not a number, or too many or too few
         raise _first_fault(path, lines, fields, known) from None
-    negative = np.flatnonzero(values[:, 7:10].min(axis=1, initial=0) < 0)
     if (
-        not np.isfinite(values).all()
-        or (known is not None and any(name not in known for name in categories))
-        or any(categories[index] != DONT_CARE for index in negative)
+        any(len(row) != fields for row in rows)
+        or not np.isfinite(values).all()
+        or (known is not None and not frozenset(known).issuperset(categories))
+        or _has_negative_side(categories, values[:, 7:10])
     ):
         raise _first_fault(path, lines, fields, known)
     return KittiObjects(as_categories(categories), *_columns(values))
@@ -276,6 +276,14 @@ def _read_lines(path: Path) -> list[str]:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: is not a text file (byte {error.start})") from error
+
+
+def _has_negative_side(categories: Sequence[str], dimensions: np.ndarray) -> bool:
+    """Whether an object that is not DontCare has a negative dimension."""
+    if dimensions.min(initial=0) >= 0:
+        return False
+    rows = np.flatnonzero((dimensions < 0).any(axis=1))
+    return any(categories[row] != DONT_CARE for row in rows)
 
 
 def _first_fault(

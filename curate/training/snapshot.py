@@ -73,13 +73,15 @@ def load_snapshot(
     if not path.exists():
         return None
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        if state["fingerprint"] != mark:
-            _log.info("%s is of another training; starting anew", path)
-            return None
-        network.load_state_dict(state["network"])
-        optimizer.load_state_dict(state["optimizer"])
-        return dict(state["progress"])
+        content = io.BytesIO(path.read_bytes())
+        state = torch.load(content, map_location="cpu", weights_only=True)
+        own = state["fingerprint"] == mark
     except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError):
         _log.warning("%s is damaged; starting anew", path)
         return None
+    if not own:
+        _log.info("%s is of another training; starting anew", path)
+        return None
+    network.load_state_dict(state["network"])
+    optimizer.load_state_dict(state["optimizer"])
+    return dict(state["progress"])

@@ -76,11 +76,19 @@ class Canvas:
         outline = centre + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
         self.lines(outline, colour, width, closed=True)
 
-    def box(self, left: float, top: float, right: float, bottom: float, colour: Colour,
-            opacity: float = 1.0) -> None:  # fmt: skip
-        """A filled rectangle."""
-        corners = [[left, top], [right, top], [right, bottom], [left, bottom]]
-        self.fill(np.array(corners, dtype=np.float64), colour, opacity)
+    def box(
+        self,
+        left: float,
+        top: float,
+        right: float,
+        bottom: float,
+        colour: Colour,
+        opacity: float = 1.0,
+    ) -> None:
+        """A rectangle with crisp edges, blended over what is there."""
+        edges = (np.array([left, top, right, bottom]) * _SUPER).round().astype(int).clip(0)
+        region = self._pixels[edges[1] : edges[3], edges[0] : edges[2]]
+        region[:] = np.rint(opacity * np.array(colour) + (1 - opacity) * region)
 
     def text(
         self, left: float, baseline: float, text: str, colour: Colour, size: float = 13.0

@@ -44,7 +44,7 @@ class Repredict(Predict):
             "reprediction": [
                 (v, *row)
                 for v, ((_, found), loss) in enumerate(zip(views, losses, strict=True))
-                for row in _reprediction_rows(found, loss, self.config.repredict)
+                for row in _reprediction_rows(found, loss)
             ],
             "consistency": _consistency_rows(losses),
         }
@@ -95,19 +95,15 @@ def function(workspace: Workspace, context: RoundContext) -> Repredict:
     return Repredict(predict, context.seed, context.number)
 
 
-def _reprediction_rows(
-    found: Detections, loss: Consistency, section: RepredictSection
-) -> list[tuple[Any, ...]]:
-    """The rows of one view; the two losses are stored without their factors."""
+def _reprediction_rows(found: Detections, loss: Consistency) -> list[tuple[Any, ...]]:
+    """The rows of one view, each with what matched it."""
     matched = {int(i): k for k, i in enumerate(loss.matched) if i >= 0}
     rows: list[tuple[Any, ...]] = []
     for i, (category, score, *box) in enumerate(prediction_rows(found)):
         k = matched.get(i)
         match: tuple[Any, ...] = (None,) * 4
         if k is not None:
-            score_loss = loss.score_loss[k] / section.score_weight if section.score_weight else 0.0
-            box_loss = loss.box_loss[k] / section.box_weight if section.box_weight else 0.0
-            match = (k, float(loss.iou[k]), float(score_loss), float(box_loss))
+            match = (k, *(float(of[k]) for of in (loss.iou, loss.score_loss, loss.box_loss)))
         rows.append((i, category, score, *match, *box))
     return rows
 

@@ -1,7 +1,5 @@
 """Tests of files that are either whole or absent."""
 
-
-
 import pytest
 
 from curate.atomic import replace_file

@@ -23,7 +23,8 @@ def database(tmp_path: Path) -> Database:
 def _frame(database: Database, split: str) -> int:
     with database.writing() as connection:
         bulk.insert(connection, "frame", [("kitti", f"f-{split}", split, "p", "i", "c", None)])
-        return connection.exec_driver_sql(f"SELECT id FROM frame WHERE split = '{split}'").scalar_one()
+        query = f"SELECT id FROM frame WHERE split = '{split}'"
+        return connection.exec_driver_sql(query).scalar_one()
 
 
 def _truth(frame_id: int, split: str) -> tuple:

@@ -167,7 +167,7 @@ def test_solve_refuses_to_weigh_half_a_round(workspace: Workspace) -> None:
     """It says which command is missing."""
     context = open_round(workspace, 1)
     run_frames(workspace, context, stage("predict"), SerialExecutor(), Silent())
-    with pytest.raises(WorkspaceError, match="repredict: 6 frames.*curate repredict"):
+    with pytest.raises(WorkspaceError, match=r"repredict: 6 frames.*curate repredict"):
         run_round(workspace, context, stage("solve"), "pspsl", Silent())
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from curate.datasets.synthetic.materials import TEXTURE
+from curate.datasets.synthetic.pixels import cast_pixels
 from curate.datasets.synthetic.rig import IMAGE_SIZE, CameraRig
 from curate.datasets.synthetic.scene import Caster, Scene
 from curate.datasets.synthetic.shading import TILE, Air, Markings, Surfaces, shade
@@ -83,15 +84,16 @@ class Light:
         """Sky, windows and grain for the kernel."""
         window = _WINDOW * (0.6 + self.ambient)
         return Air(
-            self.sky.astype(np.float32), window.astype(np.float32), self.grain, self.grain_offset
+            self.sky.astype(np.float32),
+            window.astype(np.float32),
+            np.float32(self.grain),
+            self.grain_offset,
         )
 
 
 def render(scene: Scene, caster: Caster, rig: CameraRig, generator: np.random.Generator) -> View:
     """The camera's view of a scene."""
-    width, height = IMAGE_SIZE
-    rays = rig.rays()
-    hits = caster.first_hits(rays)
+    hits = cast_pixels(caster, rig)
     light = Light.draw(generator)
     surfaces = Surfaces(
         light.shade(scene.normals, scene.colours),
@@ -100,27 +102,36 @@ def render(scene: Scene, caster: Caster, rig: CameraRig, generator: np.random.Ge
         TEXTURE,
         _noise_tile(),
     )
-    markings = _markings(scene.street, light)
-    sharp = shade(rays, hits.distance, hits.triangle, width, surfaces, markings, light.air())
-    # The sky has triangle -1, which is the last entry of these tables.
-    things = np.append(scene.things, np.int32(-1))[hits.triangle]
-    semantic = np.append(scene.thing_classes(), np.uint8(0))[things]
-    return View(
-        cv2.GaussianBlur(sharp, (3, 3), 0.55),  # the lens
-        semantic.reshape(height, width),
-        things.reshape(height, width),
+    inverse, origin = (part.astype(np.float32) for part in rig.pixel_geometry())
+    shape = IMAGE_SIZE[::-1]
+    triangle = hits.triangle.reshape(shape)
+    sharp = shade(
+        inverse,
+        origin,
+        hits.distance.reshape(shape),
+        triangle,
+        surfaces,
+        _markings(scene.street, light),
+        light.air(),
     )
+    # The sky has triangle -1, which is the last entry of these tables.
+    things = np.append(scene.things, np.int32(-1))[triangle]
+    semantic = np.append(scene.thing_classes(), np.uint8(0))[things]
+    image = cv2.GaussianBlur(sharp, (3, 3), 0.55)  # the lens
+    return View(image, semantic, things)
 
 
 def _markings(street: Street, light: Light) -> Markings:
     """The lines of a street, interrupted where another crosses."""
     lines = street.axis_d + street.lane_m * np.arange(-street.lanes, street.lanes + 1)
-    crossing = np.full(2, np.nan if street.crossing_s is None else street.crossing_s)
-    crossing += (street.crossing_half_m + 1.5) * np.array([-1, 1])
+    half = street.crossing_half_m + 1.5
+    crossing = (
+        np.zeros(2) if street.crossing_s is None else street.crossing_s + np.array([-half, half])
+    )
     paint = _LINE_PAINT * (light.ambient + 0.6 * light.direct)
     return Markings(
-        float(np.cos(street.heading_rad)),
-        float(np.sin(street.heading_rad)),
+        np.float32(np.cos(street.heading_rad)),
+        np.float32(np.sin(street.heading_rad)),
         lines.astype(np.float32),
         crossing.astype(np.float32),
         paint.astype(np.float32),

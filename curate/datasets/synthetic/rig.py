@@ -70,20 +70,22 @@ class CameraRig:
             for key, matrix in matrices.items()
         )
 
-    def rays(self, pixels: np.ndarray | None = None) -> np.ndarray:
+    def pixel_geometry(self) -> tuple[np.ndarray, np.ndarray]:
+        """(3, 3) from homogeneous pixels to directions, (3,) the camera's centre; LiDAR frame."""
+        matrix = self.calibration.lidar_to_image
+        inverse = np.linalg.inv(matrix[:, :3])
+        return inverse, -inverse @ matrix[:, 3]
+
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Rays through pixel centres, LiDAR frame.
 
         Args:
-            pixels: (n,) row * width + column; default every pixel, row by row.
+            pixels: (n,) row * width + column.
 
         Returns:
             (n, 6) float32 origin and unit direction.
         """
-        width, height = IMAGE_SIZE
-        matrix = self.calibration.lidar_to_image
-        inverse = np.linalg.inv(matrix[:, :3])
-        chosen = np.arange(width * height) if pixels is None else pixels
-        return np.asarray(pixel_rays(inverse, -inverse @ matrix[:, 3], chosen, width))
+        return np.asarray(pixel_rays(*self.pixel_geometry(), pixels, IMAGE_SIZE[0]))
 
 
 def _rotation(vector_rad: np.ndarray) -> np.ndarray:

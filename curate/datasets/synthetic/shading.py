@@ -8,7 +8,8 @@ from numba import njit
 from curate.datasets.synthetic.materials import Material
 
 TILE = 256  # pixels of the repeating texture and grain
-_HAZE_M = 420.0
+_HAZE_M, _TEXTURE_M, _FAR_M = 420.0, 40.0, 512
+_BARE, _LINE, _WINDOW = range(3)
 _ASPHALT, _WALL = int(Material.ASPHALT), int(Material.WALL)
 
 
@@ -37,12 +38,12 @@ class Markings(NamedTuple):
         cos: of the street's heading.
         sin: of the street's heading.
         lines_d: (n,) float32 d of the lines, from right to left; the inner ones are dashed.
-        crossing_s: (2,) float32 where a crossing street begins and ends; NaN for none.
+        crossing_s: (2,) float32 where a crossing street begins and ends; equal for none.
         colour: (3,) float32 of the paint, lit.
     """
 
-    cos: float
-    sin: float
+    cos: np.float32
+    sin: np.float32
     lines_d: np.ndarray
     crossing_s: np.ndarray
     colour: np.ndarray
@@ -60,12 +61,14 @@ class Air(NamedTuple):
 
     sky: np.ndarray
     window: np.ndarray
-    grain: float
+    grain: np.float32
     grain_offset: tuple[int, int]
 
 
 @njit(cache=True, nogil=True)
-def pixel_rays(inverse: np.ndarray, origin: np.ndarray, pixels: np.ndarray, width: int) -> np.ndarray:
+def pixel_rays(
+    inverse: np.ndarray, origin: np.ndarray, pixels: np.ndarray, width: int
+) -> np.ndarray:
     """Rays through pixel centres.
 
     Args:
@@ -80,42 +83,27 @@ def pixel_rays(inverse: np.ndarray, origin: np.ndarray, pixels: np.ndarray, widt
     rays = np.empty((len(pixels), 6), dtype=np.float32)
     for i in range(len(pixels)):
         row, column = divmod(pixels[i], width)
-        x = inverse[0, 0] * column + inverse[0, 1] * row + inverse[0, 2]
-        y = inverse[1, 0] * column + inverse[1, 1] * row + inverse[1, 2]
-        z = inverse[2, 0] * column + inverse[2, 1] * row + inverse[2, 2]
-        length = np.sqrt(x * x + y * y + z * z)
         rays[i, 0], rays[i, 1], rays[i, 2] = origin[0], origin[1], origin[2]
-        rays[i, 3], rays[i, 4], rays[i, 5] = x / length, y / length, z / length
+        rays[i, 3], rays[i, 4], rays[i, 5] = _direction(inverse, row, column)
     return rays
 
 
-@njit(cache=True, nogil=True)
-def _is_painted(x: float, y: float, markings: Markings) -> bool:
-    """Whether a place on the asphalt carries a line."""
-    d = markings.cos * y - markings.sin * x
-    last = len(markings.lines_d) - 1
-    for line in range(last + 1):
-        if abs(d - markings.lines_d[line]) < 0.08:
-            s = markings.cos * x + markings.sin * y
-            if markings.crossing_s[0] < s < markings.crossing_s[1]:
-                return False
-            return line in (0, last) or s % 9.0 < 4.0
-    return False
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _direction(inverse: np.ndarray, row: float, column: float) -> tuple[float, float, float]:
+    """The unit direction of a pixel's ray."""
+    x = inverse[0, 0] * column + inverse[0, 1] * row + inverse[0, 2]
+    y = inverse[1, 0] * column + inverse[1, 1] * row + inverse[1, 2]
+    z = inverse[2, 0] * column + inverse[2, 1] * row + inverse[2, 2]
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
 
 
-@njit(cache=True, nogil=True)
-def _is_window(across: float, along: float) -> bool:
-    """Whether a place on a wall lies in a window, by metres across the wall and of height."""
-    column, storey = across % 2.7, (along + 1.7) % 2.9
-    return 0.8 < column < 1.95 and 0.9 < storey < 2.3
-
-
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def shade(
-    rays: np.ndarray,
+    inverse: np.ndarray,
+    origin: np.ndarray,
     distance: np.ndarray,
     triangle: np.ndarray,
-    width: int,
     surfaces: Surfaces,
     markings: Markings,
     air: Air,
@@ -123,64 +111,104 @@ def shade(
     """The image.
 
     Args:
-        rays: (n, 6) float32, row by row.
-        distance: (n,) float32 metres along each ray.
-        triangle: (n,) int32 what it hits, -1 for the sky.
-        width: of the image.
+        inverse: (3, 3) float32 from homogeneous pixels to directions.
+        origin: (3,) float32 the camera's centre.
+        distance: (height, width) float32 metres along each pixel's ray.
+        triangle: (height, width) int32 what it hits, -1 for the sky.
         surfaces: of the scene.
         markings: of the road.
         air: and the sensor.
 
     Returns:
-        (n / width, width, 3) uint8 RGB.
+        (height, width, 3) uint8 RGB.
     """
-    image = np.empty((len(rays) // width, width, 3), dtype=np.uint8)
-    colour = np.empty(3, dtype=np.float32)
-    for i in range(len(rays)):
-        row, column = divmod(i, width)
-        if triangle[i] < 0:
-            share = min(max(3 * rays[i, 5], 0.0), 1.0)
+    height, width = triangle.shape
+    image = np.empty((height, width, 3), dtype=np.uint8)
+    fading = np.exp(-np.arange(_FAR_M) / np.float32(_TEXTURE_M)).astype(np.float32)
+    clearness = np.exp(-np.arange(_FAR_M) / np.float32(_HAZE_M)).astype(np.float32)
+    for row in range(height):
+        for column in range(width):
+            hit, reach = triangle[row, column], distance[row, column]
+            ray_x, ray_y, ray_z = _direction(inverse, np.float32(row), np.float32(column))
+            grain_row = (row + air.grain_offset[0]) & (TILE - 1)
+            grain_column = (column + air.grain_offset[1]) & (TILE - 1)
+            grain = air.grain * surfaces.tile[grain_row, grain_column]
+            if hit < 0:
+                share = min(max(np.float32(3) * ray_z, np.float32(0)), np.float32(1))
+                for k in range(3):
+                    level = air.sky[0, k] + (air.sky[1, k] - air.sky[0, k]) * share
+                    image[row, column, k] = _grey_level(level, grain)
+                continue
+            x, y = origin[0] + ray_x * reach, origin[1] + ray_y * reach
+            z = origin[2] + ray_z * reach
+            kind, across, along = _paint(x, y, z, hit, surfaces, markings)
+            texel = _texel(across, along, surfaces.materials[hit], surfaces)
+            metre = min(int(reach), _FAR_M - 1)
+            contrast = 1 + fading[metre] * texel
             for k in range(3):
-                colour[k] = air.sky[0, k] + (air.sky[1, k] - air.sky[0, k]) * share
-        else:
-            _surface(colour, rays[i], distance[i], triangle[i], surfaces, markings, air)
-        grain_row, grain_column = row + air.grain_offset[0], column + air.grain_offset[1]
-        grain = air.grain * surfaces.tile[grain_row % TILE, grain_column % TILE]
-        for k in range(3):  # gamma 2
-            level = 255 * np.sqrt(min(max(colour[k], 0.0), 1.0)) + grain
-            image[row, column, k] = np.uint8(min(max(level, 0.0), 255.0))
+                colour = surfaces.lit[hit, k]
+                if kind == _LINE:
+                    colour = markings.colour[k]
+                elif kind == _WINDOW:
+                    colour = air.window[k]
+                clear = clearness[metre]
+                level = air.sky[0, k] * (1 - clear) + colour * contrast * clear
+                image[row, column, k] = _grey_level(level, grain)
     return image
 
 
-@njit(cache=True, nogil=True)
-def _surface(
-    colour: np.ndarray,
-    ray: np.ndarray,
-    distance: float,
-    triangle: int,
-    surfaces: Surfaces,
-    markings: Markings,
-    air: Air,
-) -> None:
-    """Writes the colour of one hit: paint or window or lit surface, texture, haze."""
-    x = ray[0] + ray[3] * distance
-    y = ray[1] + ray[4] * distance
-    z = ray[2] + ray[5] * distance
-    normal, material = surfaces.normals[triangle], surfaces.materials[triangle]
-    flat = abs(normal[2]) > 0.7
-    across = x if flat else normal[0] * y - normal[1] * x
-    along = y if flat else z
-    for k in range(3):
-        colour[k] = surfaces.lit[triangle, k]
-    if material == _ASPHALT and _is_painted(x, y, markings):
-        for k in range(3):
-            colour[k] = markings.colour[k]
-    elif material == _WALL and not flat and _is_window(across, along):
-        for k in range(3):
-            colour[k] = air.window[k]
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _grey_level(colour: float, grain: float) -> int:
+    """Linear light with gamma 2, noise and rounding."""
+    clipped = min(max(np.float32(colour), np.float32(0)), np.float32(1))
+    level = np.float32(255) * np.sqrt(clipped) + grain
+    return np.uint8(min(max(level, np.float32(0)), np.float32(255)))
+
+
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _texel(across: float, along: float, material: int, surfaces: Surfaces) -> float:
+    """The texture of a material at a place on a surface, by metres across and along it."""
     scale = surfaces.texture[material, 1]
-    texel = surfaces.tile[int(np.floor(across * scale)) % TILE, int(np.floor(along * scale)) % TILE]
-    contrast = 1 + surfaces.texture[material, 0] * np.exp(-distance / 40) * texel
-    haze = np.exp(-distance / _HAZE_M)
-    for k in range(3):
-        colour[k] = air.sky[0, k] * (1 - haze) + colour[k] * contrast * haze
+    # The offset keeps the numbers positive, where truncation is rounding down.
+    column = int((across + np.float32(1024)) * scale) & (TILE - 1)
+    row = int((along + np.float32(1024)) * scale) & (TILE - 1)
+    return surfaces.texture[material, 0] * surfaces.tile[row, column]
+
+
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _paint(
+    x: float, y: float, z: float, hit: int, surfaces: Surfaces, markings: Markings
+) -> tuple[int, float, float]:
+    """What covers a surface (line, window or nothing), and where on it the place lies."""
+    flat = abs(surfaces.normals[hit, 2]) > np.float32(0.7)
+    if flat:
+        if surfaces.materials[hit] == _ASPHALT and _is_painted(x, y, markings):
+            return _LINE, x, y
+        return _BARE, x, y
+    across = surfaces.normals[hit, 0] * y - surfaces.normals[hit, 1] * x
+    if surfaces.materials[hit] == _WALL:
+        column = _fraction(across / np.float32(2.7))
+        storey = _fraction((z + np.float32(1.7)) / np.float32(2.9))
+        if 0.3 < column < 0.72 and 0.31 < storey < 0.8:
+            return _WINDOW, across, z
+    return _BARE, across, z
+
+
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _fraction(value: float) -> float:
+    """The part after the decimal point, 0 to 1; the remainder operator is slow."""
+    return value - np.floor(value)
+
+
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _is_painted(x: float, y: float, markings: Markings) -> bool:
+    """Whether a place on the asphalt carries a line."""
+    d = markings.cos * y - markings.sin * x
+    last = len(markings.lines_d) - 1
+    for line in range(last + 1):
+        if abs(d - markings.lines_d[line]) < np.float32(0.08):
+            s = markings.cos * x + markings.sin * y
+            if markings.crossing_s[0] < s < markings.crossing_s[1]:
+                return False
+            return line in (0, last) or _fraction(s / np.float32(9)) < 0.45
+    return False

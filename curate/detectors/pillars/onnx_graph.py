@@ -35,9 +35,10 @@ def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: i
     rows = graph.node("Reshape", [canvas, graph.constant(np.array([-1, 4 * pillars]))])
     rows = graph.product(rows, "stem.mix", "stem.norm")
     rows = graph.node("Reshape", [rows, graph.constant(np.array([1, cells_x, cells_y, -1]))])
-    fine = graph.scale(graph.node("Transpose", [rows], perm=[0, 3, 1, 2]), "scale1")
-    middle = graph.scale(fine, "scale2")
-    coarse = graph.scale(middle, "scale3")
+    maps = graph.node("Transpose", [rows], perm=[0, 3, 1, 2])
+    fine = graph.scale(maps, "scale1", preset.depths[0], down=False)
+    middle = graph.scale(fine, "scale2", 1 + preset.depths[1], down=True)
+    coarse = graph.scale(middle, "scale3", 1 + preset.depths[2], down=True)
     middle = graph.node("Add", [middle, graph.doubled(graph.pointwise(coarse, "up3"))])
     fine = graph.node(
         "Add", [graph.pointwise(fine, "side1"), graph.doubled(graph.pointwise(middle, "up2"))]
@@ -107,14 +108,11 @@ class _Graph:
         kernel = self.constant(self._weights[f"{name}.weight"][:, :, None, None])
         return self.node("Conv", [maps, kernel, self.constant(self._weights[f"{name}.bias"])])
 
-    def scale(self, maps: str, name: str) -> str:
-        """All convolutions of one scale; one that changes the number of channels goes down."""
-        i = 0
-        while f"{name}.{i}.0.weight" in self._weights:
-            channels_out, channels_in = self._weights[f"{name}.{i}.0.weight"].shape[:2]
-            stride = 1 if channels_in == channels_out else 2
+    def scale(self, maps: str, name: str, convolutions: int, *, down: bool) -> str:
+        """All convolutions of one scale; the first may go down to it."""
+        for i in range(convolutions):
+            stride = 2 if down and i == 0 else 1
             maps = self.convolution(maps, f"{name}.{i}.0", f"{name}.{i}.1", stride)
-            i += 1
         return maps
 
     def doubled(self, maps: str) -> str:

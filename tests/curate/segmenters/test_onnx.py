@@ -29,7 +29,7 @@ def model(path, nodes, shape, kind, constants=(), *, answer=TensorProto.INT64, r
 
 
 def red_channel_model(path, shape):
-    """uint8 NHWC; the class id of a pixel is its red channel."""
+    """A uint8 NHWC model; the class id of a pixel is its red channel."""
     nodes = [
         helper.make_node("Gather", ["image", "zero"], ["red"], axis=3),
         helper.make_node("Cast", ["red"], ["answer"], to=TensorProto.INT64),
@@ -38,7 +38,7 @@ def red_channel_model(path, shape):
 
 
 def brightest_channel_model(path, shape, *, channels_last=False):
-    """float NCHW; scores of three classes are the channels as the model sees them."""
+    """A float NCHW model; scores of three classes are the channels as the model sees them."""
     if channels_last:
         nodes = [helper.make_node("Transpose", ["image"], ["answer"], perm=[0, 2, 3, 1])]
     else:
@@ -47,7 +47,7 @@ def brightest_channel_model(path, shape, *, channels_last=False):
 
 
 def constant_model(path, class_ids):
-    """uint8 NHWC; the same class ids whatever the image."""
+    """A uint8 NHWC model; the same class ids whatever the image."""
     height, width = class_ids.shape
     nodes = [
         helper.make_node("ReduceMax", ["image", "axes"], ["most"], keepdims=1),
@@ -143,9 +143,7 @@ def test_a_class_that_counts_wins_where_crops_overlap(tmp_path):
 @pytest.mark.parametrize("channels_last", [False, True])
 def test_scores_of_classes_in_either_order(tmp_path, channels_last):
     """The class with the highest score wins, wherever the model puts the classes."""
-    path = brightest_channel_model(
-        tmp_path / "a.onnx", [1, 3, 20, 60], channels_last=channels_last
-    )
+    path = brightest_channel_model(tmp_path / "a.onnx", [1, 3, 20, 60], channels_last=channels_last)
     image = np.zeros((20, 60, 3), np.uint8)
     image[:, :20, 0] = image[:, 20:40, 1] = image[:, 40:, 2] = 200
     found = OnnxSegmenter(path, CLASSES, scaling="unit").segment(frame(image)).class_ids

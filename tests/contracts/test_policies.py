@@ -1,0 +1,58 @@
+"""What every registered policy promises."""
+
+import numpy as np
+import pytest
+
+from curate.weighting.base import Age, Evidence
+from pipelines.registry import POLICIES
+
+AGES = [Age(1, 1), Age(1, 3), Age(3, 3)]
+
+
+def evidence(n: int, seed: int = 0) -> Evidence:
+    """So many labels of a few frames and categories, a fifth of them without a match."""
+    rng = np.random.default_rng(seed)
+    loss = rng.exponential(size=n)
+    loss[rng.random(n) < 0.2] = np.nan
+    return Evidence(
+        frame_index=rng.integers(0, max(n // 4, 1), n),
+        category=rng.choice(["Car", "Pedestrian", "Cyclist"], n),
+        score=rng.random(n),
+        loss=loss,
+        rho={"rho_diff": rng.random(n), "rho_anno": rng.random(n)},
+    )
+
+
+@pytest.fixture(params=sorted(POLICIES.classes))
+def policy(request: pytest.FixtureRequest):
+    """Every registered policy with its default settings."""
+    return POLICIES.build(request.param, offered={}, options={})
+
+
+@pytest.mark.parametrize("age", AGES)
+@pytest.mark.parametrize("n", [0, 1, 200])
+def test_weights_are_finite_and_between_0_and_1(policy, age: Age, n: int) -> None:
+    """One weight per label, whatever the evidence."""
+    weights = policy.weigh(evidence(n), age)
+    assert weights.v.shape == weights.lambda_u.shape == (n,)
+    assert ((weights.v >= 0) & (weights.v <= 1)).all()
+
+
+def test_weights_do_not_depend_on_the_order_of_the_labels(policy) -> None:
+    """A permutation of the labels permutes the weights."""
+    labels = evidence(100)
+    order = np.random.default_rng(1).permutation(100)
+    shuffled = Evidence(
+        labels.frame_index[order],
+        labels.category[order],
+        labels.score[order],
+        labels.loss[order],
+        {name: rho[order] for name, rho in labels.rho.items()},
+    )
+    expected = policy.weigh(labels, Age(1, 2)).v[order]
+    assert policy.weigh(shuffled, Age(1, 2)).v == pytest.approx(expected)
+
+
+def test_a_policy_goes_by_its_registered_name(policy, request: pytest.FixtureRequest) -> None:
+    """So that weights in the database and settings agree."""
+    assert policy.name in POLICIES.classes

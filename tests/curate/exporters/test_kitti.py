@@ -1,0 +1,156 @@
+"""Tests of weighted labels as KITTI label files."""
+
+import json
+
+import numpy as np
+import pytest
+from toys import IMAGE_SIZE, toy_calibration
+
+from curate.datasets.kitti_labels import read_objects, to_detections
+from curate.detections import Detections
+from curate.errors import ConfigError, DataError
+from curate.exporters.kitti import WeightedFrame, export_kitti
+
+BOXES = np.array(
+    [[20.0, 0, 0, 4, 2, 1.5, 0.1], [10, -2, 0, 0.8, 0.6, 1.7, 3], [9, 2, 0, 4, 2, 1, 1]]
+)
+
+
+def weighted_frame(name="000001", weights=(0.75, 0.0, 0.5)):
+    """Three labels, the second of which is to be ignored."""
+    count = len(weights)
+    labels = Detections(
+        BOXES[:count],
+        np.array([0.9, 0.3, 0.6])[:count],
+        np.array(["Car", "Pedestrian", "Car"])[:count],
+    )
+    return WeightedFrame(name, labels, np.array(weights), toy_calibration(), IMAGE_SIZE)
+
+
+def files(directory):
+    """Every file below a folder, by its path there."""
+    paths = [path for path in directory.rglob("*") if path.is_file()]
+    return {str(path.relative_to(directory)): path.read_text() for path in paths}
+
+
+def test_labels_are_kitti_lines_with_their_weight(tmp_path):
+    """The reader of result files gets boxes, categories, and the weight in place of the score."""
+    assert export_kitti(tmp_path / "out", [weighted_frame()]) == 3
+    objects = read_objects(tmp_path / "out" / "label_2" / "000001.txt", scored=True)
+    assert objects.categories.tolist() == ["Car", "DontCare", "Car"]
+    assert objects.scores.tolist() == [0.75, 0.0, 0.5]
+    kept = to_detections(objects, toy_calibration())
+    assert kept.boxes == pytest.approx(BOXES[[0, 2]], abs=1e-3)
+
+
+def test_a_label_of_weight_0_is_an_ignored_region(tmp_path):
+    """Its line keeps the rectangle only; category and 3D box are in the folder `weight`."""
+    export_kitti(tmp_path / "out", [weighted_frame()])
+    lines = (tmp_path / "out" / "label_2" / "000001.txt").read_text().splitlines()
+    fields = lines[1].split()
+    assert fields[:4] == ["DontCare", "-1", "-1", "-10"]
+    left, top, right, bottom = map(float, fields[4:8])
+    assert 0 <= left < right <= IMAGE_SIZE[0]
+    assert 0 <= top < bottom <= IMAGE_SIZE[1]
+    assert fields[8:15] == ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
+    sidecar = (tmp_path / "out" / "weight" / "000001.txt").read_text().splitlines()
+    category, *numbers = sidecar[1].split()
+    assert category == "Pedestrian"
+    assert [float(number) for number in numbers] == pytest.approx([0.0, 0.3, *BOXES[1]])
+
+
+@pytest.mark.parametrize(
+    ("last_field", "scores"), [("weight", [0.75, 0, 0.5]), ("score", [0.9, 0.3, 0.6])]
+)
+def test_the_last_field_is_chosen(tmp_path, last_field, scores):
+    """Weight or score in the 16th field."""
+    export_kitti(tmp_path / "out", [weighted_frame()], last_field=last_field)
+    objects = read_objects(tmp_path / "out" / "label_2" / "000001.txt", scored=True)
+    assert objects.scores.tolist() == scores
+
+
+def test_without_a_last_field_they_are_plain_label_files(tmp_path):
+    """15 fields, as KITTI's own."""
+    export_kitti(tmp_path / "out", [weighted_frame()], last_field="none")
+    assert len(read_objects(tmp_path / "out" / "label_2" / "000001.txt")) == 3
+    with pytest.raises(ConfigError, match="use one of weight, score, none"):
+        export_kitti(tmp_path / "out", [], last_field="loss")
+
+
+def test_frames_without_labels_get_empty_files(tmp_path):
+    """So that a trainer finds a file for every frame."""
+    export_kitti(tmp_path / "out", [weighted_frame(weights=())])
+    assert files(tmp_path / "out") == {
+        "label_2/000001.txt": "",
+        "weight/000001.txt": "",
+        "export.json": (tmp_path / "out" / "export.json").read_text(),
+    }
+
+
+def test_a_later_export_leaves_nothing_of_the_former(tmp_path):
+    """Files of frames that are no longer there are gone, and no partial folder is left."""
+    out = tmp_path / "out"
+    export_kitti(out, [weighted_frame("000001"), weighted_frame("000002")])
+    export_kitti(out, [weighted_frame("000003", (0.5,))])
+    assert set(files(out)) == {"label_2/000003.txt", "weight/000003.txt", "export.json"}
+    marker = json.loads((out / "export.json").read_text())
+    assert (marker["frames"], marker["labels"], marker["last_field"]) == (1, 1, "weight")
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_an_export_that_fails_leaves_the_former_as_it_was(tmp_path):
+    """Whatever breaks in the middle of the frames."""
+    out = tmp_path / "out"
+    export_kitti(out, [weighted_frame()])
+    former = files(out)
+
+    def breaking():
+        yield weighted_frame("000005")
+        raise DataError("frame 000006 cannot be read")
+
+    with pytest.raises(DataError, match="000006"):
+        export_kitti(out, breaking())
+    assert files(out) == former
+    assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize("marker", [None, "{}", "[]", "no json", '{"format": "other"}'])
+def test_folders_that_are_no_former_export_are_left_alone(tmp_path, marker):
+    """A data set's own labels are never overwritten."""
+    label = tmp_path / "training" / "label_2" / "000001.txt"
+    label.parent.mkdir(parents=True)
+    label.write_text("precious")
+    if marker is not None:
+        (tmp_path / "training" / "export.json").write_text(marker)
+    with pytest.raises(ConfigError, match="no former export; name another folder"):
+        export_kitti(tmp_path / "training", [weighted_frame()])
+    assert label.read_text() == "precious"
+
+
+def test_a_file_in_the_place_of_the_folder_is_left_alone(tmp_path):
+    """The same for a file."""
+    (tmp_path / "out").write_text("precious")
+    with pytest.raises(ConfigError, match="no former export"):
+        export_kitti(tmp_path / "out", [weighted_frame()])
+
+
+def test_an_empty_folder_and_the_rest_of_a_killed_export_are_taken(tmp_path):
+    """Both hold nothing that could be lost."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / ".out.partial" / "label_2").mkdir(parents=True)
+    (tmp_path / ".out.partial" / "label_2" / "000009.txt").write_text("")
+    export_kitti(tmp_path / "out", [weighted_frame()])
+    assert "label_2/000009.txt" not in files(tmp_path / "out")
+
+
+@pytest.mark.parametrize("weights", [(0.5, np.nan, 0.5), (0.5, 1.1, 0.5), (0.5, -0.1, 0.5)])
+def test_weights_out_of_range_are_refused(tmp_path, weights):
+    """The error names the frame."""
+    with pytest.raises(DataError, match="frame 000001: needs one weight in"):
+        export_kitti(tmp_path / "out", [weighted_frame(weights=weights)])
+
+
+def test_a_frame_that_occurs_twice_is_refused(tmp_path):
+    """Otherwise the first would be lost in silence."""
+    with pytest.raises(DataError, match="frame 000001 occurs twice"):
+        export_kitti(tmp_path / "out", [weighted_frame(), weighted_frame()])

@@ -1,0 +1,118 @@
+"""The reader of exported labels."""
+
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+import torch
+
+from curate.errors import DataError, LeakageError
+from curate.frames import Frame
+from curate.training.labels import WeightedLabels
+
+
+def change(path, statement):
+    """Changes a label file behind the writer's back."""
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(statement)
+        connection.commit()
+
+
+def test_labeled_and_unlabeled_samples(make_labels):
+    """Ground truth weighs 1, pseudo-labels weigh what the file says, splits are told apart."""
+    labels = WeightedLabels(make_labels(labeled=2, unlabeled=1, weight=0.25))
+    assert isinstance(labels, torch.utils.data.Dataset)
+    assert len(labels) == 3
+    assert [sample.labeled for sample in labels] == labels.labeled.tolist() == [True, True, False]
+    assert labels.categories == ("Car", "Pedestrian", "Cyclist")
+    assert labels[0].weights.tolist() == [1.0, 1.0, 1.0]
+    assert labels[2].weights.tolist() == [0.25, 0.25, 0.25]
+    assert labels[2].boxes.shape == (3, 7)
+    assert sorted(labels[2].categories.tolist()) == ["Car", "Cyclist", "Pedestrian"]
+    assert labels[0].points.dtype == np.float32
+
+
+def test_a_torch_loader_takes_the_labels(make_labels):
+    """The reader serves a user's own training loop."""
+    labels = WeightedLabels(make_labels(labeled=2))
+    loader = torch.utils.data.DataLoader(labels, batch_size=2, collate_fn=list)
+    assert [sample.frame_id for batch in loader for sample in batch] == ["000000", "000001"]
+
+
+def test_only_points_in_the_camera_view_are_kept(make_labels):
+    """Toy frames have points beside the view, which the detector never sees."""
+    labels = WeightedLabels(make_labels(labeled=1))
+    points = labels[0].points
+    assert len(points) > 0
+    assert (np.abs(points[:, 1]) <= points[:, 0] + 1e-3).all()
+
+
+def test_weight_zero_is_marked_as_ignored(make_labels):
+    """A label of weight 0 is there, marked as a region to leave out."""
+    sample = WeightedLabels(make_labels(labeled=1, unlabeled=1, weight=0.0))[1]
+    assert sample.ignored.all()
+    assert len(sample.boxes) == 3
+
+
+def test_neighbour_categories_are_ignored_and_strangers_left_out(make_labels):
+    """A Van is neither Car nor background, a Tram is nothing to a detector of cars."""
+    path = make_labels(labeled=1, categories=("Car",))
+    change(path, "UPDATE ground_truth SET category = 'Van' WHERE category = 'Pedestrian'")
+    sample = WeightedLabels(path)[0]
+    assert sample.categories.tolist() == ["Car", "Car"]
+    assert sorted(sample.weights.tolist()) == [0.0, 1.0]
+
+
+def test_a_frame_without_boxes_is_a_sample_too(make_labels):
+    """Frames on which nothing was found teach what background looks like."""
+    path = make_labels(labeled=1, unlabeled=1)
+    change(path, "DELETE FROM label")
+    sample = WeightedLabels(path)[1]
+    assert sample.boxes.shape == (0, 7)
+    assert sample.weights.shape == sample.categories.shape == (0,)
+
+
+def test_a_reader_of_the_callers_own(make_labels):
+    """Frames of any data set can be served by a function."""
+    path = make_labels(labeled=1)
+    original = WeightedLabels(path)
+    reference = original._read("000000")
+
+    def read(frame_id: str) -> Frame:
+        return Frame(frame_id, reference.points[:50], reference.calibration, reference.image_size)
+
+    assert len(WeightedLabels(path, read=read)[0].points) <= 50
+
+
+def test_the_data_set_may_have_moved(make_labels, toy_kitti, tmp_path):
+    """A root given by the caller counts instead of the one in the file."""
+    path = make_labels(labeled=1)
+    toy_kitti.rename(tmp_path / "moved")
+    with pytest.raises(DataError, match="kitti"):
+        WeightedLabels(path)
+    assert len(WeightedLabels(path, root=tmp_path / "moved")[0].points)
+
+
+def test_smuggled_ground_truth_is_refused(make_labels):
+    """A file whose ground truth reaches an unlabeled frame is not read, and the frame is named."""
+    path = make_labels(labeled=1, unlabeled=1)
+    change(path, "UPDATE ground_truth SET frame = '000001' WHERE k = 0")
+    with pytest.raises(LeakageError, match="000001"):
+        WeightedLabels(path)
+
+
+def test_files_that_are_no_label_files(tmp_path, make_labels):
+    """Missing, not SQLite, without the tables, of another version: one line that says so."""
+    with pytest.raises(DataError, match=r"none\.sqlite: no such label file"):
+        WeightedLabels(tmp_path / "none.sqlite")
+    (tmp_path / "text.sqlite").write_text("round,frame,weight\n" * 100)
+    with pytest.raises(DataError, match=r"text\.sqlite: not a label file"):
+        WeightedLabels(tmp_path / "text.sqlite")
+    (tmp_path / "empty.sqlite").touch()
+    with pytest.raises(DataError, match=r"empty\.sqlite: not a label file"):
+        WeightedLabels(tmp_path / "empty.sqlite")
+    path = make_labels()
+    change(path, "UPDATE meta SET value = '7' WHERE key = 'format_version'")
+    with pytest.raises(DataError, match="label format 7"):
+        WeightedLabels(path)

@@ -1,0 +1,126 @@
+"""The weighted loss, with numbers worked by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from curate.detectors.pillars.encoding import BOX_CODE, encode_boxes
+from curate.detectors.pillars.presets import PRESETS
+from curate.training.loss import BatchTargets, box_loss, heatmap_loss, weighted_loss
+
+PRESET = replace(PRESETS["small"], x_range=(0.0, 20.48), y_range=(-10.24, 10.24))
+CAR = [10.0, 0.0, -0.8, 4.0, 1.6, 1.5, 0.3]
+
+
+def targets_of(*frames):
+    """Targets of frames, each a list of (box, weight), of one category."""
+    return BatchTargets.stack(
+        [
+            encode_boxes(
+                np.array([box for box, _ in frame]).reshape(-1, 7),
+                np.zeros(len(frame), dtype=int),
+                np.array([weight for _, weight in frame]),
+                1,
+                PRESET,
+            )
+            for frame in frames
+        ]
+    )
+
+
+def answers(frames=1, seed=0):
+    """Random logits and codes that ask for gradients."""
+    generator = torch.Generator().manual_seed(seed)
+    logits = torch.randn(frames, *PRESET.cells, 1, generator=generator, dtype=torch.float64)
+    codes = torch.randn(frames, *PRESET.cells, BOX_CODE, generator=generator, dtype=torch.float64)
+    return logits.requires_grad_(), codes.requires_grad_()
+
+
+def gradients(targets, seed=0, frames=1):
+    """Of the whole loss."""
+    logits, codes = answers(frames, seed)
+    weighted_loss(logits, codes, targets, 1.0).backward()
+    return logits.grad, codes.grad
+
+
+def test_background_alone():
+    """Without objects each of the 32 x 32 cells at p = 1/2 adds 1/4 * ln 2."""
+    logits = torch.zeros(1, *PRESET.cells, 1)
+    expected = 32 * 32 * 0.25 * math.log(2)
+    assert float(heatmap_loss(logits, targets_of([]))) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_centre_adds_its_focal_term_times_v():
+    """At p = 1/4 the centre of an object adds v * (3/4)^2 * ln 4, more than an ignored one."""
+    logits = torch.full((1, *PRESET.cells, 1), math.log(1 / 3), dtype=torch.float64)
+    kept = targets_of([(CAR, 0.5)])
+    silent = replace(kept, weights=torch.zeros(1))
+    difference = heatmap_loss(logits, kept) - heatmap_loss(logits, silent)
+    assert float(difference) == pytest.approx(0.5 * 0.75**2 * math.log(4))
+
+
+def test_the_box_term_is_l1_times_v():
+    """All codes wrong by 1/2 in each of their entries cost v * BOX_CODE / 2."""
+    targets = targets_of([(CAR, 0.25)])
+    codes = torch.zeros(1, *PRESET.cells, BOX_CODE)
+    codes.flatten(0, 2)[targets.code_cells] = targets.codes + 0.5
+    assert float(box_loss(codes, targets)) == pytest.approx(0.25 * BOX_CODE / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("v", [0.1, 0.5])
+def test_the_gradient_of_an_object_is_v_times_that_of_a_sure_one(v):
+    """In the object's region every gradient is scaled by v, outside nothing changes."""
+    sure, unsure = targets_of([(CAR, 1.0)]), targets_of([(CAR, v)])
+    region = (unsure.background < 1)[0, ..., 0]
+    logits_sure, codes_sure = gradients(sure)
+    logits_unsure, codes_unsure = gradients(unsure)
+    torch.testing.assert_close(logits_unsure[0][region], v * logits_sure[0][region])
+    torch.testing.assert_close(logits_unsure[0][~region], logits_sure[0][~region])
+    torch.testing.assert_close(codes_unsure, v * codes_sure)
+    assert codes_sure.abs().sum() > 0
+
+
+def test_an_ignored_region_has_no_gradient():
+    """A label of weight 0 says nothing: neither object nor background where it lies."""
+    targets = targets_of([(CAR, 0.0)])
+    logits, codes = gradients(targets)
+    region = (targets.background == 0)[0, ..., 0]
+    assert int(region.sum()) >= 15
+    assert not logits[0][region].any()
+    assert logits[0][~region].abs().min() > 0
+    assert not codes.any()
+
+
+def test_the_weights_of_other_objects_do_not_matter():
+    """A sure object's gradient is the same beside unsure ones: no sum of weights divides it."""
+    other = [10.0, 7.0, *CAR[2:]]
+    alone = gradients(targets_of([(CAR, 1.0)], []), frames=2)[1]
+    for weight in (0.0, 0.3, 1.0):
+        together = gradients(targets_of([(CAR, 1.0)], [(other, weight)]), frames=2)[1]
+        torch.testing.assert_close(together[0], alone[0])
+
+
+def test_frames_of_a_batch_do_not_mix():
+    """The loss of a batch is the sum of the losses of its frames."""
+    frames = ([(CAR, 1.0)], [], [([5.0, -3.0, *CAR[2:]], 0.4), (CAR, 0.9)])
+    logits, codes = answers(3)
+    together = weighted_loss(logits, codes, targets_of(*frames), 2.0)
+    alone = [
+        weighted_loss(logits[i : i + 1], codes[i : i + 1], targets_of(frame), 2.0)
+        for i, frame in enumerate(frames)
+    ]
+    torch.testing.assert_close(together, sum(alone))
+
+
+def test_large_logits_stay_finite():
+    """Saturated answers give finite losses and gradients."""
+    logits = torch.full((1, *PRESET.cells, 1), 60.0, requires_grad=True)
+    wrong = heatmap_loss(logits, targets_of([(CAR, 1.0)])) + heatmap_loss(
+        -logits, targets_of([(CAR, 1.0)])
+    )
+    wrong.backward()
+    assert math.isfinite(float(wrong.detach()))
+    assert torch.isfinite(logits.grad).all()

@@ -1,0 +1,167 @@
+"""Cut-and-paste: where the bank comes from, and what a paste leaves behind."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from curate.errors import LeakageError
+from curate.geometry.overlap import bev_iou
+from curate.geometry.points_in_boxes import count_points_in_boxes
+from curate.training.augmentation import Augmentation
+from curate.training.labels import Sample
+from curate.training.object_bank import ObjectBank, paste_objects
+
+
+def wall(distance, half_width=30.0):
+    """Points of a wall across the view, from the ground to 2 m above the sensor."""
+    y, z = np.meshgrid(np.arange(-half_width, half_width, 0.1), np.arange(-1.7, 2, 0.1))
+    points = np.stack([np.full(y.size, distance), y.ravel(), z.ravel(), np.zeros(y.size)], axis=1)
+    inside_view = np.abs(points[:, 1]) < 0.8 * points[:, 0]
+    return points[inside_view].astype(np.float32)
+
+
+def sample_of(points, boxes=(), name="000000", **changes):
+    """A labeled sample of cars with weight 1."""
+    boxes = np.array(boxes, dtype=float).reshape(-1, 7)
+    n = len(boxes)
+    base = Sample(name, True, points, boxes, np.array(["Car"] * n, dtype=np.str_), np.ones(n))
+    return replace(base, **changes)
+
+
+# A little slack for points on a side.
+GROWTH = np.array([0, 0, 0, 0.01, 0.01, 0.01, 0])
+CAR = [15.0, 3.0, -0.9, 4.0, 1.6, 1.5, 0.4]
+
+
+def car_points(count=60, seed=0):
+    """Points inside CAR."""
+    rng = np.random.default_rng(seed)
+    local = rng.uniform(-0.49, 0.49, (count, 3)) * CAR[3:6]
+    cos, sin = np.cos(CAR[6]), np.sin(CAR[6])
+    local[:, :2] = local[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+    return np.column_stack([local + CAR[:3], np.full(count, 0.9)]).astype(np.float32)
+
+
+@pytest.fixture
+def bank():
+    """One car of 60 points."""
+    return ObjectBank.build([sample_of(car_points(), [CAR])], ("Car", "Tram"))
+
+
+def test_the_bank_holds_objects_with_their_points(bank):
+    """Box and points of each object are cut out as they were seen."""
+    (car,) = bank.objects["Car"]
+    assert car.box.tolist() == CAR
+    assert len(car.points) == 60
+    assert bank.objects["Tram"] == ()
+
+
+def test_objects_with_few_points_or_weight_zero_are_left_out():
+    """What can hardly be seen, or is not sure to be an object, is no example."""
+    few = sample_of(car_points(4), [CAR])
+    ignored = sample_of(car_points(), [CAR], weights=np.zeros(1))
+    assert ObjectBank.build([few, ignored], ("Car",), 5).objects["Car"] == ()
+
+
+def test_an_unlabeled_frame_in_the_bank_is_a_leak():
+    """Pseudo-labels never become examples; the frame is named."""
+    with pytest.raises(LeakageError, match="000077"):
+        ObjectBank.build([sample_of(car_points(), [CAR], "000077", labeled=False)], ("Car",))
+
+
+def paste(sample, bank, count=3, seeds=range(12)):
+    """The results of several pastes that added something."""
+    results = [paste_objects(sample, bank, count, np.random.default_rng(seed)) for seed in seeds]
+    return [result for result in results if len(result.boxes) > len(sample.boxes)]
+
+
+def test_a_pasted_object_keeps_its_points_and_its_distance(bank):
+    """It comes with weight 1 and all its points, as far from the sensor as it was."""
+    results = paste(sample_of(wall(40)), bank)
+    assert results
+    for result in results:
+        assert result.categories.tolist() == ["Car"]
+        assert result.weights.tolist() == [1.0]
+        box = result.boxes[0]
+        assert np.hypot(*box[:2]) == pytest.approx(np.hypot(*CAR[:2]))
+        assert box[2:6].tolist() == pytest.approx(CAR[2:6])
+        grown = box + GROWTH
+        assert count_points_in_boxes(result.points, grown[None])[0] == 60
+
+
+def test_a_pasted_object_hides_what_lies_behind_it(bank):
+    """The wall has a hole in the object's shadow and is untouched beside it."""
+    scene = wall(40)
+    for result in paste(sample_of(scene), bank):
+        box = result.boxes[0]
+        left = result.points[result.points[:, 3] == 0]
+        azimuth = np.arctan2(left[:, 1], left[:, 0]) - np.arctan2(box[1], box[0])
+        slope = left[:, 2] / np.hypot(left[:, 0], left[:, 1])
+        top, bottom = (box[2] + s * box[5] / 2 for s in (0.9, -0.9))
+        distance = np.hypot(box[0], box[1])
+        in_shadow = (
+            (np.abs(azimuth) < 0.02) & (slope < top / distance) & (slope > bottom / distance)
+        )
+        assert not in_shadow.any()
+        gone = len(scene) - len(left)
+        assert 0 < gone < len(scene) / 2
+
+
+def test_nothing_is_pasted_behind_a_wall(bank):
+    """A place that the sensor could not see stays empty."""
+    assert paste(sample_of(wall(8)), bank) == []
+
+
+def test_nothing_is_pasted_onto_a_box_or_onto_another_pasted_object(bank):
+    """Boxes do not overlap afterwards, whatever their weights."""
+    standing = [[15.0, y, -0.9, 4.0, 1.6, 1.5, 0.0] for y in (-6.0, 0.0, 6.0)]
+    sample = sample_of(wall(40), standing, weights=np.array([1.0, 0.2, 0.0]))
+    many = ObjectBank({"Car": bank.objects["Car"] * 6})
+    results = paste(sample, many)
+    assert results
+    for result in results:
+        overlap = bev_iou(result.boxes, result.boxes)
+        np.fill_diagonal(overlap, 0)
+        assert overlap.max() == 0
+
+
+def test_pasting_stays_in_view(bank):
+    """An object that would stick out of the view's sides is not placed."""
+    for result in paste(sample_of(wall(40, half_width=8.0)), bank, seeds=range(40)):
+        assert np.abs(result.points[:, 1] / result.points[:, 0]).max() < 8.1 / 40
+
+
+def test_pasting_is_repeatable_and_leaves_the_sample_alone(bank):
+    """The same generator gives the same result; the given sample is not changed."""
+    sample = sample_of(wall(40))
+    before = sample.points.copy()
+    first, second = (paste_objects(sample, bank, 2, np.random.default_rng(3)) for _ in range(2))
+    np.testing.assert_array_equal(first.points, second.points)
+    np.testing.assert_array_equal(sample.points, before)
+
+
+def test_no_points_no_paste(bank):
+    """An empty frame, or a count of 0, is given back as it is."""
+    empty = sample_of(np.zeros((0, 4), dtype=np.float32))
+    assert paste_objects(empty, bank, 3, np.random.default_rng(0)) is empty
+    full = sample_of(wall(40))
+    assert len(paste_objects(full, bank, 0, np.random.default_rng(0)).boxes) == 0
+
+
+def test_augmentation_moves_points_and_boxes_together(bank):
+    """Every object has its points inside its box afterwards."""
+    augmentation = Augmentation(0.5, np.pi / 4, (0.9, 1.1), pasted=2, fewest_points=5)
+    sample = sample_of(np.concatenate([wall(40), car_points()]), [CAR])
+    for seed in range(10):
+        changed = augmentation.apply(sample, bank, np.random.default_rng(seed))
+        grown = changed.boxes + GROWTH
+        assert (count_points_in_boxes(changed.points, grown) >= 60).all()
+        assert (changed.weights == 1).all()
+
+
+def test_what_is_not_seen_is_ignored(bank):
+    """An object with too few points is neither taught nor background."""
+    augmentation = Augmentation(0.0, 0.0, (1.0, 1.0), pasted=0, fewest_points=5)
+    sample = sample_of(np.concatenate([wall(40), car_points(4)]), [CAR])
+    assert augmentation.apply(sample, bank, np.random.default_rng(0)).weights.tolist() == [0.0]

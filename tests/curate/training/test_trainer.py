@@ -1,0 +1,234 @@
+"""Training: it learns, it goes on after a kill, and it refuses what it cannot use."""
+
+import logging
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from curate.datasets.kitti import KittiDataset
+from curate.detectors.pillars import PillarDetector
+from curate.detectors.pillars.checkpoint import load_checkpoint
+from curate.errors import ConfigError, DataError, ModelError
+from curate.training.batches import Batches
+from curate.training.labels import WeightedLabels
+from curate.training.settings import TrainingSettings
+from curate.training.snapshot import snapshot_path
+from curate.training.trainer import one_cycle, train
+
+
+def quick(tiny, **changes):
+    """Settings of a training of a second or so."""
+    settings = {"preset": tiny, "steps": 6, "batch_size": 2, "pasted": 1, "snapshot_seconds": 0.0}
+    return TrainingSettings(**(settings | changes))
+
+
+class Killed(Exception):  # noqa: N818 - stands for a signal
+    """Ends a training in the middle."""
+
+
+def kill_at(last):
+    """A progress callback that ends the training after a step."""
+
+    def progress(step, steps, loss):
+        if step == last:
+            raise Killed
+
+    return progress
+
+
+def weights_of(path):
+    """All tensors of a checkpoint."""
+    return load_checkpoint(path).weights
+
+
+def assert_same_weights(path_a, path_b):
+    """Two checkpoints are equal to the last bit."""
+    a, b = weights_of(path_a), weights_of(path_b)
+    assert a.keys() == b.keys()
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_a_training_learns_its_frames(make_labels, tiny, toy_kitti, tmp_path):
+    """After a few seconds every object of two labeled frames is found where it is."""
+    path = tmp_path / "teacher.safetensors"
+    settings = quick(
+        tiny, steps=120, learning_rate=1e-2, pasted=0, flip_probability=0.0,
+        rotation_limit_rad=0.0, scale_range=(1.0, 1.0), snapshot_seconds=60.0,
+    )  # fmt: skip
+    report = train(make_labels(labeled=2), path, settings)
+    assert report.steps == 120
+    assert report.bank == {"Car": 2, "Pedestrian": 2, "Cyclist": 2}
+    detector, dataset = PillarDetector(path, score_threshold=0.3), KittiDataset(toy_kitti)
+    for frame_id in ("000000", "000001"):
+        truth = dataset.annotations(frame_id)
+        found = detector.predict(dataset.read(frame_id))
+        for box, category in zip(truth.boxes, truth.categories, strict=True):
+            away = found.boxes[found.categories == category] - box
+            assert np.abs(away[:, :2]).max(axis=1).min() < 0.4, (frame_id, category)
+
+
+def test_a_killed_training_ends_with_the_same_weights(make_labels, tiny, tmp_path):
+    """Killed after step 4 and called again, it goes on there and ends as if nothing happened."""
+    labels, settings = make_labels(labeled=3, unlabeled=2), quick(tiny)
+    whole, killed = tmp_path / "whole.safetensors", tmp_path / "killed.safetensors"
+    whole_report = train(labels, whole, settings)
+    with pytest.raises(Killed):
+        train(labels, killed, settings, progress=kill_at(5))
+    assert not killed.exists()
+    report = train(labels, killed, settings)
+    assert report.resumed_at == 4
+    assert report.loss == whole_report.loss
+    assert_same_weights(whole, killed)
+    assert not snapshot_path(killed).exists()
+
+
+@pytest.mark.parametrize("change", ["settings", "labels", "start", "damage", "pickle"])
+def test_a_snapshot_of_another_training_is_not_used(make_labels, tiny, tmp_path, change):
+    """With other settings, labels or start, or a damaged snapshot, a training begins anew."""
+    labels, output = make_labels(labeled=2), tmp_path / "out.safetensors"
+    settings, start = quick(tiny), None
+    train(labels, tmp_path / "start.safetensors", quick(tiny, steps=1))
+    with pytest.raises(Killed):
+        train(labels, output, settings, progress=kill_at(4))
+    if change == "settings":
+        settings = quick(tiny, learning_rate=1e-3)
+    elif change == "labels":
+        labels = make_labels(labeled=3, name="more.sqlite")
+    elif change == "start":
+        start = tmp_path / "start.safetensors"
+    elif change == "damage":
+        snapshot_path(output).write_bytes(snapshot_path(output).read_bytes()[:5000])
+    else:
+        snapshot_path(output).write_bytes(pickle.dumps({"fingerprint": print}))
+    assert train(labels, output, settings, start=start).resumed_at == 0
+
+
+def test_fine_tuning_begins_with_the_teacher(make_labels, tiny, tmp_path):
+    """With a vanishing rate the student is the teacher, up to the running means of its norms."""
+    labels, teacher = make_labels(labeled=2), tmp_path / "teacher.safetensors"
+    student = tmp_path / "student.safetensors"
+    train(labels, teacher, quick(tiny))
+    train(labels, student, quick(tiny, learning_rate=1e-12), start=teacher)
+    for name, array in weights_of(teacher).items():
+        if "running" not in name and "num_batches" not in name:
+            np.testing.assert_allclose(weights_of(student)[name], array, atol=1e-6)
+
+
+def test_a_start_that_does_not_fit_is_refused(make_labels, tiny, tmp_path):
+    """A teacher of other categories or of another preset is an error of one line."""
+    teacher = tmp_path / "teacher.safetensors"
+    train(make_labels(labeled=2), teacher, quick(tiny, steps=1))
+    cars = make_labels(labeled=2, name="cars.sqlite", categories=("Car",))
+    with pytest.raises(ConfigError, match=r"teacher\.safetensors: is a tiny detector of Car, Ped"):
+        train(cars, tmp_path / "out.safetensors", quick(tiny), start=teacher)
+    with pytest.raises(ConfigError, match="the training is for small"):
+        train(make_labels(), tmp_path / "out.safetensors", quick("small"), start=teacher)
+    teacher.write_bytes(b"no model")
+    with pytest.raises(ModelError, match="teacher"):
+        train(make_labels(), tmp_path / "out.safetensors", quick(tiny), start=teacher)
+
+
+def test_the_result_depends_on_the_seed_only(make_labels, tiny, tmp_path):
+    """Same seed, same weights, whatever torch's global generator holds; another seed, others."""
+    labels = make_labels(labeled=2)
+    paths = [tmp_path / f"{name}.safetensors" for name in "abc"]
+    for path, seed in zip(paths, (1, 1, 2), strict=True):
+        torch.manual_seed(len(str(path)) + seed * 7)
+        before = torch.random.get_rng_state()
+        train(labels, path, quick(tiny, steps=2, seed=seed))
+        assert torch.equal(torch.random.get_rng_state(), before)
+    assert_same_weights(paths[0], paths[1])
+    name = "answer.weight"
+    assert not np.array_equal(weights_of(paths[0])[name], weights_of(paths[2])[name])
+
+
+def test_batches_hold_the_share_of_labeled_frames(make_labels, tiny):
+    """Half of each batch is labeled; without an unlabeled split all of it is."""
+    mixed = Batches(WeightedLabels(make_labels(2, 6)), quick(tiny, batch_size=4))
+    for step in range(5):
+        chosen = mixed._chosen(step)
+        assert sum(index in mixed.labeled for index in chosen) == 2
+    seen = {index for step in range(3) for index in mixed._chosen(step)}
+    assert seen == set(range(8))
+    alone = Batches(WeightedLabels(make_labels(2, name="b.sqlite")), quick(tiny, batch_size=4))
+    assert all(index in alone.labeled for index in alone._chosen(7))
+
+
+def test_labels_of_weight_zero_can_become_background(make_labels, tiny):
+    """`background` forgets them, `ignore` blanks their regions."""
+    labels = WeightedLabels(make_labels(labeled=1, unlabeled=1, weight=0.0))
+    blank = {
+        zero: Batches(labels, quick(tiny, pasted=0, zero_weight=zero))[0]
+        .targets.background[1]
+        .eq(0)
+        .sum()
+        for zero in ("ignore", "background")
+    }
+    assert blank["ignore"] > 0
+    assert blank["background"] == 0
+
+
+def test_frames_that_do_not_fit_into_memory_are_read_again(make_labels, tiny):
+    """Without room in the cache the batches are the same."""
+    labels = WeightedLabels(make_labels(labeled=3))
+    with_room = Batches(labels, quick(tiny))[2]
+    without = Batches(labels, quick(tiny, cache_bytes=0))[2]
+    assert torch.equal(with_room.features, without.features)
+    assert torch.equal(with_room.targets.heatmap, without.targets.heatmap)
+
+
+def test_without_labeled_frames_there_is_no_training(make_labels, tiny, tmp_path):
+    """A label file of pseudo-labels alone is refused."""
+    with pytest.raises(DataError, match="no labeled frame"):
+        train(make_labels(0, 2), tmp_path / "out.safetensors", quick(tiny))
+
+
+def test_a_category_without_ground_truth_is_announced(make_labels, tiny, tmp_path, caplog):
+    """A category that X_l never shows is a warning that names it."""
+    labels = make_labels(labeled=1, categories=("Car", "Tram"))
+    with caplog.at_level(logging.WARNING):
+        train(labels, tmp_path / "out.safetensors", quick(tiny, steps=1))
+    assert "no labeled Tram" in caplog.text
+
+
+def test_an_empty_frame_can_be_trained_on(make_labels, tiny, toy_kitti, tmp_path):
+    """A sweep without a single point breaks nothing."""
+    labels = make_labels(labeled=1, unlabeled=1)
+    (toy_kitti / "training" / "velodyne" / "000001.bin").write_bytes(b"")
+    report = train(labels, tmp_path / "out.safetensors", quick(tiny, steps=2))
+    assert np.isfinite(report.loss)
+
+
+def test_the_rate_rises_and_falls():
+    """One cycle: a tenth of the peak first, the peak after three tenths, nothing in the end."""
+    rates = [one_cycle(step, 100, 2.0) for step in range(100)]
+    assert rates[0] == pytest.approx(0.2)
+    assert max(rates) == rates[30] == pytest.approx(2.0)
+    assert rates[99] < 0.01
+    assert one_cycle(0, 1, 1.0) > 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"preset": "huge"}, "unknown preset 'huge'"),
+        ({"steps": 0}, "steps is 0"),
+        ({"learning_rate": 0.0}, "learning_rate"),
+        ({"labeled_share": 0.0}, "labeled_share"),
+        ({"scale_range": (0.0, 1.0)}, "scale_range"),
+        ({"zero_weight": "perhaps"}, "choose ignore or background"),
+    ],
+)
+def test_settings_that_no_training_can_use(wrong, message):
+    """A wrong setting is named before anything is read."""
+    with pytest.raises(ConfigError, match=message):
+        TrainingSettings(**wrong)
+
+
+def test_an_unknown_device_is_named(make_labels, tiny, tmp_path):
+    """A device that is not there is a configuration error."""
+    with pytest.raises(ConfigError, match="cuda:99"):
+        train(make_labels(), tmp_path / "out.safetensors", quick(tiny, device="cuda:99"))

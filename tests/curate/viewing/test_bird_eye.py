@@ -1,0 +1,87 @@
+"""Tests of the bird's eye view."""
+
+import numpy as np
+import pytest
+
+from curate.viewing.bird_eye import Region, draw_bird_eye
+from curate.viewing.legend import TITLE_HEIGHT
+from curate.viewing.palette import GROUND_TRUTH, weight_colours
+from curate.viewing.tags import ShownLabels
+
+REGION = Region(0, 40, -20, 20, 10)
+
+
+def labels(boxes, weights):
+    """Cars with weights."""
+    boxes = np.array(boxes, dtype=np.float64).reshape(-1, 7)
+    count = len(boxes)
+    return ShownLabels(boxes, np.array(["Car"] * count, dtype=np.str_), np.full(count, 0.9),
+                       np.array(weights, dtype=np.float64))  # fmt: skip
+
+
+def near(picture, place, colour, reach=2):
+    """Whether a colour is seen close to a place (x, y in metres)."""
+    column, row = np.rint(REGION.to_pixels(np.array(place, dtype=np.float64))).astype(int)
+    around = picture[row - reach : row + reach + 1, column - reach : column + reach + 1]
+    return (np.abs(around.astype(int) - colour).max(axis=2) < 40).any()
+
+
+def test_forward_is_up_and_left_is_left():
+    """The LiDAR's x points up, its y to the left."""
+    origin = REGION.to_pixels(np.zeros(2))
+    assert origin.tolist() == [200, 400 + TITLE_HEIGHT]
+    assert REGION.to_pixels(np.array([10.0, 5.0])).tolist() == [150, 300 + TITLE_HEIGHT]
+    assert REGION.size == (400, 400)
+
+
+def test_footprints_have_the_colour_of_their_weight():
+    """The outline of a turned box is where its corners are."""
+    box = [20, 5, 0, 4, 2, 1.5, np.pi / 2]
+    picture = draw_bird_eye(np.zeros((0, 4)), labels([box], [0.6]), region=REGION)
+    colour = weight_colours(np.array([0.6]))[0].astype(int)
+    for corner in ((21, 7), (19, 7), (19, 3), (21, 3)):
+        assert near(picture, corner, colour)
+    assert not near(picture, (22, 5), colour)
+
+
+def test_ground_truth_is_white_and_may_be_unknown():
+    """Regions without a box are left out."""
+    truth = np.array([[30.0, 0, 0, 4, 2, 1.5, 0], [np.nan] * 7])
+    with_truth = draw_bird_eye(np.zeros((0, 4)), labels([], []), truth, region=REGION)
+    without = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
+    assert near(with_truth, (32, 1), np.array(GROUND_TRUTH))
+    assert not near(without, (32, 1), np.array(GROUND_TRUTH))
+
+
+def test_points_are_seen():
+    """Points in the region brighten their place; those outside do no harm."""
+    points = np.array([[15.3, -7.2, 1.0, 0], [500, 500, 0, 0], [-5, 0, 0, 0]])
+    empty = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
+    picture = draw_bird_eye(points, labels([], []), region=REGION)
+    rows, columns = np.nonzero((picture != empty).any(axis=2))
+    place = REGION.to_pixels(points[0, :2])
+    assert len(rows) > 0
+    assert np.hypot(columns - place[0], rows - place[1]).max() < 3
+
+
+def test_titles_are_written():
+    """The strip above the picture changes with the title."""
+    plain = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
+    titled = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION, title="frame 000008")
+    assert (plain[:TITLE_HEIGHT] != titled[:TITLE_HEIGHT]).any()
+    assert (plain[TITLE_HEIGHT:] == titled[TITLE_HEIGHT:]).all()
+
+
+@pytest.mark.parametrize("frame_id", ["000008", "000023"])
+def test_real_frames(kitti_root, frame_id):
+    """A crowded and a usual frame are drawn whole."""
+    from curate.datasets.kitti import KittiDataset
+    from curate.detectors.recorded import RecordedDetector
+
+    dataset = KittiDataset(kitti_root)
+    frame = dataset.read(frame_id)
+    found = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv").predict(frame)
+    shown = ShownLabels(found.boxes, found.categories, found.scores, found.scores)
+    picture = draw_bird_eye(frame.points, shown, dataset.annotations(frame_id).boxes)
+    assert picture.shape[2] == 3
+    assert (picture.max(axis=2) > 90).mean() > 0.01

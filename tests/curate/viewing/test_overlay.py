@@ -1,0 +1,92 @@
+"""Tests of the image overlay."""
+
+import numpy as np
+import pytest
+from toys import toy_calibration
+
+from curate.geometry.boxes import box_corners
+from curate.geometry.projection import project_points
+from curate.viewing.legend import STRIP_HEIGHT, TITLE_HEIGHT
+from curate.viewing.overlay import box_strokes, draw_overlay
+from curate.viewing.palette import weight_colours
+from curate.viewing.tags import ShownLabels
+
+SIZE = (1200, 400)
+
+
+def calibration():
+    """The toy camera with a focal length for a large image."""
+    toy = toy_calibration()
+    toy.projection[:] = [[600, 0, 600, 0], [0, 600, 200, 0], [0, 0, 1, 0]]
+    return toy
+
+
+def labels(boxes, weights):
+    """Cars with weights."""
+    boxes = np.array(boxes, dtype=np.float64).reshape(-1, 7)
+    count = len(boxes)
+    return ShownLabels(boxes, np.array(["Car"] * count, dtype=np.str_), np.full(count, 0.9),
+                       np.array(weights, dtype=np.float64))  # fmt: skip
+
+
+def test_strokes_are_the_edges_of_the_projected_box():
+    """Twelve edges whose ends are the projected corners, the front face first."""
+    box = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3]])
+    [strokes] = box_strokes(box, calibration(), SIZE)
+    corners, _ = project_points(box_corners(box)[0], calibration())
+    assert strokes.shape == (12, 2, 2)
+    for end in strokes.reshape(-1, 2):
+        assert np.linalg.norm(corners - end, axis=1).min() < 1e-6
+    lengths = {tuple(sorted(map(tuple, np.rint(stroke).tolist()))) for stroke in strokes}
+    assert len(lengths) == 12
+    front = corners[[0, 3, 7, 4]]
+    for end in strokes[:4].reshape(-1, 2):
+        assert np.linalg.norm(front - end, axis=1).min() < 1e-6
+
+
+def test_boxes_behind_the_camera_have_no_strokes():
+    """Nor do boxes beside the image; one that is half behind has finite ones."""
+    boxes = np.array([
+        [-15.0, 1, 0, 4, 2, 1.5, 0.3], [5, 60, 0, 4, 2, 1.5, 0], [1.0, -1.5, 0, 4, 2, 1.5, 0],
+    ])  # fmt: skip
+    behind, beside, partly = box_strokes(boxes, calibration(), SIZE)
+    assert len(behind) == len(beside) == 0
+    assert 0 < len(partly) < 12
+    assert np.isfinite(partly).all()
+
+
+def test_no_boxes():
+    """An empty frame is drawn as it is."""
+    image = np.full((400, 1200, 3), 90, np.uint8)
+    picture = draw_overlay(image, calibration(), labels([], []), np.zeros((0, 7)))
+    assert picture.shape == (400 + TITLE_HEIGHT + STRIP_HEIGHT, 1200, 3)
+    assert (picture[TITLE_HEIGHT:-STRIP_HEIGHT] == 90).all()
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
+def test_boxes_have_the_colour_of_their_weight(weight):
+    """The colour is seen along an edge, on the image."""
+    shown = labels([[15.0, 1, 0, 4, 2, 1.5, 0.3]], [weight])
+    picture = draw_overlay(np.full((400, 1200, 3), 90, np.uint8), calibration(), shown)
+    stroke = box_strokes(shown.boxes, calibration(), SIZE)[0][1]
+    column, row = np.rint(stroke.mean(axis=0)).astype(int)
+    around = picture[row + TITLE_HEIGHT - 2 : row + TITLE_HEIGHT + 3, column - 2 : column + 3]
+    colour = weight_colours(np.array([weight]))[0].astype(int)
+    assert (np.abs(around.astype(int) - colour).max(axis=2) < 30).any()
+
+
+def test_small_images_are_enlarged():
+    """By a whole factor, so that captions can be read."""
+    picture = draw_overlay(np.zeros((40, 500, 3), np.uint8), calibration(), labels([], []))
+    assert picture.shape[:2] == (40 * 3 + TITLE_HEIGHT + STRIP_HEIGHT, 1500)
+
+
+def test_ground_truth_may_be_drawn():
+    """It changes the picture; regions without a box are left out."""
+    image = np.full((400, 1200, 3), 90, np.uint8)
+    truth = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3], [np.nan] * 7])
+    nothing = draw_overlay(image, calibration(), labels([], []), np.zeros((0, 7)))
+    picture = draw_overlay(image, calibration(), labels([], []), truth)
+    changed = picture[(picture != nothing).any(axis=2)]
+    assert len(changed) > 100
+    assert changed.max() > 230

@@ -1,0 +1,102 @@
+"""The house: who may import whom, and what may be said in it."""
+
+import ast
+import subprocess
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+# pipelines -> db -> curate, pipelines -> curate; never back.
+MAY_IMPORT = {
+    "curate": {"curate"},
+    "db": {"db", "curate"},
+    "pipelines": {"pipelines", "db", "curate"},
+}
+HOUSE = sorted(path for folder in MAY_IMPORT for path in (ROOT / folder).rglob("*.py"))
+
+
+def imports(path: Path) -> Iterator[str]:
+    """The modules that a file imports, anywhere in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module or ""
+
+
+@pytest.mark.parametrize("path", HOUSE, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_go_one_way(path: Path) -> None:
+    """A module imports only from its own folder and those below it."""
+    folder = path.relative_to(ROOT).parts[0]
+    own = {name.split(".")[0] for name in imports(path)} & set(MAY_IMPORT)
+    assert own <= MAY_IMPORT[folder]
+
+
+def test_curate_stands_alone() -> None:
+    """`curate` imports where db and pipelines do not exist, so a user's own db.py does no harm."""
+    modules = [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for path in HOUSE
+        if path.relative_to(ROOT).parts[0] == "curate"
+    ]
+    code = (
+        "import sys, importlib\n"
+        "sys.modules['db'] = sys.modules['pipelines'] = None\n"
+        f"for name in {modules!r}: importlib.import_module(name)\n"
+    )
+    python = ROOT / ".venv" / "bin" / "python"
+    import sys
+
+    subprocess.run(
+        [python if python.exists() else sys.executable, "-c", code], check=True, cwd=ROOT
+    )
+
+
+def test_only_the_label_file_format_speaks_sql_in_curate() -> None:
+    """The science knows no database."""
+    users = {
+        str(path.relative_to(ROOT))
+        for path in HOUSE
+        if {"sqlite3", "sqlalchemy"} & {name.split(".")[0] for name in imports(path)}
+        and path.relative_to(ROOT).parts[0] == "curate"
+    }
+    assert users <= {"curate/exporters/sqlite.py", "curate/training/labels.py"}
+
+
+def test_every_module_says_what_it_is_for() -> None:
+    """A docstring of one sentence first."""
+    silent = [str(path) for path in HOUSE if not ast.get_docstring(ast.parse(path.read_text()))]
+    assert silent == []
+
+
+def test_nothing_unpickles_files() -> None:
+    """torch.load and pickle.load are absent; the process executor unpickles its parent's bytes."""
+    calls = {
+        (str(path.relative_to(ROOT)), ast.unparse(node.func))
+        for path in HOUSE
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+        and ast.unparse(node.func) in {"pickle.load", "pickle.loads", "eval", "exec", "torch.load"}
+        and not any(keyword.arg == "weights_only" for keyword in node.keywords)
+    }
+    assert calls == {("pipelines/executors/process.py", "pickle.loads")}
+
+
+def test_every_dependency_is_pinned() -> None:
+    """The constraints file names a version for each package of the card."""
+    pinned = {
+        line.split("==")[0].lower().replace("_", "-")
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if "==" in line
+    }
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = {
+        requirement.split(">")[0].split(";")[0].split("[")[0].strip().lower()
+        for requirement in (*project["dependencies"], *extras["test"], *extras["lint"])
+    }
+    assert wanted - {"open3d"} <= pinned
