@@ -1,6 +1,11 @@
 """Views for people who query."""
 
-from sqlalchemy import Connection, text
+from sqlalchemy import Connection, column, table, text
+
+from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS
+
+# The view, to select from.
+WEIGHTED_LABELS = table("weighted_labels", *map(column, WEIGHTED_LABEL_COLUMNS))
 
 _VIEWS = {
     "weighted_labels": """

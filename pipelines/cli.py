@@ -53,6 +53,9 @@ for command in (
     evaluate,
 ):
     command.register(app)
+COMMANDS = tuple(
+    command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands
+)
 
 
 def main() -> None:

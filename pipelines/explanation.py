@@ -6,9 +6,9 @@ from typing import Any
 from sqlalchemy import func, select, text
 
 from curate.errors import WorkspaceError
-from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS
 from curate.weighting.self_paced import easiness
 from db import bulk
+from db.views import WEIGHTED_LABELS
 from pipelines.config import Config
 from pipelines.workspace import Workspace
 
@@ -64,20 +64,16 @@ def _label(
         if round_number is None:
             newest = select(func.max(weight.c.round)).where(weight.c.policy == policy)
             round_number = connection.execute(newest).scalar_one()
-        columns = ", ".join(WEIGHTED_LABEL_COLUMNS)
-        query = text(
-            f"SELECT {columns} FROM weighted_labels WHERE round = :round "
-            "AND frame = :frame AND k = :k AND policy = :policy"  # noqa: S608
-        )
+        labels = WEIGHTED_LABELS.c
         key = {"round": round_number, "frame": frame, "k": k, "policy": policy}
-        row = connection.execute(query, key).fetchone()
+        query = select(WEIGHTED_LABELS).where(*(labels[name] == key[name] for name in key))
+        row = connection.execute(query).fetchone()
     if row is None:
         raise WorkspaceError(
-            f"no label {k} of frame {frame} weighted by {policy}"
-            + (f" in round {round_number}" if round_number else "")
-            + '; list them with `curate query "SELECT frame, k, weight FROM weighted_labels"`'
+            f"round {round_number or 1} has no label {k} of frame {frame} weighted by {policy}; "
+            "the view weighted_labels lists what there is, see `curate query --help`"
         )
-    return dict(zip(WEIGHTED_LABEL_COLUMNS, row, strict=True))
+    return dict(row._mapping)  # noqa: SLF001 - its public name
 
 
 def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple[View, ...]:

@@ -5,16 +5,14 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from sqlalchemy import text
+from sqlalchemy import select
 
 from curate.detections import Detections
 from curate.errors import WorkspaceError
+from db import bulk
+from db.models import BOX_COLUMNS
+from db.views import WEIGHTED_LABELS
 from pipelines.workspace import Workspace
-
-_QUERY = """
-    SELECT frame, category, score, x, y, z, length, width, height, yaw, weight, points
-    FROM weighted_labels WHERE round = :round AND policy = :policy ORDER BY frame, k
-"""
 
 
 @dataclass(frozen=True)
@@ -40,16 +38,22 @@ def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterato
     Raises:
         WorkspaceError: the policy has weighted nothing in that round.
     """
+    labels = WEIGHTED_LABELS.c
+    names = ("frame", "category", "score", *BOX_COLUMNS, "weight", "points")
+    query = (
+        select(*(labels[name] for name in names))
+        .where(labels.round == round_number, labels.policy == policy)
+        .order_by(labels.frame, labels.k)
+    )
     with workspace.database.reading() as connection:
-        key = {"round": round_number, "policy": policy}
-        rows = connection.execute(text(_QUERY), key).fetchall()
+        rows = bulk.select(connection, query)
     if not rows:
         raise WorkspaceError(
             f"round {round_number} has no labels weighted by {policy}; "
             f"run `curate solve --policy {policy}`"
         )
     for frame, group in groupby(rows, key=lambda row: str(row[0])):
-        own = [tuple(row) for row in group]
+        own = list(group)
         counts = [row[-1] for row in own]
         yield FrameLabels(
             frame,

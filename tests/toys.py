@@ -46,8 +46,8 @@ def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: b
         for c in categories
     ])  # fmt: skip
     boxes[:, 1] += np.array([-6, 0, 6])
-    points = [np.column_stack([rng.uniform(2, 40, (400, 1)), rng.uniform(-20, 20, (400, 1)),
-                               np.full((400, 1), -1.7), rng.uniform(0, 0.5, (400, 1))])]  # fmt: skip
+    ground = rng.uniform([2, -20, -1.7, 0], [40, 20, -1.7, 0.5], (400, 4))
+    points = [ground]
     for box, category in zip(boxes, categories, strict=True):
         inside = rng.uniform(-0.45, 0.45, (int(rng.integers(20, 60)), 3)) * box[3:6]
         turn = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]])

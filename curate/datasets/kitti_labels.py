@@ -282,7 +282,7 @@ def _has_negative_side(categories: Sequence[str], dimensions: np.ndarray) -> boo
     """Whether an object that is not DontCare has a negative dimension."""
     if dimensions.min(initial=0) >= 0:
         return False
-    rows = np.flatnonzero((dimensions < 0).any(axis=1))
+    rows = np.flatnonzero((dimensions < 0).any(axis=1)).tolist()
     return any(categories[row] != DONT_CARE for row in rows)
 
 

@@ -26,7 +26,9 @@ def score(
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Ask the priors: LiDAR points in each box (Eq. 8), segmentation in its rectangle (Eq. 9).
+    """Ask the priors: LiDAR points in each box, segmentation in its rectangle.
+
+    The equations are 8 and 9 of the paper.
 
     Example: curate score --prior points
     """

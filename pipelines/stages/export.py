@@ -1,17 +1,18 @@
 """export: the weighted labels of a round as files that trainers read."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, select, text
+from sqlalchemy import Connection, select
 
 import curate
 from curate.exporters.kitti import WeightedFrame, export_kitti
-from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS, LabelFileDescription, write_labels
+from curate.exporters.sqlite import LabelFileDescription, write_labels
 from db import bulk
 from db.models import BOX_COLUMNS
+from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
 from pipelines.labels import read_labels
 from pipelines.progress import Progress
@@ -69,13 +70,15 @@ def write_label_file(workspace: Workspace, path: Path, round_number: int, policy
     return len(labels)
 
 
-def label_rows(connection: Connection, round_number: int, policy: str) -> list[Any]:
+def label_rows(connection: Connection, round_number: int, policy: str) -> Sequence[bulk.Row]:
     """The rows of `weighted_labels` of a round and policy."""
-    query = text(
-        f"SELECT {', '.join(WEIGHTED_LABEL_COLUMNS)} FROM weighted_labels "  # noqa: S608 - fixed names
-        "WHERE round = :round AND policy = :policy ORDER BY frame, k"
+    labels = WEIGHTED_LABELS.c
+    query = (
+        select(WEIGHTED_LABELS)
+        .where(labels.round == round_number, labels.policy == policy)
+        .order_by(labels.frame, labels.k)
     )
-    return [tuple(r) for r in connection.execute(query, {"round": round_number, "policy": policy})]
+    return bulk.select(connection, query)
 
 
 def _frames(connection: Connection, with_labels: set[str]) -> Iterator[tuple[Any, ...]]:

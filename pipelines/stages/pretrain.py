@@ -46,6 +46,7 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
             output=path,
             settings=training_settings(workspace, config.train.pretrain_steps, 0),
             start=None,
+            read=workspace.dataset.read,
             progress=progress,
         )
         summary = f"{report.steps} steps on {len(labeled)} frames, {workspace.relative(path)}"

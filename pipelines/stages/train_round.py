@@ -1,11 +1,13 @@
 """train-round: the student, from the exported labels and the teacher."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection
 
 from curate.errors import ConfigError
+from curate.frames import Frame
 from pipelines.assembly import device
 from pipelines.progress import Progress
 from pipelines.rounds import is_trainable, register_checkpoint
@@ -48,6 +50,7 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
         output=path,
         settings=training_settings(workspace, section.round_steps, job.context.number),
         start=job.context.teacher.path if section.start == "teacher" else None,
+        read=workspace.dataset.read,
         progress=progress,
     )
 
@@ -80,6 +83,7 @@ def train_with_progress(
     output: Path,
     settings: "TrainingSettings",
     start: Path | None,
+    read: Callable[[str], Frame],
     progress: Progress,
 ) -> "TrainingReport":
     """Trains with a bar that counts steps and shows the loss."""
@@ -93,4 +97,4 @@ def train_with_progress(
             advance(step - done, f"loss {loss:.2f}")
             done = step
 
-        return train(labels, output, settings, start=start, progress=show)
+        return train(labels, output, settings, start=start, read=read, progress=show)

@@ -289,8 +289,9 @@ def test_a_killed_command_continues_and_loses_nothing(
     assert curate("run")[0] == 0
     assert curate("run", "-w", tmp_path / "whole")[0] == 0
     dump = "SELECT * FROM weighted_labels ORDER BY frame, k"
-    killed, whole = curate("query", dump, "--csv"), curate(
-        "query", dump, "--csv", "-w", tmp_path / "whole"
+    killed, whole = (
+        curate("query", dump, "--csv"),
+        curate("query", dump, "--csv", "-w", tmp_path / "whole"),
     )
     assert killed == whole
     assert killed[1].count("\n") == 19

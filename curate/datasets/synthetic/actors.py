@@ -32,14 +32,8 @@ _CAR_STYLES = np.array(
 @cache
 def actor_mesh(category: str, variant: int) -> Mesh:
     """The mesh number `variant` of `category`, the same in every process."""
-    builders: dict[str, Callable[[np.random.Generator], Mesh]] = {
-        "Car": _car,
-        "Pedestrian": _pedestrian,
-        "Cyclist": _cyclist,
-    }
-    stream = list(VARIANTS).index(category)
-    generator = np.random.default_rng([stream, variant])
-    return builders[category](generator).standing_on_origin()
+    generator = np.random.default_rng([list(_BUILDERS).index(category), variant])
+    return _BUILDERS[category](generator).standing_on_origin()
 
 
 def actor_colours(category: str, generator: np.random.Generator) -> dict[Material, np.ndarray]:
@@ -235,7 +229,7 @@ def bicycle(generator: np.random.Generator) -> Mesh:
     parts = [cylinder(start, end, 0.022, Material.METAL, sides=5) for start, end in tubes]
     parts += [ring(hub, wheel, 0.045, 0.04, Material.RUBBER) for hub in (front, rear)]
     for hub in (front, rear):  # spokes, as one thin disc would hide too much
-        for angle in np.arange(4) * np.pi / 4:
+        for angle in np.arange(3) * np.pi / 3:
             reach = np.array([np.cos(angle), 0, np.sin(angle)]) * (wheel - 0.04)
             parts.append(
                 cylinder(
@@ -255,10 +249,10 @@ def bicycle(generator: np.random.Generator) -> Mesh:
 def _cyclist(generator: np.random.Generator) -> Mesh:
     """A bicycle and a rider: bent legs, leaning torso, arms to the bar, head."""
     lean = generator.uniform(0.1, 0.42)
-    rise = generator.uniform(0.46, 0.56)
+    rise = generator.uniform(0.42, 0.52)
     hip = np.array([-0.24, 0.0, 1.0])
     shoulder = hip + np.array([lean, 0, rise])
-    head = shoulder + np.array([0.08, 0, generator.uniform(0.2, 0.25)])
+    head = shoulder + np.array([0.08, 0, generator.uniform(0.16, 0.21)])
     girth = generator.uniform(0.15, 0.19)
     phase = generator.uniform(0, 2 * np.pi)
     parts = [bicycle(generator)]
@@ -285,3 +279,10 @@ def _cyclist(generator: np.random.Generator) -> Mesh:
         ellipsoid(head + np.array([-0.02, 0, 0.05]), (0.12, 0.09, 0.1), Material.HAIR),
     ]
     return merge(parts)
+
+
+_BUILDERS: dict[str, Callable[[np.random.Generator], Mesh]] = {
+    "Car": _car,
+    "Pedestrian": _pedestrian,
+    "Cyclist": _cyclist,
+}

@@ -1,10 +1,10 @@
 """The ground truth of one scene as KITTI defines it.
 
 2D box: the tight box around the whole object's projection, hidden parts included, clipped to the
-image. Truncated: the share of the unclipped 2D box that lies outside the image. Occluded: 0 from 80
-percent visible, 1 from 45, else 2, by the share of the object's pixels within the image that nothing
-hides. Objects of which no pixel is seen are not labelled; tiny, very far or almost hidden ones
-become DontCare regions.
+image. Truncated: the share of the unclipped 2D box that lies outside the image. Occluded: 0 from
+80 percent visible, 1 from 45, else 2, by the share of the object's pixels within the image that
+nothing hides. Objects of which no pixel is seen are not labelled; tiny, very far or almost hidden
+ones become DontCare regions.
 """
 
 import numpy as np
@@ -57,8 +57,7 @@ def annotate(scene: Scene, view: View, rig: CameraRig) -> Annotations:
 def _box(scene: Scene, number: int) -> np.ndarray:
     """(7,) the tight box around an object, in the LiDAR frame."""
     placement = scene.placements[number - 1]
-    low, high = placement.mesh.bounds
-    size = (high - low) * placement.scale
+    size = placement.mesh.size * placement.scale
     centre = placement.position + np.array([0, 0, size[2] / 2])
     return np.array([*centre, *size, placement.yaw_rad])
 
@@ -68,7 +67,8 @@ def _alpha(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
     matrix = calibration.lidar_to_camera
     centres = boxes[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
     rotation_y = -boxes[:, 6] - np.pi / 2
-    return wrap_angle(rotation_y - np.arctan2(centres[:, 0], centres[:, 2]))
+    alpha: np.ndarray = wrap_angle(rotation_y - np.arctan2(centres[:, 0], centres[:, 2]))
+    return alpha
 
 
 def _outline(scene: Scene, number: int, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
@@ -147,4 +147,4 @@ def _probe_pixels(box_2d: np.ndarray) -> np.ndarray:
     rows, columns = np.meshgrid(
         np.arange(top, bottom + 1, step), np.arange(left, right + 1, step), indexing="ij"
     )
-    return (rows * IMAGE_SIZE[0] + columns).ravel()
+    return np.asarray(rows * IMAGE_SIZE[0] + columns).ravel()

@@ -75,7 +75,7 @@ def _intensity(
 def _loss(
     material: np.ndarray, incidence: np.ndarray, distance: np.ndarray, intensity: np.ndarray
 ) -> np.ndarray:
-    """(n,) probability that a pulse does not return: by material, grazing angle, range, darkness."""
+    """(n,) probability that no pulse returns: by material, grazing angle, range, darkness."""
     grazing = np.exp(-incidence / 0.02)
     faint = np.clip((distance - 25) / 90, 0, 1) * np.clip(1.2 - 3 * intensity, 0, 1)
     kept = (1 - LOSS[material]) * (1 - 0.5 * grazing) * (1 - faint)

@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from curate.datasets.synthetic.materials import Material
 
@@ -24,10 +25,16 @@ class Mesh:
     triangles: np.ndarray
     materials: np.ndarray
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """The lowest and the highest x, y, z, each (3,)."""
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
+
+    @property
+    def size(self) -> np.ndarray:
+        """(3,) extent along x, y and z."""
+        low, high = self.bounds
+        return np.asarray(high - low)
 
     def standing_on_origin(self) -> Self:
         """The mesh moved so that its bounds are centred in x and y and begin at z = 0."""
@@ -35,7 +42,7 @@ class Mesh:
         base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
         return replace(self, vertices=(self.vertices - base).astype(np.float32))
 
-    def moved(self, rotation: np.ndarray, translation: Sequence[float]) -> Self:
+    def moved(self, rotation: np.ndarray, translation: ArrayLike) -> Self:
         """The mesh turned by a (3, 3) rotation, then shifted."""
         vertices = self.vertices @ rotation.T.astype(np.float32)
         return replace(self, vertices=vertices + np.asarray(translation, dtype=np.float32))
@@ -59,14 +66,14 @@ def rotation_z(angle_rad: float) -> np.ndarray:
     return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
-def box(centre: Sequence[float], size: Sequence[float], material: Material) -> Mesh:
+def box(centre: ArrayLike, size: ArrayLike, material: Material) -> Mesh:
     """An axis-aligned box."""
     return frustum(centre, size, (1.0, 1.0), material)
 
 
 def frustum(
-    centre: Sequence[float],
-    size: Sequence[float],
+    centre: ArrayLike,
+    size: ArrayLike,
     top_scale: tuple[float, float],
     material: Material,
     *,
@@ -82,9 +89,7 @@ def frustum(
     return _mesh(shaped + np.asarray(centre, dtype=np.float32), triangles, material)
 
 
-def ellipsoid(
-    centre: Sequence[float], radii: Sequence[float], material: Material, *, sides: int = 8
-) -> Mesh:
+def ellipsoid(centre: ArrayLike, radii: ArrayLike, material: Material, *, sides: int = 8) -> Mesh:
     """An ellipsoid with axes along x, y and z."""
     vertices, triangles = _unit_sphere(sides)
     shaped = vertices * np.asarray(radii, dtype=np.float32)
@@ -92,8 +97,8 @@ def ellipsoid(
 
 
 def cylinder(
-    start: Sequence[float],
-    end: Sequence[float],
+    start: ArrayLike,
+    end: ArrayLike,
     radius: float,
     material: Material,
     *,
@@ -116,7 +121,7 @@ def cylinder(
 
 
 def ring(
-    centre: Sequence[float],
+    centre: ArrayLike,
     radius: float,
     thickness: float,
     width: float,

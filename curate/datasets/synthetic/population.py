@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from curate.datasets.synthetic import actors, scenery
-from curate.datasets.synthetic.materials import palette
+from curate.datasets.synthetic.materials import Material, palette
 from curate.datasets.synthetic.meshes import Mesh
 from curate.datasets.synthetic.street import Street
 
@@ -97,7 +97,7 @@ class Population:
     def _people(self) -> None:
         """Pedestrians, alone or in groups, mostly on the pavements."""
         street, generator = self.street, self.generator
-        for _ in range(generator.poisson(generator.choice([1.2, 2.6, 5.0]))):
+        for _ in range(generator.poisson(generator.choice([1.5, 3.2, 5.6]))):
             s = 5 + 70 * generator.random() ** 1.4
             onward = generator.choice([0.0, np.pi])
             place = generator.random()
@@ -118,7 +118,7 @@ class Population:
     def _riders(self) -> None:
         """Cyclists along the edge of the lanes, on the pavements, or crossing."""
         street, generator = self.street, self.generator
-        for _ in range(generator.poisson(generator.choice([0.8, 2.2, 3.6]))):
+        for _ in range(generator.poisson(generator.choice([1.0, 2.6, 4.2]))):
             s = 5 + 65 * generator.random() ** 1.3
             side = generator.choice([-1, 1])
             along = 0.0 if side < 0 else np.pi
@@ -209,7 +209,7 @@ class Population:
             s += spacing
 
     def _beside(self, side: int, outward: float) -> float:
-        """d at `outward` metres beyond the kerb of a side (+1 left, -1 right)."""
+        """Road coordinate d, `outward` metres beyond the kerb of a side (+1 left, -1 right)."""
         return self.street.left_d + outward if side > 0 else self.street.right_d - outward
 
     def _stand(
@@ -217,19 +217,11 @@ class Population:
     ) -> None:
         """Places a random mesh of the kind, unless it is out of view or in another's place."""
         generator = self.generator
-        actor = kind in actors.VARIANTS
-        if actor:
-            variant = int(generator.integers(actors.VARIANTS[kind]))
-            mesh, colours = actors.actor_mesh(kind, variant), actors.actor_colours(kind, generator)
-        else:
-            variant = int(generator.integers(scenery.VARIANTS))
-            mesh = scenery.scenery_mesh(kind, variant)
-            colours = scenery.scenery_colours(kind, generator)
+        mesh = self._mesh(kind)
         scale = generator.uniform(0.93, 1.03) * generator.uniform(0.97, 1.03, size=3)
         position = self.street.to_lidar(s, d)
         yaw_rad = float(np.mod(self.street.heading_rad + yaw + np.pi, 2 * np.pi) - np.pi)
-        low, high = mesh.bounds
-        extent = (high - low)[:2] * scale[:2]
+        extent = mesh.size[:2] * scale[:2]
         if not _in_view(position, float(extent.max())):
             return
         discs = _footprint(position, yaw_rad, extent, margin)
@@ -237,13 +229,37 @@ class Population:
             return
         if apart and kind != "tree":
             self._discs = np.concatenate([self._discs, discs])
-        placement = Placement(kind, mesh, position, yaw_rad, scale, palette(colours))
-        self.placements.append(placement)
+        if kind in actors.VARIANTS:
+            colours = actors.actor_colours(kind, generator)
+        else:
+            colours = scenery.scenery_colours(kind, generator)
+        self.placements.append(Placement(kind, mesh, position, yaw_rad, scale, palette(colours)))
+        if kind in actors.VARIANTS or kind in scenery.CLUTTER:
+            self.placements.append(_shadow(position, yaw_rad, extent))
+
+    def _mesh(self, kind: str) -> Mesh:
+        """One of the meshes of a kind."""
+        if kind in actors.VARIANTS:
+            variant = int(self.generator.integers(actors.VARIANTS[kind]))
+            return actors.actor_mesh(kind, variant)
+        return scenery.scenery_mesh(kind, int(self.generator.integers(scenery.VARIANTS)))
 
     def _taken(self, discs: np.ndarray) -> bool:
         """Whether any (n, 3) disc overlaps one that is already there."""
         apart = np.linalg.norm(self._discs[:, None, :2] - discs[None, :, :2], axis=2)
         return bool((apart < self._discs[:, None, 2] + discs[None, :, 2]).any())
+
+
+def _shadow(position: np.ndarray, yaw_rad: float, extent: np.ndarray) -> Placement:
+    """The dark patch under a thing."""
+    return Placement(
+        "shadow",
+        scenery.shadow_mesh(),
+        position + np.array([0, 0, 0.02]),
+        yaw_rad,
+        np.array([*(extent * 1.05 + 0.06), 1.0]),
+        palette({Material.PAVEMENT: np.full(3, 0.1)}),
+    )
 
 
 def _in_view(position: np.ndarray, extent: float) -> bool:

@@ -37,6 +37,19 @@ def scenery_mesh(kind: str, variant: int) -> Mesh:
     return _BUILDERS[kind](np.random.default_rng([100 + stream, variant]))
 
 
+@cache
+def shadow_mesh() -> Mesh:
+    """A flat octagon of length and width 1."""
+    blunt = np.array([[0.5, 0.3], [0.3, 0.5], [-0.3, 0.5], [-0.5, 0.3]])
+    outline = np.concatenate([blunt, -blunt])
+    fan = np.arange(1, len(outline) - 1)
+    return Mesh(
+        np.column_stack([outline, np.zeros(len(outline))]).astype(np.float32),
+        np.stack([np.zeros_like(fan), fan, fan + 1], axis=1),
+        np.full(len(fan), Material.PAVEMENT, dtype=np.uint8),
+    )
+
+
 def scenery_colours(kind: str, generator: np.random.Generator) -> dict[Material, np.ndarray]:
     """Colours for one piece of scenery."""
     green = np.array([0.20, 0.33, 0.12]) * generator.uniform(0.6, 1.3, size=3)

@@ -8,6 +8,8 @@ from numba import njit
 from curate.datasets.synthetic.materials import Material
 
 TILE = 256  # pixels of the repeating texture and grain
+_Real = float | np.floating
+
 _HAZE_M, _TEXTURE_M, _FAR_M = 420.0, 40.0, 512
 _BARE, _LINE, _WINDOW = range(3)
 _ASPHALT, _WALL = int(Material.ASPHALT), int(Material.WALL)
@@ -89,7 +91,7 @@ def pixel_rays(
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _direction(inverse: np.ndarray, row: float, column: float) -> tuple[float, float, float]:
+def _direction(inverse: np.ndarray, row: _Real, column: _Real) -> tuple[_Real, _Real, _Real]:
     """The unit direction of a pixel's ray."""
     x = inverse[0, 0] * column + inverse[0, 1] * row + inverse[0, 2]
     y = inverse[1, 0] * column + inverse[1, 1] * row + inverse[1, 2]
@@ -158,7 +160,7 @@ def shade(
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _grey_level(colour: float, grain: float) -> int:
+def _grey_level(colour: _Real, grain: _Real) -> np.uint8:
     """Linear light with gamma 2, noise and rounding."""
     clipped = min(max(np.float32(colour), np.float32(0)), np.float32(1))
     level = np.float32(255) * np.sqrt(clipped) + grain
@@ -166,19 +168,20 @@ def _grey_level(colour: float, grain: float) -> int:
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _texel(across: float, along: float, material: int, surfaces: Surfaces) -> float:
+def _texel(across: _Real, along: _Real, material: int, surfaces: Surfaces) -> _Real:
     """The texture of a material at a place on a surface, by metres across and along it."""
     scale = surfaces.texture[material, 1]
     # The offset keeps the numbers positive, where truncation is rounding down.
     column = int((across + np.float32(1024)) * scale) & (TILE - 1)
     row = int((along + np.float32(1024)) * scale) & (TILE - 1)
-    return surfaces.texture[material, 0] * surfaces.tile[row, column]
+    texel: _Real = surfaces.texture[material, 0] * surfaces.tile[row, column]
+    return texel
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _paint(
-    x: float, y: float, z: float, hit: int, surfaces: Surfaces, markings: Markings
-) -> tuple[int, float, float]:
+    x: _Real, y: _Real, z: _Real, hit: int, surfaces: Surfaces, markings: Markings
+) -> tuple[int, _Real, _Real]:
     """What covers a surface (line, window or nothing), and where on it the place lies."""
     flat = abs(surfaces.normals[hit, 2]) > np.float32(0.7)
     if flat:
@@ -195,13 +198,14 @@ def _paint(
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _fraction(value: float) -> float:
+def _fraction(value: _Real) -> _Real:
     """The part after the decimal point, 0 to 1; the remainder operator is slow."""
-    return value - np.floor(value)
+    whole: _Real = np.floor(value)
+    return value - whole
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _is_painted(x: float, y: float, markings: Markings) -> bool:
+def _is_painted(x: _Real, y: _Real, markings: Markings) -> bool:
     """Whether a place on the asphalt carries a line."""
     d = markings.cos * y - markings.sin * x
     last = len(markings.lines_d) - 1
@@ -210,5 +214,5 @@ def _is_painted(x: float, y: float, markings: Markings) -> bool:
             s = markings.cos * x + markings.sin * y
             if markings.crossing_s[0] < s < markings.crossing_s[1]:
                 return False
-            return line in (0, last) or _fraction(s / np.float32(9)) < 0.45
+            return line in (0, last) or bool(_fraction(s / np.float32(9)) < 0.45)
     return False

@@ -71,17 +71,17 @@ class Street:
 
     @property
     def axis_d(self) -> float:
-        """d of the line between the directions; the sensors ride in the rightmost lane."""
+        """Coordinate d of the line between the directions; the sensors ride rightmost."""
         return (self.lanes - 0.5) * self.lane_m
 
     @property
     def left_d(self) -> float:
-        """d of the kerb on the left."""
+        """Coordinate d of the kerb on the left."""
         return self.axis_d + self.lanes * self.lane_m + self.parking_left_m
 
     @property
     def right_d(self) -> float:
-        """d of the kerb on the right."""
+        """Coordinate d of the kerb on the right."""
         return self.axis_d - self.lanes * self.lane_m - self.parking_right_m
 
     def in_crossing(self, s: np.ndarray | float, margin: float = 0.0) -> np.ndarray:
@@ -98,7 +98,7 @@ class Street:
         return np.array([cos * s - sin * d, sin * s + cos * d, height])
 
     def to_road(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """s and d of places in the LiDAR frame."""
+        """Coordinates s and d of places in the LiDAR frame."""
         cos, sin = np.float32(np.cos(self.heading_rad)), np.float32(np.sin(self.heading_rad))
         return cos * x + sin * y, cos * y - sin * x
 
@@ -158,4 +158,5 @@ class Street:
         amplitude, length, phase = self.wave
         swing = np.sin(2 * np.pi * self._knots_s / length + phase) - np.sin(phase)
         rise = self.slope[0] * self._knots_s + amplitude * swing
-        return rise - rise[np.searchsorted(self._knots_s, 0.0)] - SENSOR_HEIGHT_M
+        level = rise[np.searchsorted(self._knots_s, 0.0)] + SENSOR_HEIGHT_M
+        return np.asarray(rise - level)

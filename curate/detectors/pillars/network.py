@@ -34,6 +34,7 @@ class PillarNetwork(nn.Module):
             nn.ReLU(),
         )
         self.stem = _Pointwise(4 * preset.pillar_channels, first)
+        self.stem_norm = nn.BatchNorm2d(first)
         self.scale1 = _scale(first, first, preset.depths[0], down=False)
         self.scale2 = _scale(first, second, preset.depths[1], down=True)
         self.scale3 = _scale(second, third, preset.depths[2], down=True)
@@ -65,7 +66,8 @@ class PillarNetwork(nn.Module):
         canvas: Tensor = _SlotMaximum.apply(  # type: ignore[no-untyped-call]
             self.points(features), slots, 4 * frames * cells_x * cells_y
         )
-        fine = self.scale1(self.stem(canvas.view(frames, cells_x, cells_y, -1).permute(0, 3, 1, 2)))
+        maps = self.stem(canvas.view(frames, cells_x, cells_y, -1).permute(0, 3, 1, 2))
+        fine = self.scale1(functional.relu(self.stem_norm(maps)))
         middle = self.scale2(fine)
         coarse = self.scale3(middle)
         middle = middle + functional.interpolate(self.up3(coarse), scale_factor=2.0)
@@ -114,17 +116,16 @@ class _SlotMaximum(torch.autograd.Function):
 
 
 class _Pointwise(nn.Module):
-    """A 1 x 1 convolution with batch norm and ReLU on channels-last maps."""
+    """A 1 x 1 convolution on channels-last maps."""
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
         self.mix = nn.Linear(channels_in, channels_out, bias=False)
-        self.norm = nn.BatchNorm2d(channels_out)
 
     def forward(self, maps: Tensor) -> Tensor:
         """(b, channels_in, x, y) to (b, channels_out, x, y)."""
-        mixed = self.mix(maps.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
-        return functional.relu(self.norm(mixed))
+        mixed: Tensor = self.mix(maps.permute(0, 2, 3, 1))
+        return mixed.permute(0, 3, 1, 2)
 
 
 def _convolution(channels_in: int, channels_out: int, stride: int = 1) -> nn.Sequential:

@@ -33,7 +33,7 @@ def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: i
     empty = graph.constant(np.zeros((4 * cells_x * cells_y, pillars), np.float32))
     canvas = graph.node("ScatterND", [empty, "slots", values], reduction="max")
     rows = graph.node("Reshape", [canvas, graph.constant(np.array([-1, 4 * pillars]))])
-    rows = graph.product(rows, "stem.mix", "stem.norm")
+    rows = graph.product(rows, "stem.mix", "stem_norm")
     rows = graph.node("Reshape", [rows, graph.constant(np.array([1, cells_x, cells_y, -1]))])
     maps = graph.node("Transpose", [rows], perm=[0, 3, 1, 2])
     fine = graph.scale(maps, "scale1", preset.depths[0], down=False)
@@ -97,11 +97,9 @@ class _Graph:
         return self.node("Relu", [convolved])
 
     def pointwise(self, maps: str, name: str) -> str:
-        """ReLU of a normalised 1 x 1 convolution."""
-        scale, shift = self._norm(f"{name}.norm")
-        kernel = self._weights[f"{name}.mix.weight"] * scale[:, None]
-        inputs = [maps, self.constant(kernel[:, :, None, None]), self.constant(shift)]
-        return self.node("Relu", [self.node("Conv", inputs)])
+        """A 1 x 1 convolution."""
+        kernel = self._weights[f"{name}.mix.weight"]
+        return self.node("Conv", [maps, self.constant(kernel[:, :, None, None])])
 
     def answers(self, maps: str, name: str) -> str:
         """A 1 x 1 convolution with bias and nothing after it."""

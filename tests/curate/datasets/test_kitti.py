@@ -300,3 +300,11 @@ def test_real_calibration_puts_points_of_a_car_into_its_rectangle(kitti_root):
     assert inside.sum() > 100
     assert depth.min() > 10
     assert ((pixels > (left - 3, top - 3)) & (pixels < (right + 3, bottom + 3))).all()
+
+
+def test_points_may_be_left_out(toy_kitti):
+    """Calibration and image are read although the points could not be."""
+    (toy_kitti / "training" / "velodyne" / "000001.bin").write_bytes(b"truncated")
+    frame = KittiDataset(toy_kitti).read("000001", points=False)
+    assert frame.points.shape == (0, 4)
+    assert frame.image_size == (120, 40)

@@ -227,6 +227,14 @@ def test_low_detections_are_ignored():
     assert ap_of_cars([[car()]], [[car(), middle]])[3].tolist() == [100, 50, 50]
 
 
+def test_a_low_detection_of_another_category_takes_an_object_out():
+    """The kit's own quirk: too low comes before the category, and the higher score is asked."""
+    low = car(category="Pedestrian", score=0.9, box_2d=(400, 100, 480, 120))
+    found = [[car(score=0.5), low]]
+    assert ap_of_cars([[car()]], found)[3].tolist() == [0, 0, 0]
+    assert ap_of_cars([[car()]], [[car(score=0.5), {**low, "score": 0.4}]])[3, 0] == 100
+
+
 def test_a_second_detection_of_the_same_object_is_false():
     """One object is found once."""
     assert ap_of_cars([[car()]], [[car(score=0.9), car(score=0.9)]])[3, 0] == 50

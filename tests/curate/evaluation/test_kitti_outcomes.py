@@ -44,6 +44,22 @@ def test_each_object_has_its_outcome():
     assert set(of_results.categories) == {"Car"}
 
 
+def test_an_object_that_only_a_low_detection_finds_is_left_out():
+    """It is neither found nor missed, and names the detection."""
+    low = car(box_2d=(100, 100, 180, 120))
+    of_labels, of_results = outcomes_of([[car()]], [[low]])
+    assert of_labels.outcomes.tolist() == of_results.outcomes.tolist() == ["ignored"]
+    assert of_labels.matches.tolist() == of_results.matches.tolist() == [0]
+
+
+def test_detections_below_the_score_threshold_do_not_take_part():
+    """They have no row, and leave no overlap behind."""
+    of_labels, of_results = outcomes_of([[car()]], [[car(score=0.2)]], score_threshold=0.3)
+    assert of_labels.outcomes.tolist() == ["fn"]
+    assert of_labels.overlaps.tolist() == [0]
+    assert len(of_results) == 0
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
