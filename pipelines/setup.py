@@ -107,7 +107,7 @@ def _choose(
 def _store(
     workspace: Workspace, dataset: Dataset, split: Split, truth: dict[str, Annotations]
 ) -> None:
-    root = workspace.config.dataset.root.resolve()
+    root = workspace.config.dataset.root
     kind = workspace.config.dataset.kind
     rows = []
     for name in ("labeled", "unlabeled", "val"):
@@ -115,7 +115,7 @@ def _store(
             files = dataset.files(frame)
             label = None if name == "unlabeled" else files.label
             paths = (files.points, files.image, files.calibration, label)
-            relative = [str(p.resolve().relative_to(root)) if p else None for p in paths]
+            relative = [str(p.relative_to(root)) if p else None for p in paths]
             rows.append((kind, frame, name, *relative))
     table = bulk.table("frame")
     with workspace.database.writing() as connection:

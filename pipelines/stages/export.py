@@ -52,7 +52,7 @@ def write_label_file(workspace: Workspace, path: Path, round_number: int, policy
     """
     description = LabelFileDescription(
         dataset=workspace.config.dataset.kind,
-        root=workspace.config.dataset.root.resolve(),
+        root=workspace.config.dataset.root,
         categories=workspace.config.dataset.categories,
         round=round_number,
         policy=policy,

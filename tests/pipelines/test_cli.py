@@ -8,35 +8,14 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from pipelines_cli import Curate
 
 from curate.errors import ConfigError, DataError, FramesFailed, WorkspaceError
-from pipelines.cli import main
 
 LABELS = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
-Curate = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def curate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Curate:
-    """Runs the command line in this process: exit code, standard output, standard error."""
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["curate", *map(str, arguments)])
-        capsys.readouterr()
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        else:
-            code = 0
-        output = capsys.readouterr()
-        return code, output.out, output.err
-
-    return run
 
 
 @pytest.fixture

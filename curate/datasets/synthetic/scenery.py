@@ -61,11 +61,14 @@ def scenery_colours(kind: str, generator: np.random.Generator) -> dict[Material,
         colours[Material.WALL] *= generator.uniform(0.75, 1.15)
         colours[Material.ROOF] = np.array([0.4, 0.26, 0.22]) * generator.uniform(0.5, 1.2)
         return colours
+    colours[Material.CONCRETE] = np.full(3, generator.uniform(0.4, 0.68))
+    if kind in ("pole", "sign"):
+        colours[Material.METAL] = np.full(3, generator.uniform(0.15, 0.6))
+        return colours
     coats = [(0.12, 0.3, 0.2), (0.5, 0.28, 0.1), (0.2, 0.28, 0.42), (0.5, 0.5, 0.48)]
     coats += [(0.6, 0.5, 0.15), (0.35, 0.12, 0.1), (0.3, 0.3, 0.3)]
     colours[Material.METAL] = np.array(coats[generator.integers(len(coats))])
     colours[Material.WOOD] = np.array([0.48, 0.35, 0.22]) * generator.uniform(0.6, 1.3)
-    colours[Material.CONCRETE] = np.full(3, generator.uniform(0.4, 0.68))
     return colours
 
 

@@ -117,7 +117,7 @@ def test_the_finished_file_refuses_ground_truth_of_unlabeled_frames_too(tmp_path
         connection.execute("PRAGMA foreign_keys = ON")
         names = "frame, k, category, x, y, z, length, width, height, yaw, truncated, occluded"
         marks = ", ".join("?" * 12)
-        insert = f"INSERT INTO ground_truth ({names}) VALUES ({marks})"  # noqa: S608
+        insert = f"INSERT INTO ground_truth ({names}) VALUES ({marks})"
         connection.execute(insert, truth("a"))
         with pytest.raises(sqlite3.IntegrityError, match="FOREIGN KEY"):
             connection.execute(insert, truth("b"))

@@ -1,0 +1,77 @@
+"""The commands on real KITTI frames, with a real detector's record and a real segmenter."""
+
+import csv
+import json
+import sqlite3
+from pathlib import Path
+
+import pytest
+from pipelines_cli import Curate
+
+pytestmark = pytest.mark.kitti
+
+FRAMES = ("000000", "000004", "000008", "000016", "000020", "000025")
+
+
+@pytest.fixture
+def real_frames(tmp_path: Path, kitti_root: Path) -> Path:
+    """Six real frames in KITTI's layout."""
+    for folder, ending in (("velodyne", "bin"), ("image_2", "png"), ("calib", "txt")):
+        (tmp_path / "kitti" / folder).mkdir(parents=True)
+        for frame in FRAMES:
+            name = f"{frame}.{ending}"
+            (tmp_path / "kitti" / folder / name).symlink_to(kitti_root / "training" / folder / name)
+    (tmp_path / "kitti" / "label_2").symlink_to(kitti_root / "training" / "label_2")
+    return tmp_path / "kitti"
+
+
+def test_real_frames_get_weights_that_a_query_lists(
+    curate: Curate, tmp_path: Path, real_frames: Path, kitti_root: Path
+) -> None:
+    """Stage by stage to the exported file; the parked cars in front are trusted, clutter is not."""
+    work = tmp_path / "work"
+    (tmp_path / "labeled.txt").write_text("000000\n000004\n")
+    code, out, err = curate(
+        "init", work, "--dataset", "kitti", "--root", real_frames,
+        "--labeled", tmp_path / "labeled.txt",
+        "--detector", "recorded", "--detector-path", kitti_root / "recorded" / "pointgnn_T0.csv",
+        "--segmenter", "onnx", "--segmenter-classes", "voc", "--segmenter-path",
+        kitti_root / "segmenter" / "deeplabv3_mnv2_pascal_quant.onnx",
+    )  # fmt: skip
+    assert (code, err) == (0, "")
+    assert "2 labeled, 4 unlabeled and 0 val frames" in out
+    for command in ("predict", "repredict", "score", "solve", "export"):
+        code, out, err = curate(command, "-w", work)
+        assert code == 0, err
+    sql = "SELECT frame, k, score, points, rho_anno, weight FROM weighted_labels ORDER BY weight"
+    rows = json.loads(curate("query", sql, "--json", "-w", work)[1])
+    record = csv.DictReader((kitti_root / "recorded" / "pointgnn_T0.csv").open())
+    recorded = [row for row in record if row["frame"] in FRAMES[2:] and row["view"] == "0"]
+    assert len(rows) == len(recorded)
+    best = [row for row in rows if row["frame"] == "000008" and row["weight"] > 0.5]
+    assert len(best) >= 4
+    assert all(row["weight"] == 0 for row in rows if row["points"] == 0)
+    with sqlite3.connect(work / "exports" / "labels.sqlite") as file:
+        assert file.execute("SELECT count(*) FROM weighted_labels").fetchone() == (len(rows),)
+        truth = file.execute("SELECT DISTINCT frame FROM ground_truth ORDER BY 1").fetchall()
+    assert truth == [("000000",), ("000004",)]
+
+
+def test_frames_without_labels_are_read_too(
+    curate: Curate, tmp_path: Path, kitti_root: Path
+) -> None:
+    """The raw drive has no label_2; the record dictates its own augmented copies."""
+    work = tmp_path / "work"
+    code, out, err = curate(
+        "init", work, "--root", kitti_root / "raw", "--labeled", "0",
+        "--detector", "recorded",
+        "--detector-path", kitti_root / "recorded" / "pointgnn_T0_raw.csv",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "0 labeled, 13 unlabeled" in out
+    code, out, err = curate("run", "-w", work)
+    assert code == 0, err
+    sql = "SELECT count(*) AS n, max(weight) AS best FROM weighted_labels"
+    [row] = json.loads(curate("query", sql, "--json", "-w", work)[1])
+    assert row["n"] > 100
+    assert row["best"] > 0.9
