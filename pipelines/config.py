@@ -96,6 +96,8 @@ class TrainSection(Section):
     pretrain_steps: AtLeastOne = 600
     round_steps: AtLeastOne = 600
     batch_size: AtLeastOne = 4
+    learning_rate: Positive = 2e-3  # peak, from scratch
+    round_learning_rate: Positive = 1e-3  # peak, from the teacher
     threads: AtLeastOne = 2
     zero_weight: Literal["ignore", "background"] = "ignore"
     start: Literal["teacher", "scratch"] = "teacher"

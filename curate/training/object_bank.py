@@ -2,7 +2,7 @@
 
 An object keeps its distance to the sensor, so that its points stay as dense as the sensor would
 have seen them, and is turned about the sensor's vertical axis to a place that is free and open to
-view. There it hides what lies behind it, as it would have done.
+view. There it stands on the ground as it stood before, and hides what lies behind it.
 """
 
 from collections.abc import Iterable
@@ -17,6 +17,7 @@ from curate.geometry.boxes import box_corners
 from curate.geometry.overlap import bev_iou
 from curate.geometry.points_in_boxes import box_of_points
 from curate.geometry.similarity import Similarity
+from curate.training.ground import GroundMap
 from curate.training.labels import Sample
 
 # Tries per object that is asked for; crowded frames get fewer objects.
@@ -27,13 +28,25 @@ _HIDDEN_SHARE = 0.3
 _GROUND_METRES = 0.25
 
 
+# A place this much higher or lower than where the object stood is a roof or a wall, not ground.
+_HIGHEST_STEP_METRES = 0.7
+
+
 @dataclass(frozen=True)
 class BankObject:
-    """One object: its category, its (7,) box and its (n, 4) points, where they were seen."""
+    """One object as it was seen.
+
+    Attributes:
+        category: of the object.
+        box: (7,).
+        points: (n, 4) inside the box.
+        ground: height of the ground around it; NaN where no point tells.
+    """
 
     category: str
     box: np.ndarray
     points: np.ndarray
+    ground: float
 
 
 @dataclass(frozen=True)
@@ -62,12 +75,16 @@ class ObjectBank:
                     f"object bank: frame {sample.frame_id} is not of the labeled split; "
                     "the bank is built from labeled frames only"
                 )
+            if len(sample.points) == 0:
+                continue
             owner = box_of_points(sample.points, sample.boxes)
+            ground = GroundMap.of(sample.points).at(sample.boxes[:, :2])
             for k in np.flatnonzero(~sample.ignored):
                 points = sample.points[owner == k]
                 if len(points) >= fewest_points:
                     category = str(sample.categories[k])
-                    objects[category].append(BankObject(category, sample.boxes[k], points))
+                    found = BankObject(category, sample.boxes[k], points, float(ground[k]))
+                    objects[category].append(found)
         return cls({category: tuple(found) for category, found in objects.items()})
 
     def draw(self, count: int, generator: np.random.Generator) -> list[BankObject]:
@@ -92,8 +109,12 @@ def paste_objects(
     boxes = np.concatenate(
         [turn.apply_to_boxes(found.box[None]) for turn, found in zip(turns, drawn, strict=True)]
     )
+    lifts = GroundMap.of(sample.points).at(boxes[:, :2]) - [found.ground for found in drawn]
+    lifts = np.where(np.isnan(lifts), 0.0, lifts)
+    boxes[:, 2] += lifts
     outlines = _Outlines.of(boxes)
     blocked = np.any(bev_iou(boxes, sample.boxes) > 0, axis=1)
+    blocked |= np.abs(lifts) > _HIGHEST_STEP_METRES
     meets = np.greater(bev_iou(boxes, boxes), 0)
     wanted = dict.fromkeys(bank.objects, count)
     accepted: list[int] = []
@@ -104,7 +125,7 @@ def paste_objects(
             accepted.append(k)
             blocked |= meets[k]
             wanted[found.category] -= 1
-    pasted = [turns[k].apply_to_points(drawn[k].points) for k in accepted]
+    pasted = [_lifted(turns[k].apply_to_points(drawn[k].points), lifts[k]) for k in accepted]
     names = [drawn[k].category for k in accepted]
     return replace(
         sample,
@@ -173,6 +194,12 @@ class _Scene:
     def left(self) -> np.ndarray:
         """The points that no pasted object has taken the place of or hidden."""
         return self._points[self._kept]
+
+
+def _lifted(points: np.ndarray, lift: float) -> np.ndarray:
+    """The points, higher by `lift`; changes them in place."""
+    points[:, 2] += lift
+    return points
 
 
 def _turns(

@@ -28,7 +28,9 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
     labeled = workspace.frames("labeled")
     if not labeled:
         raise WorkspaceError("no labeled frames to learn from; `curate init --labeled` takes some")
-    settings = config.train.model_dump(mode="json", exclude={"round_steps", "threads", "start"})
+    settings = config.train.model_dump(
+        mode="json", exclude={"round_steps", "round_learning_rate", "threads", "start"}
+    )
     key = [
         settings,
         sorted(labeled),
@@ -44,7 +46,9 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
         report = train_with_progress(
             labels=labels,
             output=path,
-            settings=training_settings(workspace, config.train.pretrain_steps, 0),
+            settings=training_settings(
+                workspace, config.train.pretrain_steps, config.train.learning_rate, 0
+            ),
             start=None,
             read=workspace.dataset.read,
             progress=progress,

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 def settings(workspace: Workspace, context: RoundContext, _policy: str) -> Settings:
     """What a student depends on beside teacher and labels."""
-    section = workspace.config.train.model_dump(mode="json", exclude={"pretrain_steps", "threads"})
+    section = workspace.config.train.model_dump(
+        mode="json", exclude={"pretrain_steps", "learning_rate", "threads"}
+    )
     return {**section, "seed": context.seed, "device": workspace.config.detector.device}
 
 
@@ -48,7 +50,9 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
     report = train_with_progress(
         labels=export.file(workspace, job.context, job.policy),
         output=path,
-        settings=training_settings(workspace, section.round_steps, job.context.number),
+        settings=training_settings(
+            workspace, section.round_steps, section.round_learning_rate, job.context.number
+        ),
         start=job.context.teacher.path if section.start == "teacher" else None,
         read=workspace.dataset.read,
         progress=progress,
@@ -60,7 +64,9 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
     return Product(f"{report.steps} steps, {workspace.relative(path)}", write)
 
 
-def training_settings(workspace: Workspace, steps: int, round_number: int) -> "TrainingSettings":
+def training_settings(
+    workspace: Workspace, steps: int, learning_rate: float, round_number: int
+) -> "TrainingSettings":
     """The trainer's settings."""
     from curate.training.settings import TrainingSettings
 
@@ -69,6 +75,7 @@ def training_settings(workspace: Workspace, steps: int, round_number: int) -> "T
         preset=section.preset,
         steps=steps,
         batch_size=section.batch_size,
+        learning_rate=learning_rate,
         threads=section.threads,
         zero_weight=section.zero_weight,
         seed=workspace.config.run.seed + round_number,

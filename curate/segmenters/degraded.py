@@ -1,0 +1,170 @@
+"""The renderer's truth of simulated frames, made worse by a stated error model.
+
+For each frame, from a generator of (seed, frame id) alone, in this order:
+
+1. Missed instances: every connected region of a class is erased with probability
+   `missed_instance`, or `missed_small_instance` where it has fewer than `small_px` pixels.
+2. Class confusion: a region that is left becomes another class with probability `confused`,
+   pedestrian and cyclist into each other, a car into either.
+3. Boundary errors: its outline is shrunk or grown by a whole number of pixels, uniform between
+   -`boundary_px` and +`boundary_px` (it never shrinks to less than a third of its height or width).
+4. Missed patches: a Poisson number (mean `patches`) of ellipses with half axes of 3 to
+   `patch_px` pixels, centred on object pixels, become background.
+5. False blobs: a Poisson number (mean `blobs`) of ellipses with half axes of 4 to `blob_px` pixels,
+   anywhere in the lower two thirds of the image, become a random class.
+"""
+
+import hashlib
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from curate.errors import ConfigError
+from curate.frames import Frame
+from curate.segmenters.base import SemanticMap
+from curate.segmenters.classes import class_map
+from curate.segmenters.saved import SavedSegmenter
+
+_BACKGROUND, _CAR, _PEDESTRIAN, _CYCLIST = range(4)
+_CONFUSED_WITH = {
+    _CAR: (_PEDESTRIAN, _CYCLIST),
+    _PEDESTRIAN: (_CYCLIST,),
+    _CYCLIST: (_PEDESTRIAN,),
+}
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Rates and sizes of the errors; the module's text says what each does.
+
+    Raises:
+        ConfigError: a value is negative, a probability is above 1, or pixels are no whole number.
+    """
+
+    missed_instance: float = 0.06
+    missed_small_instance: float = 0.20
+    small_px: int = 250
+    confused: float = 0.06
+    boundary_px: int = 3
+    patches: float = 5.0
+    patch_px: int = 18
+    blobs: float = 3.0
+    blob_px: int = 40
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        for name, value in asdict(self).items():
+            highest = 1.0 if name.startswith(("missed", "confused")) else np.inf
+            if not 0 <= value <= highest:
+                raise ConfigError(f"degraded segmenter: {name} is {value}, not 0 to {highest:g}")
+            if name.endswith("_px") and not isinstance(value, int):
+                raise ConfigError(f"degraded segmenter: {name} is {value}, not a whole number")
+
+
+class DegradedSegmenter:
+    """A `Segmenter` that reads a simulated data set's semantic_2 and degrades it.
+
+    Args:
+        directory: the folder semantic_2 of the data set.
+        seed: of the errors.
+        rates: values of `ErrorModel` that differ from the defaults.
+
+    Raises:
+        DataError: there is no such folder.
+        ConfigError: a rate is unknown or out of range.
+    """
+
+    needs_image = False
+
+    def __init__(self, directory: Path, *, seed: int = 0, **rates: Any) -> None:
+        self.seed = seed
+        known = {field.name for field in fields(ErrorModel)}
+        if unknown := sorted(set(rates) - known):
+            raise ConfigError(
+                f"degraded segmenter: no option {unknown[0]!r}; takes {', '.join(sorted(known))}"
+            )
+        self.errors = ErrorModel(**rates)
+        self._truth = SavedSegmenter(directory, class_map("simulated"))
+
+    def segment(self, frame: Frame) -> SemanticMap:
+        """The frame's degraded map; the same for the same seed.
+
+        Raises:
+            DataError: there is no map of the truth, or it is no map of the frame's image.
+        """
+        truth = self._truth.segment(frame)
+        digest = hashlib.sha256(frame.frame_id.encode()).digest()
+        generator = np.random.default_rng([self.seed, int.from_bytes(digest[:8], "little")])
+        return SemanticMap(degrade(truth.class_ids, self.errors, generator), truth.category_classes)
+
+
+def degrade(
+    class_ids: np.ndarray, errors: ErrorModel, generator: np.random.Generator
+) -> np.ndarray:
+    """(height, width) uint8 class ids with the errors of the model."""
+    degraded = np.zeros_like(class_ids)
+    for class_id in (_CAR, _PEDESTRIAN, _CYCLIST):
+        count, regions, stats, _ = cv2.connectedComponentsWithStats(
+            (class_ids == class_id).astype(np.uint8)
+        )
+        for region in range(1, count):
+            small = stats[region, cv2.CC_STAT_AREA] < errors.small_px
+            missed = errors.missed_small_instance if small else errors.missed_instance
+            if generator.random() < missed:
+                continue
+            answer = class_id
+            if generator.random() < errors.confused:
+                answer = int(generator.choice(_CONFUSED_WITH[class_id]))
+            _paint_region(degraded, regions == region, stats[region], answer, errors, generator)
+    objects = np.flatnonzero(class_ids)
+    if len(objects):
+        for _ in range(generator.poisson(errors.patches)):
+            row, column = divmod(int(generator.choice(objects)), class_ids.shape[1])
+            _paint_ellipse(degraded, column, row, (3, errors.patch_px), _BACKGROUND, generator)
+    height, width = class_ids.shape
+    for _ in range(generator.poisson(errors.blobs)):
+        column, row = int(generator.integers(width)), int(generator.integers(height // 3, height))
+        class_id = int(generator.integers(_CAR, _CYCLIST + 1))
+        _paint_ellipse(degraded, column, row, (4, errors.blob_px), class_id, generator)
+    return degraded
+
+
+def _paint_region(
+    degraded: np.ndarray,
+    region: np.ndarray,
+    stats: np.ndarray,
+    class_id: int,
+    errors: ErrorModel,
+    generator: np.random.Generator,
+) -> None:
+    """Paints a region with its outline moved in or out."""
+    limit = errors.boundary_px
+    shift = int(generator.integers(-limit, limit + 1))
+    smallest = int(min(stats[cv2.CC_STAT_WIDTH], stats[cv2.CC_STAT_HEIGHT]))
+    shift = max(shift, -(smallest // 3))
+    left, top = (max(0, int(stats[k]) - limit) for k in (cv2.CC_STAT_LEFT, cv2.CC_STAT_TOP))
+    right = int(stats[cv2.CC_STAT_LEFT] + stats[cv2.CC_STAT_WIDTH]) + limit
+    bottom = int(stats[cv2.CC_STAT_TOP] + stats[cv2.CC_STAT_HEIGHT]) + limit
+    window = np.s_[top:bottom, left:right]
+    reach = 2 * abs(shift) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    change = cv2.MORPH_DILATE if shift > 0 else cv2.MORPH_ERODE
+    moved = cv2.morphologyEx(region[window].astype(np.uint8), change, kernel)
+    degraded[window][moved > 0] = class_id
+
+
+def _paint_ellipse(
+    degraded: np.ndarray,
+    column: int,
+    row: int,
+    half_axes_px: tuple[int, int],
+    class_id: int,
+    generator: np.random.Generator,
+) -> None:
+    """Paints an ellipse with half axes from the given range."""
+    low, high = half_axes_px
+    axes = [int(axis) for axis in generator.integers(low, max(low, high) + 1, size=2)]
+    cv2.ellipse(degraded, (column, row), axes, 0, 0, 360, class_id, thickness=-1)

@@ -1,0 +1,90 @@
+"""The README's commands, run as they stand there."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+
+
+def commands(under: str) -> list[list[str]]:
+    """The command lines of the shell block under a heading, one list of words each."""
+    block = re.search(rf"## {under}\n.*?```sh\n(.*?)```", README, re.DOTALL)
+    assert block, f"README.md has no shell block under '{under}'"
+    text = block[1].replace("\\\n", " ").replace(" && ", "\n")
+    lines = [re.sub(r"\s+#.*", "", line).strip() for line in text.splitlines()]
+    return [shlex.split(line) for line in lines if line]
+
+
+def run_all(lines: list[list[str]], folder: Path, replace: dict[str, str], edit=None) -> str:
+    """Runs command lines one after the other as a shell would; gives what they print."""
+    printed = []
+    for line in lines:
+        words = [replace.get(word, word) for word in line]
+        if words[0] == "source":
+            continue
+        if words[0] == "cd":
+            folder = folder / words[1]
+            continue
+        assert words[0] == "curate", line
+        ended = subprocess.run(
+            [sys.executable, "-m", "pipelines", *words[1:]],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert ended.returncode == 0, f"{shlex.join(line)}\n{ended.stderr}"
+        printed.append(ended.stdout)
+        if words[1] == "init" and edit:
+            edit(folder / words[2] / "curate.toml")
+    return "\n".join(printed)
+
+
+def short_training(path: Path) -> None:
+    """Trainings of two steps: the commands are tested here, not the detector."""
+    text = path.read_text()
+    for name in ("pretrain_steps", "round_steps"):
+        text, found = re.subn(rf"{name} = \d+", f"{name} = 2", text)
+        assert found == 1
+    path.write_text(text.replace('executor = "serial"', 'executor = "process"'))
+
+
+def test_the_commands_on_your_data(tmp_path: Path) -> None:
+    """From nothing to the weight of one label explained."""
+    lines = commands("On your data")
+    explain = [line for line in lines if line[1] == "explain"]
+    printed = run_all(
+        [line for line in lines if line not in explain], tmp_path, {"80": "24"}, short_training
+    )
+    assert "round 2  train-round" in printed
+    assert "weight" in printed
+    sql = "SELECT frame, k FROM weighted_labels LIMIT 1"
+    work = tmp_path / "work"
+    found = run_all([["curate", "query", sql, "--csv"]], work, {}).split()[1].split(",")
+    replace = dict(zip(explain[0][2:], found, strict=True))
+    assert "recomputed" in run_all(explain, work, replace)
+
+
+@pytest.mark.kitti
+def test_the_commands_with_your_detector(tmp_path: Path, kitti_root: Path) -> None:
+    """A real detector's record and a real segmenter."""
+    frames = tmp_path / "few"
+    for folder in ("velodyne", "image_2", "calib", "label_2"):
+        (frames / folder).mkdir(parents=True)
+        for path in sorted((kitti_root / "training" / folder).iterdir())[:4]:
+            (frames / folder / path.name).symlink_to(path)
+    replace = {
+        "KITTI/training": str(frames),
+        "detections.csv": str(kitti_root / "recorded" / "pointgnn_T0.csv"),
+        "deeplab.onnx": str(kitti_root / "segmenter" / "deeplabv3_mnv2_pascal_quant.onnx"),
+    }
+    printed = run_all(commands("With your detector and your segmenter"), tmp_path, replace)
+    assert "labels in exports/round-01-pspsl.sqlite" in printed
