@@ -240,11 +240,16 @@ def bootstrap(
         size = count[drawn]
         within = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
         values[replicate] = statistic(order[np.repeat(start[drawn], size) + within], drawn)
-    defined = values[~np.isnan(values)]
+    return percentile_interval(values, level)
+
+
+def percentile_interval(replicates: np.ndarray, level: float = 0.95) -> Interval:
+    """The interval that holds the share `level` of the (r,) defined replicates."""
+    defined = replicates[~np.isnan(replicates)]
     if not len(defined):
         return Interval(np.nan, np.nan, 1.0)
     low, high = np.quantile(defined, [(1 - level) / 2, (1 + level) / 2])
-    return Interval(float(low), float(high), 1.0 - len(defined) / replicates)
+    return Interval(float(low), float(high), 1.0 - len(defined) / len(replicates))
 
 
 def _minimum_iou(settings: JudgeSettings, category: str) -> float:

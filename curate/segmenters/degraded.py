@@ -47,19 +47,20 @@ class ErrorModel:
     missed_instance: float = 0.06
     missed_small_instance: float = 0.20
     small_px: int = 250
-    confused: float = 0.06
-    boundary_px: int = 3
+    confused: float = 0.05
+    boundary_px: int = 2
     patches: float = 5.0
     patch_px: int = 18
-    blobs: float = 3.0
-    blob_px: int = 40
+    blobs: float = 2.0
+    blob_px: int = 25
 
     def __post_init__(self) -> None:
         """Checks the values."""
         for name, value in asdict(self).items():
             highest = 1.0 if name.startswith(("missed", "confused")) else np.inf
-            if not 0 <= value <= highest:
-                raise ConfigError(f"degraded segmenter: {name} is {value}, not 0 to {highest:g}")
+            number = isinstance(value, int | float)
+            if not (number and 0 <= value <= highest):
+                raise ConfigError(f"degraded segmenter: {name} is {value!r}, not 0 to {highest:g}")
             if name.endswith("_px") and not isinstance(value, int):
                 raise ConfigError(f"degraded segmenter: {name} is {value}, not a whole number")
 

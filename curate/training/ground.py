@@ -1,12 +1,11 @@
 """The height of the ground in a sweep, as far as pasting objects needs it."""
 
-import warnings
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-_CELL_METRES = 2.0
+_CELL_METRES = 3.0
 
 
 @dataclass(frozen=True)
@@ -35,13 +34,12 @@ class GroundMap:
     def at(self, places: np.ndarray) -> np.ndarray:
         """(n,) height of the ground around (n, 2) places, NaN where no point tells.
 
-        The median of the nine squares around a place: a wall or a car that covers one of them does
-        not raise it.
+        The second lowest of the nine squares around a place, or the lowest where there is but one:
+        walls and cars that cover the others do not raise it, nor does one stray point lower it.
         """
         last = np.array(self.heights.shape) - 1
         square = ((places - self.low) / _CELL_METRES).astype(np.int64)
         around = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(1, 9, 2)
         squares = np.clip(square[:, None] + around, 0, last)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
-            return np.nanmedian(self.heights[squares[..., 0], squares[..., 1]], axis=1)
+        lowest = np.sort(self.heights[squares[..., 0], squares[..., 1]], axis=1)
+        return np.asarray(np.where(np.isnan(lowest[:, 1]), lowest[:, 0], lowest[:, 1]))

@@ -34,19 +34,11 @@ _HIGHEST_STEP_METRES = 0.7
 
 @dataclass(frozen=True)
 class BankObject:
-    """One object as it was seen.
-
-    Attributes:
-        category: of the object.
-        box: (7,).
-        points: (n, 4) inside the box.
-        ground: height of the ground around it; NaN where no point tells.
-    """
+    """One object: its category, its (7,) box and its (n, 4) points, where they were seen."""
 
     category: str
     box: np.ndarray
     points: np.ndarray
-    ground: float
 
 
 @dataclass(frozen=True)
@@ -75,16 +67,12 @@ class ObjectBank:
                     f"object bank: frame {sample.frame_id} is not of the labeled split; "
                     "the bank is built from labeled frames only"
                 )
-            if len(sample.points) == 0:
-                continue
             owner = box_of_points(sample.points, sample.boxes)
-            ground = GroundMap.of(sample.points).at(sample.boxes[:, :2])
             for k in np.flatnonzero(~sample.ignored):
                 points = sample.points[owner == k]
                 if len(points) >= fewest_points:
                     category = str(sample.categories[k])
-                    found = BankObject(category, sample.boxes[k], points, float(ground[k]))
-                    objects[category].append(found)
+                    objects[category].append(BankObject(category, sample.boxes[k], points))
         return cls({category: tuple(found) for category, found in objects.items()})
 
     def draw(self, count: int, generator: np.random.Generator) -> list[BankObject]:
@@ -109,7 +97,7 @@ def paste_objects(
     boxes = np.concatenate(
         [turn.apply_to_boxes(found.box[None]) for turn, found in zip(turns, drawn, strict=True)]
     )
-    lifts = GroundMap.of(sample.points).at(boxes[:, :2]) - [found.ground for found in drawn]
+    lifts = GroundMap.of(sample.points).at(boxes[:, :2]) - (boxes[:, 2] - boxes[:, 5] / 2)
     lifts = np.where(np.isnan(lifts), 0.0, lifts)
     boxes[:, 2] += lifts
     outlines = _Outlines.of(boxes)

@@ -83,6 +83,8 @@ def simulate(
         raise ConfigError(f"workers must be at least 1, not {workers}")
     _claim(directory, settings)
     home = directory / "training"
+    for leftover in home.glob("*/.*.partial"):  # of a run that was killed
+        leftover.unlink()
     missing = [index for index in range(frames) if not _is_whole(home, index)]
     done = frames - len(missing)
     if progress:

@@ -1,0 +1,427 @@
+"""What pseudo-labels and their weights are worth, on frames whose ground truth is known.
+
+The labels of such frames are made and weighed as if the frames were unlabeled. Then the truth is
+asked how many are right, and how well each policy's weight tells right from wrong: over all, by
+category, by distance from the LiDAR, and by LiDAR points in the box. Intervals come from a
+bootstrap over frames, the unit that was sampled; policies are compared within the same draws.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+
+from curate.detections import Annotations, Detections, as_categories
+from curate.evaluation.reliability import (
+    JudgeSettings,
+    ReliabilityBins,
+    auroc,
+    average_precision,
+    expected_calibration_error,
+    judge,
+    percentile_interval,
+    reliability_bins,
+    weighted_precision,
+    weighted_recall,
+)
+from curate.evaluation.resampling import draw_frames, ranked_replicates
+
+ALL = "all"
+"""Stands for all categories together."""
+
+DISTANCES = (0.0, 20.0, 40.0, np.inf)
+"""Edges in metres, over the ground from the LiDAR to the centre of the box."""
+POINTS = (0.0, 10.0, 50.0, 200.0, np.inf)
+"""Edges in LiDAR points inside the box."""
+
+
+@dataclass(frozen=True)
+class AuditedFrame:
+    """A frame with its labels and its ground truth.
+
+    Attributes:
+        labels: n labels in the LiDAR frame.
+        truth: what annotators wrote.
+        rectangles: (n, 4) left, top, right, bottom of the labels in the image, NaN where invisible.
+        points: (n,) LiDAR points in each label, NaN where they were not counted.
+    """
+
+    labels: Detections
+    truth: Annotations
+    rectangles: np.ndarray
+    points: np.ndarray
+
+
+@dataclass(frozen=True)
+class JudgedLabels:
+    """The n labels and the m objects of all audited frames, as columns.
+
+    Attributes:
+        frames: number of frames, those without labels or objects included.
+        frame_index: (n,) int64.
+        category: (n,) str.
+        distance: (n,) metres over the ground.
+        points: (n,) float64, NaN where unknown.
+        right: (n,) bool.
+        counted: (n,) bool, False where a label is neither right nor wrong.
+        object_frame: (m,) int64.
+        object_category: (m,) str.
+        object_distance: (m,) metres over the ground.
+    """
+
+    frames: int
+    frame_index: np.ndarray
+    category: np.ndarray
+    distance: np.ndarray
+    points: np.ndarray
+    right: np.ndarray
+    counted: np.ndarray
+    object_frame: np.ndarray
+    object_category: np.ndarray
+    object_distance: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.frame_index)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The frames of all parts, one after the other."""
+        offset = np.cumsum([0, *(part.frames for part in parts)])
+        columns = {
+            field.name: np.concatenate([
+                getattr(part, field.name) + (start if field.name in _FRAME_COLUMNS else 0)
+                if field.name not in _NAME_COLUMNS
+                else getattr(part, field.name)
+                for part, start in zip(parts, offset[:-1], strict=True)
+            ])
+            for field in fields(cls)
+            if field.name != "frames"
+        }
+        return cls(int(offset[-1]), **columns)
+
+
+_FRAME_COLUMNS = ("frame_index", "object_frame")
+_NAME_COLUMNS = ("category", "object_category", "right", "counted")
+
+
+@dataclass(frozen=True)
+class Slice:
+    """Labels of a range of distances or of point counts; the whole where `by` is "all".
+
+    Attributes:
+        by: "all", "distance" or "points".
+        low: lower edge, included.
+        high: upper edge, not included.
+    """
+
+    by: str
+    low: float = 0.0
+    high: float = np.inf
+
+    def holds(self, values: np.ndarray) -> np.ndarray:
+        """(n,) bool, which of the values it holds."""
+        return np.asarray((values >= self.low) & (values < self.high))
+
+    def __str__(self) -> str:
+        unit = " m" if self.by == "distance" else ""
+        if self.by == "all":
+            return ALL
+        return f"{self.low:g}-{self.high:g}{unit}" if self.high < np.inf else f"{self.low:g}+{unit}"
+
+
+WHOLE = Slice("all")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure with its interval; NaN where it is undefined."""
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, value: float, replicates: np.ndarray, level: float) -> Self:
+        """The figure, and the interval from its (r,) replicates."""
+        interval = percentile_interval(replicates, level)
+        return cls(float(value), interval.low, interval.high)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How good the labels of a category in a slice are, and how well a policy's weight judges them.
+
+    Attributes:
+        policy: whose weight.
+        category: or `ALL`.
+        slice: see `Slice`.
+        labels: that are right or wrong.
+        neutral: further labels that are neither.
+        right: of the labels.
+        objects: to be found; None where it is not known which belong to the slice.
+        share_right: right / labels.
+        auroc: chance that a right label weighs more than a wrong one.
+        average_precision: of the labels ranked by weight.
+        weighted_precision: share of the weight that lies on right labels.
+        weighted_recall: weight on right labels per object.
+        calibration_error: expected distance of the weight and the share of right labels.
+        bins: labels, precision and recall by weight.
+    """
+
+    policy: str
+    category: str
+    slice: Slice
+    labels: int
+    neutral: int
+    right: int
+    objects: int | None
+    share_right: Estimate
+    auroc: Estimate
+    average_precision: Estimate
+    weighted_precision: Estimate
+    weighted_recall: Estimate
+    calibration_error: Estimate
+    bins: ReliabilityBins
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """By how much the AUROC of one policy exceeds that of another, over the same frames."""
+
+    category: str
+    policy: str
+    other: str
+    difference: Estimate
+
+    @property
+    def beyond_chance(self) -> bool:
+        """Whether the interval of the difference leaves 0 out."""
+        return self.difference.low > 0 or self.difference.high < 0
+
+
+@dataclass(frozen=True)
+class Audit:
+    """All figures of an audit.
+
+    Attributes:
+        frames: that were audited.
+        level: coverage of the intervals.
+        figures: by category, slice and policy.
+        comparisons: of every two policies, by category.
+    """
+
+    frames: int
+    level: float
+    figures: tuple[Figures, ...]
+    comparisons: tuple[Comparison, ...]
+
+    def whole(self, category: str = ALL) -> dict[str, Figures]:
+        """The figures of all distances and point counts, by policy."""
+        return {
+            found.policy: found
+            for found in self.figures
+            if found.slice == WHOLE and found.category == category
+        }
+
+    def compare(self, policy: str, other: str, category: str = ALL) -> Comparison:
+        """The comparison of two policies, in this order."""
+        for found in self.comparisons:
+            if (found.category, found.policy, found.other) == (category, policy, other):
+                return found
+        found = self.compare(other, policy, category)
+        turned = Estimate(-found.difference.value, -found.difference.high, -found.difference.low)
+        return Comparison(category, policy, other, turned)
+
+
+def judge_frames(frames: Iterable[AuditedFrame], settings: JudgeSettings) -> JudgedLabels:
+    """Ask the truth about the labels of some frames.
+
+    Raises:
+        ConfigError: a label's category has no minimum IoU.
+    """
+    parts = [_judge_frame(frame, settings) for frame in frames]
+    nothing = AuditedFrame(Detections.empty(), Annotations.empty(), np.zeros((0, 4)), np.zeros(0))
+    whole = JudgedLabels.joined([_judge_frame(nothing, settings), *parts])
+    return _without_first_frame(whole)
+
+
+def audit(
+    labels: JudgedLabels,
+    weights: Mapping[str, np.ndarray],
+    categories: Sequence[str],
+    generator: np.random.Generator,
+    *,
+    replicates: int = 1000,
+    level: float = 0.95,
+    bins: int = 10,
+) -> Audit:
+    """All figures, with intervals.
+
+    Args:
+        labels: see `JudgedLabels`.
+        weights: (n,) in [0, 1] by policy.
+        categories: to be looked at one by one, and all together.
+        generator: source of the draws.
+        replicates: number of draws.
+        level: coverage of the intervals.
+        bins: of the weight.
+    """
+    draws = draw_frames(generator, labels.frames, replicates)
+    figures: list[Figures] = []
+    comparisons: list[Comparison] = []
+    for category in (ALL, *categories):
+        for part in (WHOLE, *slices(labels)):
+            sample = _sample(labels, category, part)
+            aurocs: dict[str, np.ndarray] = {}
+            for policy, of_all in weights.items():
+                found, aurocs[policy] = _figures(policy, of_all, sample, draws, level, bins)
+                figures.append(found)
+            if part == WHOLE:
+                comparisons += _comparisons(figures[-len(weights) :], aurocs, level)
+    return Audit(labels.frames, level, tuple(figures), tuple(comparisons))
+
+
+def slices(labels: JudgedLabels) -> tuple[Slice, ...]:
+    """The ranges of distance, and those of point counts where points were counted."""
+    edges = {"distance": DISTANCES}
+    if not np.isnan(labels.points).all():
+        edges["points"] = POINTS
+    return tuple(
+        Slice(by, low, high)
+        for by, values in edges.items()
+        for low, high in zip(values, values[1:], strict=False)
+    )
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """The counted labels of a category and slice; `objects` is (f,), None where unknown."""
+
+    category: str
+    part: Slice
+    index: np.ndarray
+    frame_index: np.ndarray
+    right: np.ndarray
+    neutral: int
+    objects: np.ndarray | None
+
+
+def _sample(labels: JudgedLabels, category: str, part: Slice) -> _Sample:
+    of_category = np.full(len(labels), True) if category == ALL else labels.category == category
+    objects = np.full(len(labels.object_frame), True)
+    if category != ALL:
+        objects = labels.object_category == category
+    if part.by != "all":
+        of_category &= part.holds(getattr(labels, part.by))
+        objects &= part.holds(labels.object_distance)
+    index = np.flatnonzero(of_category & labels.counted)
+    return _Sample(
+        category,
+        part,
+        index,
+        labels.frame_index[index],
+        labels.right[index],
+        int((of_category & ~labels.counted).sum()),
+        # Points are counted in labels only, so nobody knows how many objects have few of them.
+        None
+        if part.by == "points"
+        else np.bincount(labels.object_frame[objects], minlength=labels.frames),
+    )
+
+
+def _figures(
+    policy: str,
+    of_all: np.ndarray,
+    sample: _Sample,
+    draws: np.ndarray,
+    level: float,
+    bins: int,
+) -> tuple[Figures, np.ndarray]:
+    """The figures of one policy, and the replicates of its AUROC."""
+    v, right = of_all[sample.index], sample.right
+    frames = draws.shape[1]
+    objects = 0 if sample.objects is None else int(sample.objects.sum())
+    ranked = ranked_replicates(v, right, sample.frame_index, draws)
+    counts, found, weight, trusted = (
+        draws @ np.bincount(sample.frame_index, column, minlength=frames)
+        for column in (np.ones(len(v)), right, v, v * right)
+    )
+    of_objects = draws @ (np.zeros(frames) if sample.objects is None else sample.objects)
+    error = _calibration_replicates(v, sample, draws, bins) / np.where(counts, counts, np.nan)
+
+    def estimate(value: float, replicates: np.ndarray) -> Estimate:
+        return Estimate.of(value, replicates, level)
+
+    return Figures(
+        policy=policy,
+        category=sample.category,
+        slice=sample.part,
+        labels=len(v),
+        neutral=sample.neutral,
+        right=int(right.sum()),
+        objects=None if sample.objects is None else objects,
+        share_right=estimate(_mean(right), _ratio(found, counts)),
+        auroc=estimate(auroc(v, right), ranked[0]),
+        average_precision=estimate(average_precision(v, right), ranked[1]),
+        weighted_precision=estimate(weighted_precision(v, right), _ratio(trusted, weight)),
+        weighted_recall=estimate(weighted_recall(v, right, objects), _ratio(trusted, of_objects)),
+        calibration_error=estimate(expected_calibration_error(v, right, bins), error),
+        bins=reliability_bins(v, right, objects, bins),
+    ), ranked[0]
+
+
+def _calibration_replicates(
+    v: np.ndarray, sample: _Sample, draws: np.ndarray, bins: int
+) -> np.ndarray:
+    """(r,) sum over the bins of |right labels - weight|: the calibration error times the labels."""
+    edges = np.arange(bins + 1) / bins
+    member = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, bins - 1)
+    cell = sample.frame_index * bins + member
+    gap = np.bincount(cell, sample.right - v, minlength=draws.shape[1] * bins)
+    return np.asarray(np.abs(draws @ gap.reshape(-1, bins)).sum(axis=1))
+
+
+def _comparisons(
+    figures: Sequence[Figures], aurocs: Mapping[str, np.ndarray], level: float
+) -> list[Comparison]:
+    """Every policy with each that follows it."""
+    return [
+        Comparison(
+            one.category,
+            one.policy,
+            other.policy,
+            Estimate.of(
+                one.auroc.value - other.auroc.value, aurocs[one.policy] - aurocs[other.policy], level
+            ),
+        )
+        for i, one in enumerate(figures)
+        for other in figures[i + 1 :]
+    ]
+
+
+def _judge_frame(frame: AuditedFrame, settings: JudgeSettings) -> JudgedLabels:
+    verdict = judge(frame.labels, frame.truth, settings, frame.rectangles)
+    objects = np.isin(frame.truth.categories, list(settings.minimum_iou))
+    n, m = len(frame.labels), int(objects.sum())
+    return JudgedLabels(
+        frames=1,
+        frame_index=np.zeros(n, dtype=np.int64),
+        category=as_categories(frame.labels.categories),
+        distance=np.hypot(frame.labels.boxes[:, 0], frame.labels.boxes[:, 1]),
+        points=np.asarray(frame.points, dtype=np.float64),
+        right=verdict.right,
+        counted=verdict.counted,
+        object_frame=np.zeros(m, dtype=np.int64),
+        object_category=as_categories(frame.truth.categories[objects]),
+        object_distance=np.hypot(*frame.truth.boxes[objects, :2].T),
+    )
+
+
+def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """(r,) part / whole, NaN where the whole is 0."""
+    return np.asarray(part / np.where(whole > 0, whole, np.nan))
+
+
+def _mean(right: np.ndarray) -> float:
+    return float(right.mean()) if len(right) else float("nan")

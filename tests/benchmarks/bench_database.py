@@ -1,0 +1,221 @@
+"""The database in rows per second, against the bare driver on the same tables and pragmas."""
+
+import shutil
+import sqlite3
+
+import numpy as np
+import pytest
+from benchmarks.measuring import OURS, measure
+from sqlalchemy import insert, select
+
+from db import bulk
+from db.session import BUSY_TIMEOUT_MS, Database
+from pipelines.config import make_config
+from pipelines.stage import RoundContext, RoundJob, Teacher
+from pipelines.stages import solve
+from pipelines.progress import Silent
+from pipelines.workspace import Workspace
+
+FRAMES, EACH = 2000, 50
+ROWS = FRAMES * EACH
+WRITE = f"Writing {ROWS:,} rows of prediction (SQLite)"
+READ = f"Reading {ROWS:,} rows of prediction (SQLite)"
+SOLVE = f"The stage solve on {ROWS:,} labels in SQLite"
+BARE = "sqlite3, bare driver"
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory):
+    """A workspace whose database holds frames and a round, but no predictions."""
+    root = tmp_path_factory.mktemp("database")
+    config = make_config({"dataset": {"root": root}}, "benchmark")
+    workspace = Workspace.create(root / "work", config)
+    frames = [
+        ("kitti", f"{i:06d}", "unlabeled", f"{i}.bin", f"{i}.png", f"{i}.txt", None)
+        for i in range(FRAMES)
+    ]
+    with workspace.database.writing() as connection:
+        bulk.insert(connection, "frame", frames)
+        bulk.insert(connection, "round", [(1, 3, None, "{}", "0", 0)])
+    workspace.database.close()
+    return workspace
+
+
+@pytest.fixture(scope="module")
+def predictions():
+    """The rows of `prediction`."""
+    generator = np.random.default_rng(0)
+    boxes, scores = generator.normal(0, 10, (ROWS, 7)).tolist(), generator.random(ROWS).tolist()
+    categories = generator.choice(["Car", "Pedestrian", "Cyclist"], ROWS).tolist()
+    place = {name: position for position, name in enumerate(bulk.columns("prediction"))}
+    rows = []
+    for i, (box, score, category) in enumerate(zip(boxes, scores, categories, strict=True)):
+        row = [1, 1 + i // EACH, i % EACH, *[None] * 9]
+        row[place["category"]], row[place["score"]] = category, score
+        row[place["x"] : place["yaw"] + 1] = box
+        rows.append(tuple(row))
+    return rows
+
+
+@pytest.fixture
+def copies(template, tmp_path):
+    """A function that returns the path of a fresh copy of the template."""
+
+    def fresh():
+        path = tmp_path / f"{len(list(tmp_path.glob('*.db')))}.db"
+        shutil.copyfile(template.root / "curate.db", path)
+        return path
+
+    return fresh
+
+
+def bare_connection(path):
+    """The driver alone with the pragmas of `db.session`."""
+    connection = sqlite3.connect(path, isolation_level=None)
+    connection.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = NORMAL")
+    connection.execute("PRAGMA foreign_keys = ON")
+    return connection
+
+
+def write_bare(path, rows):
+    """sqlite3's executemany in one transaction."""
+    connection = bare_connection(path)
+    marks = ", ".join("?" * len(rows[0]))
+    names = ", ".join(f'"{name}"' for name in bulk.columns("prediction"))
+    connection.execute("BEGIN IMMEDIATE")
+    connection.executemany(f"INSERT INTO prediction ({names}) VALUES ({marks})", rows)
+    connection.execute("COMMIT")
+    connection.close()
+
+
+def write_ours(database, rows):
+    """`db.bulk.insert` in one transaction."""
+    with database.writing() as connection:
+        bulk.insert(connection, "prediction", rows)
+    database.close()
+
+
+def write_core(database, rows):
+    """SQLAlchemy Core with a dictionary per row."""
+    names = bulk.columns("prediction")
+    with database.writing() as connection:
+        connection.execute(
+            insert(bulk.table("prediction")),
+            [dict(zip(names, row, strict=True)) for row in rows],
+        )
+    database.close()
+
+
+WRITERS = {OURS: write_ours, BARE: write_bare, "SQLAlchemy Core, dictionaries": write_core}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def bench_write(benchmark, name, copies, predictions):
+    """Into an empty table with its primary key, foreign keys and index."""
+    last = []
+
+    def setup() -> tuple[tuple, dict]:
+        last[:] = [copies()]
+        target = last[0] if name == BARE else Database(f"sqlite:///{last[0]}")
+        return (target, predictions), {}
+
+    measure(
+        benchmark,
+        WRITERS[name],
+        group=WRITE,
+        name=name,
+        amount=ROWS,
+        unit="rows",
+        setup=setup,
+        rounds=3,
+    )
+    connection = bare_connection(last[0])
+    assert connection.execute("SELECT count(*) FROM prediction").fetchone() == (ROWS,)
+    connection.close()
+
+
+@pytest.mark.parametrize("name", [OURS, BARE])
+def bench_read(benchmark, name, copies, predictions):
+    """All rows with all columns, as tuples."""
+    path = copies()
+    write_bare(path, predictions)
+    names = bulk.columns("prediction")
+    database, bare = Database(f"sqlite:///{path}"), bare_connection(path)
+
+    def ours():
+        with database.reading() as connection:
+            return bulk.select(connection, select(bulk.table("prediction")))
+
+    def driver():
+        return bare.execute(f"SELECT {', '.join(names)} FROM prediction").fetchall()
+
+    read = ours if name == OURS else driver
+    rows = measure(benchmark, read, group=READ, name=name, amount=ROWS, unit="rows")
+    assert len(rows) == ROWS
+    database.close()
+    bare.close()
+
+
+@pytest.fixture(scope="module")
+def solvable(template, predictions, tmp_path_factory):
+    """A workspace with the evidence of every label."""
+    workspace = Workspace.create(tmp_path_factory.mktemp("solve"), template.config)
+    workspace.database.close()
+    shutil.copyfile(template.root / "curate.db", workspace.root / "curate.db")
+    generator = np.random.default_rng(1)
+    keys = [row[:3] for row in predictions]
+    losses, rhos = generator.exponential(1, ROWS).tolist(), generator.random((2, ROWS)).tolist()
+    evidence = {
+        "consistency": [(*key, loss, 1, 1) for key, loss in zip(keys, losses, strict=True)],
+        "point_prior": [(*key, 5, 10.0, rho) for key, rho in zip(keys, rhos[0], strict=True)],
+        "semantic_prior": [(*key, 5, 10, rho) for key, rho in zip(keys, rhos[1], strict=True)],
+    }
+    with workspace.database.writing() as connection:
+        bulk.insert(connection, "prediction", predictions)
+        for table, rows in evidence.items():
+            bulk.insert(connection, table, rows)
+    return workspace
+
+
+def solve_product(workspace):
+    """What solve computes; its `write` stores the weights."""
+    context = RoundContext(1, 3, 0, Teacher(workspace.root, ""))
+    frames = list(workspace.frames("unlabeled").values())
+    return solve.run(workspace, RoundJob(context, "pspsl", frames), Silent())
+
+
+def bench_solve_reads(benchmark, solvable):
+    """Evidence joined from four tables, and the weight of every label."""
+    measure(
+        benchmark,
+        lambda: solve_product(solvable),
+        group=SOLVE,
+        name="read the evidence, weigh",
+        amount=ROWS,
+        unit="labels",
+        figure="rate",
+    )
+
+
+def bench_solve_writes(benchmark, solvable):
+    """The rows of `weight`, in place of those of the last time."""
+    product = solve_product(solvable)
+
+    def write():
+        with solvable.database.writing() as connection:
+            product.write(connection)
+
+    measure(
+        benchmark,
+        write,
+        group=SOLVE,
+        name="replace the weights",
+        amount=ROWS,
+        unit="labels",
+        figure="rate",
+    )
+    with solvable.database.reading() as connection:
+        [count] = connection.exec_driver_sql("SELECT count(*) FROM weight").one()
+    assert count == ROWS

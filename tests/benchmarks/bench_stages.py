@@ -1,0 +1,189 @@
+"""The stages of a round in frames per second on one core, without the networks' own time."""
+
+import numpy as np
+import pytest
+from benchmarks.measuring import measure
+from benchmarks.scenes import guesses_around
+
+from curate.datasets.synthetic import simulate
+from curate.detectors.pillars.encoding import encode_points
+from curate.detectors.pillars.presets import PRESETS
+from curate.weighting.base import Age, Evidence
+from curate.weighting.self_paced import PSPSL
+from pipelines.config import make_config
+from pipelines.executors.base import FrameJob
+from pipelines.setup import initialise
+from pipelines.stage import RoundContext, Teacher
+from pipelines.stages import points, predict, repredict, semantic
+
+GROUP = "Stages on simulated frames, one core, 60 boxes or more per frame"
+FRAMES = 4
+CLUTTER = 55
+
+
+class KnownAnswers:
+    """A detector that takes no time: it answers what it was given for a frame."""
+
+    def __init__(self, answers):
+        self.answers = answers
+
+    def predict(self, frame):
+        """The frame's boxes."""
+        return self.answers[frame.frame_id]
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    """A workspace on simulated frames, one of them labeled."""
+    root = tmp_path_factory.mktemp("simulated")
+    simulate(root / "data", FRAMES, 0, val_frames=0, workers=1)
+    document = {
+        "dataset": {"root": root / "data"},
+        "segmenter": {
+            "name": "saved",
+            "path": root / "data" / "training" / "semantic_2",
+            "classes": "simulated",
+        },
+    }
+    return initialise(root / "work", make_config(document, "benchmark"), str(1 / FRAMES), "")
+
+
+@pytest.fixture(scope="module")
+def context(workspace):
+    """The first round."""
+    return RoundContext(1, 3, 0, Teacher(workspace.root / "none", ""))
+
+
+@pytest.fixture(scope="module")
+def guesses(workspace):
+    """Predictions by frame id."""
+    generator = np.random.default_rng(0)
+    return {
+        name: guesses_around(generator, workspace.dataset.annotations(name), CLUTTER)
+        for name in workspace.dataset.frame_ids()
+    }
+
+
+def of_frames(benchmark, names, function, name):
+    """Measures what is done with every frame."""
+    return measure(
+        benchmark,
+        lambda: [function(frame) for frame in names],
+        group=GROUP,
+        name=name,
+        amount=len(names),
+        unit="frames",
+        figure="rate",
+    )
+
+
+def of_jobs(benchmark, guesses, stage, name):
+    """Measures a stage with the predictions of every frame, and returns the rows of the first."""
+    jobs = {frame: FrameJob(0, frame, found) for frame, found in guesses.items()}
+    rows = of_frames(benchmark, list(jobs), lambda frame: stage(jobs[frame]), name)
+    return rows[0]
+
+
+def bench_simulate(benchmark, tmp_path):
+    """Sweep, image, semantic map and labels of a frame."""
+    count = 3
+
+    def setup() -> tuple[tuple, dict]:
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        return (folder, count, 1), {"val_frames": 0, "workers": 1}
+
+    measure(
+        benchmark,
+        simulate,
+        group=GROUP,
+        name="simulate",
+        amount=count,
+        unit="frames",
+        setup=setup,
+        rounds=2,
+        figure="rate",
+    )
+
+
+def bench_read(benchmark, workspace):
+    """Points, calibration and the size of the image."""
+    frames = of_frames(
+        benchmark, workspace.dataset.frame_ids(), workspace.dataset.read, "read: sweep, calibration"
+    )
+    assert len(frames[0].points) > 10_000
+
+
+def bench_read_image(benchmark, workspace):
+    """The image as well."""
+    of_frames(
+        benchmark,
+        workspace.dataset.frame_ids(),
+        lambda name: workspace.dataset.read(name, image=True),
+        "read: sweep, calibration, image",
+    )
+
+
+def bench_predict(benchmark, workspace):
+    """Up to the network: read, crop to the camera's view, make pillars."""
+
+    def prepare(name):
+        frame = predict.visible(workspace.dataset.read(name), workspace.config)
+        return encode_points(frame.points, PRESETS["small"])
+
+    pillars = of_frames(
+        benchmark, workspace.dataset.frame_ids(), prepare, "predict, up to the network"
+    )
+    assert len(pillars[0].slots) > 1000
+
+
+def bench_repredict(benchmark, workspace, context, guesses):
+    """Read, crop, A, the answers mapped back, matching, consistency loss."""
+    section = workspace.config.repredict
+    answers = {}
+    for name, found in guesses.items():
+        [similarity] = repredict.draw(context.seed, context.number, name, section)
+        boxes = similarity.apply_to_boxes(found.boxes)
+        answers[name] = type(found)(boxes, found.scores, found.categories)
+    stage = repredict.function(workspace, context)
+    stage.dataset, stage.detector = workspace.dataset, KnownAnswers(answers)
+    rows = of_jobs(benchmark, guesses, stage, "repredict, without the network")
+    assert all(matched for *_, matched in rows["consistency"])
+
+
+def bench_points(benchmark, workspace, context, guesses):
+    """Read, count the points in the boxes."""
+    stage = points.function(workspace, context)
+    stage.open()
+    rows = of_jobs(benchmark, guesses, stage, "score --prior points")
+    assert len(rows["point_prior"]) > CLUTTER
+
+
+def bench_semantic(benchmark, workspace, context, guesses):
+    """Read the frame and its saved semantic map, count the pixels in the boxes."""
+    stage = semantic.function(workspace, context)
+    stage.open()
+    rows = of_jobs(benchmark, guesses, stage, "score --prior semantic, saved maps")
+    assert len(rows["semantic_prior"]) > CLUTTER
+
+
+def bench_solve(benchmark):
+    """The closed form over a million labels of 20,000 frames, in memory."""
+    generator = np.random.default_rng(0)
+    count = 1_000_000
+    evidence = Evidence(
+        frame_index=np.repeat(np.arange(count // 50), 50),
+        category=generator.choice(["Car", "Pedestrian", "Cyclist"], count),
+        score=generator.random(count),
+        loss=np.where(generator.random(count) < 0.1, np.nan, generator.exponential(1, count)),
+        rho={"rho_diff": generator.random(count), "rho_anno": generator.random(count)},
+    )
+    weights = measure(
+        benchmark,
+        lambda: PSPSL().weigh(evidence, Age(1, 3)),
+        group=GROUP,
+        name="solve in memory, 1,000,000 labels",
+        amount=count,
+        unit="labels",
+        figure="rate",
+    )
+    assert 0 < weights.v.mean() < 1

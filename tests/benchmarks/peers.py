@@ -1,0 +1,228 @@
+"""The same work done with other libraries, each as well as a careful user of it would.
+
+Every peer is prepared first: what it needs in a form of its own is made outside the measured time.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from curate.geometry.boxes import bev_corners
+
+Counter = Callable[[], np.ndarray]
+Pairs = tuple[np.ndarray, np.ndarray]
+
+
+def count_with_open3d(points: np.ndarray, boxes: np.ndarray) -> Counter:
+    """Open3D's oriented bounding boxes, one after the other."""
+    from curate.datasets.open3d_loader import load
+
+    open3d = load()
+    cloud = open3d.utility.Vector3dVector(points[:, :3].astype(np.float64))
+    oriented = [
+        open3d.geometry.OrientedBoundingBox(
+            box[:3],
+            open3d.geometry.get_rotation_matrix_from_xyz(np.array([0, 0, box[6]])),
+            box[3:6],
+        )
+        for box in boxes
+    ]
+    return lambda: np.array(
+        [len(box.get_point_indices_within_bounding_box(cloud)) for box in oriented]
+    )
+
+
+def count_with_numpy(points: np.ndarray, boxes: np.ndarray) -> Counter:
+    """NumPy, one box after the other against all points."""
+    columns = np.ascontiguousarray(points[:, :3].T)
+
+    def count() -> np.ndarray:
+        return np.array([np.count_nonzero(_inside(columns, box)) for box in boxes])
+
+    return count
+
+
+def count_with_sorted_numpy(points: np.ndarray, boxes: np.ndarray) -> Counter:
+    """NumPy with the points sorted by x, which is measured: each box looks at its own slab."""
+
+    def count() -> np.ndarray:
+        columns = np.ascontiguousarray(points[np.argsort(points[:, 0]), :3].T)
+        reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2
+        first = np.searchsorted(columns[0], boxes[:, 0] - reach)
+        last = np.searchsorted(columns[0], boxes[:, 0] + reach, side="right")
+        return np.array(
+            [
+                np.count_nonzero(_inside(columns[:, start:end], box))
+                for box, start, end in zip(boxes, first, last, strict=True)
+            ]
+        )
+
+    return count
+
+
+def count_with_torch(points: np.ndarray, boxes: np.ndarray) -> Counter:
+    """Torch, all boxes against all points at once."""
+    import torch
+
+    cloud, all_boxes = torch.from_numpy(points[:, :3]), torch.from_numpy(boxes.astype(np.float32))
+    cos, sin = torch.cos(all_boxes[:, 6:]), torch.sin(all_boxes[:, 6:])
+    half = all_boxes[:, 3:6] / 2
+
+    def count() -> np.ndarray:
+        x, y, z = (cloud[:, axis] - all_boxes[:, axis, None] for axis in range(3))
+        inside = (cos * x + sin * y).abs() <= half[:, :1]
+        inside &= (cos * y - sin * x).abs() <= half[:, 1:2]
+        inside &= z.abs() <= half[:, 2:]
+        return inside.sum(dim=1).numpy()
+
+    return count
+
+
+def _inside(columns: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """(p,) bool, which of (3, p) points lie in a box; only those at its height are turned."""
+    half = (box[3:6] / 2).astype(np.float32)
+    x, y, z = (columns[axis] - np.float32(box[axis]) for axis in range(3))
+    cos, sin = np.float32(np.cos(box[6])), np.float32(np.sin(box[6]))
+    inside = np.abs(z) <= half[2]
+    inside &= np.abs(cos * x + sin * y) <= half[0]
+    inside &= np.abs(cos * y - sin * x) <= half[1]
+    return np.asarray(inside)
+
+
+def near_pairs(a: np.ndarray, b: np.ndarray) -> Pairs:
+    """Rows of (n, 7) and (m, 7) boxes whose circles meet."""
+    reach = np.hypot(a[:, 3], a[:, 4])[:, None] / 2 + np.hypot(b[:, 3], b[:, 4]) / 2
+    away = a[:, None, :2] - b[:, :2]
+    rows_a, rows_b = np.nonzero((away**2).sum(axis=2) < reach**2)
+    return rows_a, rows_b
+
+
+def shapely_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n, m) BEV IoU by shapely: its tree finds the pairs, GEOS the common areas."""
+    import shapely
+
+    polygons_a, polygons_b = shapely.polygons(bev_corners(a)), shapely.polygons(bev_corners(b))
+    rows_a, rows_b = shapely.STRtree(polygons_b).query(polygons_a, predicate="intersects")
+    common = shapely.area(shapely.intersection(polygons_a[rows_a], polygons_b[rows_b]))
+    return _matrix(a, b, (rows_a, rows_b), common)
+
+
+def cv2_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n, m) BEV IoU by OpenCV, pair by pair where the circles meet."""
+    import cv2
+
+    rows_a, rows_b = near_pairs(a, b)
+    rectangles_a, rectangles_b = cv2_rectangles(a), cv2_rectangles(b)
+    common = np.zeros(len(rows_a))
+    for pair, (i, j) in enumerate(zip(rows_a.tolist(), rows_b.tolist(), strict=True)):
+        _, region = cv2.rotatedRectangleIntersection(rectangles_a[i], rectangles_b[j])
+        if region is not None:
+            common[pair] = cv2.contourArea(cv2.convexHull(region))
+    return _matrix(a, b, (rows_a, rows_b), common)
+
+
+def torch_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n, m) BEV IoU by torch: all pairs whose circles meet at once."""
+    rows_a, rows_b = near_pairs(a, b)
+    common = torch_common_areas(bev_corners(a)[rows_a], bev_corners(b)[rows_b])
+    return _matrix(a, b, (rows_a, rows_b), common)
+
+
+def torch_common_areas(corners_a: np.ndarray, corners_b: np.ndarray) -> np.ndarray:
+    """(p,) common areas of (p, 4, 2) rectangles: their common corners, sorted by angle."""
+    import torch
+
+    a, b = torch.from_numpy(corners_a), torch.from_numpy(corners_b)
+    edges_a, edges_b = a.roll(-1, 1) - a, b.roll(-1, 1) - b
+
+    def cross(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+        return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+
+    def inside(points: torch.Tensor, corners: torch.Tensor, edges: torch.Tensor) -> torch.Tensor:
+        left_of = cross(edges[:, None], points[:, :, None] - corners[:, None])
+        return (left_of >= -1e-9).all(dim=2)
+
+    away = b[:, None] - a[:, :, None]
+    turn = cross(edges_a[:, :, None], edges_b[:, None])
+    along_a = cross(away, edges_b[:, None].expand_as(away)) / turn
+    along_b = cross(away, edges_a[:, :, None].expand_as(away)) / turn
+    crossing = (along_a >= 0) & (along_a <= 1) & (along_b >= 0) & (along_b <= 1)
+    crossings = a[:, :, None] + along_a.nan_to_num(0, 0, 0)[..., None] * edges_a[:, :, None]
+    points = torch.cat([a, b, crossings.flatten(1, 2)], dim=1)
+    valid = torch.cat([inside(a, b, edges_b), inside(b, a, edges_a), crossing.flatten(1)], dim=1)
+    counts = valid.sum(dim=1, keepdim=True).clamp(min=1)
+    middle = (points * valid[..., None]).sum(dim=1, keepdim=True) / counts[..., None]
+    away = torch.where(valid[..., None], points - middle, 0.0)
+    angle = torch.where(valid, torch.atan2(away[..., 1], away[..., 0]), torch.inf)
+    order = angle.argsort(dim=1)
+    ring = away.gather(1, order[..., None].expand_as(away))
+    # The ring closes at its first point, so what is not valid repeats that point.
+    ring = torch.where(valid.gather(1, order)[..., None], ring, ring[:, :1])
+    return np.asarray(cross(ring, ring.roll(-1, 1)).sum(dim=1).clamp(min=0) / 2)
+
+
+def shapely_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarray:
+    """Greedy NMS with shapely's overlaps: the tree finds the pairs, Python suppresses."""
+    import shapely
+
+    polygons = shapely.polygons(bev_corners(boxes))
+    rows, others = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+    upper = rows < others
+    rows, others = rows[upper], others[upper]
+    common = shapely.area(shapely.intersection(polygons[rows], polygons[others]))
+    areas = boxes[:, 3] * boxes[:, 4]
+    over = common / (areas[rows] + areas[others] - common) > threshold
+    rivals: list[list[int]] = [[] for _ in boxes]
+    for i, j in zip(rows[over].tolist(), others[over].tolist(), strict=True):
+        rivals[i].append(j)
+        rivals[j].append(i)
+    kept, gone = [], np.zeros(len(boxes), dtype=bool)
+    for i in np.argsort(-scores, kind="stable").tolist():
+        if not gone[i]:
+            kept.append(i)
+            gone[rivals[i]] = True
+    return np.array(kept)
+
+
+def torch_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarray:
+    """Greedy NMS with torch's overlaps: each kept box against the rest whose circles it meets."""
+    order = np.argsort(-scores, kind="stable")
+    ranked, corners = boxes[order], bev_corners(boxes[order])
+    radius, areas = np.hypot(ranked[:, 3], ranked[:, 4]) / 2, ranked[:, 3] * ranked[:, 4]
+    kept, gone = [], np.zeros(len(boxes), dtype=bool)
+    for i in range(len(boxes)):
+        if gone[i]:
+            continue
+        kept.append(i)
+        away = ((ranked[i + 1 :, :2] - ranked[i, :2]) ** 2).sum(axis=1)
+        near = (away < (radius[i + 1 :] + radius[i]) ** 2) & ~gone[i + 1 :]
+        rest = i + 1 + np.flatnonzero(near)
+        if len(rest):
+            one = np.broadcast_to(corners[i], (len(rest), 4, 2)).copy()
+            common = torch_common_areas(one, corners[rest])
+            gone[rest[common / (areas[i] + areas[rest] - common) > threshold]] = True
+    return np.asarray(order[kept])
+
+
+def cv2_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarray:
+    """OpenCV's own greedy NMS of rotated rectangles, in C++."""
+    import cv2
+
+    kept = cv2.dnn.NMSBoxesRotated(cv2_rectangles(boxes), scores.tolist(), 0.0, threshold)
+    return np.asarray(kept).reshape(-1)
+
+
+def cv2_rectangles(boxes: np.ndarray) -> list[tuple]:
+    """Footprints as OpenCV wants them: centre, sides, degrees."""
+    return [
+        ((x, y), (length, width), np.degrees(yaw))
+        for x, y, _, length, width, _, yaw in boxes.tolist()
+    ]
+
+
+def _matrix(a: np.ndarray, b: np.ndarray, pairs: Pairs, common: np.ndarray) -> np.ndarray:
+    """(n, m) IoU from the common areas of some pairs."""
+    areas_a, areas_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
+    matrix = np.zeros((len(a), len(b)))
+    matrix[pairs] = common / (areas_a[pairs[0]] + areas_b[pairs[1]] - common)
+    return matrix
