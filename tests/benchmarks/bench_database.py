@@ -11,16 +11,17 @@ from sqlalchemy import insert, select
 from db import bulk
 from db.session import BUSY_TIMEOUT_MS, Database
 from pipelines.config import make_config
+from pipelines.progress import Silent
 from pipelines.stage import RoundContext, RoundJob, Teacher
 from pipelines.stages import solve
-from pipelines.progress import Silent
 from pipelines.workspace import Workspace
 
 FRAMES, EACH = 2000, 50
 ROWS = FRAMES * EACH
 WRITE = f"Writing {ROWS:,} rows of prediction (SQLite)"
 READ = f"Reading {ROWS:,} rows of prediction (SQLite)"
-SOLVE = f"The stage solve on {ROWS:,} labels in SQLite"
+SOLVE = f"The stage solve on {ROWS:,} labels in SQLite, without writing"
+WEIGHTS = f"Replacing {ROWS:,} rows of weight, as solve does (SQLite)"
 BARE = "sqlite3, bare driver"
 
 
@@ -199,23 +200,36 @@ def bench_solve_reads(benchmark, solvable):
     )
 
 
-def bench_solve_writes(benchmark, solvable):
+@pytest.mark.parametrize("name", [OURS, BARE])
+def bench_solve_writes(benchmark, name, solvable):
     """The rows of `weight`, in place of those of the last time."""
     product = solve_product(solvable)
+    with solvable.database.writing() as connection:
+        product.write(connection)
+    with solvable.database.reading() as connection:
+        rows = bulk.select(connection, select(bulk.table("weight")))
+    solvable.database.close()
 
-    def write():
+    def ours():
         with solvable.database.writing() as connection:
             product.write(connection)
 
+    def driver():
+        connection = bare_connection(solvable.root / "curate.db")
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("DELETE FROM weight WHERE round = 1 AND policy = 'pspsl'")
+        connection.executemany("INSERT INTO weight VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
+        connection.execute("COMMIT")
+        connection.close()
+
     measure(
         benchmark,
-        write,
-        group=SOLVE,
-        name="replace the weights",
+        ours if name == OURS else driver,
+        group=WEIGHTS,
+        name=name,
         amount=ROWS,
-        unit="labels",
-        figure="rate",
+        unit="rows",
     )
     with solvable.database.reading() as connection:
-        [count] = connection.exec_driver_sql("SELECT count(*) FROM weight").one()
-    assert count == ROWS
+        assert bulk.select(connection, select(bulk.table("weight"))) == rows
+    solvable.database.close()

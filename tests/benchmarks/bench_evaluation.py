@@ -22,9 +22,7 @@ def folders(tmp_path_factory):
     """A folder of label files and one of result files."""
     examples = Path(os.environ.get("CURATE_KITTI_EVAL", EXAMPLES))
     root = tmp_path_factory.mktemp("kitti")
-    frames = kitti_frames(
-        np.random.default_rng(0), FRAMES, examples if examples.is_dir() else None
-    )
+    frames = kitti_frames(np.random.default_rng(0), FRAMES, examples if examples.is_dir() else None)
     for folder, objects in zip(("label_2", "results"), frames, strict=True):
         (root / folder).mkdir()
         for i, one in enumerate(objects):

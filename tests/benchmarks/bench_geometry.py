@@ -28,11 +28,10 @@ SUPPRESSORS: dict[str, Callable] = {
     "torch": peers.torch_nms,
     "shapely": peers.shapely_nms,
 }
-OVERLAPS: dict[str, Callable] = {
-    OURS: bev_iou,
-    "torch": peers.torch_iou,
-    "OpenCV": peers.cv2_iou,
-    "shapely": peers.shapely_iou,
+COMMON_AREAS: dict[str, Callable] = {
+    "torch": peers.torch_common_areas,
+    "OpenCV": peers.cv2_common_areas,
+    "shapely": peers.shapely_common_areas,
 }
 
 
@@ -77,23 +76,25 @@ def bench_nms(benchmark, name):
     assert len(odd) <= (CV2_TOLERANCE * len(expected) if "OpenCV" in name else 0)
 
 
-@pytest.mark.parametrize("name", OVERLAPS)
+@pytest.mark.parametrize("name", [OURS, *COMMON_AREAS])
 def bench_iou_of_frames(benchmark, name):
-    """BEV IoU of predictions and labels, frame by frame."""
+    """BEV IoU of predictions and labels, frame by frame; peers get the near pairs of all at once."""
     generator = np.random.default_rng(2)
     frames, each = 500, 20
     a = scenes.scattered_boxes(generator, frames * each, 20)
     b = a + generator.normal(0, 0.1, a.shape)
     starts = np.arange(frames + 1) * each
 
-    def ours() -> float:
-        return float(overlapping_pairs(a, starts, b, starts)[2].sum())
+    def ours() -> np.ndarray:
+        return overlapping_pairs(a, starts, b, starts)[2]
 
-    def peer() -> float:
-        pairs = zip(a.reshape(frames, each, 7), b.reshape(frames, each, 7), strict=True)
-        return float(sum(OVERLAPS[name](one, other).sum() for one, other in pairs))
+    def peer() -> np.ndarray:
+        shape = (frames, each, 7)
+        rows_a, rows_b = peers.near_pairs_of_groups(a.reshape(shape), b.reshape(shape))
+        pairs = a[rows_a], b[rows_b]
+        return peers.iou_of_pairs(*pairs, COMMON_AREAS[name](*pairs))
 
-    total = measure(
+    overlaps = measure(
         benchmark,
         ours if name == OURS else peer,
         group="BEV IoU: 500 frames, 20 x 20 boxes each",
@@ -101,17 +102,28 @@ def bench_iou_of_frames(benchmark, name):
         amount=frames,
         unit="frames",
     )
-    assert total == pytest.approx(ours(), rel=CV2_TOLERANCE if name == "OpenCV" else 1e-6)
+    expected = ours()
+    assert len(expected) >= frames * each
+    tolerance = CV2_TOLERANCE if name == "OpenCV" else 1e-6
+    assert overlaps.sum() == pytest.approx(expected.sum(), rel=tolerance)
 
 
-@pytest.mark.parametrize("name", OVERLAPS)
+@pytest.mark.parametrize("name", [OURS, *COMMON_AREAS])
 def bench_iou_dense(benchmark, name):
-    """BEV IoU of all boxes with all others, crowded."""
+    """BEV IoU of all boxes with all others, crowded; peers get the near pairs first."""
     generator = np.random.default_rng(3)
     a, b = (scenes.scattered_boxes(generator, 1000, 20) for _ in range(2))
+
+    def peer() -> np.ndarray:
+        rows = peers.near_pairs(a, b)
+        pairs = a[rows[0]], b[rows[1]]
+        matrix = np.zeros((len(a), len(b)))
+        matrix[rows] = peers.iou_of_pairs(*pairs, COMMON_AREAS[name](*pairs))
+        return matrix
+
     overlaps = measure(
         benchmark,
-        lambda: OVERLAPS[name](a, b),
+        (lambda: bev_iou(a, b)) if name == OURS else peer,
         group="BEV IoU: 1,000 x 1,000 boxes on 40 x 40 m",
         name=name,
         amount=len(a) * len(b),
@@ -119,6 +131,5 @@ def bench_iou_dense(benchmark, name):
     )
     expected = bev_iou(a, b)
     assert np.count_nonzero(expected) > 1000
-    np.testing.assert_allclose(
-        overlaps, expected, atol=CV2_TOLERANCE if name == "OpenCV" else 1e-6
-    )
+    tolerance = CV2_TOLERANCE if name == "OpenCV" else 1e-6
+    np.testing.assert_allclose(overlaps, expected, atol=tolerance)

@@ -91,48 +91,54 @@ def _inside(columns: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 def near_pairs(a: np.ndarray, b: np.ndarray) -> Pairs:
     """Rows of (n, 7) and (m, 7) boxes whose circles meet."""
-    reach = np.hypot(a[:, 3], a[:, 4])[:, None] / 2 + np.hypot(b[:, 3], b[:, 4]) / 2
-    away = a[:, None, :2] - b[:, :2]
-    rows_a, rows_b = np.nonzero((away**2).sum(axis=2) < reach**2)
+    rows_a, rows_b = near_pairs_of_groups(a[None], b[None])
     return rows_a, rows_b
 
 
-def shapely_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n, m) BEV IoU by shapely: its tree finds the pairs, GEOS the common areas."""
+def near_pairs_of_groups(a: np.ndarray, b: np.ndarray) -> Pairs:
+    """Rows of (g, n, 7) and (g, m, 7) boxes, flat, whose circles meet within a group."""
+    radius_a, radius_b = (np.hypot(boxes[..., 3], boxes[..., 4]) / 2 for boxes in (a, b))
+    away_x = a[:, :, None, 0] - b[:, None, :, 0]
+    away_y = a[:, :, None, 1] - b[:, None, :, 1]
+    reach = radius_a[:, :, None] + radius_b[:, None]
+    group, i, j = np.nonzero(away_x**2 + away_y**2 < reach**2)
+    return group * a.shape[1] + i, group * b.shape[1] + j
+
+
+def iou_of_pairs(a: np.ndarray, b: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """(p,) BEV IoU of (p, 7) boxes from their common areas."""
+    return np.asarray(common / (a[:, 3] * a[:, 4] + b[:, 3] * b[:, 4] - common))
+
+
+def shapely_common_areas(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(p,) common areas of the footprints of (p, 7) boxes by shapely, that is GEOS."""
     import shapely
 
     polygons_a, polygons_b = shapely.polygons(bev_corners(a)), shapely.polygons(bev_corners(b))
-    rows_a, rows_b = shapely.STRtree(polygons_b).query(polygons_a, predicate="intersects")
-    common = shapely.area(shapely.intersection(polygons_a[rows_a], polygons_b[rows_b]))
-    return _matrix(a, b, (rows_a, rows_b), common)
+    return np.asarray(shapely.area(shapely.intersection(polygons_a, polygons_b)))
 
 
-def cv2_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n, m) BEV IoU by OpenCV, pair by pair where the circles meet."""
+def cv2_common_areas(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(p,) common areas of the footprints of (p, 7) boxes by OpenCV, pair by pair."""
     import cv2
 
-    rows_a, rows_b = near_pairs(a, b)
-    rectangles_a, rectangles_b = cv2_rectangles(a), cv2_rectangles(b)
-    common = np.zeros(len(rows_a))
-    for pair, (i, j) in enumerate(zip(rows_a.tolist(), rows_b.tolist(), strict=True)):
-        _, region = cv2.rotatedRectangleIntersection(rectangles_a[i], rectangles_b[j])
+    common = np.zeros(len(a))
+    rectangles = zip(cv2_rectangles(a), cv2_rectangles(b), strict=True)
+    for pair, (one, other) in enumerate(rectangles):
+        _, region = cv2.rotatedRectangleIntersection(one, other)
         if region is not None:
             common[pair] = cv2.contourArea(cv2.convexHull(region))
-    return _matrix(a, b, (rows_a, rows_b), common)
+    return common
 
 
-def torch_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n, m) BEV IoU by torch: all pairs whose circles meet at once."""
-    rows_a, rows_b = near_pairs(a, b)
-    common = torch_common_areas(bev_corners(a)[rows_a], bev_corners(b)[rows_b])
-    return _matrix(a, b, (rows_a, rows_b), common)
+def torch_common_areas(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+    """(p,) common areas of the footprints of (p, 7) boxes by torch, all at once.
 
-
-def torch_common_areas(corners_a: np.ndarray, corners_b: np.ndarray) -> np.ndarray:
-    """(p,) common areas of (p, 4, 2) rectangles: their common corners, sorted by angle."""
+    The usual way: the corners of the common polygon, sorted by angle.
+    """
     import torch
 
-    a, b = torch.from_numpy(corners_a), torch.from_numpy(corners_b)
+    a, b = torch.from_numpy(bev_corners(boxes_a)), torch.from_numpy(bev_corners(boxes_b))
     edges_a, edges_b = a.roll(-1, 1) - a, b.roll(-1, 1) - b
 
     def cross(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
@@ -187,7 +193,7 @@ def shapely_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.n
 def torch_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarray:
     """Greedy NMS with torch's overlaps: each kept box against the rest whose circles it meets."""
     order = np.argsort(-scores, kind="stable")
-    ranked, corners = boxes[order], bev_corners(boxes[order])
+    ranked = boxes[order]
     radius, areas = np.hypot(ranked[:, 3], ranked[:, 4]) / 2, ranked[:, 3] * ranked[:, 4]
     kept, gone = [], np.zeros(len(boxes), dtype=bool)
     for i in range(len(boxes)):
@@ -198,8 +204,8 @@ def torch_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.nda
         near = (away < (radius[i + 1 :] + radius[i]) ** 2) & ~gone[i + 1 :]
         rest = i + 1 + np.flatnonzero(near)
         if len(rest):
-            one = np.broadcast_to(corners[i], (len(rest), 4, 2)).copy()
-            common = torch_common_areas(one, corners[rest])
+            one = np.broadcast_to(ranked[i], (len(rest), 7))
+            common = torch_common_areas(one, ranked[rest])
             gone[rest[common / (areas[i] + areas[rest] - common) > threshold]] = True
     return np.asarray(order[kept])
 
@@ -218,11 +224,3 @@ def cv2_rectangles(boxes: np.ndarray) -> list[tuple]:
         ((x, y), (length, width), np.degrees(yaw))
         for x, y, _, length, width, _, yaw in boxes.tolist()
     ]
-
-
-def _matrix(a: np.ndarray, b: np.ndarray, pairs: Pairs, common: np.ndarray) -> np.ndarray:
-    """(n, m) IoU from the common areas of some pairs."""
-    areas_a, areas_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
-    matrix = np.zeros((len(a), len(b)))
-    matrix[pairs] = common / (areas_a[pairs[0]] + areas_b[pairs[1]] - common)
-    return matrix
