@@ -98,7 +98,7 @@ class TrainSection(Section):
     batch_size: AtLeastOne = 4
     learning_rate: Positive = 2e-3  # peak, from scratch
     round_learning_rate: Positive = 1e-3  # peak, from the teacher
-    threads: AtLeastOne = 2
+    threads: AtLeastOne = 1
     zero_weight: Literal["ignore", "background"] = "ignore"
     start: Literal["teacher", "scratch"] = "teacher"
     options: Options = {}

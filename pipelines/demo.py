@@ -32,9 +32,10 @@ from pipelines.workspace import Workspace
 Say = Callable[[str], None]
 
 # Policies whose students the demo compares with the one of the configured policy.
+LEARNED = "from X_l and the pseudo-labels, weighted"
 OTHERS = {
-    "baseline": "as long again on X_l alone",
-    "uniform": "on all pseudo-labels, unweighted",
+    "baseline": "from X_l alone, as long again",
+    "uniform": "from X_l and all pseudo-labels, unweighted",
 }
 JUDGED = ("uniform", "threshold", "spsl", "pspsl")
 QUERY = (
@@ -74,7 +75,7 @@ class Demo:
             "train": {
                 "pretrain_steps": self.steps,
                 "round_steps": self.steps,
-                "threads": min(self.processes, 2),
+                "threads": 1,
             },
             "run": {"rounds": self.rounds, "seed": self.seed},
         }
@@ -95,14 +96,19 @@ def run_demo(demo: Demo, say: Say) -> None:
         "   {} labeled, {} unlabeled, {} val frames; segmentation: the shipped ONNX".format(*counts)
     )
     say("   model, trained on other simulated images (never the renderer's truth).\n")
-    for report in run_all(workspace, demo.rounds, Bar()):
+    for report in run_all(workspace, demo.rounds, Bar(), train=False):
         print_report(report)
     _weigh_for_others(workspace)
     say("\n   Ask for any weight in SQL:\n")
     say(f'   curate query -w {_shown(demo.directory)} "{QUERY}"')
     _print_query(workspace)
-    say("\n3. The same training, as long, without and with unweighted pseudo-labels.\n")
-    _train_others(workspace, demo, say)
+    say("3. Students learn, all from the teacher and for as long as it did.\n")
+    _train_students(workspace, demo)
+    for report in run_all(workspace, demo.rounds, Bar()):
+        if report.done:
+            print_report(report)
+    for policy, how in {workspace.config.solve.policy: LEARNED, **OTHERS}.items():
+        say(f"   {policy:<9} {how}")
     say("\n4. How good are the labels? Judged by the truth that the simulation knows.\n")
     _print_quality(workspace)
     say("5. How good are the detectors, on val frames that nobody trained on?\n")
@@ -150,19 +156,17 @@ def _weigh_for_others(workspace: Workspace) -> None:
                 run_round(workspace, context, found, policy, Bar())
 
 
-def _train_others(workspace: Workspace, demo: Demo, say: Say) -> None:
-    """One process per student, each on its share of the cores."""
-    threads = max(1, demo.processes // len(OTHERS))
-    with ThreadPoolExecutor(min(demo.processes, len(OTHERS))) as pool:
-        list(pool.map(lambda policy: _train_other(workspace, policy, threads), OTHERS))
-    for policy, how in OTHERS.items():
-        say(f"   {policy:<9} trained {how}")
+def _train_students(workspace: Workspace, demo: Demo) -> None:
+    """One process of one thread per student; more threads hardly help so small a network."""
+    policies = (workspace.config.solve.policy, *OTHERS)
+    with ThreadPoolExecutor(len(policies) if demo.processes > 1 else 1) as pool:
+        list(pool.map(lambda policy: _train_student(workspace, policy), policies))
 
 
-def _train_other(workspace: Workspace, policy: str, threads: int) -> None:
+def _train_student(workspace: Workspace, policy: str) -> None:
     command = [
         *(sys.executable, "-m", "pipelines", "train-round", "--round", "1", "--policy", policy),
-        *("--threads", str(threads), "--workspace", str(workspace.root)),
+        *("--workspace", str(workspace.root)),
     ]
     ended = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)  # noqa: S603
     if ended.returncode:

@@ -11,15 +11,23 @@ from pipelines.stages.pretrain import pretrain
 from pipelines.workspace import Workspace
 
 
-def run_all(workspace: Workspace, rounds: int | None, progress: Progress) -> Iterator[Report]:
+def run_all(
+    workspace: Workspace, rounds: int | None, progress: Progress, *, train: bool = True
+) -> Iterator[Report]:
     """Brings every stage of every round up to date, and says what each did as it ends.
 
     A detector that the user brings is not trained, so it has one round, without train-round.
+
+    Args:
+        workspace: see `Workspace`.
+        rounds: E; None for the configured number.
+        progress: see `Progress`.
+        train: whether students are trained; without them only the first round can be run.
     """
     trainable = is_trainable(workspace)
     if trainable:
         yield pretrain(workspace, progress)
-    total = (rounds or workspace.config.run.rounds) if trainable else 1
+    total = (rounds or workspace.config.run.rounds) if trainable and train else 1
     policy = workspace.config.solve.policy
     with open_executor(workspace) as executor:
         for number in range(1, total + 1):
@@ -27,5 +35,5 @@ def run_all(workspace: Workspace, rounds: int | None, progress: Progress) -> Ite
             for stage in active(workspace.config.run.priors):
                 if isinstance(stage, FrameStage):
                     yield run_frames(workspace, context, stage, executor, progress)
-                elif trainable or stage.name != "train-round":
+                elif (trainable and train) or stage.name != "train-round":
                     yield run_round(workspace, context, stage, policy, progress)

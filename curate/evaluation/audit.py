@@ -6,131 +6,24 @@ category, by distance from the LiDAR, and by LiDAR points in the box. Intervals 
 bootstrap over frames, the unit that was sampled; policies are compared within the same draws.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from curate.detections import Annotations, Detections, as_categories
+from curate.evaluation.judged_labels import ALL, WHOLE, JudgedLabels, Slice, slices
 from curate.evaluation.reliability import (
-    JudgeSettings,
     ReliabilityBins,
     auroc,
     average_precision,
     expected_calibration_error,
-    judge,
     percentile_interval,
     reliability_bins,
     weighted_precision,
     weighted_recall,
 )
 from curate.evaluation.resampling import draw_frames, ranked_replicates
-
-ALL = "all"
-"""Stands for all categories together."""
-
-DISTANCES = (0.0, 20.0, 40.0, np.inf)
-"""Edges in metres, over the ground from the LiDAR to the centre of the box."""
-POINTS = (0.0, 10.0, 50.0, 200.0, np.inf)
-"""Edges in LiDAR points inside the box."""
-
-
-@dataclass(frozen=True)
-class AuditedFrame:
-    """A frame with its labels and its ground truth.
-
-    Attributes:
-        labels: n labels in the LiDAR frame.
-        truth: what annotators wrote.
-        rectangles: (n, 4) left, top, right, bottom of the labels in the image, NaN where invisible.
-        points: (n,) LiDAR points in each label, NaN where they were not counted.
-    """
-
-    labels: Detections
-    truth: Annotations
-    rectangles: np.ndarray
-    points: np.ndarray
-
-
-@dataclass(frozen=True)
-class JudgedLabels:
-    """The n labels and the m objects of all audited frames, as columns.
-
-    Attributes:
-        frames: number of frames, those without labels or objects included.
-        frame_index: (n,) int64.
-        category: (n,) str.
-        distance: (n,) metres over the ground.
-        points: (n,) float64, NaN where unknown.
-        right: (n,) bool.
-        counted: (n,) bool, False where a label is neither right nor wrong.
-        object_frame: (m,) int64.
-        object_category: (m,) str.
-        object_distance: (m,) metres over the ground.
-    """
-
-    frames: int
-    frame_index: np.ndarray
-    category: np.ndarray
-    distance: np.ndarray
-    points: np.ndarray
-    right: np.ndarray
-    counted: np.ndarray
-    object_frame: np.ndarray
-    object_category: np.ndarray
-    object_distance: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.frame_index)
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """The frames of all parts, one after the other."""
-        offset = np.cumsum([0, *(part.frames for part in parts)])
-        columns = {
-            field.name: np.concatenate([
-                getattr(part, field.name) + (start if field.name in _FRAME_COLUMNS else 0)
-                if field.name not in _NAME_COLUMNS
-                else getattr(part, field.name)
-                for part, start in zip(parts, offset[:-1], strict=True)
-            ])
-            for field in fields(cls)
-            if field.name != "frames"
-        }
-        return cls(int(offset[-1]), **columns)
-
-
-_FRAME_COLUMNS = ("frame_index", "object_frame")
-_NAME_COLUMNS = ("category", "object_category", "right", "counted")
-
-
-@dataclass(frozen=True)
-class Slice:
-    """Labels of a range of distances or of point counts; the whole where `by` is "all".
-
-    Attributes:
-        by: "all", "distance" or "points".
-        low: lower edge, included.
-        high: upper edge, not included.
-    """
-
-    by: str
-    low: float = 0.0
-    high: float = np.inf
-
-    def holds(self, values: np.ndarray) -> np.ndarray:
-        """(n,) bool, which of the values it holds."""
-        return np.asarray((values >= self.low) & (values < self.high))
-
-    def __str__(self) -> str:
-        unit = " m" if self.by == "distance" else ""
-        if self.by == "all":
-            return ALL
-        return f"{self.low:g}-{self.high:g}{unit}" if self.high < np.inf else f"{self.low:g}+{unit}"
-
-
-WHOLE = Slice("all")
 
 
 @dataclass(frozen=True)
@@ -234,18 +127,6 @@ class Audit:
         return Comparison(category, policy, other, turned)
 
 
-def judge_frames(frames: Iterable[AuditedFrame], settings: JudgeSettings) -> JudgedLabels:
-    """Ask the truth about the labels of some frames.
-
-    Raises:
-        ConfigError: a label's category has no minimum IoU.
-    """
-    parts = [_judge_frame(frame, settings) for frame in frames]
-    nothing = AuditedFrame(Detections.empty(), Annotations.empty(), np.zeros((0, 4)), np.zeros(0))
-    whole = JudgedLabels.joined([_judge_frame(nothing, settings), *parts])
-    return _without_first_frame(whole)
-
-
 def audit(
     labels: JudgedLabels,
     weights: Mapping[str, np.ndarray],
@@ -280,18 +161,6 @@ def audit(
             if part == WHOLE:
                 comparisons += _comparisons(figures[-len(weights) :], aurocs, level)
     return Audit(labels.frames, level, tuple(figures), tuple(comparisons))
-
-
-def slices(labels: JudgedLabels) -> tuple[Slice, ...]:
-    """The ranges of distance, and those of point counts where points were counted."""
-    edges = {"distance": DISTANCES}
-    if not np.isnan(labels.points).all():
-        edges["points"] = POINTS
-    return tuple(
-        Slice(by, low, high)
-        for by, values in edges.items()
-        for low, high in zip(values, values[1:], strict=False)
-    )
 
 
 @dataclass(frozen=True)
@@ -392,30 +261,14 @@ def _comparisons(
             one.policy,
             other.policy,
             Estimate.of(
-                one.auroc.value - other.auroc.value, aurocs[one.policy] - aurocs[other.policy], level
+                one.auroc.value - other.auroc.value,
+                aurocs[one.policy] - aurocs[other.policy],
+                level,
             ),
         )
         for i, one in enumerate(figures)
         for other in figures[i + 1 :]
     ]
-
-
-def _judge_frame(frame: AuditedFrame, settings: JudgeSettings) -> JudgedLabels:
-    verdict = judge(frame.labels, frame.truth, settings, frame.rectangles)
-    objects = np.isin(frame.truth.categories, list(settings.minimum_iou))
-    n, m = len(frame.labels), int(objects.sum())
-    return JudgedLabels(
-        frames=1,
-        frame_index=np.zeros(n, dtype=np.int64),
-        category=as_categories(frame.labels.categories),
-        distance=np.hypot(frame.labels.boxes[:, 0], frame.labels.boxes[:, 1]),
-        points=np.asarray(frame.points, dtype=np.float64),
-        right=verdict.right,
-        counted=verdict.counted,
-        object_frame=np.zeros(m, dtype=np.int64),
-        object_category=as_categories(frame.truth.categories[objects]),
-        object_distance=np.hypot(*frame.truth.boxes[objects, :2].T),
-    )
 
 
 def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:

@@ -54,7 +54,7 @@ class SegmentationSettings:
 
     frames: int = 320
     test_frames: int = 60
-    steps: int = 1000
+    steps: int = 1200
     batch_size: int = 8
     learning_rate: float = 3e-3
     threads: int = 2

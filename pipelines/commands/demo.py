@@ -11,12 +11,12 @@ def demo(
         "demo"
     ),
     frames: Annotated[int, typer.Option(min=8, help="Training frames to simulate.")] = 400,
-    val: Annotated[int, typer.Option(min=4, help="Validation frames to simulate.")] = 160,
+    val: Annotated[int, typer.Option(min=4, help="Validation frames to simulate.")] = 120,
     labeled: Annotated[
         float, typer.Option(help="Share of the training frames with labels.")
     ] = 0.06,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds.")] = 1,
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 600,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 400,
     seed: Annotated[int, typer.Option(help="Of simulation, split and training.")] = 0,
     workers: Annotated[
         Optional[int],  # noqa: UP045

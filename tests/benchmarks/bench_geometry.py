@@ -78,7 +78,7 @@ def bench_nms(benchmark, name):
 
 @pytest.mark.parametrize("name", [OURS, *COMMON_AREAS])
 def bench_iou_of_frames(benchmark, name):
-    """BEV IoU of predictions and labels, frame by frame; peers get the near pairs of all at once."""
+    """BEV IoU of predictions and labels within each frame; peers take all near pairs at once."""
     generator = np.random.default_rng(2)
     frames, each = 500, 20
     a = scenes.scattered_boxes(generator, frames * each, 20)

@@ -52,6 +52,19 @@ def test_an_object_that_only_a_low_detection_finds_is_left_out():
     assert of_labels.matches.tolist() == of_results.matches.tolist() == [0]
 
 
+def test_detections_in_dont_care_regions_are_left_out_of_the_image_metric():
+    """What a label matches stays a true positive there; in 3D the region is unknown."""
+    region = car(
+        category="DontCare",
+        dimensions=(-1, -1, -1),
+        location=(-1000, -1000, -1000),
+        box_2d=(0, 0, 1000, 300),
+    )
+    frames = [[car(), region]], [[car(), car(x=6)]]
+    assert outcomes_of(*frames, metric="image")[1].outcomes.tolist() == ["tp", "ignored"]
+    assert outcomes_of(*frames, metric="3d")[1].outcomes.tolist() == ["tp", "fp"]
+
+
 def test_detections_below_the_score_threshold_do_not_take_part():
     """They have no row, and leave no overlap behind."""
     of_labels, of_results = outcomes_of([[car()]], [[car(score=0.2)]], score_threshold=0.3)
