@@ -93,9 +93,9 @@ class TrainSection(Section):
     """How the detector learns."""
 
     preset: Literal["small", "kitti"] = "small"
-    pretrain_steps: AtLeastOne = 600
-    round_steps: AtLeastOne = 600
-    batch_size: AtLeastOne = 4
+    pretrain_steps: AtLeastOne = 1200
+    round_steps: AtLeastOne = 1200
+    batch_size: AtLeastOne = 2
     learning_rate: Positive = 2e-3  # peak, from scratch
     round_learning_rate: Positive = 1e-3  # peak, from the teacher
     threads: AtLeastOne = 1

@@ -7,6 +7,7 @@ from curate.datasets.kitti_labels import KittiObjects, from_annotations, from_de
 from curate.detections import Detections
 from curate.errors import FramesFailed, WorkspaceError
 from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
+from curate.evaluation.kitti_rules import MIN_OVERLAPS
 from pipelines import plan
 from pipelines.executors.base import FrameJob
 from pipelines.progress import Progress
@@ -24,6 +25,15 @@ def evaluate_checkpoint(workspace: Workspace, path: Path, progress: Progress) ->
     Raises:
         FramesFailed: the detector failed on some frames.
     """
+    return evaluate_detections(workspace, detect_val(workspace, path, progress))
+
+
+def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str, Detections]:
+    """What a checkpoint finds in the val frames.
+
+    Raises:
+        FramesFailed: the detector failed on some frames.
+    """
     frames = workspace.frames("val")
     predict = Predict(workspace.config, path)
     jobs = [FrameJob(key, name) for name, key in frames.items()]
@@ -35,7 +45,7 @@ def evaluate_checkpoint(workspace: Workspace, path: Path, progress: Progress) ->
             rows = [row[1:] for row in outcome.rows["prediction"]]
             found[outcome.job.frame] = Detections.from_rows(rows)
             advance(1, "")
-    return evaluate_detections(workspace, found)
+    return found
 
 
 def evaluate_round(workspace: Workspace, round_number: int) -> KittiEvaluation:
@@ -60,8 +70,12 @@ def evaluate_round(workspace: Workspace, round_number: int) -> KittiEvaluation:
     return evaluate_detections(workspace, {name: stored[key] for name, key in keys.items()})
 
 
-def evaluate_detections(workspace: Workspace, found: Mapping[str, Detections]) -> KittiEvaluation:
-    """The KITTI evaluation of detections of val frames."""
+def evaluate_detections(
+    workspace: Workspace,
+    found: Mapping[str, Detections],
+    min_overlaps: Mapping[str, float] = MIN_OVERLAPS,
+) -> KittiEvaluation:
+    """The KITTI evaluation of detections of val frames; overlaps are KITTI's unless given."""
     truth = workspace.ground_truth("val")
     if not truth:
         raise WorkspaceError("no val frames; `curate init --val` takes some")
@@ -71,4 +85,4 @@ def evaluate_detections(workspace: Workspace, found: Mapping[str, Detections]) -
         frame = workspace.dataset.read(name, points=False)
         labels.append(from_annotations(annotations, frame.calibration))
         results.append(from_detections(found[name], frame.calibration, frame.image_size))
-    return evaluate(labels, results)
+    return evaluate(labels, results, min_overlaps=min_overlaps)
