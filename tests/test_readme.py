@@ -49,10 +49,10 @@ def run_all(lines: list[list[str]], folder: Path, replace: dict[str, str], edit=
 
 
 def short_training(path: Path) -> None:
-    """Trainings of two steps: the commands are tested here, not the detector."""
+    """Trainings of a few steps: the commands are tested here, not the detector."""
     text = path.read_text()
     for name in ("pretrain_steps", "round_steps"):
-        text, found = re.subn(rf"{name} = \d+", f"{name} = 2", text)
+        text, found = re.subn(rf"{name} = \d+", f"{name} = 60", text)
         assert found == 1
     path.write_text(text.replace('executor = "serial"', 'executor = "process"'))
 
@@ -66,7 +66,7 @@ def test_the_commands_on_your_data(tmp_path: Path) -> None:
     )
     assert "round 2  train-round" in printed
     assert "weight" in printed
-    sql = "SELECT frame, k FROM weighted_labels LIMIT 1"
+    sql = "SELECT frame, k FROM weighted_labels ORDER BY round DESC LIMIT 1"
     work = tmp_path / "work"
     found = run_all([["curate", "query", sql, "--csv"]], work, {}).split()[1].split(",")
     replace = dict(zip(explain[0][2:], found, strict=True))

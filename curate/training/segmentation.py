@@ -226,7 +226,7 @@ def _batch(
 def _intersection_over_union(
     net: SegmentationNet, images: np.ndarray, truth: list[np.ndarray]
 ) -> dict[str, float]:
-    """By class, over all pixels of all images in full size."""
+    """By class, over all pixels of all images in full size; NaN for a class that has none."""
     model = _ClassIds(net)
     counts = np.zeros((_CLASSES, _CLASSES))
     for image, expected in zip(images, truth, strict=True):
@@ -237,7 +237,8 @@ def _intersection_over_union(
         counts += np.bincount(pairs, minlength=_CLASSES**2).reshape(_CLASSES, _CLASSES)
     union = counts.sum(axis=0) + counts.sum(axis=1) - np.diag(counts)
     names = ("background", *SEMANTIC_CLASSES)
-    return dict(zip(names, (np.diag(counts) / union).tolist(), strict=True))
+    shares = np.divide(np.diag(counts), union, out=np.full(_CLASSES, np.nan), where=union > 0)
+    return dict(zip(names, shares.tolist(), strict=True))
 
 
 def _exported(net: SegmentationNet) -> bytes:

@@ -76,27 +76,41 @@ def simulate(
 
     Raises:
         ConfigError: a number is out of range, or the directory holds another simulation.
-        DataError: the directory holds other data, or its simulation.json is damaged.
+        DataError: the directory holds other data or cannot be written, or its simulation.json is
+            damaged.
     """
     settings = _settings(frames, seed, val_frames)
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, not {workers}")
-    _claim(directory, settings)
-    home = directory / "training"
+    try:
+        _claim(directory, settings)
+        _complete(directory / "training", settings, workers or os.cpu_count() or 1, progress)
+        _write_splits(directory, settings)
+    except OSError as error:
+        reason = error.strerror or error
+        raise DataError(f"{directory}: cannot be written: {reason}") from error
+
+
+def _complete(
+    home: Path,
+    settings: SimulationSettings,
+    workers: int,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    """Makes the frames that are not there yet."""
     for leftover in home.glob("*/.*.partial"):  # of a run that was killed
         leftover.unlink()
-    missing = [index for index in range(frames) if not _is_whole(home, index)]
-    done = frames - len(missing)
+    missing = [index for index in range(settings.frames) if not _is_whole(home, index)]
+    done = settings.frames - len(missing)
     if progress:
-        progress(done, frames)
-    task = partial(_simulate_frame, home, seed)
-    with _mapped(task, missing, workers or os.cpu_count() or 1) as finished:
+        progress(done, settings.frames)
+    task = partial(_simulate_frame, home, settings.seed)
+    with _mapped(task, missing, workers) as finished:
         for _ in finished:
             done += 1
             if progress:
-                progress(done, frames)
-    _write_splits(directory, settings)
-    _log.info("%s: %d simulated frames, %d of them made now", directory, frames, len(missing))
+                progress(done, settings.frames)
+    _log.info("%s: %d simulated frames, %d made now", home, settings.frames, len(missing))
 
 
 def _settings(frames: int, seed: int, val_frames: int | None) -> SimulationSettings:

@@ -20,8 +20,9 @@ from curate.errors import ModelError
 
 FORMAT = "curate-pillars"
 FORMAT_VERSION = "1"
-# Key in the graph's metadata of the digest of the checkpoint that it was made from.
-GRAPH_DIGEST = "checkpoint_sha256"
+# Key in the graph's metadata of the digest of the checkpoint that it was made from. The number
+# grows with every change of what a graph answers, so that older ones are made again.
+GRAPH_DIGEST = "checkpoint_sha256_2"
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ class PillarDetector:
         *,
         device: str = "cpu",
         score_threshold: float = 0.1,
-        nms_iou: float = 0.2,
+        nms_iou: float = 0.1,
         threads: int = 1,
     ) -> None:
         self._checkpoint = load_checkpoint(checkpoint)
@@ -124,11 +124,11 @@ def _torch_answers(
     """The network itself, on a GPU."""
     import torch
 
-    from curate.detectors.pillars.network import Peaks, network_of
+    from curate.detectors.pillars.network import SingleFrame, network_of
 
     try:
         place = torch.device(device)
-        network = Peaks(network_of(checkpoint)).eval().to(place)
+        network = SingleFrame(network_of(checkpoint)).eval().to(place)
     except (RuntimeError, AssertionError) as error:
         message = str(error).splitlines()[0]
         raise ConfigError(f"device {device!r} cannot be used: {message}") from None

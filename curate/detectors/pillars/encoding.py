@@ -27,7 +27,7 @@ _NARROWEST_SPREAD_CELLS = 0.7
 _SPREADS = 3.0
 # Cells around the centre that also learn the object's box.
 _NEIGHBOURS = 1
-_CANDIDATES = 300
+_CANDIDATES = 500
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,9 @@ def decode(
     """The boxes in the network's answers, before non-maximum suppression.
 
     Args:
-        scores: (x cells, y cells, categories) in [0, 1], 0 where a neighbour cell is higher.
+        scores: (x cells, y cells, categories) in [0, 1]. All cells that reach the threshold answer,
+            not only local maxima: two pedestrians can stand in adjacent cells, and cells that see
+            the same object answer the same box, of which suppression leaves one.
         codes: (x cells, y cells, BOX_CODE).
         categories: their names.
         preset: the grid.

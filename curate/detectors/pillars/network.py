@@ -76,20 +76,17 @@ class PillarNetwork(nn.Module):
         return answers[..., : self.categories], answers[..., self.categories :]
 
 
-class Peaks(nn.Module):
-    """The network as it is used after training: one frame in, scores of local maxima out."""
+class SingleFrame(nn.Module):
+    """The network as it is used after training: one frame in, scores and box codes out."""
 
     def __init__(self, network: PillarNetwork) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, features: Tensor, slots: Tensor) -> tuple[Tensor, Tensor]:
-        """(x cells, y cells, categories) scores, 0 beside a higher one, and box codes."""
+        """(x cells, y cells, categories) scores and (x cells, y cells, BOX_CODE) codes."""
         logits, codes = self.network(features, slots, 1)
-        logits = logits.permute(0, 3, 1, 2)
-        highest = functional.max_pool2d(logits, 3, stride=1, padding=1)
-        scores = torch.sigmoid(logits) * (logits == highest)
-        return scores.permute(0, 2, 3, 1)[0], codes[0]
+        return torch.sigmoid(logits[0]), codes[0]
 
 
 class _SlotMaximum(torch.autograd.Function):

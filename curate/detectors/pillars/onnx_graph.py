@@ -21,7 +21,7 @@ _EPSILON = 1e-5
 
 
 def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: int) -> ModelProto:
-    """The graph of `network.Peaks` with the state `weights` of its `PillarNetwork`.
+    """The graph of `network.SingleFrame` with the state `weights` of its `PillarNetwork`.
 
     Inputs `features` (n, POINT_FEATURES) float32 and `slots` (n, 1) int64, n > 0; outputs `scores`
     (x cells, y cells, categories) and `codes` (x cells, y cells, BOX_CODE).
@@ -46,10 +46,7 @@ def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: i
     answers = graph.answers(graph.convolution(fine, "head.0", "head.1"), "answer")
     parts = graph.constant(np.array([categories, BOX_CODE]))
     logits, codes = graph.split(answers, parts)
-    highest = graph.node("MaxPool", [logits], kernel_shape=[3, 3], pads=[1, 1, 1, 1])
-    is_peak = graph.node("Cast", [graph.node("Equal", [logits, highest])], to=TensorProto.FLOAT)
-    scores = graph.node("Mul", [graph.node("Sigmoid", [logits]), is_peak])
-    graph.output(scores, "scores")
+    graph.output(graph.node("Sigmoid", [logits]), "scores")
     graph.output(codes, "codes")
     return graph.model(
         {"scores": (cells_x, cells_y, categories), "codes": (cells_x, cells_y, BOX_CODE)}

@@ -197,6 +197,14 @@ def test_decode_takes_what_reaches_the_threshold_best_first():
     assert found.boxes[0] == pytest.approx([20.5 * 0.64, 0.5 * 0.64, 0, 1, 1, 1, 0])
 
 
+def test_decode_answers_neighbouring_cells_too():
+    """Two people can stand in adjacent cells: neither is dropped for being beside the other."""
+    scores = np.zeros((*SMALL.cells, 3), dtype=np.float32)
+    codes = np.zeros((*SMALL.cells, BOX_CODE), dtype=np.float32)
+    scores[20, 50, 1], scores[20, 51, 1] = 0.9, 0.8
+    assert decode(scores, codes, NAMES, SMALL, 0.1).scores == pytest.approx([0.9, 0.8])
+
+
 def test_decode_of_silence_is_empty():
     """No peak at all, even at threshold 0, is an empty answer of the right shapes."""
     zeros = np.zeros((*SMALL.cells, 3), dtype=np.float32)

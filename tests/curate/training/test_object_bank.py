@@ -126,6 +126,27 @@ def test_nothing_is_pasted_onto_a_box_or_onto_another_pasted_object(bank):
         assert overlap.max() == 0
 
 
+def test_a_pasted_object_stands_on_the_ground(bank):
+    """On a field that lies half a metre higher the object is lifted with its points."""
+    x, y = np.meshgrid(np.arange(5, 40, 0.5), np.arange(-30, 30, 0.5))
+    bottom = CAR[2] - CAR[5] / 2
+    field = np.stack([x, y, np.full(x.shape, bottom + 0.5), np.zeros(x.shape)], axis=-1)
+    points = field.reshape(-1, 4).astype(np.float32)
+    results = paste(sample_of(points[np.abs(points[:, 1]) < 0.8 * points[:, 0]]), bank)
+    assert results
+    for result in results:
+        assert result.boxes[0, 2] == pytest.approx(CAR[2] + 0.5, abs=1e-5)
+        assert count_points_in_boxes(result.points[-60:], result.boxes + GROWTH)[0] == 60
+
+
+def test_nothing_is_pasted_onto_a_roof(bank):
+    """Where the lowest points are metres above the ground there is no place to stand."""
+    roof = wall(40)
+    roof[:, 0] = np.random.default_rng(0).uniform(8, 40, len(roof))
+    roof[:, 2] = 3.0
+    assert paste(sample_of(roof), bank) == []
+
+
 def test_pasting_stays_in_view(bank):
     """An object that would stick out of the view's sides is not placed."""
     for result in paste(sample_of(wall(40, half_width=8.0)), bank, seeds=range(40)):

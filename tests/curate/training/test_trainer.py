@@ -102,7 +102,7 @@ def test_a_snapshot_of_another_training_is_not_used(make_labels, tiny, tmp_path,
     elif change == "damage":
         snapshot_path(output).write_bytes(snapshot_path(output).read_bytes()[:5000])
     else:
-        snapshot_path(output).write_bytes(pickle.dumps({"fingerprint": print}))
+        snapshot_path(output).write_bytes(pickle.dumps({"fingerprint": print}, protocol=2))
     assert train(labels, output, settings, start=start).resumed_at == 0
 
 

@@ -123,6 +123,13 @@ def test_foreign_data_is_never_written_over(tmp_path):
         simulate(tmp_path, 1, 0, workers=1)
 
 
+def test_a_place_that_cannot_be_written_is_reported(tmp_path):
+    """One line that names the directory."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="file: cannot be written"):
+        simulate(tmp_path / "file", 1, 0, workers=1)
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"seed": 1}'])
 def test_a_damaged_settings_file_is_reported(tmp_path, text):
     """One line that names the file."""
