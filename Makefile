@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test prove lint docs clean
+.PHONY: demo test prove bench lint docs clean
 
 demo: $(READY)
 	$(BIN)/curate demo
@@ -14,6 +14,15 @@ test: $(READY)
 
 prove: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# One thread per library; ratios and frames per second, written to docs/benchmarks.{json,md}.
+bench: $(READY)
+	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'
+	@mkdir -p .benchmarks
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/benchmarks/bench_*.py -q \
+		-o python_functions='bench_*' --benchmark-disable-gc --benchmark-group-by=group \
+		--benchmark-columns=min,median,rounds --benchmark-json=.benchmarks/measured.json
+	$(BIN)/python tests/benchmarks/report.py .benchmarks/measured.json docs
 
 lint: $(READY)
 	$(BIN)/ruff format --check .

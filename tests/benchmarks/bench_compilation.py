@@ -5,7 +5,9 @@ import subprocess
 import sys
 
 import pytest
-from benchmarks.measuring import measure
+from benchmarks.measuring import cpu_seconds_of_children, measure
+
+pytestmark = pytest.mark.benchmark(timer=cpu_seconds_of_children)
 
 GROUP = "First answer of the kernels, a whole Python process each"
 IMPORTS = """

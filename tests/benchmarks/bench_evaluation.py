@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.measuring import measure
+from benchmarks.measuring import cpu_seconds, measure
 from benchmarks.scenes import kitti_frames
 
 from curate.datasets.kitti_labels import write_objects
 from curate.evaluation.kitti_ap import evaluate
 from curate.evaluation.kitti_folders import read_folders
+
+pytestmark = pytest.mark.benchmark(timer=cpu_seconds)
 
 FRAMES = 3769
 GROUP = f"KITTI AP: {FRAMES:,} frames, 3 categories, all metrics, R11 and R40"

@@ -5,11 +5,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from benchmarks import peers, scenes
-from benchmarks.measuring import OURS, measure
+from benchmarks.measuring import OURS, cpu_seconds, measure
 
 from curate.geometry.nms import nms_bev
 from curate.geometry.overlap import bev_iou, overlapping_pairs
 from curate.geometry.points_in_boxes import count_points_in_boxes
+
+pytestmark = pytest.mark.benchmark(timer=cpu_seconds)
 
 NMS_IOU = 0.2
 # OpenCV calculates in float32, so that its borderline cases fall otherwise.

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.measuring import measure
+from benchmarks.measuring import cpu_seconds, measure
 from benchmarks.scenes import guesses_around
 
 from curate.datasets.synthetic import simulate
@@ -15,6 +15,8 @@ from pipelines.executors.base import FrameJob
 from pipelines.setup import initialise
 from pipelines.stage import RoundContext, Teacher
 from pipelines.stages import points, predict, repredict, semantic
+
+pytestmark = pytest.mark.benchmark(timer=cpu_seconds)
 
 GROUP = "Stages on simulated frames, one core, 60 boxes or more per frame"
 FRAMES = 4

@@ -23,16 +23,18 @@ def measured(*lines):
     }
 
 
-def line(group, name, seconds, *, figure="ratio", target=None, amount=100):
+def line(group, name, seconds, *, figure="ratio", target=None, amount=100, timer="process_time"):
     """One benchmark of such a document."""
     told = {"name": name, "figure": figure, "amount": amount, "unit": "boxes", "target_s": target}
+    told["clock_s"] = 3 * seconds
     stats = {"min": seconds, "median": 2 * seconds, "rounds": 5}
-    return {"group": group, "extra_info": told, "stats": stats}
+    options = {"timer": timer}
+    return {"group": group, "extra_info": told, "stats": stats, "options": options}
 
 
 def test_ratios_are_multiples_of_our_time() -> None:
     """Within a group, wherever our line stands."""
-    summary = summarise(measured(line("NMS", "peer", 0.5), line("NMS", OURS, 0.25)), {})
+    summary = summarise(measured(line("NMS", "peer", 0.5), line("NMS", OURS, 0.25)), {}, 1.0)
     [peer, ours] = summary["groups"]["NMS"]
     assert (peer["ratio"], ours["ratio"]) == (2.0, 1.0)
     assert ours["per_second"] == 400
@@ -46,17 +48,28 @@ def test_lines_that_do_different_work_have_no_ratio() -> None:
             line("stages", "read", 0.01, figure="rate"), line("stages", OURS, 4.0, figure="rate")
         ),
         {},
+        1.0,
     )
     assert [one["ratio"] for one in summary["groups"]["stages"]] == [None, None]
     assert "| read | 10 ms | 10,000 boxes |" in render(summary)
 
 
+@pytest.mark.parametrize(
+    ("timer", "shown"), [("process_time", "CPU time"), ("perf_counter", "by the clock")]
+)
+def test_a_table_says_what_its_times_are(timer: str, shown: str) -> None:
+    """CPU time and the time on the clock differ on a busy machine."""
+    page = render(summarise(measured(line("NMS", OURS, 0.25, timer=timer)), {}, 1.0))
+    assert f"| {shown} | times curate's |" in page
+
+
 @pytest.mark.parametrize(("seconds", "verdict"), [(1e-3, "met"), (1.1e-3, "**not met**")])
 def test_targets_are_judged_honestly(seconds: float, verdict: str) -> None:
     """A target that is reached is met; one that is missed by a tenth is not."""
-    page = render(summarise(measured(line("NMS", OURS, seconds, target=1e-3)), {}))
+    page = render(summarise(measured(line("NMS", OURS, seconds, target=1e-3)), {}, 1.0))
     [row] = [row for row in page.splitlines() if "1 ms |" in row and row.startswith("| NMS")]
     assert row.split(" | ")[-1] == f"{verdict} |"
+    assert f" {3000 * seconds:.3g} ms " in row
 
 
 def test_nothing_of_the_machine_but_its_kind_is_published(tmp_path: Path) -> None:
