@@ -33,6 +33,8 @@ Pixels = Annotated[float, mapped_column(Float(53), comment="pixels")]
 Share = Annotated[float, mapped_column(Float(53), comment="0 to 1")]
 Number = Annotated[float, mapped_column(Float(53))]
 Name = Annotated[str, mapped_column(Text)]
+Figure = Annotated[float | None, mapped_column(Float(53))]
+Bound = Annotated[float | None, mapped_column(Float(53), comment="bound of its interval")]
 
 
 class Base(DeclarativeBase):
@@ -273,6 +275,154 @@ class Weight(Base):
     lambda_u: Mapped[float | None] = mapped_column(Float(53), comment="Eq. 4; null where unused")
     rho_det: Mapped[float | None] = mapped_column(Float(53), comment="product of the priors")
     v: Mapped[Share]
+
+
+class _Audited:
+    """The key of a row of an audit."""
+
+    round: Mapped[int] = mapped_column(
+        Integer, primary_key=True, sort_order=-1, comment="of the teacher"
+    )
+    frames: Mapped[str] = mapped_column(
+        Text, primary_key=True, sort_order=-1, comment="which: val, labeled, or e.g. 5 folds"
+    )
+    overlap: Mapped[str] = mapped_column(Text, primary_key=True, sort_order=-1, comment="bev | 3d")
+    policy: Mapped[str] = mapped_column(
+        Text,
+        primary_key=True,
+        sort_order=-1,
+        comment="or score, rho_det, consistency: evidence by itself",
+    )
+    category: Mapped[str] = mapped_column(Text, primary_key=True, sort_order=-1, comment="or 'all'")
+
+
+class _Judgement:
+    """What is said of the labels of an audit; every figure is null where it is undefined."""
+
+    labels: Mapped[int] = mapped_column(Integer, comment="that are right or wrong")
+    neutral: Mapped[int] = mapped_column(Integer, comment="further labels that are neither")
+    right_labels: Mapped[int] = mapped_column(Integer, comment="of the labels")
+    objects: Mapped[int | None] = mapped_column(Integer, comment="to be found; null = unknown")
+    share_right: Mapped[Figure]
+    share_right_low: Mapped[Bound]
+    share_right_high: Mapped[Bound]
+    auroc: Mapped[Figure] = mapped_column(
+        comment="chance that a right label weighs more than a wrong one"
+    )
+    auroc_low: Mapped[Bound]
+    auroc_high: Mapped[Bound]
+    average_precision: Mapped[Figure] = mapped_column(comment="of the labels ranked by weight")
+    average_precision_low: Mapped[Bound]
+    average_precision_high: Mapped[Bound]
+    weighted_precision: Mapped[Figure] = mapped_column(
+        comment="share of the weight that lies on right labels"
+    )
+    weighted_precision_low: Mapped[Bound]
+    weighted_precision_high: Mapped[Bound]
+    weighted_recall: Mapped[Figure] = mapped_column(comment="weight on right labels per object")
+    weighted_recall_low: Mapped[Bound]
+    weighted_recall_high: Mapped[Bound]
+    calibration_error: Mapped[Figure] = mapped_column(
+        comment="expected distance of weight and share of right labels"
+    )
+    calibration_error_low: Mapped[Bound]
+    calibration_error_high: Mapped[Bound]
+
+
+class Audit(_Audited, _Judgement, Base):
+    """How well a policy's weight tells right labels from wrong ones, on frames with ground truth.
+
+    The frames were treated as if they were unlabeled. Intervals are of 95 %, over frames.
+    """
+
+    __tablename__ = "audit"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+
+class AuditSlice(_Audited, _Judgement, Base):
+    """The same for a range of distances from the LiDAR, or of LiDAR points in the label."""
+
+    __tablename__ = "audit_slice"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    kind: Mapped[str] = mapped_column(Text, primary_key=True, comment="distance | points")
+    low: Mapped[float] = mapped_column(
+        Float(53), primary_key=True, comment="metres or points, included"
+    )
+    high: Mapped[float | None] = mapped_column(
+        Float(53), comment="metres or points, not included; null = open"
+    )
+
+
+class AuditBin(_Audited, Base):
+    """The labels of an audit whose weight lies in a bin; the last bin holds its upper edge."""
+
+    __tablename__ = "audit_bin"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    low: Mapped[float] = mapped_column(Float(53), primary_key=True, comment="weight, included")
+    high: Mapped[float] = mapped_column(Float(53), comment="weight, not included")
+    labels: Mapped[int] = mapped_column(Integer)
+    mean_weight: Mapped[Figure]
+    precision: Mapped[Figure] = mapped_column(comment="share of right labels in the bin")
+    recall: Mapped[Figure] = mapped_column(comment="right labels of the bin per object")
+
+
+class EvaluationObject(Box, Base):
+    """What became of an object or a detection of a val frame under KITTI's rules.
+
+    An object is found (tp), missed (fn) or ignored, a detection is right (tp), false (fp) or
+    ignored. People query it through the view `evaluation`.
+    """
+
+    __tablename__ = "evaluation_object"
+    __table_args__ = (
+        CheckConstraint("side IN ('object', 'detection')", name="side"),
+        CheckConstraint("outcome IN ('tp', 'fp', 'fn', 'ignored')", name="outcome"),
+        Index("ix_evaluation_object_outcome", "source", "outcome"),
+        {"sqlite_with_rowid": False},
+    )
+
+    source: Mapped[str] = mapped_column(
+        Text, primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
+    )
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
+    side: Mapped[str] = mapped_column(Text, primary_key=True, comment="object | detection")
+    k: Mapped[int] = mapped_column(
+        Integer, primary_key=True, autoincrement=False, comment="of ground_truth or of prediction"
+    )
+    category: Mapped[str] = mapped_column(
+        Text, primary_key=True, comment="under evaluation; a Van is an ignored object of Car"
+    )
+    outcome: Mapped[str] = mapped_column(Text, comment="tp | fp | fn | ignored")
+    matched_k: Mapped[int | None] = mapped_column(Integer, comment="of the other side")
+    iou: Mapped[float] = mapped_column(
+        Float(53), comment="with the match, else the greatest with any that took part"
+    )
+    score: Mapped[float | None] = mapped_column(
+        Float(53), comment="of the detection, for objects of the matched one"
+    )
+    overlap: Mapped[str] = mapped_column(Text, comment="what iou is: image | bev | 3d")
+    difficulty: Mapped[str] = mapped_column(Text, comment="objects beyond it are ignored")
+
+
+class EvaluationAp(Base):
+    """KITTI average precision of the detections of val frames."""
+
+    __tablename__ = "evaluation_ap"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    source: Mapped[str] = mapped_column(
+        Text, primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
+    )
+    category: Mapped[str] = mapped_column(Text, primary_key=True)
+    figure: Mapped[str] = mapped_column(Text, primary_key=True, comment="image | aos | bev | 3d")
+    difficulty: Mapped[str] = mapped_column(
+        Text, primary_key=True, comment="easy | moderate | hard"
+    )
+    objects: Mapped[int] = mapped_column(Integer, comment="that count")
+    ap_r40: Mapped[float | None] = mapped_column(Float(53), comment="percent")
+    ap_r11: Mapped[float | None] = mapped_column(Float(53), comment="percent")
 
 
 class Task(Base):

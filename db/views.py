@@ -25,6 +25,15 @@ _VIEWS = {
             ON sp.round = w.round AND sp.frame_id = w.frame_id AND sp.k = w.k
         WHERE f.split = 'unlabeled'
     """,
+    "evaluation": """
+        SELECT e.source, f.frame, e.side, e.k, e.category, e.outcome, e.matched_k, e.iou, e.score,
+               e.x, e.y, e.z, e.length, e.width, e.height, e.yaw, g.truncated, g.occluded,
+               e.overlap, e.difficulty
+        FROM evaluation_object AS e
+        JOIN frame AS f ON f.id = e.frame_id
+        LEFT JOIN ground_truth AS g
+            ON e.side = 'object' AND g.frame_id = e.frame_id AND g.k = e.k
+    """,
     "failed_frames": """
         SELECT t.round, t.stage, f.frame, f.split, t.error
         FROM task AS t JOIN frame AS f ON f.id = t.frame_id

@@ -8,6 +8,7 @@ import typer
 
 from curate.errors import CurateError
 from pipelines.commands import (
+    audit,
     demo,
     evaluate,
     explain,
@@ -51,6 +52,7 @@ for command in (
     query,
     explain,
     evaluate,
+    audit,
 ):
     command.register(app)
 COMMANDS = tuple(

@@ -19,15 +19,6 @@ from pipelines.stages.predict import Predict
 from pipelines.workspace import Workspace
 
 
-def evaluate_checkpoint(workspace: Workspace, path: Path, progress: Progress) -> KittiEvaluation:
-    """The KITTI evaluation of a checkpoint on the val split.
-
-    Raises:
-        FramesFailed: the detector failed on some frames.
-    """
-    return evaluate_detections(workspace, detect_val(workspace, path, progress))
-
-
 def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str, Detections]:
     """What a checkpoint finds in the val frames.
 
@@ -48,8 +39,8 @@ def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str
     return found
 
 
-def evaluate_round(workspace: Workspace, round_number: int) -> KittiEvaluation:
-    """The KITTI evaluation of a round's stored val predictions.
+def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]:
+    """What a round's teacher found in the val frames, as `curate predict --split val` stored it.
 
     Raises:
         WorkspaceError: the round has no predictions for some val frames.
@@ -67,7 +58,7 @@ def evaluate_round(workspace: Workspace, round_number: int) -> KittiEvaluation:
             f"run `curate predict --split val --round {round_number}`"
         )
     stored = workspace.predictions(round_number, list(keys.values()))
-    return evaluate_detections(workspace, {name: stored[key] for name, key in keys.items()})
+    return {name: stored[key] for name, key in keys.items()}
 
 
 def evaluate_detections(
@@ -76,6 +67,17 @@ def evaluate_detections(
     min_overlaps: Mapping[str, float] = MIN_OVERLAPS,
 ) -> KittiEvaluation:
     """The KITTI evaluation of detections of val frames; overlaps are KITTI's unless given."""
+    return evaluate(*val_objects(workspace, found), min_overlaps=min_overlaps)
+
+
+def val_objects(
+    workspace: Workspace, found: Mapping[str, Detections]
+) -> tuple[list[KittiObjects], list[KittiObjects]]:
+    """Ground truth and detections of the val frames in KITTI's form, in the order of their names.
+
+    Raises:
+        WorkspaceError: there are no val frames.
+    """
     truth = workspace.ground_truth("val")
     if not truth:
         raise WorkspaceError("no val frames; `curate init --val` takes some")
@@ -85,4 +87,4 @@ def evaluate_detections(
         frame = workspace.dataset.read(name, points=False)
         labels.append(from_annotations(annotations, frame.calibration))
         results.append(from_detections(found[name], frame.calibration, frame.image_size))
-    return evaluate(labels, results, min_overlaps=min_overlaps)
+    return labels, results

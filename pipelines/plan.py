@@ -113,15 +113,17 @@ def counts(workspace: Workspace, context: RoundContext, of: FrameStage, split: s
     return Counts(done, empty, failed, len(states) - done - empty - failed)
 
 
-def complete_frames(workspace: Workspace, context: RoundContext) -> list[int]:
-    """The unlabeled frames that every stage before solve has finished, with at least one label.
+def complete_frames(
+    workspace: Workspace, context: RoundContext, split: str = "unlabeled"
+) -> list[int]:
+    """The frames of a split that every stage before solve has finished, with at least one label.
 
     Raises:
         WorkspaceError: some frames wait; failed ones do not count as waiting, they are left out.
     """
     prints = fingerprints(workspace, context, workspace.config.solve.policy)
     needed = frames_before(stage("solve"), workspace.config.run.priors)
-    frames = workspace.frames("unlabeled").values()
+    frames = workspace.frames(split).values()
     with workspace.database.reading() as connection:
         states = {
             other.name: _states(connection, context.number, other.name, prints[other.name])

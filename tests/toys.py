@@ -37,6 +37,15 @@ def write_toy_kitti(root: Path, frames: int, val: int = 0, *, labels: bool = Tru
     (root / "ImageSets" / "val.txt").write_text("\n".join(names[frames - val :]) + "\n")
 
 
+def toy_document(root: Path, weights_file: Path) -> dict:
+    """The settings of a toy workspace."""
+    return {
+        "dataset": {"root": root},
+        "detector": {"name": "toys:ToyDetector", "path": weights_file},
+        "segmenter": {"name": "toys:ToySegmenter", "path": weights_file},
+    }
+
+
 def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: bool) -> None:
     import cv2
 

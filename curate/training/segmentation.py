@@ -54,8 +54,8 @@ class SegmentationSettings:
 
     frames: int = 320
     test_frames: int = 60
-    steps: int = 1200
-    batch_size: int = 8
+    steps: int = 1500
+    batch_size: int = 4
     learning_rate: float = 3e-3
     threads: int = 2
     seed: int = 0

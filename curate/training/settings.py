@@ -36,8 +36,8 @@ class TrainingSettings:
     """
 
     preset: str = "small"
-    steps: int = 600
-    batch_size: int = 4
+    steps: int = 1200
+    batch_size: int = 2
     learning_rate: float = 2e-3
     labeled_share: float = 0.5
     flip_probability: float = 0.5

@@ -1,7 +1,7 @@
 """curate evaluate: KITTI average precision."""
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -14,6 +14,12 @@ from pipelines.commands.options import (
     print_json,
     print_table,
 )
+
+if TYPE_CHECKING:
+    from curate.evaluation.kitti_ap import KittiEvaluation
+    from pipelines.workspace import Workspace
+
+OUTCOMES = {"tp": "found", "fn": "missed", "ignored": "ignored"}
 
 
 def evaluate(
@@ -33,12 +39,22 @@ def evaluate(
         Optional[Path],  # noqa: UP045
         typer.Option(help="Run this checkpoint on the val frames; default: the newest."),
     ] = None,
+    store: Annotated[
+        bool, typer.Option("--store", help="Keep AP and every object's outcome in the database.")
+    ] = False,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Evaluate as the KITTI benchmark does: image, aos, bev and 3d AP, R40 and R11, and recall.
+
+    Every frame needs both files, an empty one where it has nothing. Equal scores enter together.
+    Without objects, or without detections, AP is 0.
+
+    With --store, ask which objects were missed: curate query "SELECT frame, category, x, y,
+    occluded, iou FROM evaluation WHERE outcome = 'fn'" (tp, fp, fn, ignored; 3D overlap, hard,
+    detections of every score).
 
     Example: curate evaluate --labels data/label_2 --results out/results --json
     """
@@ -47,28 +63,49 @@ def evaluate(
     if (labels is None) != (results is None):
         raise ConfigError("evaluate: --labels and --results go together")
     if labels is not None and results is not None:
+        if store:
+            raise ConfigError("evaluate: --store needs a workspace, not --labels and --results")
         from curate.evaluation.kitti_ap import evaluate as compare
         from curate.evaluation.kitti_folders import read_folders
 
         _, truth, answers = read_folders(labels, results)
         found = compare(truth, answers)
     else:
-        from pipelines.evaluation import evaluate_checkpoint, evaluate_round
-        from pipelines.progress import Bar
-        from pipelines.rounds import newest_checkpoint
-
+        if round_number is not None and checkpoint is not None:
+            raise ConfigError("evaluate: give --round or --checkpoint, not both")
         opened = open_workspace(workspace, executor, workers)
-        if round_number is not None:
-            found = evaluate_round(opened, round_number)
-        else:
-            path = checkpoint or newest_checkpoint(opened)
-            found = evaluate_checkpoint(opened, path, Bar())
-            if not as_json:
-                typer.echo(f"{path} on {len(opened.frames('val'))} val frames")
+        found, notes = _evaluate_val(opened, round_number, checkpoint, store=store)
+        if not as_json:
+            typer.echo(notes)
     if as_json:
         print_json(found.as_dict())
     else:
         _print(found.as_dict())
+
+
+def _evaluate_val(
+    workspace: "Workspace", round_number: int | None, checkpoint: Path | None, *, store: bool
+) -> "tuple[KittiEvaluation, str]":
+    """The evaluation on the val frames, and what to say of it."""
+    from pipelines.evaluation import detect_val, evaluate_detections, stored_val
+    from pipelines.progress import Bar
+    from pipelines.rounds import newest_checkpoint
+    from pipelines.stored_evaluation import store_evaluation
+
+    if round_number is not None:
+        source = f"round {round_number}"
+        answers = stored_val(workspace, round_number)
+    else:
+        path = checkpoint or newest_checkpoint(workspace)
+        source = workspace.relative(path)
+        answers = detect_val(workspace, path, Bar())
+    found = evaluate_detections(workspace, answers)
+    notes = f"{source} on {len(answers)} val frames"
+    if store:
+        counts = store_evaluation(workspace, source, answers, found)
+        tail = ", ".join(f"{counts.get(name, 0)} {word}" for name, word in OUTCOMES.items())
+        notes += f"; stored as source '{source}': {tail} objects"
+    return found, notes
 
 
 def _print(figures: dict[str, Any]) -> None:

@@ -4,9 +4,13 @@ import sqlite3
 from pathlib import Path
 
 import pytest
+from alembic import command
 from alembic.autogenerate import compare_metadata
+from alembic.config import Config
 from alembic.migration import MigrationContext
+from sqlalchemy import inspect
 
+import db
 from curate.errors import DatabaseError, LeakageError
 from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS
 from db import bulk
@@ -36,6 +40,24 @@ def test_migrations_make_the_tables_of_the_models(database: Database) -> None:
     with database.reading() as connection:
         difference = compare_metadata(MigrationContext.configure(connection), Base.metadata)
     assert difference == [], "make a migration: alembic -x url=... revision --autogenerate"
+
+
+def test_a_database_of_an_older_curate_is_migrated(tmp_path: Path) -> None:
+    """Its rows are kept, the new tables and views are there, and its backward step undoes it."""
+    url = f"sqlite:///{tmp_path / 'curate.db'}"
+    database = Database(url)
+    _frame(database, "val")
+    config = Config()
+    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
+    with database.writing() as connection:
+        config.attributes["connection"] = connection
+        command.downgrade(config, "0001")
+        assert "audit" not in inspect(connection).get_table_names()
+    database.close()
+    with Database(url).reading() as connection:
+        assert connection.exec_driver_sql("SELECT count(*) FROM frame").scalar_one() == 1
+        for name in ("audit", "audit_slice", "audit_bin", "evaluation", "evaluation_ap"):
+            assert connection.exec_driver_sql(f"SELECT count(*) FROM {name}").scalar_one() == 0
 
 
 def test_weighted_labels_has_exactly_the_columns_of_the_format(database: Database) -> None:

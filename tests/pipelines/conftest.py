@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from pipelines_cli import Curate, in_process
+from toys import toy_document
 
 from pipelines.config import make_config
 from pipelines.setup import initialise
@@ -16,15 +17,6 @@ def weights_file(tmp_path: Path) -> Path:
     path = tmp_path / "detector.txt"
     path.write_text("")
     return path
-
-
-def toy_document(root: Path, weights_file: Path) -> dict:
-    """The settings of a toy workspace."""
-    return {
-        "dataset": {"root": root},
-        "detector": {"name": "toys:ToyDetector", "path": weights_file},
-        "segmenter": {"name": "toys:ToySegmenter", "path": weights_file},
-    }
 
 
 @pytest.fixture

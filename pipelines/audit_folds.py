@@ -1,0 +1,68 @@
+"""Held-out folds of X_l: small workspaces inside the workspace, each with its own database.
+
+The teacher of a fold learns from the other folds; the fold itself is its val split. What a fold has
+done it keeps, so an audit that was killed continues.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from curate.errors import ConfigError
+from pipelines.config import Config, read_config, write_config
+from pipelines.setup import initialise
+from pipelines.workspace import CONFIG_NAME, Workspace
+
+
+def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
+    """The workspace of every fold, made where it does not exist yet.
+
+    Raises:
+        ConfigError: there are fewer labeled frames than folds.
+    """
+    labeled = sorted(workspace.frames("labeled"))
+    if not 2 <= folds <= len(labeled):
+        raise ConfigError(
+            f"--folds {folds}: the {len(labeled)} labeled frames make 2 to {len(labeled)} folds"
+        )
+    seed = workspace.config.run.seed
+    shuffled = np.random.default_rng([seed, folds]).permutation(labeled).tolist()
+    home = workspace.root / "reports" / "audit" / f"{folds}-folds-seed-{seed}"
+    for fold in range(folds):
+        held_out = sorted(shuffled[fold::folds])
+        root = home / f"fold-{fold + 1}"
+        root.mkdir(parents=True, exist_ok=True)
+        rest = sorted(set(labeled) - set(held_out))
+        lists = [
+            _write_list(root / f"{split}.txt", names)
+            for split, names in (("labeled", rest), ("val", held_out))
+        ]
+        config = _fold_config(workspace)
+        if (root / CONFIG_NAME).exists() and read_config(root / CONFIG_NAME) != config:
+            # Settings of the workspace have changed since; what depends on them becomes stale.
+            write_config(root / CONFIG_NAME, config)
+        yield initialise(root, config, *map(str, lists))
+
+
+def _fold_config(workspace: Workspace) -> Config:
+    """The workspace's settings with absolute paths and the fold's own database."""
+    config = workspace.config
+    detector, segmenter = config.detector.path, config.segmenter.path
+    changes = {
+        "dataset": {"root": config.dataset.root.resolve()},
+        "detector": {"path": detector and (workspace.root / detector).resolve()},
+        "segmenter": {"path": segmenter and segmenter.resolve()},
+        "run": {"database": None},
+    }
+    return config.model_copy(
+        update={
+            section: getattr(config, section).model_copy(update=values)
+            for section, values in changes.items()
+        }
+    )
+
+
+def _write_list(path: Path, names: Sequence[str]) -> Path:
+    path.write_text("".join(f"{name}\n" for name in names))
+    return path

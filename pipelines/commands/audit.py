@@ -1,0 +1,184 @@
+"""curate audit: how far weights can be trusted."""
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+from pipelines.commands.options import (
+    ExecutorOption,
+    JsonOption,
+    RoundOption,
+    ThreadsOption,
+    WorkersOption,
+    WorkspaceOption,
+    end,
+    open_workspace,
+    print_json,
+    print_report,
+    print_table,
+)
+
+if TYPE_CHECKING:
+    from curate.evaluation.audit import Audit, Estimate, Figures
+    from pipelines.audit import AuditedRound
+
+
+def audit(
+    split: Annotated[
+        str, typer.Option(help="val; labeled for a detector that never saw these frames.")
+    ] = "val",
+    folds: Annotated[
+        int, typer.Option(min=0, help="Held-out folds of the labeled frames instead.")
+    ] = 0,
+    policy: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            help="Policy, or score, rho_det, consistency; repeat it for several. Default: "
+            "pspsl, spsl, threshold, uniform and the three."
+        ),
+    ] = None,
+    overlap: Annotated[str, typer.Option(help="A right label overlaps in bev or 3d.")] = "bev",
+    replicates: Annotated[
+        int, typer.Option(min=10, help="Draws of the bootstrap for the intervals.")
+    ] = 1000,
+    round_number: RoundOption = None,
+    executor: ExecutorOption = None,
+    workers: WorkersOption = None,
+    threads: ThreadsOption = None,
+    workspace: WorkspaceOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Say how many pseudo-labels are right and which policy's weights judge them best.
+
+    Treats frames with ground truth that the teacher has not seen as if they were unlabeled, and
+    then asks the truth: a label is right with an IoU above 0.7 (Car) or 0.5 (others). With --folds
+    K, K teachers each learn from the other folds. Draws reports/audit-*.png and fills the tables
+    audit, audit_slice (by distance and points) and audit_bin (by weight):
+    curate query "SELECT policy, category, auroc, auroc_low, auroc_high FROM audit"
+
+    Example: curate audit --policy pspsl --policy threshold --policy score
+    """
+    from typing import cast, get_args
+
+    from curate.errors import ConfigError
+    from curate.evaluation.audit_summary import as_numbers
+    from curate.evaluation.reliability import Overlap
+    from curate.viewing.canvas import save_png
+    from curate.viewing.reliability_diagram import draw_reliability
+    from pipelines.audit import AuditRequest, in_plain_words, picture_path, run_audit
+    from pipelines.progress import Bar
+    from pipelines.stored_audit import store_audit
+
+    if overlap not in get_args(Overlap):
+        raise ConfigError(f"--overlap {overlap}: use bev or 3d")
+    options: dict[str, Any] = {"names": tuple(dict.fromkeys(policy))} if policy else {}
+    request = AuditRequest(
+        split,
+        folds,
+        round_number,
+        overlap=cast("Overlap", overlap),
+        replicates=replicates,
+        **options,
+    )
+    opened = open_workspace(workspace, executor, workers, threads)
+    found = run_audit(opened, request, Bar(), (lambda _: None) if as_json else print_report)
+    store_audit(opened, found)
+    picture = picture_path(opened, found)
+    save_png(picture, draw_reliability(found.figures, _title(found)))
+    words = in_plain_words(found)
+    if as_json:
+        about = {
+            "round": found.context.number,
+            "rounds": found.context.rounds,
+            "audited": request.frames,
+            "overlap": overlap,
+            "summary": words,
+            "picture": str(picture),
+        }
+        print_json({**about, **as_numbers(found.figures)})
+    else:
+        _print(found.figures, _title(found))
+        typer.echo("\n".join(words))
+        typer.echo(f"picture: {picture}")
+    end(found.reports, as_json=False)
+
+
+def _title(found: "AuditedRound") -> str:
+    request, context = found.request, found.context
+    kind = "BEV" if request.overlap == "bev" else "3D"
+    return (
+        f"audit of round {context.number} of {context.rounds} on {request.frames}, "
+        f"right by {kind} overlap"
+    )
+
+
+def _print(figures: "Audit", title: str) -> None:
+    """All policies, their AUROC by category, the first one's weight bins, and the slices."""
+    by_policy = figures.whole()
+    typer.echo(f"{title}; {100 * figures.level:.0f} % intervals over {figures.frames} frames\n")
+    print_table(
+        ("weight of", "AUROC", "interval", "AP", "precision", "interval", "recall", "calib. error"),
+        [
+            (
+                each.policy,
+                *(_shown(each.auroc.value), _interval(each.auroc)),
+                _shown(each.average_precision.value),
+                *(_shown(each.weighted_precision.value), _interval(each.weighted_precision)),
+                *(_shown(each.weighted_recall.value), _shown(each.calibration_error.value)),
+            )
+            for each in by_policy.values()
+        ],
+        title="the weight as a judge, and what of it lies on right labels",
+    )
+    print_table(
+        ("labels", "right", "of", "objects", *by_policy),
+        _parts(figures),
+        title="AUROC by category, distance and points in the label",
+    )
+    first = next(iter(by_policy.values()))
+    print_table(
+        ("weight", "labels", "precision", "recall"),
+        [
+            (f"{low:.1f}-{high:.1f}", labels, _shown(precision), _shown(recall))
+            for low, high, labels, precision, recall in zip(
+                *(first.bins.edges[:-1], first.bins.edges[1:], first.bins.labels),
+                *(first.bins.precision, first.bins.recall),
+                strict=True,
+            )
+            if labels
+        ],
+        title=f"labels by weight of {first.policy}; the others are in the table audit_bin",
+    )
+
+
+def _parts(figures: "Audit") -> Iterator[tuple[Any, ...]]:
+    """A row per category over all distances, then per distance and point count over all of them."""
+    rows: dict[tuple[str, str], list[Figures]] = {}
+    for each in figures.figures:
+        if each.slice.by == "all" or each.category == "all":
+            rows.setdefault((each.category, f"{each.slice.by} {each.slice}"), []).append(each)
+    for (category, part), policies in sorted(rows.items(), key=lambda row: row[0][1] != "all all"):
+        some = policies[0]
+        name = category if part == "all all" else part
+        yield (
+            name,
+            some.right,
+            some.labels,
+            "" if some.objects is None else some.objects,
+            *(_shown(each.auroc.value) for each in policies),
+        )
+
+
+def _interval(estimate: "Estimate") -> str:
+    return "" if math.isnan(estimate.low) else f"{estimate.low:.2f} - {estimate.high:.2f}"
+
+
+def _shown(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.3f}"
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command."""
+    app.command()(audit)

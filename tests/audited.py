@@ -1,0 +1,71 @@
+"""A handful of judged labels whose figures can be worked out by hand."""
+
+import numpy as np
+
+from curate.detections import as_categories
+from curate.evaluation.audit import audit
+from curate.evaluation.judged_labels import JudgedLabels
+
+WEIGHTS = {
+    "good": np.array([0.9, 0.8, 0.15, 0.05, 0.5, 0.0]),
+    "bad": np.array([0.05, 0.25, 0.85, 0.95, 0.5, 1.0]),
+    "all": np.ones(6),
+}
+"""Of `six_labels`; the fifth label is neutral and must not matter."""
+
+
+def six_labels(points=(5, 60, 300, 5, 60, 20)):
+    """Two right and two wrong cars, a neutral one, a wrong cyclist; five objects; frame 2 is empty.
+
+    Distances 10, 30, 30, 50, 10 and 15 m.
+    """
+    return JudgedLabels(
+        frames=3,
+        frame_index=np.array([0, 0, 1, 1, 1, 1]),
+        category=as_categories(["Car"] * 5 + ["Cyclist"]),
+        distance=np.array([10.0, 30, 30, 50, 10, 15]),
+        points=np.array(points, dtype=np.float64),
+        right=np.array([True, True, False, False, False, False]),
+        counted=np.array([True, True, True, True, False, True]),
+        object_frame=np.array([0, 0, 1, 1, 2]),
+        object_category=as_categories(["Car", "Car", "Car", "Car", "Cyclist"]),
+        object_distance=np.array([10.0, 30, 10, 60, 12]),
+    )
+
+
+def small_audit(weights=None, labels=None, **options):
+    """The audit of `six_labels`."""
+    return audit(
+        six_labels() if labels is None else labels,
+        WEIGHTS if weights is None else weights,
+        ("Car", "Cyclist"),
+        np.random.default_rng(0),
+        **{"replicates": 200, **options},
+    )
+
+
+def many_labels(frames=60, seed=0):
+    """Right and wrong labels of many frames, and a good, a fair and a blind judge of them."""
+    generator = np.random.default_rng(seed)
+    frame = np.repeat(np.arange(frames), 5)
+    n = len(frame)
+    right = generator.random(n) < 0.4
+    labels = JudgedLabels(
+        frames=frames,
+        frame_index=frame,
+        category=as_categories(generator.choice(["Car", "Cyclist"], n)),
+        distance=generator.uniform(0, 60, n),
+        points=generator.integers(0, 400, n).astype(float),
+        right=right,
+        counted=np.full(n, True),
+        object_frame=frame,
+        object_category=as_categories(["Car"] * n),
+        object_distance=generator.uniform(0, 60, n),
+    )
+    noise = generator.random((3, n))
+    weights = {
+        "good": np.clip(0.7 * right + 0.3 * noise[0], 0, 1),
+        "fair": np.clip(0.3 * right + 0.7 * noise[1], 0, 1),
+        "blind": noise[2],
+    }
+    return labels, weights

@@ -1,0 +1,163 @@
+"""The figures of an audit, worked out by hand and against the functions that they come from."""
+
+import numpy as np
+import pytest
+from audited import WEIGHTS, many_labels, six_labels, small_audit
+
+from curate.evaluation.audit import audit
+from curate.evaluation.judged_labels import JudgedLabels
+
+
+def part(found, policy, category, name):
+    """The figures of a policy, category and slice."""
+    return next(
+        each
+        for each in found.figures
+        if (each.policy, each.category) == (policy, category) and f"{each.slice}" == name
+    )
+
+
+def test_the_figures_by_hand():
+    """Right: 0.9, 0.8. Wrong: 0.15, 0.05, 0. The neutral label of 0.5 is left out."""
+    good = small_audit().whole()["good"]
+    assert (good.labels, good.neutral, good.right, good.objects) == (5, 1, 2, 5)
+    assert good.share_right.value == 2 / 5
+    assert good.auroc.value == good.average_precision.value == 1
+    assert good.weighted_precision.value == pytest.approx(1.7 / 1.9)
+    assert good.weighted_recall.value == pytest.approx(1.7 / 5)
+    # Alone in their bins: |1 - 0.9|, |1 - 0.8|, |0 - 0.15|; together in the first: |0 - 0.025| * 2.
+    error = (0.1 + 0.2 + 0.15 + 2 * 0.025) / 5
+    assert good.calibration_error.value == pytest.approx(error)
+    assert good.bins.labels.tolist() == [2, 1, 0, 0, 0, 0, 0, 0, 1, 1]
+    assert good.bins.precision[[0, 1, 8, 9]].tolist() == [0, 0, 1, 1]
+    assert good.bins.recall[[0, 8, 9]].tolist() == [0, 1 / 5, 1 / 5]
+
+
+def test_a_judge_that_is_always_wrong():
+    """Every wrong label weighs more than every right one: precision 1/4 and 2/5 where they come."""
+    bad = small_audit().whole()["bad"]
+    assert bad.auroc.value == 0
+    assert bad.average_precision.value == pytest.approx((1 / 4 + 2 / 5) / 2)
+    assert bad.weighted_precision.value == pytest.approx(0.3 / 3.1)
+
+
+def test_categories_are_looked_at_alone():
+    """The cyclist's only label is wrong, so nothing can be told apart; its object is missed."""
+    found = small_audit()
+    car, cyclist = found.whole("Car")["good"], found.whole("Cyclist")["good"]
+    assert (car.labels, car.neutral, car.right, car.objects) == (4, 1, 2, 4)
+    assert (cyclist.labels, cyclist.right, cyclist.objects) == (1, 0, 1)
+    assert cyclist.share_right.value == 0
+    assert np.isnan(cyclist.auroc.value)
+    assert np.isnan(cyclist.auroc.low)
+
+
+def test_distances_and_points_break_the_labels_down():
+    """Each label in one range of each; objects are known by distance, not by points."""
+    found = small_audit()
+    near = part(found, "good", "all", "0-20 m")
+    assert (near.labels, near.neutral, near.right, near.objects) == (2, 1, 1, 3)
+    middle = part(found, "good", "all", "20-40 m")
+    assert (middle.labels, middle.right, middle.objects) == (2, 1, 1)
+    assert middle.auroc.value == 1
+    few = part(found, "good", "all", "0-10")
+    assert (few.labels, few.right, few.objects) == (2, 1, None)
+    assert np.isnan(few.weighted_recall.value)
+    for kind in ("distance", "points"):
+        parts = [
+            each
+            for each in found.figures
+            if (each.slice.by, each.policy, each.category) == (kind, "all", "all")
+        ]
+        assert sum(each.labels for each in parts) == 5
+
+
+def test_comparisons_are_of_every_two_and_can_be_turned():
+    """The good judge exceeds the bad one by 1 in every draw where both are defined."""
+    found = small_audit()
+    compared = found.compare("good", "bad")
+    assert (compared.difference.value, compared.difference.low, compared.difference.high) == (
+        1,
+    ) * 3
+    assert compared.beyond_chance
+    turned = found.compare("bad", "good")
+    assert (turned.policy, turned.difference.value, turned.difference.low) == ("bad", -1, -1)
+    assert turned.beyond_chance
+    assert len([each for each in found.comparisons if each.category == "all"]) == 3
+
+
+def test_intervals_hold_the_figure_and_shrink_with_more_frames():
+    """Four times the frames, about half the width."""
+    few, many = (audit_of(*many_labels(frames)).whole()["fair"] for frames in (50, 200))
+    for name in ("share_right", "auroc", "average_precision", "weighted_precision"):
+        narrow, wide = getattr(many, name), getattr(few, name)
+        assert wide.low < wide.value < wide.high
+        assert narrow.high - narrow.low < 0.7 * (wide.high - wide.low)
+
+
+def test_a_difference_beyond_chance_is_told_from_one_within_it():
+    """A good judge beats a blind one; two blind ones are not told apart."""
+    labels, weights = many_labels()
+    weights["blind too"] = np.random.default_rng(9).random(len(labels))
+    found = audit_of(labels, weights)
+    assert found.compare("good", "blind").beyond_chance
+    assert found.compare("fair", "blind").beyond_chance
+    assert not found.compare("blind", "blind too").beyond_chance
+    assert abs(found.whole()["blind"].auroc.value - 0.5) < 0.1
+
+
+def test_the_interval_covers_the_truth_about_as_often_as_it_says():
+    """A judge whose AUROC is known, 80 % intervals of 60 data sets: between 65 and 95 % hold it.
+
+    Right labels weigh u, wrong ones u * u' for uniform u, u': P(u > u'' u') = 3/4.
+    """
+    hits = 0
+    for seed in range(60):
+        labels, _ = many_labels(frames=50, seed=seed)
+        u = np.random.default_rng(1000 + seed).random((2, len(labels)))
+        weights = np.where(labels.right, u[0], u[0] * u[1])
+        found = audit(
+            labels, {"judge": weights}, (), np.random.default_rng(seed), replicates=200, level=0.8
+        ).whole()["judge"]
+        hits += found.auroc.low <= 0.75 <= found.auroc.high
+    assert 0.65 * 60 <= hits <= 0.95 * 60
+
+
+def test_the_same_seed_gives_the_same_audit():
+    """To the last bit; another seed gives the same figures with other intervals."""
+    labels, weights = many_labels()
+    one, same = audit_of(labels, weights), audit_of(labels, weights)
+    assert [each.auroc for each in one.figures] == [each.auroc for each in same.figures]
+    other = audit(labels, weights, ("Car",), np.random.default_rng(7), replicates=200)
+    assert one.whole()["good"].auroc.value == other.whole()["good"].auroc.value
+    assert one.whole()["good"].weighted_recall.low != other.whole()["good"].weighted_recall.low
+
+
+def test_the_order_of_frames_does_not_change_a_figure():
+    """Frames renumbered backwards."""
+    labels = six_labels()
+    turned = JudgedLabels(
+        **{
+            **vars(labels),
+            "frame_index": 2 - labels.frame_index,
+            "object_frame": 2 - labels.object_frame,
+        }
+    )
+    for one, other in zip(small_audit().figures, small_audit(labels=turned).figures, strict=True):
+        for name in ("share_right", "auroc", "weighted_recall", "calibration_error"):
+            values = getattr(one, name).value, getattr(other, name).value
+            assert values[0] == pytest.approx(values[1], nan_ok=True)
+
+
+def test_no_labels_and_no_objects_are_no_failure():
+    """Counts of 0 and figures that are undefined."""
+    nothing = JudgedLabels.of_no_frame()
+    found = small_audit({name: np.zeros(0) for name in WEIGHTS}, nothing).whole()["good"]
+    assert (found.labels, found.right, found.objects) == (0, 0, 0)
+    for name in ("share_right", "auroc", "weighted_precision", "weighted_recall"):
+        assert np.isnan(getattr(found, name).value)
+
+
+def audit_of(labels, weights):
+    """The audit of many labels."""
+    return audit(labels, weights, ("Car",), np.random.default_rng(0), replicates=200)

@@ -1,0 +1,75 @@
+"""An audit in words and as plain numbers."""
+
+import json
+
+import numpy as np
+from audited import many_labels, six_labels, small_audit
+
+from curate.evaluation.audit import audit
+from curate.evaluation.audit_summary import as_numbers, in_words
+from curate.evaluation.judged_labels import JudgedLabels
+
+
+def words(labels, weights, policies, evidence=()):
+    """All sentences as one text."""
+    found = audit(labels, weights, ("Car", "Cyclist"), np.random.default_rng(0), replicates=200)
+    return " ".join(in_words(found, policies, evidence))
+
+
+def test_it_says_how_much_is_right_and_what_was_left_out():
+    """In all and by category, with the neutral labels and a warning for few frames."""
+    text = " ".join(in_words(small_audit(), ("good", "bad", "all"), ()))
+    assert text.startswith("2 of 5 labels are right, 40.0 % (")
+    assert "on 3 frames with 5 objects (Car 50.0 %, Cyclist 0.0 %)" in text
+    assert "1 more are neither right nor wrong" in text
+    assert "With 3 frames the intervals are rough" in text
+
+
+def test_it_names_the_best_judge_and_the_next():
+    """With the difference, and whether that may be chance."""
+    labels, weights = many_labels()
+    text = words(labels, weights, ("blind", "good"))
+    assert "Of the policies, good judges best: AUROC 1.000" in text
+    assert "before blind with 0.5" in text
+    assert "is more than chance" in text
+    weights["as blind"] = np.random.default_rng(4).random(len(labels))
+    assert "may be chance" in words(labels, weights, ("blind", "as blind"))
+
+
+def test_it_says_where_the_weight_lies():
+    """The best policy by that measure first, with the share of each."""
+    text = " ".join(in_words(small_audit(), ("all", "good"), ()))
+    assert "from good, 89.5 %" in text
+    assert text.endswith("lies on right labels; all 40.0 %.")
+
+
+def test_evidence_that_judges_better_than_every_policy_is_not_hidden():
+    """Plainly named, with its difference; evidence that judges worse is not mentioned."""
+    labels, weights = many_labels()
+    text = words(labels, weights, ("fair",), ("good", "blind"))
+    assert "good alone, without a policy, ranks the labels better than fair" in text
+    assert "blind alone" not in text
+    assert "fair: AUROC" in text
+
+
+def test_nothing_to_tell_apart_is_said():
+    """All wrong, and no labels at all."""
+    wrong = six_labels()
+    wrong.right[:] = False
+    text = words(wrong, {"all": np.ones(6)}, ("all",))
+    assert "All labels are wrong, so no weight can tell right from wrong" in text
+    nothing = words(JudgedLabels.of_no_frame(), {"all": np.zeros(0)}, ("all",))
+    assert nothing == "There is no label on 0 frames with 0 objects, so there is nothing to audit."
+
+
+def test_the_numbers_are_strict_json():
+    """No NaN and no infinity: null where a figure is undefined or an edge is open."""
+    numbers = as_numbers(small_audit())
+    text = json.dumps(numbers, allow_nan=False)
+    assert json.loads(text) == numbers
+    first = numbers["figures"][0]
+    assert first["slice"] == {"by": "all", "low": 0, "high": None}
+    assert first["auroc"]["value"] == 1
+    assert [each["labels"] for each in first["bins"]] == [2, 1, 0, 0, 0, 0, 0, 0, 1, 1]
+    assert first["bins"][5]["precision"] is None
+    assert numbers["comparisons"][0]["beyond_chance"] is True

@@ -1,0 +1,84 @@
+"""The fast bootstrap against copied labels and hand-worked draws."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from curate.evaluation.reliability import auroc, average_precision, bootstrap, percentile_interval
+from curate.evaluation.resampling import draw_frames, ranked_replicates
+
+
+def test_a_draw_holds_as_many_frames_as_there_are():
+    """With replacement: some twice, some not at all, the sum is kept."""
+    draws = draw_frames(np.random.default_rng(0), 12, 50)
+    assert draws.shape == (50, 12)
+    assert set(draws.sum(axis=1)) == {12}
+    assert draws.max() > 1
+    assert draws.min() == 0
+
+
+def test_the_same_seed_draws_the_same():
+    """And another seed something else."""
+    one, same, other = (draw_frames(np.random.default_rng(seed), 9, 20) for seed in (1, 1, 2))
+    assert np.array_equal(one, same)
+    assert not np.array_equal(one, other)
+
+
+def test_multiplicities_by_hand():
+    """Frame 0 has a right label of weight 0.9 and a wrong one of 0.5, frame 1 a right one of 0.2.
+
+    Once each: the pairs are (0.9, 0.5) won and (0.2, 0.5) lost. Frame 1 twice: 1 of 3 pairs won;
+    precision is 1 at the first right label and 3/4 at the other two.
+    """
+    weights, right = np.array([0.9, 0.5, 0.2]), np.array([True, False, True])
+    draws = np.array([[1.0, 1.0], [1.0, 2.0], [0.0, 2.0]])
+    found, area = ranked_replicates(weights, right, np.array([0, 0, 1]), draws)
+    assert found[:2] == pytest.approx([1 / 2, 1 / 3])
+    assert np.isnan(found[2])
+    assert area == pytest.approx([(1 + 2 / 3) / 2, (1 + 3 / 4 + 3 / 4) / 3, 1])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 25))
+def test_it_equals_the_figures_of_copied_labels(seed, n):
+    """Ties, empty frames, draws without a right or without a wrong label."""
+    generator = np.random.default_rng(seed)
+    weights = generator.choice([0.0, 0.2, 0.2, 0.7, generator.random()], n)
+    right, frame = generator.random(n) < 0.4, generator.integers(6, size=n)
+    draws = draw_frames(generator, 6, 10)
+    found, area = ranked_replicates(weights, right, frame, draws)
+    for replicate, times in enumerate(draws.astype(int)):
+        copies = np.repeat(np.arange(n), times[frame])
+        expected = (
+            auroc(weights[copies], right[copies]),
+            average_precision(weights[copies], right[copies]),
+        )
+        assert (found[replicate], area[replicate]) == pytest.approx(expected, nan_ok=True)
+
+
+def test_its_interval_is_that_of_the_general_bootstrap():
+    """The same statistic over as many draws of another generator, within sampling error."""
+    generator = np.random.default_rng(3)
+    right, frame = generator.random(300) < 0.5, generator.integers(40, size=300)
+    weights = np.clip(0.5 * right + generator.normal(0.3, 0.3, 300), 0, 1)
+    fast, _ = ranked_replicates(weights, right, frame, draw_frames(generator, 40, 2000))
+    slow = bootstrap(
+        lambda labels, _: auroc(weights[labels], right[labels]),
+        frame,
+        40,
+        generator,
+        replicates=2000,
+    )
+    ours = percentile_interval(fast)
+    assert (ours.low, ours.high) == pytest.approx((slow.low, slow.high), abs=0.01)
+
+
+def test_no_frames_have_no_figures():
+    """Every replicate is undefined."""
+    draws = draw_frames(np.random.default_rng(0), 0, 5)
+    nothing = np.zeros(0)
+    found, area = ranked_replicates(nothing, nothing.astype(bool), nothing.astype(int), draws)
+    assert np.isnan(found).all()
+    assert np.isnan(area).all()
+    assert percentile_interval(found).undefined == 1
