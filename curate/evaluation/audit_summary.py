@@ -21,6 +21,8 @@ def in_words(audit: Audit, policies: Sequence[str], evidence: Sequence[str]) -> 
         policies: the audited policies that weigh labels for a training.
         evidence: the audited pieces of evidence, judges that no training uses by themselves.
     """
+    if not policies:
+        policies, evidence = evidence, ()
     by_policy = audit.whole()
     some = next(iter(by_policy.values()))
     sentences = [_how_much_is_right(audit, some), *_what_was_left_out(audit, some)]

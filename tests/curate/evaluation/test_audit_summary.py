@@ -52,6 +52,11 @@ def test_evidence_that_judges_better_than_every_policy_is_not_hidden():
     assert "fair: AUROC" in text
 
 
+def test_evidence_without_a_policy_is_judged_too():
+    """As if each piece were a policy."""
+    assert "good judges best" in words(*many_labels(), (), ("good", "blind"))
+
+
 def test_nothing_to_tell_apart_is_said():
     """All wrong, and no labels at all."""
     wrong = six_labels()
