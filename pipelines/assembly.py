@@ -27,7 +27,6 @@ def open_detector(config: Config, path: Path) -> Detector:
         path,
         offered={
             "minimum_score": lambda: section.minimum_score,
-            "score_threshold": lambda: section.minimum_score,
             "device": lambda: device(config),
             "categories": lambda: config.dataset.categories,
             "threads": lambda: 1,

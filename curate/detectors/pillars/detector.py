@@ -29,7 +29,7 @@ class PillarDetector:
     Args:
         checkpoint: its safetensors file.
         device: "cpu", or a torch device such as "cuda".
-        score_threshold: boxes with a lower score are left out.
+        minimum_score: boxes with a lower score are left out.
         nms_iou: BEV IoU above which the better box of a category suppresses the other.
         threads: for the network, on CPU.
 
@@ -43,12 +43,12 @@ class PillarDetector:
         checkpoint: Path,
         *,
         device: str = "cpu",
-        score_threshold: float = 0.1,
+        minimum_score: float = 0.1,
         nms_iou: float = 0.1,
         threads: int = 1,
     ) -> None:
         self._checkpoint = load_checkpoint(checkpoint)
-        self._score_threshold = score_threshold
+        self._minimum_score = minimum_score
         self._nms_iou = nms_iou
         self._answers = (
             _onnx_answers(checkpoint, self._checkpoint, threads)
@@ -68,7 +68,7 @@ class PillarDetector:
         if len(pillars.slots) == 0:
             return Detections.empty()
         scores, codes = self._answers(pillars)
-        found = decode(scores, codes, self.categories, preset, self._score_threshold)
+        found = decode(scores, codes, self.categories, preset, self._minimum_score)
         kept = [np.zeros(0, dtype=np.int64)]
         for category in self.categories:
             of_category = np.flatnonzero(found.categories == category)

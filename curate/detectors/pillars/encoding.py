@@ -148,7 +148,7 @@ def decode(
     codes: np.ndarray,
     categories: tuple[str, ...],
     preset: Preset,
-    score_threshold: float,
+    minimum_score: float,
 ) -> Detections:
     """The boxes in the network's answers, before non-maximum suppression.
 
@@ -159,10 +159,10 @@ def decode(
         codes: (x cells, y cells, BOX_CODE).
         categories: their names.
         preset: the grid.
-        score_threshold: lower scores are left out.
+        minimum_score: lower scores are left out.
     """
     flat = scores.reshape(-1)
-    candidates = np.flatnonzero(flat >= max(score_threshold, np.finfo(np.float32).tiny))
+    candidates = np.flatnonzero(flat >= max(minimum_score, np.finfo(np.float32).tiny))
     best = np.argsort(-flat[candidates], kind="stable")[:_CANDIDATES]
     candidates = candidates[best]
     cells, category_ids = np.divmod(candidates, len(categories))

@@ -81,7 +81,7 @@ def test_an_empty_frame_has_no_detections(small):
 
 def test_detections_are_sorted_and_do_not_overlap_within_a_category(small):
     """After suppression, boxes of a category overlap at most by the threshold."""
-    detector = PillarDetector(small, score_threshold=0.0, nms_iou=0.3)
+    detector = PillarDetector(small, minimum_score=0.0, nms_iou=0.3)
     found = detector.predict(frame_of(cloud(3000)))
     assert len(found) > 10
     assert (np.diff(found.scores) <= 0).all()
@@ -92,12 +92,12 @@ def test_detections_are_sorted_and_do_not_overlap_within_a_category(small):
         assert overlap.max(initial=0) <= 0.3
 
 
-def test_the_score_threshold_cuts(small):
+def test_the_minimum_score_cuts(small):
     """A higher threshold keeps the better part of the same detections."""
     frame = frame_of(cloud(3000))
-    everything = PillarDetector(small, score_threshold=0.0).predict(frame)
+    everything = PillarDetector(small, minimum_score=0.0).predict(frame)
     middle = float(np.median(everything.scores))
-    better = PillarDetector(small, score_threshold=middle).predict(frame)
+    better = PillarDetector(small, minimum_score=middle).predict(frame)
     assert 0 < len(better) < len(everything)
     assert better.scores.min() >= middle
 
@@ -105,15 +105,15 @@ def test_the_score_threshold_cuts(small):
 def test_a_missing_or_outdated_graph_is_made_again(small):
     """The checkpoint is what counts: its graph is replaced where it is not there or another's."""
     frame = frame_of(cloud(500))
-    expected = PillarDetector(small, score_threshold=0.0).predict(frame)
+    expected = PillarDetector(small, minimum_score=0.0).predict(frame)
     graph = graph_path(small)
     for spoil in (graph.unlink, lambda: graph.write_bytes(b"no graph")):
         spoil()
-        again = PillarDetector(small, score_threshold=0.0).predict(frame)
+        again = PillarDetector(small, minimum_score=0.0).predict(frame)
         np.testing.assert_array_equal(again.boxes, expected.boxes)
     save_checkpoint(small.with_name("other.safetensors"), lively("kitti"))
     small.with_name("other.onnx").replace(graph)
-    again = PillarDetector(small, score_threshold=0.0).predict(frame)
+    again = PillarDetector(small, minimum_score=0.0).predict(frame)
     np.testing.assert_array_equal(again.boxes, expected.boxes)
 
 

@@ -61,7 +61,7 @@ def test_a_training_learns_its_frames(make_labels, tiny, toy_kitti, tmp_path):
     report = train(make_labels(labeled=2), path, settings)
     assert report.steps == 120
     assert report.bank == {"Car": 2, "Pedestrian": 2, "Cyclist": 2}
-    detector, dataset = PillarDetector(path, score_threshold=0.3), KittiDataset(toy_kitti)
+    detector, dataset = PillarDetector(path, minimum_score=0.3), KittiDataset(toy_kitti)
     for frame_id in ("000000", "000001"):
         truth = dataset.annotations(frame_id)
         found = detector.predict(dataset.read(frame_id))
