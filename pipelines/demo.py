@@ -120,7 +120,7 @@ def run_demo(demo: Demo, say: Say) -> None:
     _print_detectors(workspace)
     _draw(workspace, say)
     say(f"\nThe demo took {(time.perf_counter() - start) / 60:.1f} minutes. Look around:")
-    for command in ("status", "explain FRAME K", "graph", "evaluate"):
+    for command in ("status", "explain FRAME K", "graph", "audit", "evaluate"):
         say(
             f"   curate {command}" + ("" if command == "graph" else f" -w {_shown(demo.directory)}")
         )
