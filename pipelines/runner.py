@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, select
 
 from db import bulk
 from pipelines import plan, registry
@@ -232,15 +232,30 @@ class _Writer:
             self.errors.append((outcome.job.frame, outcome.error))
 
     def _clear(self, connection: Connection, keys: Sequence[int]) -> None:
-        """Removes what an earlier run stored; evidence leaves with its prediction."""
+        """Removes what an earlier run stored, and the tasks that made it.
+
+        Whatever else is known of a frame hangs on its predictions and leaves with them. So do the
+        tasks, or it would count as known once the former settings are back.
+        """
+        task = bulk.table("task")
+        made = [task.c.round == self.context.number, task.c.frame_id.in_(keys)]
+        if "prediction" in self.stage.writes:
+            self._forget_weights(connection, keys)
+        else:
+            made.append(task.c.stage == self.stage.name)
         for table in self.stage.writes:
             bulk.delete_frames(connection, table, self.context.number, keys)
-        task = bulk.table("task")
+        connection.execute(task.delete().where(*made))
+
+    def _forget_weights(self, connection: Connection, keys: Sequence[int]) -> None:
+        """Removes the tasks of the policies that have weighted labels of these frames."""
+        task, weight = bulk.table("task"), bulk.table("weight")
+        weighted = (weight.c.round == self.context.number, weight.c.frame_id.in_(keys))
         connection.execute(
             task.delete().where(
                 task.c.round == self.context.number,
-                task.c.stage == self.stage.name,
-                task.c.frame_id.in_(keys),
+                task.c.stage == "solve",
+                task.c.variant.in_(select(weight.c.policy).where(*weighted)),
             )
         )
 

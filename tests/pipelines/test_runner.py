@@ -86,6 +86,17 @@ def test_a_changed_setting_redoes_its_stage_and_what_follows(
     assert {name for name, frames in done.items() if frames} == redone
 
 
+def test_what_left_with_its_prediction_is_made_again(workspace: Workspace) -> None:
+    """Predictions made anew take evidence and weights with them, and their tasks as well."""
+    run(workspace)
+    before = dump(workspace)
+    tried = with_setting(workspace, "detector", minimum_score=0.5)
+    run_frames(tried, open_round(tried, 1), stage("predict"), SerialExecutor(), Silent())
+    assert count(workspace, "weight") == 0
+    run(workspace)
+    assert dump(workspace) == before
+
+
 def test_another_detector_makes_everything_stale(workspace: Workspace, weights_file: Path) -> None:
     """The teacher's hash is part of every fingerprint."""
     run(workspace)
