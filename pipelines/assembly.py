@@ -1,12 +1,14 @@
 """The one place where sections of the configuration become objects of curate."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.consistency import ConsistencySettings
 from curate.detectors.base import Detector
 from curate.errors import ConfigError
+from curate.priors.base import Prior
 from curate.priors.points import PointSettings
 from curate.priors.semantic import SemanticSettings
 from curate.segmenters.base import Segmenter
@@ -93,8 +95,31 @@ def consistency_settings(config: Config) -> ConsistencySettings:
     return _from_section(ConsistencySettings, config.repredict)
 
 
+def open_prior(
+    config: Config, name: str, thresholds: Mapping[str, float], *, measures: bool = True
+) -> Prior:
+    """A prior with its settings.
+
+    Args:
+        config: all sections.
+        name: of the prior.
+        thresholds: points per category, learned from X_l; read by priors that name them.
+        measures: whether it will look at frames, for which alone a segmenter is opened.
+    """
+    prior: Prior = registry.PRIORS.build(
+        name,
+        offered={
+            "thresholds": lambda: thresholds,
+            "segmenter": lambda: open_segmenter(config) if measures else None,
+            "settings": lambda: semantic_settings(config),
+        },
+        options=config.run.prior_options.get(name, {}),
+    )
+    return prior
+
+
 def point_settings(config: Config) -> PointSettings:
-    """How the point prior learns its thresholds."""
+    """How points per category are learned from X_l."""
     return _from_section(PointSettings, config.points)
 
 

@@ -110,6 +110,7 @@ class RunSection(Section):
     rounds: AtLeastOne = 3
     seed: int = 0
     priors: tuple[str, ...] = ("points", "semantic")
+    prior_options: dict[str, Options] = {}  # of your own priors, by name
     executor: str = "serial"
     workers: AtLeastOne = 1
     database: str | None = None  # an SQLAlchemy URL; default: curate.db in the workspace

@@ -3,6 +3,9 @@
 The fingerprint of a stage is a hash of all that its rows depend on: its settings and the
 fingerprints of the stages that write what it reads. A frame is done where its task carries the
 current fingerprint; a changed setting thus makes stale what follows, and only that.
+
+The fingerprint of a stage that recalls what it has measured has two parts, MEASURED.REST. A frame
+whose task carries the current first part needs not be measured again.
 """
 
 import hashlib
@@ -73,6 +76,10 @@ def fingerprints(workspace: Workspace, context: RoundContext, policy: str) -> di
         )
         inputs = [known[name] for name in each.reads if name in known]
         prints[each.name] = digest([each.name, settings, inputs])
+        if isinstance(each, FrameStage) and each.recall:
+            inputs = [known[name] for name in each.recall.reads]
+            measured = digest([each.name, each.recall.settings(workspace, context), inputs])
+            prints[each.name] = f"{measured}.{prints[each.name]}"
         known |= dict.fromkeys(each.writes, prints[each.name])
     return prints
 
@@ -100,6 +107,20 @@ def waiting_frames(
         for key, name in frames
         if own.get(key) not in FINISHED and all(states.get(key) in FINISHED for states in before)
     ]
+
+
+def measured_frames(workspace: Workspace, context: RoundContext, of: FrameStage) -> set[int]:
+    """The frames whose stored measurements still hold, though what follows from them may not."""
+    current = fingerprints(workspace, context, workspace.config.solve.policy)[of.name]
+    task = bulk.table("task")
+    query = select(task.c.frame_id).where(
+        task.c.round == context.number,
+        task.c.stage == of.name,
+        task.c.state == "done",
+        task.c.fingerprint.startswith(current.partition(".")[0] + "."),
+    )
+    with workspace.database.reading() as connection:
+        return {row[0] for row in bulk.select(connection, query)}
 
 
 def counts(workspace: Workspace, context: RoundContext, of: FrameStage, split: str) -> Counts:

@@ -35,6 +35,10 @@ class Registry:
         except (ImportError, AttributeError) as error:
             raise ConfigError(f"{self.kind} '{name}' cannot be imported: {error}") from error
 
+    def takes(self, name: str, argument: str) -> bool:
+        """Whether the constructor behind a name has an argument of that name."""
+        return argument in inspect.signature(self.load(name)).parameters
+
     def build(
         self,
         name: str,
@@ -82,6 +86,13 @@ SEGMENTERS = Registry(
         "onnx": "curate.segmenters.onnx:OnnxSegmenter",
         "saved": "curate.segmenters.saved:SavedSegmenter",
         "degraded": "curate.segmenters.degraded:DegradedSegmenter",
+    },
+)
+PRIORS = Registry(
+    "prior",
+    {
+        "points": "curate.priors.points:PointPrior",
+        "semantic": "curate.priors.semantic:SemanticPrior",
     },
 )
 POLICIES = Registry(

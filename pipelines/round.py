@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 
+from pipelines.registry import PRIORS
 from pipelines.stage import FrameStage, RoundStage, Stage
-from pipelines.stages import export, points, predict, repredict, semantic, solve, train_round
+from pipelines.stages import export, predict, repredict, score, solve, train_round
 
-ROUND: tuple[Stage, ...] = (
+_DETECT: tuple[Stage, ...] = (
     FrameStage(
         "predict",
         command="predict",
@@ -22,22 +23,8 @@ ROUND: tuple[Stage, ...] = (
         settings=repredict.settings,
         function=repredict.function,
     ),
-    FrameStage(
-        "points",
-        command="score --prior points",
-        reads=("frame", "ground_truth", "prediction"),
-        writes=("point_prior",),
-        settings=points.settings,
-        function=points.function,
-    ),
-    FrameStage(
-        "semantic",
-        command="score --prior semantic",
-        reads=("frame", "prediction"),
-        writes=("semantic_prior",),
-        settings=semantic.settings,
-        function=semantic.function,
-    ),
+)
+_DECIDE: tuple[Stage, ...] = (
     RoundStage(
         "solve",
         command="solve",
@@ -65,17 +52,21 @@ ROUND: tuple[Stage, ...] = (
         file=train_round.file,
     ),
 )
-PRIORS = ("points", "semantic")
+ROUND = (*_DETECT, *map(score.stage, PRIORS.classes), *_DECIDE)
 
 
 def stage(name: str) -> Stage:
-    """The stage of that name."""
-    return next(stage for stage in ROUND if stage.name == name)
+    """The stage of that name, or the one that asks the prior of that name."""
+    return next((stage for stage in ROUND if stage.name == name), None) or score.stage(name)
 
 
 def active(priors: Sequence[str]) -> tuple[Stage, ...]:
-    """The stages of a round in which only some priors are asked."""
-    return tuple(s for s in ROUND if s.name not in PRIORS or s.name in priors)
+    """The stages of a round in which only some priors are asked.
+
+    Raises:
+        ConfigError: there is no such prior, or no place for its evidence.
+    """
+    return (*_DETECT, *score.stages(priors), *_DECIDE)
 
 
 def frames_before(of: Stage, priors: Sequence[str]) -> tuple[FrameStage, ...]:
@@ -89,3 +80,15 @@ def frames_before(of: Stage, priors: Sequence[str]) -> tuple[FrameStage, ...]:
             if isinstance(other, FrameStage):
                 found.insert(0, other)
     return tuple(found)
+
+
+def unaffected(of: FrameStage, priors: Sequence[str]) -> tuple[str, ...]:
+    """The stages whose rows of a frame stay where a stage's own are made anew.
+
+    All that is known of a frame hangs on its predictions and leaves with them. Priors that are
+    stored in the same table take each other's place.
+    """
+    if "prediction" in of.writes:
+        return ()
+    known = {stage.name: stage for stage in (*ROUND, *active(priors))}
+    return tuple(name for name, other in known.items() if not set(of.writes) & set(other.writes))

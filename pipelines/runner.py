@@ -16,8 +16,10 @@ from sqlalchemy import Connection, select
 from db import bulk
 from pipelines import plan, registry
 from pipelines.executors.base import Executor, FrameJob, Outcome
+from pipelines.executors.serial import SerialExecutor
 from pipelines.progress import Progress
-from pipelines.stage import FrameStage, Product, RoundContext, RoundJob, RoundStage
+from pipelines.round import unaffected
+from pipelines.stage import FrameStage, Product, Recall, RoundContext, RoundJob, RoundStage
 from pipelines.workspace import Workspace
 
 READ_AHEAD = 256  # frames whose earlier rows are read at once
@@ -86,12 +88,7 @@ def run_frames(
         advance(writer.empty, "")
         jobs = [(key, name) for key, name, empty in waiting if not empty]
         if jobs:
-            function = stage.function(workspace, context)
-            needs = "prediction" in stage.reads
-            outcomes = executor.map(
-                function, _jobs(workspace, context, jobs, with_predictions=needs)
-            )
-            for outcome in outcomes:
+            for outcome in _outcomes(workspace, context, stage, jobs, executor):
                 writer.add(outcome)
                 advance(1, f"{writer.failed} failed" if writer.failed else "")
             writer.flush()
@@ -146,19 +143,41 @@ def run_once(
     return Report(what.stage, what.round, done=1, seconds=seconds, summary=product.summary)
 
 
+def _outcomes(
+    workspace: Workspace,
+    context: RoundContext,
+    stage: FrameStage,
+    frames: Sequence[tuple[int, str]],
+    executor: Executor,
+) -> Iterator[Outcome]:
+    """The executor works on the frames; those whose measurements still hold need none."""
+    recall = stage.recall
+    known = plan.measured_frames(workspace, context, stage) if recall else set()
+    recalled = [frame for frame in frames if frame[0] in known]
+    if recall and recalled:
+        jobs = _jobs(workspace, context, stage, recalled, recall)
+        yield from SerialExecutor().map(recall.function(workspace, context), jobs)
+    fresh = [frame for frame in frames if frame[0] not in known]
+    if fresh:
+        jobs = _jobs(workspace, context, stage, fresh)
+        yield from executor.map(stage.function(workspace, context), jobs)
+
+
 def _jobs(
     workspace: Workspace,
     context: RoundContext,
+    stage: FrameStage,
     frames: Sequence[tuple[int, str]],
-    *,
-    with_predictions: bool,
+    recall: Recall | None = None,
 ) -> Iterator[FrameJob]:
-    """The jobs of frames, with their predictions where the stage needs them."""
+    """The jobs of frames, with their predictions and measurements where they are needed."""
     for batch in _batched(frames, READ_AHEAD):
         keys = [key for key, _ in batch]
-        found = workspace.predictions(context.number, keys) if with_predictions else {}
+        reads = "prediction" in stage.reads
+        found = workspace.predictions(context.number, keys) if reads else {}
+        measured = recall.read(workspace, context, keys) if recall else {}
         for key, name in batch:
-            yield FrameJob(key, name, found.get(key))
+            yield FrameJob(key, name, found.get(key), measured.get(key))
 
 
 def _batched(items: Sequence[Item], size: int) -> Iterator[Sequence[Item]]:
@@ -175,6 +194,7 @@ class _Writer:
         self.stage = stage
         prints = plan.fingerprints(workspace, context, workspace.config.solve.policy)
         self.fingerprint = prints[stage.name]
+        self.unaffected = unaffected(stage, workspace.config.run.priors)
         self.done = self.empty = self.failed = self.labels = 0
         self.errors: list[tuple[str, str]] = []
         self._waiting: list[Outcome] = []
@@ -232,20 +252,22 @@ class _Writer:
             self.errors.append((outcome.job.frame, outcome.error))
 
     def _clear(self, connection: Connection, keys: Sequence[int]) -> None:
-        """Removes what an earlier run stored, and the tasks that made it.
+        """Removes what an earlier run stored, and the tasks of all whose rows leave with it.
 
-        Whatever else is known of a frame hangs on its predictions and leaves with them. So do the
-        tasks, or it would count as known once the former settings are back.
+        A task that stayed would make the frame count as done once the former settings are back.
         """
         task = bulk.table("task")
-        made = [task.c.round == self.context.number, task.c.frame_id.in_(keys)]
         if "prediction" in self.stage.writes:
             self._forget_weights(connection, keys)
-        else:
-            made.append(task.c.stage == self.stage.name)
         for table in self.stage.writes:
             bulk.delete_frames(connection, table, self.context.number, keys)
-        connection.execute(task.delete().where(*made))
+        connection.execute(
+            task.delete().where(
+                task.c.round == self.context.number,
+                task.c.frame_id.in_(keys),
+                task.c.stage.not_in(self.unaffected),
+            )
+        )
 
     def _forget_weights(self, connection: Connection, keys: Sequence[int]) -> None:
         """Removes the tasks of the policies that have weighted labels of these frames."""

@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
+from curate.priors.base import Measured
 from curate.weighting.base import Age
 from pipelines.executors.base import FrameFunction
 from pipelines.progress import Progress
@@ -79,6 +80,23 @@ class Product:
 
 
 @dataclass(frozen=True)
+class Recall:
+    """How a stage goes on from what it once measured, where only the formula has changed.
+
+    Attributes:
+        reads: tables or sources; together with `settings` all that its measurements depend on.
+        settings: what they depend on beside what it reads.
+        read: the measured columns of some frames, by key.
+        function: what it does with a frame and its measurements, without looking at the frame.
+    """
+
+    reads: tuple[str, ...]
+    settings: Callable[[Workspace, RoundContext], Settings]
+    read: Callable[[Workspace, RoundContext, Sequence[int]], Mapping[int, Measured]]
+    function: Callable[[Workspace, RoundContext], FrameFunction]
+
+
+@dataclass(frozen=True)
 class FrameStage:
     """A stage that treats every frame alone.
 
@@ -87,8 +105,9 @@ class FrameStage:
         command: that runs it.
         reads: tables or sources; together with `settings` all that its rows depend on.
         writes: tables.
-        settings: what its rows depend on beside what it reads.
+        settings: what its rows depend on beside what it reads and recalls.
         function: what it does with a frame.
+        recall: see `Recall`; None where there is nothing that could be kept.
     """
 
     name: str
@@ -97,6 +116,7 @@ class FrameStage:
     writes: tuple[str, ...]
     settings: Callable[[Workspace, RoundContext], Settings]
     function: Callable[[Workspace, RoundContext], FrameFunction]
+    recall: Recall | None = None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,9 @@
 
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from curate.datasets.kitti import write_calibration
 from curate.datasets.kitti_labels import from_annotations, write_objects
 from curate.detections import Annotations, Detections
 from curate.frames import Calibration, Frame
+from curate.priors.base import Measured
 from curate.segmenters.base import SemanticMap
 
 IMAGE_SIZE = (120, 40)
@@ -126,3 +129,52 @@ class ToySegmenter:
         class_ids = np.ones((height, width), dtype=np.uint8)
         class_ids[:, width // 2 :] = 2
         return SemanticMap(class_ids, {"Car": (1,), "Pedestrian": (2,), "Cyclist": (1, 2)})
+
+
+@dataclass(frozen=True)
+class ToyEvidence:
+    """What the toy prior says: columns of the point prior's table."""
+
+    points: np.ndarray
+    points_threshold: np.ndarray
+    rho_diff: np.ndarray
+
+    @property
+    def rho(self) -> np.ndarray:
+        """(n,) rho_diff."""
+        return self.rho_diff
+
+
+@dataclass(frozen=True)
+class ToyPrior:
+    """A user's own prior in the place of the point prior: it counts all points of the frame.
+
+    Attributes:
+        plenty: so many are enough.
+    """
+
+    plenty: float = 1000.0
+    name: ClassVar[str] = "toy"
+    rho_column: ClassVar[str] = "rho_diff"
+    measured_columns: ClassVar[tuple[str, ...]] = ("points",)
+    needs_image: ClassVar[bool] = False
+
+    def measure(self, frame: Frame, detections: Detections) -> Measured:
+        """The points of the frame, for each label."""
+        return {"points": np.full(len(detections), len(frame.points))}
+
+    def rate(self, detections: Detections, measured: Measured) -> ToyEvidence:
+        """Their share of plenty."""
+        points = measured["points"]
+        rho = np.minimum(points / self.plenty, 1.0)
+        return ToyEvidence(points, np.full(len(detections), self.plenty), rho)
+
+    def score(self, frame: Frame, detections: Detections) -> ToyEvidence:
+        """Both."""
+        return self.rate(detections, self.measure(frame, detections))
+
+
+class UnstorablePrior(ToyPrior):
+    """A prior whose trust has no place in the tables."""
+
+    rho_column: ClassVar[str] = "rho_map"

@@ -14,6 +14,7 @@ from curate.detections import Annotations, Detections
 from curate.errors import ConfigError
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
+from curate.priors.base import Measured
 
 logger = logging.getLogger(__name__)
 
@@ -155,6 +156,7 @@ class PointPrior:
     thresholds: Mapping[str, float]
     name: ClassVar[str] = "points"
     rho_column: ClassVar[str] = "rho_diff"
+    measured_columns: ClassVar[tuple[str, ...]] = ("points",)
     needs_image: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -165,15 +167,27 @@ class PointPrior:
                     f"point prior: the threshold of {category} must be positive, not {value}"
                 )
 
-    def score(self, frame: Frame, detections: Detections) -> PointEvidence:
-        """Count the points of the frame in each box and compare with the threshold.
+    def measure(self, frame: Frame, detections: Detections) -> Measured:
+        """Count the points of the frame in each box."""
+        counts = count_points_in_boxes(frame.points, detections.boxes)
+        return {"points": np.asarray(counts, dtype=np.int64)}
+
+    def rate(self, detections: Detections, measured: Measured) -> PointEvidence:
+        """Compare the counts with the threshold.
 
         Raises:
             ConfigError: a detection's category has no threshold.
         """
-        threshold = self._threshold_per_label(detections.categories)
-        points = np.asarray(count_points_in_boxes(frame.points, detections.boxes), dtype=np.int64)
+        points, threshold = measured["points"], self._threshold_per_label(detections.categories)
         return PointEvidence(points, threshold, np.minimum(points, threshold) / threshold)
+
+    def score(self, frame: Frame, detections: Detections) -> PointEvidence:
+        """Both.
+
+        Raises:
+            ConfigError: a detection's category has no threshold.
+        """
+        return self.rate(detections, self.measure(frame, detections))
 
     def _threshold_per_label(self, categories: np.ndarray) -> np.ndarray:
         """(n,) float64."""

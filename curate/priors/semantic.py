@@ -13,6 +13,7 @@ from curate.detections import Detections
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
 from curate.geometry.projection import image_rectangles
+from curate.priors.base import Measured
 from curate.segmenters.base import Segmenter, SemanticMap
 
 Mean = Literal["geometric", "product", "arithmetic"]
@@ -69,30 +70,32 @@ class SemanticPrior:
     """rho_anno = sqrt(s * S / A) with the semantic map of a segmenter.
 
     Attributes:
-        segmenter: names the class of every pixel.
+        segmenter: names the class of every pixel; None for a prior that only rates.
         settings: see `SemanticSettings`.
     """
 
-    segmenter: Segmenter
+    segmenter: Segmenter | None
     settings: SemanticSettings = _DEFAULT
     name: ClassVar[str] = "semantic"
     rho_column: ClassVar[str] = "rho_anno"
+    measured_columns: ClassVar[tuple[str, ...]] = ("mask_pixels", "box_pixels")
 
     @property
     def needs_image(self) -> bool:
         """Whether the segmenter reads the image."""
-        return self.segmenter.needs_image
+        return self.segmenter is not None and self.segmenter.needs_image
 
-    def score(self, frame: Frame, detections: Detections) -> SemanticEvidence:
-        """Segment the frame and look at each box's rectangle.
+    def measure(self, frame: Frame, detections: Detections) -> Measured:
+        """Segment the frame and look at each box's rectangle; no label, no segmentation.
 
         Raises:
-            ConfigError: the segmenter has no classes for a detection's category.
+            ConfigError: there is no segmenter, or it has no classes for a detection's category.
             ModelError: the semantic map is not in the size of the image.
         """
+        if self.segmenter is None:
+            raise ConfigError("semantic prior: pixels cannot be counted without a segmenter")
         if len(detections) == 0:
-            nothing = np.zeros(0, dtype=np.int64)
-            return SemanticEvidence(nothing, nothing, np.zeros(0))
+            return dict.fromkeys(self.measured_columns, np.zeros(0, dtype=np.int64))
         semantic_map = self.segmenter.segment(frame)
         width, height = frame.image_size
         if semantic_map.class_ids.shape != (height, width):
@@ -102,9 +105,23 @@ class SemanticPrior:
                 f"{height} pixels; make the segmenter answer in the size of the image",
             )
         rectangles = image_rectangles(detections.boxes, frame.calibration, frame.image_size)
-        mask_pixels, box_pixels = count_pixels(rectangles, detections.categories, semantic_map)
+        counts = count_pixels(rectangles, detections.categories, semantic_map)
+        return dict(zip(self.measured_columns, counts, strict=True))
+
+    def rate(self, detections: Detections, measured: Measured) -> SemanticEvidence:
+        """Equation 9."""
+        mask_pixels, box_pixels = (measured[name] for name in self.measured_columns)
         rho = semantic_trust(detections.scores, mask_pixels, box_pixels, self.settings)
         return SemanticEvidence(mask_pixels, box_pixels, rho)
+
+    def score(self, frame: Frame, detections: Detections) -> SemanticEvidence:
+        """Both.
+
+        Raises:
+            ConfigError: there is no segmenter, or it has no classes for a detection's category.
+            ModelError: the semantic map is not in the size of the image.
+        """
+        return self.rate(detections, self.measure(frame, detections))
 
 
 def semantic_trust(

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+
 from curate.detections import Detections
 from curate.errors import CurateError
 
@@ -17,11 +19,19 @@ FrameRows = Mapping[str, list[tuple[Any, ...]]]
 
 @dataclass(frozen=True)
 class FrameJob:
-    """One frame to work on, with what earlier stages found out about it."""
+    """One frame to work on, with what is known of it.
+
+    Attributes:
+        frame_id: its key.
+        frame: its name.
+        predictions: what predict found, for stages that read it.
+        measured: what the stage itself once measured, where that still holds.
+    """
 
     frame_id: int
     frame: str
     predictions: Detections | None = None
+    measured: Mapping[str, np.ndarray] | None = None
 
 
 class FrameFunction(Protocol):

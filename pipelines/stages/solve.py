@@ -9,10 +9,10 @@ from curate.weighting.base import Evidence, Weights
 from db import bulk
 from pipelines.assembly import open_policy
 from pipelines.progress import Progress
+from pipelines.registry import PRIORS
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
+from pipelines.stages.score import table_of
 from pipelines.workspace import Workspace
-
-RHO = {"points": ("point_prior", "rho_diff"), "semantic": ("semantic_prior", "rho_anno")}
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
@@ -65,7 +65,7 @@ def read_evidence(
         score=np.array(score, dtype=np.float64),
         loss=np.array(loss, dtype=np.float64),
         rho={
-            RHO[prior][1]: np.array(column, dtype=np.float64)
+            PRIORS.load(prior).rho_column: np.array(column, dtype=np.float64)
             for prior, column in zip(priors, rho, strict=True)
         },
     )
@@ -73,13 +73,15 @@ def read_evidence(
 
 def _evidence_query(round_number: int, priors: Sequence[str]) -> Select[tuple[object, ...]]:
     prediction, consistency = bulk.table("prediction"), bulk.table("consistency")
-    tables = [bulk.table(RHO[prior][0]) for prior in priors]
+    tables = [bulk.table(table_of(prior)) for prior in priors]
     source = prediction
     for table in (consistency, *tables):
         same = and_(*(table.c[key] == prediction.c[key] for key in ("round", "frame_id", "k")))
         source = source.outerjoin(table, same)  # type: ignore[assignment]
     columns = [prediction.c.frame_id, prediction.c.k, prediction.c.category, prediction.c.score]
-    rho = [table.c[RHO[prior][1]] for prior, table in zip(priors, tables, strict=True)]
+    rho = [
+        table.c[PRIORS.load(prior).rho_column] for prior, table in zip(priors, tables, strict=True)
+    ]
     return (
         select(*columns, consistency.c.loss, *rho)
         .select_from(source)

@@ -14,7 +14,7 @@ from pipelines.config import make_config
 from pipelines.executors.base import FrameJob
 from pipelines.setup import initialise
 from pipelines.stage import RoundContext, Teacher
-from pipelines.stages import points, predict, repredict, semantic
+from pipelines.stages import predict, repredict, score
 
 pytestmark = pytest.mark.benchmark(timer=cpu_seconds)
 
@@ -154,7 +154,7 @@ def bench_repredict(benchmark, workspace, context, guesses):
 
 def bench_points(benchmark, workspace, context, guesses):
     """Read, count the points in the boxes."""
-    stage = points.function(workspace, context)
+    stage = score.stage("points").function(workspace, context)
     stage.open()
     rows = of_jobs(benchmark, guesses, stage, "score --prior points")
     assert len(rows["point_prior"]) > CLUTTER
@@ -162,7 +162,7 @@ def bench_points(benchmark, workspace, context, guesses):
 
 def bench_semantic(benchmark, workspace, context, guesses):
     """Read the frame and its saved semantic map, count the pixels in the boxes."""
-    stage = semantic.function(workspace, context)
+    stage = score.stage("semantic").function(workspace, context)
     stage.open()
     rows = of_jobs(benchmark, guesses, stage, "score --prior semantic, saved maps")
     assert len(rows["semantic_prior"]) > CLUTTER

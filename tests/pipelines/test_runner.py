@@ -3,15 +3,19 @@
 from pathlib import Path
 
 import pytest
+import toys
 
 from curate.errors import WorkspaceError
+from curate.priors.points import PointPrior
+from curate.priors.semantic import SemanticPrior
 from pipelines import plan
 from pipelines.executors.serial import SerialExecutor
 from pipelines.progress import Silent
 from pipelines.round import ROUND, stage
 from pipelines.rounds import open_round
-from pipelines.runner import run_frames, run_round
+from pipelines.runner import Report, run_frames, run_round
 from pipelines.schedule import run_all
+from pipelines.setup import initialise
 from pipelines.workspace import Workspace
 
 FRAME_STAGES = ("predict", "repredict", "points", "semantic")
@@ -95,6 +99,65 @@ def test_what_left_with_its_prediction_is_made_again(workspace: Workspace) -> No
     assert count(workspace, "weight") == 0
     run(workspace)
     assert dump(workspace) == before
+
+
+@pytest.mark.parametrize(
+    ("section", "changes", "prior", "rates"),
+    [
+        ("semantic", {"mean": "product"}, "semantic", True),
+        ("semantic", {"outside": "drop"}, "semantic", True),
+        ("points", {"statistic": "fixed", "fixed": 31.0}, "points", True),
+        ("segmenter", {"classes": "coco"}, "semantic", False),
+    ],
+)
+def test_another_formula_is_applied_to_what_was_measured(
+    workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    section: str, changes: dict, prior: str, rates: bool,
+) -> None:  # fmt: skip
+    """No point or pixel is counted again, and the rows are those of a run from the start."""
+    run(workspace)
+    whole = initialise(tmp_path / "whole", workspace.config, "0.25", "")
+    run(with_setting(whole, section, **changes))
+    measured: list[str] = []
+    for kind in (PointPrior, SemanticPrior):
+        monkeypatch.setattr(kind, "measure", counted(kind.measure, measured))
+    monkeypatch.setattr(toys.ToySegmenter, "segment", counted(toys.ToySegmenter.segment, measured))
+    assert run(with_setting(workspace, section, **changes))[prior] == 6
+    assert bool(measured) is not rates
+    assert dump(workspace) == dump(whole)
+
+
+def counted(method, calls: list[str]):
+    """The method, which also leaves its name in a list."""
+
+    def call(*arguments):
+        calls.append(method.__qualname__)
+        return method(*arguments)
+
+    return call
+
+
+def test_a_frame_that_failed_is_measured_however_the_formula_changes(
+    workspace: Workspace, toy_kitti: Path
+) -> None:
+    """What was never measured cannot be recalled."""
+    name = next(iter(workspace.frames("unlabeled")))
+    path = toy_kitti / "training" / "image_2" / f"{name}.png"
+    whole = path.read_bytes()
+    run_frames_of(workspace, "predict")
+    path.write_bytes(whole[:-30])
+    assert run_frames_of(workspace, "semantic").failed == 1
+    changed = with_setting(workspace, "semantic", mean="product")
+    assert run_frames_of(changed, "semantic").failed == 1
+    path.write_bytes(whole)
+    assert run_frames_of(changed, "semantic").done == 1
+    assert count(workspace, "semantic_prior") == 18
+
+
+def run_frames_of(workspace: Workspace, name: str) -> Report:
+    """One frame stage of the first round."""
+    context = open_round(workspace, 1)
+    return run_frames(workspace, context, stage(name), SerialExecutor(), Silent())
 
 
 def test_another_detector_makes_everything_stale(workspace: Workspace, weights_file: Path) -> None:
@@ -197,8 +260,6 @@ def test_the_rows_do_not_depend_on_the_executor(
     workspace: Workspace, tmp_path: Path, toy_kitti: Path
 ) -> None:
     """Two worker processes write what one serial run writes, to the last bit."""
-    from pipelines.setup import initialise
-
     run(workspace)
     other = initialise(tmp_path / "other", workspace.config, "0.25", "")
     run(with_setting(other, "run", executor="process", workers=2))

@@ -1,0 +1,77 @@
+"""Priors as stages: the shipped ones, and those that a user brings."""
+
+import pytest
+from sqlalchemy import text
+
+from curate.errors import ConfigError
+from pipelines.progress import Silent
+from pipelines.registry import PRIORS
+from pipelines.round import ROUND, active, stage
+from pipelines.schedule import run_all
+from pipelines.workspace import Workspace
+
+OWN = "toys:ToyPrior"
+
+
+def run(workspace: Workspace) -> dict[str, int]:
+    """Runs everything; frames (or round stages) done anew, by stage."""
+    return {report.stage: report.done for report in run_all(workspace, None, Silent())}
+
+
+def answers(workspace: Workspace) -> list[tuple]:
+    """What the view shows of the point prior and of what follows from it."""
+    columns = "frame, k, points, points_threshold, rho_diff, rho_det, weight"
+    with workspace.database.reading() as connection:
+        query = text(f"SELECT {columns} FROM weighted_labels ORDER BY frame, k")
+        return list(map(tuple, connection.execute(query)))
+
+
+def test_a_prior_of_the_users_own_takes_the_place_of_another(workspace: Workspace) -> None:
+    """Named as module:Class, with an option; its evidence is stored like that of the other."""
+    options = {OWN: {"plenty": 5000.0}}
+    own = workspace.with_settings("run", priors=(OWN, "semantic"), prior_options=options)
+    assert run(own)[OWN] == 6
+    rows = answers(own)
+    assert len(rows) == 18
+    assert {row[3] for row in rows} == {5000.0}
+    assert all(row[4] == pytest.approx(row[2] / 5000) for row in rows)
+
+
+def test_priors_that_take_turns_do_not_pass_for_each_other(workspace: Workspace) -> None:
+    """Both fill the same table: back at the first, its evidence is gathered again."""
+    run(workspace)
+    before = answers(workspace)
+    own = workspace.with_settings("run", priors=(OWN, "semantic"))
+    done = run(own)
+    assert (done[OWN], done["semantic"]) == (6, 0)
+    assert answers(own) != before
+    assert run(workspace)["points"] == 6
+    assert answers(workspace) == before
+    assert set(run(workspace).values()) == {0}
+
+
+def test_two_priors_for_one_place_are_refused() -> None:
+    """The error names both and the table."""
+    with pytest.raises(ConfigError, match=r"points and toys:ToyPrior.*point_prior"):
+        active(("points", OWN))
+
+
+def test_evidence_without_a_place_is_refused() -> None:
+    """The error names what can be stored."""
+    with pytest.raises(ConfigError, match=r"rho_map.*rho_diff and rho_anno"):
+        active(("toys:UnstorablePrior",))
+
+
+def test_an_unknown_prior_is_refused() -> None:
+    """A misspelt name is not passed over."""
+    with pytest.raises(ConfigError, match="unknown prior 'pionts': use one of points, semantic"):
+        active(("pionts",))
+
+
+def test_the_shipped_round_has_a_stage_per_registered_prior() -> None:
+    """In the order of the registry, between repredict and solve."""
+    names = [each.name for each in ROUND]
+    assert names[names.index("repredict") + 1 : names.index("solve")] == list(PRIORS.classes)
+    assert set(active(("semantic",))) < set(ROUND)
+    assert stage("points").reads == ("frame", "ground_truth", "prediction")
+    assert stage("semantic").reads == ("frame", "prediction")
