@@ -2,7 +2,7 @@
 
 from sqlalchemy import Connection, column, table, text
 
-from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS
+from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 
 # The view, to select from.
 WEIGHTED_LABELS = table("weighted_labels", *map(column, WEIGHTED_LABEL_COLUMNS))

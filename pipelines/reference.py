@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import db.models
-from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS
+from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db.models import Base
 from pipelines.config import Config, write_config
 from pipelines.graph import as_mermaid

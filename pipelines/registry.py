@@ -105,6 +105,13 @@ POLICIES = Registry(
         "baseline": "curate.weighting.baseline:Baseline",
     },
 )
+EXPORTERS = Registry(
+    "exporter",
+    {
+        "sqlite": "curate.exporters.sqlite:SqliteExporter",
+        "kitti": "curate.exporters.kitti:KittiExporter",
+    },
+)
 EXECUTORS = Registry(
     "executor",
     {

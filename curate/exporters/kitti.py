@@ -13,16 +13,18 @@ DIRECTORY/export.json marks the folder as an export; nothing but a former export
 
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
 from curate.datasets.kitti_labels import DONT_CARE, from_detections, write_objects
 from curate.detections import Detections
 from curate.errors import ConfigError, DataError
+from curate.exporters.base import BOX_COLUMNS, WEIGHTED_LABEL_COLUMNS, LabelSet, Row
 from curate.frames import Calibration
 
 LastField = Literal["weight", "score", "none"]
@@ -48,6 +50,21 @@ class WeightedFrame:
     weights: np.ndarray
     calibration: Calibration
     image_size: tuple[int, int]
+
+
+class KittiExporter:
+    """An `Exporter` that writes KITTI label files of the unlabeled frames."""
+
+    name: ClassVar[str] = "kitti"
+    suffix: ClassVar[str] = ""
+
+    def write(self, path: Path, labels: LabelSet) -> int:
+        """See `curate.exporters.base.Exporter`.
+
+        Raises:
+            DataError: the calibration or the image of a frame cannot be read.
+        """
+        return export_kitti(path, _weighted_frames(labels))
 
 
 def export_kitti(
@@ -79,6 +96,24 @@ def export_kitti(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return count
+
+
+def _weighted_frames(labels: LabelSet) -> Iterator[WeightedFrame]:
+    """The unlabeled frames with their labels."""
+    found: dict[str, list[Row]] = {row[0]: [] for row in labels.frames if row[1] == "unlabeled"}
+    names = ("category", "score", *BOX_COLUMNS, "weight")
+    wanted = itemgetter(*map(WEIGHTED_LABEL_COLUMNS.index, names))
+    for row in labels.labels:
+        found[row[1]].append(wanted(row))
+    for frame_id, rows in found.items():
+        frame = labels.read(frame_id)
+        yield WeightedFrame(
+            frame_id,
+            Detections.from_rows([row[:-1] for row in rows]),
+            np.array([row[-1] for row in rows], dtype=np.float64),
+            frame.calibration,
+            frame.image_size,
+        )
 
 
 def _write_frames(folder: Path, frames: Iterable[WeightedFrame], last_field: LastField) -> int:

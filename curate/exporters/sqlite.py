@@ -10,26 +10,20 @@ import os
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
-from curate.errors import DataError, LeakageError
+from curate.errors import ConfigError, DataError, LeakageError
+from curate.exporters.base import (
+    FRAME_COLUMNS,
+    GROUND_TRUTH_COLUMNS,
+    WEIGHTED_LABEL_COLUMNS,
+    LabelFileDescription,
+    LabelSet,
+    named,
+)
 
 FORMAT_VERSION = 1
-
-WEIGHTED_LABEL_COLUMNS = (
-    "round", "frame", "k", "category", "x", "y", "z", "length", "width", "height", "yaw",
-    "score", "loss", "points", "points_threshold", "rho_diff", "mask_pixels", "box_pixels",
-    "rho_anno", "rho_det", "lambda_u", "policy", "weight",
-)  # fmt: skip
-GROUND_TRUTH_COLUMNS = (
-    "frame", "k", "category", "x", "y", "z", "length", "width", "height", "yaw",
-    "truncated", "occluded",
-)  # fmt: skip
-FRAME_COLUMNS = ("frame", "split", "points", "image", "calibration")
-
-# How many frames an error names.
-_NAMED_FRAMES = 5
 
 _TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
@@ -95,37 +89,23 @@ ANALYZE;
 """
 
 
-@dataclass(frozen=True)
-class LabelFileDescription:
-    """What the labels are about; becomes the table `meta`.
+class SqliteExporter:
+    """An `Exporter` that writes one SQLite file."""
 
-    Attributes:
-        dataset: name of the data set, as in the registry.
-        root: folder that the paths of the frames are relative to.
-        categories: the categories to be learned, in the detector's order.
-        round: round that made the labels.
-        policy: policy that weighted them.
-        code_version: of curate.
-    """
+    name: ClassVar[str] = "sqlite"
+    suffix: ClassVar[str] = ".sqlite"
 
-    dataset: str
-    root: Path
-    categories: tuple[str, ...]
-    round: int
-    policy: str
-    code_version: str
-
-    def as_meta(self) -> dict[str, str]:
-        """The rows of `meta`."""
-        return {
-            "format_version": str(FORMAT_VERSION),
-            "dataset": self.dataset,
-            "root": str(self.root),
-            "categories": json.dumps(list(self.categories)),
-            "round": str(self.round),
-            "policy": self.policy,
-            "code_version": self.code_version,
-        }
+    def write(self, path: Path, labels: LabelSet) -> int:
+        """See `curate.exporters.base.Exporter`."""
+        _refuse_foreign(path)
+        write_labels(
+            path,
+            description=labels.description,
+            frames=labels.frames,
+            ground_truth=labels.ground_truth,
+            labels=labels.labels,
+        )
+        return len(labels.labels)
 
 
 def write_labels(
@@ -185,7 +165,7 @@ def _fill(
     columns = (FRAME_COLUMNS, GROUND_TRUTH_COLUMNS, WEIGHTED_LABEL_COLUMNS)
     last: list[tuple] = [()]
     try:
-        connection.executemany("INSERT INTO meta VALUES (?, ?)", description.as_meta().items())
+        connection.executemany("INSERT INTO meta VALUES (?, ?)", _meta(description).items())
         for table, names, table_rows in zip(
             ("frame", "ground_truth", "label"), columns, rows, strict=True
         ):
@@ -207,6 +187,30 @@ def _fill(
         raise DataError(f"{path}: a row does not fit its table: {reason}") from None
     except sqlite3.OperationalError as error:
         raise DataError(f"{path}: cannot be written: {error}") from None
+
+
+def _meta(description: LabelFileDescription) -> dict[str, str]:
+    """The rows of `meta`."""
+    return {
+        "format_version": str(FORMAT_VERSION),
+        "dataset": description.dataset,
+        "root": str(description.root),
+        "categories": json.dumps(list(description.categories)),
+        "round": str(description.round),
+        "policy": description.policy,
+        "code_version": description.code_version,
+    }
+
+
+def _refuse_foreign(path: Path) -> None:
+    """ConfigError where something would be lost that is no former export."""
+    if not path.exists():
+        return
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as former:
+            former.execute("SELECT value FROM meta WHERE key = 'format_version'").fetchone()[0]
+    except (sqlite3.Error, TypeError):
+        raise ConfigError(f"{path}: is there and is no former export; name another file") from None
 
 
 def _remembered(rows: Iterable[tuple], last: list[tuple]) -> Iterator[tuple]:
@@ -231,6 +235,4 @@ def _strangers(connection: sqlite3.Connection, table: str, split: str) -> str:
         f"SELECT DISTINCT frame FROM {table} WHERE frame NOT IN "  # noqa: S608
         "(SELECT frame FROM frame WHERE split = ?) ORDER BY frame"
     )
-    names = [row[0] for row in connection.execute(query, (split,))]
-    more = f" and {len(names) - _NAMED_FRAMES} more" if len(names) > _NAMED_FRAMES else ""
-    return ", ".join(names[:_NAMED_FRAMES]) + more
+    return named(row[0] for row in connection.execute(query, (split,)))

@@ -10,10 +10,12 @@ from pipelines.commands.stages import run_round_command
 
 
 def export(
-    file_format: Annotated[str, typer.Option("--format", help="sqlite or kitti.")] = "sqlite",
+    file_format: Annotated[
+        str, typer.Option("--format", help="sqlite, kitti or module:Class.")
+    ] = "sqlite",
     output: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Folder for --format kitti; default: exports/kitti of the workspace."),
+        typer.Option(help="File or folder to write; default: in exports/ of the workspace."),
     ] = None,
     policy: PolicyOption = None,
     round_number: RoundOption = None,
@@ -24,23 +26,21 @@ def export(
 
     Example: curate export --format sqlite
     """
-    from curate.errors import ConfigError
-
     if file_format == "sqlite" and output is None:
         run_round_command("export", workspace, round_number, policy, as_json=as_json)
-    elif file_format == "kitti":
-        from pipelines.commands.options import open_workspace
-        from pipelines.rounds import open_round
-        from pipelines.stages.export import export_kitti_files
+        return
+    from pipelines.commands.options import open_workspace
+    from pipelines.registry import EXPORTERS
+    from pipelines.rounds import open_round
+    from pipelines.stages.export import export_as
 
-        opened = open_workspace(workspace)
-        context = open_round(opened, round_number)
-        chosen = policy or opened.config.solve.policy
-        folder = output or opened.root / "exports" / "kitti"
-        labels = export_kitti_files(opened, context.number, chosen, folder)
-        typer.echo(f"{labels} labels in {folder}")
-    else:
-        raise ConfigError(f"--format {file_format}: use sqlite (without --output) or kitti")
+    exporter = EXPORTERS.build(file_format, offered={}, options={})
+    opened = open_workspace(workspace)
+    path = output or opened.root / "exports" / f"{exporter.name}{exporter.suffix}"
+    context = open_round(opened, round_number)
+    chosen = policy or opened.config.solve.policy
+    labels = export_as(opened, exporter, context.number, chosen, path)
+    typer.echo(f"{labels} labels in {path}")
 
 
 def register(app: typer.Typer) -> None:

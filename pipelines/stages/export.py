@@ -1,20 +1,20 @@
 """export: the weighted labels of a round as files that trainers read."""
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from sqlalchemy import Connection, select
 
 import curate
-from curate.exporters.kitti import WeightedFrame, export_kitti
-from curate.exporters.sqlite import LabelFileDescription, write_labels
+from curate.errors import WorkspaceError
+from curate.exporters.base import Exporter, LabelFileDescription, LabelSet
+from curate.exporters.sqlite import SqliteExporter
 from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
-from pipelines.labels import read_labels
 from pipelines.progress import Progress
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.workspace import Workspace
@@ -45,11 +45,33 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
 
 
 def write_label_file(workspace: Workspace, path: Path, round_number: int, policy: str) -> int:
-    """X_l with its ground truth, and the labels that a policy weighted; none for policy ''.
+    """The file that the trainer reads, with the labels that a policy weighted; none for policy "".
 
     Returns:
         How many labels were written.
     """
+    return SqliteExporter().write(path, label_set(workspace, round_number, policy))
+
+
+def export_as(
+    workspace: Workspace, exporter: Exporter, round_number: int, policy: str, path: Path
+) -> int:
+    """Writes a policy's labels in some format; returns how many.
+
+    Raises:
+        WorkspaceError: the policy has weighted nothing in that round.
+    """
+    labels = label_set(workspace, round_number, policy)
+    if not labels.labels:
+        raise WorkspaceError(
+            f"round {round_number} has no labels weighted by {policy}; "
+            f"run `curate solve --policy {policy}`"
+        )
+    return exporter.write(path, labels)
+
+
+def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:
+    """X_l with its ground truth, and X_u with the labels that a policy weighted in a round."""
     description = LabelFileDescription(
         dataset=workspace.config.dataset.kind,
         root=workspace.config.dataset.root,
@@ -59,18 +81,14 @@ def write_label_file(workspace: Workspace, path: Path, round_number: int, policy
         code_version=curate.__version__,
     )
     with workspace.database.reading() as connection:
-        labels = label_rows(connection, round_number, policy)
-        write_labels(
-            path,
-            description=description,
-            frames=_frames(connection, {label[1] for label in labels}),
-            ground_truth=_ground_truth(connection),
-            labels=labels,
-        )
-    return len(labels)
+        labels = _labels(connection, round_number, policy)
+        frames = _frames(connection, {label[1] for label in labels})
+        truth = _ground_truth(connection)
+    read = partial(workspace.dataset.read, points=False)
+    return LabelSet(description, frames, truth, labels, read)
 
 
-def label_rows(connection: Connection, round_number: int, policy: str) -> Sequence[bulk.Row]:
+def _labels(connection: Connection, round_number: int, policy: str) -> Sequence[bulk.Row]:
     """The rows of `weighted_labels` of a round and policy."""
     labels = WEIGHTED_LABELS.c
     query = (
@@ -81,14 +99,17 @@ def label_rows(connection: Connection, round_number: int, policy: str) -> Sequen
     return bulk.select(connection, query)
 
 
-def _frames(connection: Connection, with_labels: set[str]) -> Iterator[tuple[Any, ...]]:
-    """Labeled frames, and the unlabeled ones that have labels."""
+def _frames(connection: Connection, with_labels: set[str]) -> list[bulk.Row]:
+    """All labeled frames, with or without objects, and the unlabeled ones that have labels.
+
+    An unlabeled frame in which the teacher found nothing is left out: no weight vouches for its
+    emptiness, and as background it would teach what the teacher has missed.
+    """
     frame = bulk.table("frame")
     paths = (frame.c.points_path, frame.c.image_path, frame.c.calibration_path)
     query = select(frame.c.frame, frame.c.split, *paths).where(frame.c.split != "val")
-    for row in bulk.select(connection, query.order_by(frame.c.frame)):
-        if row[1] == "labeled" or row[0] in with_labels:
-            yield row
+    rows = bulk.select(connection, query.order_by(frame.c.frame))
+    return [row for row in rows if row[1] == "labeled" or row[0] in with_labels]
 
 
 def _ground_truth(connection: Connection) -> list[bulk.Row]:
@@ -101,16 +122,3 @@ def _ground_truth(connection: Connection) -> list[bulk.Row]:
         .order_by(frame.c.frame, truth.c.k)
     )
     return list(bulk.select(connection, query))
-
-
-def export_kitti_files(workspace: Workspace, round_number: int, policy: str, folder: Path) -> int:
-    """Writes a policy's labels as KITTI label files; returns how many."""
-
-    def frames() -> Iterator[WeightedFrame]:
-        for found in read_labels(workspace, round_number, policy):
-            frame = workspace.dataset.read(found.frame, points=False)
-            yield WeightedFrame(
-                found.frame, found.labels, found.weights, frame.calibration, frame.image_size
-            )
-
-    return export_kitti(folder, frames())

@@ -12,7 +12,7 @@ from sqlalchemy import inspect
 
 import db
 from curate.errors import DatabaseError, LeakageError
-from curate.exporters.sqlite import WEIGHTED_LABEL_COLUMNS
+from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db import bulk
 from db.models import Base
 from db.session import Database

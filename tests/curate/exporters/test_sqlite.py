@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from curate.errors import DataError, LeakageError
-from curate.exporters.sqlite import LabelFileDescription, write_labels
+from curate.exporters.base import LabelFileDescription
+from curate.exporters.sqlite import write_labels
 
 DESCRIPTION = LabelFileDescription(
     "kitti", Path("/data/kitti"), ("Car", "Cyclist"), 2, "pspsl", "1"

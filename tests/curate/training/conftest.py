@@ -7,7 +7,8 @@ import pytest
 
 from curate.datasets.kitti import KittiDataset
 from curate.detectors.pillars import presets
-from curate.exporters.sqlite import LabelFileDescription, write_labels
+from curate.exporters.base import LabelFileDescription
+from curate.exporters.sqlite import write_labels
 
 NAMES = ("Car", "Pedestrian", "Cyclist")
 

@@ -64,13 +64,15 @@ def test_neighbour_categories_are_ignored_and_strangers_left_out(make_labels):
     assert sorted(sample.weights.tolist()) == [0.0, 1.0]
 
 
-def test_a_frame_without_boxes_is_a_sample_too(make_labels):
-    """Frames on which nothing was found teach what background looks like."""
-    path = make_labels(labeled=1, unlabeled=1)
-    change(path, "DELETE FROM label")
+def test_a_labeled_frame_without_objects_is_a_sample_too(make_labels):
+    """It teaches what background looks like."""
+    path = make_labels(labeled=2)
+    change(path, "DELETE FROM ground_truth WHERE frame = '000001'")
     sample = WeightedLabels(path)[1]
+    assert sample.labeled
     assert sample.boxes.shape == (0, 7)
     assert sample.weights.shape == sample.categories.shape == (0,)
+    assert len(sample.points) > 0
 
 
 def test_a_reader_of_the_callers_own(make_labels):

@@ -2,6 +2,8 @@
 
 import logging
 import pickle
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -68,6 +70,20 @@ def test_a_training_learns_its_frames(make_labels, tiny, toy_kitti, tmp_path):
         for box, category in zip(truth.boxes, truth.categories, strict=True):
             away = found.boxes[found.categories == category] - box
             assert np.abs(away[:, :2]).max(axis=1).min() < 0.4, (frame_id, category)
+
+
+def test_a_labeled_frame_without_objects_is_all_background(make_labels, tiny, tmp_path):
+    """It takes its turns in the batches, and every cell of it says that there is no object."""
+    labels, settings = make_labels(labeled=2), quick(tiny, pasted=0)
+    with closing(sqlite3.connect(labels)) as connection:
+        connection.execute("DELETE FROM ground_truth WHERE frame = '000001'")
+        connection.commit()
+    targets = Batches(WeightedLabels(labels), settings)[0].targets
+    empty, full = targets.heatmap.amax(dim=(1, 2, 3)).argsort().tolist()
+    assert targets.heatmap[empty].max() == 0
+    assert targets.background[empty].min() == 1
+    assert targets.heatmap[full].max() == 1
+    assert train(labels, tmp_path / "out.safetensors", settings).labeled_frames == 2
 
 
 def test_a_killed_training_ends_with_the_same_weights(make_labels, tiny, tmp_path):

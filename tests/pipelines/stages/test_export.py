@@ -1,0 +1,103 @@
+"""export: which frames are handed to trainers, and in which formats."""
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from pipelines_cli import Curate
+from sqlalchemy import text
+
+from curate.errors import ConfigError, WorkspaceError
+from curate.training.labels import WeightedLabels
+from pipelines.progress import Silent
+from pipelines.schedule import run_all
+from pipelines.workspace import Workspace
+
+
+def run(workspace: Workspace) -> Path:
+    """Runs everything; gives the exported file."""
+    list(run_all(workspace, None, Silent()))
+    return workspace.root / "exports" / "labels.sqlite"
+
+
+def first(workspace: Workspace, split: str) -> str:
+    """The first frame of a split."""
+    return next(iter(workspace.frames(split)))
+
+
+def test_a_labeled_frame_without_objects_is_exported(workspace: Workspace) -> None:
+    """It is known to be empty, so its background is worth learning."""
+    name = first(workspace, "labeled")
+    key = workspace.frames("labeled")[name]
+    with workspace.database.writing() as connection:
+        connection.execute(text(f"DELETE FROM ground_truth WHERE frame_id = {key}"))
+    samples = {sample.frame_id: sample for sample in WeightedLabels(run(workspace))}
+    assert len(samples) == 8
+    assert samples[name].labeled
+    assert len(samples[name].boxes) == 0
+
+
+def test_an_unlabeled_frame_without_predictions_is_left_out(
+    workspace: Workspace, toy_kitti: Path
+) -> None:
+    """No weight says how sure it is that the frame is empty."""
+    name = first(workspace, "unlabeled")
+    (toy_kitti / "training" / "velodyne" / f"{name}.bin").write_bytes(b"")
+    labels = WeightedLabels(run(workspace))
+    assert len(labels) == 7
+    assert name not in labels.frame_ids
+
+
+def test_an_unlabeled_frame_whose_labels_all_weigh_nothing_is_exported(
+    workspace: Workspace,
+) -> None:
+    """Its labels are regions to leave out; what is around them is background."""
+    strict = workspace.with_settings(
+        "solve", policy="threshold", options={"threshold": {"threshold": 1.0}}
+    )
+    samples = [sample for sample in WeightedLabels(run(strict)) if not sample.labeled]
+    assert len(samples) == 6
+    assert all(len(sample.boxes) == 3 for sample in samples)
+    assert any(sample.ignored.all() for sample in samples)
+
+
+def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_path: Path) -> None:
+    """To the workspace or to a place of the user's; unknown formats name the known."""
+    run(workspace)
+    folder = ("-w", workspace.root)
+    code, out, _ = curate("export", "--format", "kitti", *folder)
+    assert (code, out) == (0, f"18 labels in {workspace.root}/exports/kitti\n")
+    files = list((workspace.root / "exports" / "kitti" / "label_2").iterdir())
+    assert sum(len(path.read_text().splitlines()) for path in files) == 18
+    copy = tmp_path / "copy.sqlite"
+    code, out, _ = curate("export", "--output", copy, *folder)
+    assert (code, out) == (0, f"18 labels in {copy}\n")
+    with closing(sqlite3.connect(copy)) as connection:
+        assert connection.execute("SELECT count(*) FROM weighted_labels").fetchone() == (18,)
+    code, _, err = curate("export", "--format", "coco", *folder)
+    assert code == ConfigError.exit_code
+    assert "unknown exporter 'coco': use one of kitti, sqlite" in err
+
+
+def test_what_is_no_export_is_not_overwritten(
+    curate: Curate, workspace: Workspace, tmp_path: Path
+) -> None:
+    """A file of the user's in the place, or a policy that has weighted nothing."""
+    run(workspace)
+    precious = tmp_path / "thesis.tex"
+    precious.write_text("precious")
+    code, _, err = curate("export", "--output", precious, "-w", workspace.root)
+    assert code == ConfigError.exit_code
+    assert "thesis.tex: is there and is no former export" in err
+    assert precious.read_text() == "precious"
+    code, _, err = curate("export", "--format", "kitti", "--policy", "spsl", "-w", workspace.root)
+    assert code == WorkspaceError.exit_code
+    assert "curate solve --policy spsl" in err
+
+
+def test_a_student_of_labeled_frames_alone_gets_no_others(
+    workspace: Workspace,
+) -> None:
+    """Not even as background."""
+    own = workspace.with_settings("solve", policy="baseline")
+    assert WeightedLabels(run(own)).labeled.all()
