@@ -1,5 +1,7 @@
 """What every registered policy promises."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,3 +58,32 @@ def test_weights_do_not_depend_on_the_order_of_the_labels(policy) -> None:
 def test_a_policy_goes_by_its_registered_name(policy, request: pytest.FixtureRequest) -> None:
     """So that weights in the database and settings agree."""
     assert policy.name in POLICIES.classes
+
+
+def test_weights_do_not_depend_on_what_was_weighed_before(policy) -> None:
+    """Asked again after other labels and ages, the same weights to the last bit."""
+    before = policy.weigh(evidence(60), Age(1, 3))
+    policy.weigh(evidence(30, seed=5), Age(3, 3))
+    again = policy.weigh(evidence(60), Age(1, 3))
+    np.testing.assert_array_equal(again.v, before.v)
+    np.testing.assert_array_equal(again.lambda_u, before.lambda_u)
+    assert before.v.dtype == before.lambda_u.dtype == np.float64
+
+
+def test_the_evidence_is_left_as_it_is(policy) -> None:
+    """Several policies weigh the same labels."""
+    labels = evidence(50)
+    for column in (labels.category, labels.score, labels.loss, *labels.rho.values()):
+        column.flags.writeable = False
+    weights = policy.weigh(labels, Age(2, 3))
+    weights.v[:] = 0
+    np.testing.assert_array_equal(labels.score, evidence(50).score)
+
+
+def test_weights_do_not_need_every_prior(policy) -> None:
+    """Without any prior, or with one that has scored some labels only, they stay in range."""
+    labels = evidence(40)
+    holes = np.where(np.arange(40) % 2, labels.rho["rho_diff"], np.nan)
+    for rho in ({}, {"rho_diff": holes}):
+        v = policy.weigh(replace(labels, rho=rho), Age(1, 1)).v
+        assert ((v >= 0) & (v <= 1)).all()

@@ -1,0 +1,31 @@
+"""What contract tests need to know of each registered extension, and how they compare answers."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+
+Sample = TypeVar("Sample")
+
+
+def sample_of(samples: Mapping[str, Sample], name: str, wanted: str) -> Sample:
+    """The sample of a registered extension; the test fails in plain words where it has none."""
+    if name not in samples:
+        pytest.fail(f"'{name}' is registered but has no sample: add to SAMPLES here {wanted}")
+    return samples[name]
+
+
+def assert_same(one: Any, other: Any) -> None:
+    """Two dataclasses of arrays are equal to the last bit, types included."""
+    for field in fields(one):
+        a, b = np.asarray(getattr(one, field.name)), np.asarray(getattr(other, field.name))
+        assert a.dtype == b.dtype, field.name
+        np.testing.assert_array_equal(a, b, err_msg=field.name)
+
+
+def assert_one_line(error: BaseException) -> None:
+    """A message that a command can print after `error:`."""
+    assert str(error)
+    assert "\n" not in str(error)

@@ -1,0 +1,191 @@
+"""What every registered exporter promises."""
+
+import sqlite3
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from contracts.samples import assert_one_line, sample_of
+from toys import SIZES
+
+from curate.detections import CATEGORIES
+from curate.errors import ConfigError, DataError, LeakageError
+from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelFileDescription, LabelSet
+from pipelines.registry import EXPORTERS
+
+# Labels by frame: category, x, y, z, length, width, height, yaw, weight, in the order of k.
+Written = Mapping[str, list[tuple]]
+
+
+def read_sqlite(path: Path) -> Written:
+    """The view of a label file, and the unlabeled frames that have no label."""
+    query = (
+        "SELECT frame, category, x, y, z, length, width, height, yaw, weight "
+        "FROM weighted_labels ORDER BY frame, k"
+    )
+    with closing(sqlite3.connect(path)) as connection:
+        frames = connection.execute("SELECT frame FROM frame WHERE split = 'unlabeled'")
+        found: dict[str, list[tuple]] = {frame: [] for (frame,) in frames}
+        for frame, *row in connection.execute(query):
+            found[frame].append(tuple(row))
+    return found
+
+
+def read_kitti(path: Path) -> Written:
+    """The folder `weight` beside the label files."""
+    found = {}
+    for file in (path / "weight").iterdir():
+        rows = [line.split() for line in file.read_text().splitlines()]
+        found[file.stem] = [(row[0], *map(float, row[3:]), float(row[1])) for row in rows]
+    return found
+
+
+# Reads an export back.
+SAMPLES: Mapping[str, Callable[[Path], Written]] = {"sqlite": read_sqlite, "kitti": read_kitti}
+
+
+@pytest.fixture(params=sorted(EXPORTERS.classes))
+def exporter(request: pytest.FixtureRequest):
+    """Every registered exporter with its default settings."""
+    return EXPORTERS.build(request.param, offered={}, options={})
+
+
+@pytest.fixture
+def read_back(exporter) -> Callable[[Path], Written]:
+    """Reads an export of the exporter at hand."""
+    return sample_of(SAMPLES, exporter.name, "a function that reads an export back, see `Written`")
+
+
+@pytest.fixture
+def labels(frames) -> LabelSet:
+    """A labeled frame with one object, and two unlabeled frames with five labels each."""
+    rng = np.random.default_rng(0)
+    names = [frame.frame_id for frame in frames]
+    rows = []
+    for name in names[1:]:
+        for k in range(5):
+            category = CATEGORIES[k % 3]
+            box = (*rng.uniform([6, -4, -1], [30, 4, 0]).tolist(), *SIZES[category], float(k - 2))
+            # Without counterpart, without priors, weight zero and one: all that there is.
+            loss, points = (None, None) if k == 0 else (0.5, 12)
+            evidence = (loss, points, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "pspsl", k / 4)
+            rows.append((1, name, k, category, *box, 0.7, *evidence))
+    return LabelSet(
+        description=LabelFileDescription("kitti", Path("/data"), CATEGORIES, 1, "pspsl", "1"),
+        frames=[(name, "unlabeled" if k else "labeled", "p", "i", "c")
+                for k, name in enumerate(names)],
+        ground_truth=[(names[0], 0, "Car", 10.0, 0.0, -0.8, 4.0, 1.8, 1.6, 0.0, 0.0, 0)],
+        labels=rows,
+        read={frame.frame_id: frame for frame in frames}.__getitem__,
+    )  # fmt: skip
+
+
+def place(exporter, folder: Path) -> Path:
+    """A place for an export, in a folder that is not there yet."""
+    return folder / "new" / f"labels{exporter.suffix}"
+
+
+def files(path: Path) -> dict[str, bytes]:
+    """All that an export is made of, and all that was left beside it."""
+    found = [file for file in path.parent.rglob("*") if file.is_file()]
+    return {str(file.relative_to(path.parent)): file.read_bytes() for file in found}
+
+
+def with_weight(labels: LabelSet, weight: float) -> LabelSet:
+    """The same labels, the last of which has another weight."""
+    return replace(labels, labels=[*labels.labels[:-1], (*labels.labels[-1][:-1], weight)])
+
+
+def test_an_exporter_goes_by_its_registered_name(exporter, request) -> None:
+    """It is the name of the export in the workspace, too."""
+    assert exporter.name == request.node.callspec.params["exporter"]
+    assert exporter.suffix == "" or exporter.suffix.startswith(".")
+
+
+def test_every_label_arrives_with_its_weight(exporter, read_back, labels, tmp_path) -> None:
+    """Boxes to a millimetre, weights to a millionth, of all unlabeled frames."""
+    path = place(exporter, tmp_path)
+    assert exporter.write(path, labels) == 10
+    assert path.is_file() == bool(exporter.suffix)
+    found = read_back(path)
+    assert sorted(found) == sorted({row[1] for row in labels.labels})
+    for name, rows in found.items():
+        expected = [row for row in labels.labels if row[1] == name]
+        assert [row[0] for row in rows] == [row[3] for row in expected]
+        numbers = [(*row[4:11], row[-1]) for row in expected]
+        np.testing.assert_allclose([row[1:] for row in rows], numbers, atol=1e-6)
+
+
+def test_the_same_labels_make_the_same_files(exporter, labels, tmp_path) -> None:
+    """Byte for byte, in another place, and over a former export."""
+    one, other = place(exporter, tmp_path / "one"), place(exporter, tmp_path / "other")
+    exporter.write(one, labels)
+    exporter.write(other, with_weight(labels, 0.125))
+    assert files(one) != files(other)
+    exporter.write(other, labels)
+    assert files(one) == files(other)
+
+
+def test_no_labels_make_an_export_without_labels(exporter, read_back, labels, tmp_path) -> None:
+    """Of X_l alone, and of nothing at all; an unlabeled frame without labels is no failure."""
+    path = place(exporter, tmp_path)
+    for frames in (labels.frames, labels.frames[:1], []):
+        truth = labels.ground_truth if frames else []
+        bare = replace(labels, labels=[], frames=frames, ground_truth=truth)
+        assert exporter.write(path, bare) == 0
+        assert sum(map(len, read_back(path).values())) == 0
+
+
+@pytest.mark.parametrize("weight", [1.5, -0.1, float("nan")])
+def test_an_export_that_fails_leaves_the_former_as_it_was(
+    exporter, labels, tmp_path, weight: float
+) -> None:
+    """A weight that cannot be is an error of one line, and nothing half written stays."""
+    path = place(exporter, tmp_path)
+    with pytest.raises(DataError):
+        exporter.write(path, with_weight(labels, weight))
+    assert not path.exists()
+    exporter.write(path, labels)
+    before = files(path)
+    with pytest.raises(DataError) as caught:
+        exporter.write(path, with_weight(labels, weight))
+    assert_one_line(caught.value)
+    assert files(path) == before
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_what_is_no_former_export_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
+    """A file or a folder with something in it is named and kept."""
+    path = place(exporter, tmp_path)
+    precious = path if kind == "file" else path / "thesis.tex"
+    precious.parent.mkdir(parents=True)
+    precious.write_text("precious")
+    with pytest.raises(ConfigError, match=path.name) as caught:
+        exporter.write(path, labels)
+    assert_one_line(caught.value)
+    assert files(path) == {str(precious.relative_to(path.parent)): b"precious"}
+
+
+def test_the_labels_are_left_as_they_are(exporter, labels, tmp_path) -> None:
+    """Rows are read, and read only."""
+    before = [list(rows) for rows in (labels.frames, labels.ground_truth, labels.labels)]
+    exporter.write(place(exporter, tmp_path), labels)
+    assert [labels.frames, labels.ground_truth, labels.labels] == before
+
+
+def test_no_exporter_can_be_given_ground_truth_of_unlabeled_frames(labels) -> None:
+    """The label set itself refuses it, as well as other splits and labels of labeled frames."""
+    first, second, *_ = [row[0] for row in labels.frames]
+    truth = (second, *labels.ground_truth[0][1:])
+    with pytest.raises(LeakageError, match=second):
+        replace(labels, ground_truth=[truth])
+    with pytest.raises(LeakageError, match="000777"):
+        replace(labels, frames=[*labels.frames, ("000777", "val", "p", "i", "c")])
+    position = WEIGHTED_LABEL_COLUMNS.index("frame")
+    row = list(labels.labels[0])
+    row[position] = first
+    with pytest.raises(DataError, match=first):
+        replace(labels, labels=[tuple(row)])

@@ -1,0 +1,148 @@
+"""What every registered prior promises."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from contracts.samples import assert_same
+from toys import SIZES, ToySegmenter
+
+from curate.detections import CATEGORIES, Detections
+from curate.errors import ConfigError
+from curate.priors.base import columns
+from db import bulk
+from pipelines.registry import PRIORS
+from pipelines.stages.score import TABLES, table_of
+
+# Options without which a prior cannot be made.
+SAMPLES: dict[str, dict[str, Any]] = {}
+THRESHOLDS = {"Car": 30.0, "Pedestrian": 12.5, "Cyclist": 1.0}
+KEY = ("round", "frame_id", "k")
+
+
+def build(name: str, *, measures: bool = True):
+    """A prior as the pipeline builds it."""
+    offered = {
+        "thresholds": lambda: THRESHOLDS,
+        "segmenter": lambda: ToySegmenter("none") if measures else None,
+    }
+    try:
+        return PRIORS.build(name, offered=offered, options=SAMPLES.get(name, {}))
+    except ConfigError as error:
+        pytest.fail(f"{error}; where options are missing, add them to SAMPLES here")
+
+
+@pytest.fixture(params=sorted(PRIORS.classes))
+def prior(request: pytest.FixtureRequest):
+    """Every registered prior."""
+    return build(request.param)
+
+
+def labels(count: int, seed: int = 0) -> Detections:
+    """So many boxes of all categories around the camera, some behind it, scores from 0 to 1."""
+    rng = np.random.default_rng(seed)
+    categories = rng.choice(CATEGORIES, count).astype(np.str_)
+    boxes = np.column_stack([
+        rng.uniform(-8, 30, count), rng.uniform(-12, 12, count), rng.uniform(-1.5, 0.5, count),
+        np.array([SIZES[str(c)] for c in categories]).reshape(-1, 3),
+        rng.uniform(-np.pi, np.pi, count),
+    ])  # fmt: skip
+    scores = rng.random(count)
+    scores[:2] = [0.0, 1.0][:count]
+    return Detections(boxes, scores, categories)
+
+
+@pytest.mark.parametrize("count", [0, 1, 60])
+def test_evidence_fits_its_table(prior, frames, count: int) -> None:
+    """A value per label and column of the table, in its order; counts are whole numbers."""
+    found = prior.score(frames[0], labels(count))
+    table = bulk.table(TABLES[prior.rho_column])
+    assert list(columns(found)) == [name for name in bulk.columns(table.name) if name not in KEY]
+    for name, column in columns(found).items():
+        assert column.shape == (count,), name
+        kind = "iu" if table.c[name].type.python_type is int else "f"
+        assert column.dtype.kind in kind, name
+        assert np.isfinite(column).all(), name
+
+
+def test_trust_lies_between_0_and_1(prior, frames) -> None:
+    """For labels of all scores, in view or not, with points or without; not all alike."""
+    for frame in frames:
+        rho = prior.score(frame, labels(80)).rho
+        assert rho.dtype == np.float64
+        assert ((rho >= 0) & (rho <= 1)).all()
+        assert len(np.unique(rho)) > 1
+
+
+def test_a_prior_names_its_columns(request: pytest.FixtureRequest, prior, frames) -> None:
+    """The one of its trust has a table; those that it measures are among its evidence."""
+    found = columns(prior.score(frames[0], labels(5)))
+    assert prior.name == request.node.callspec.params["prior"]
+    assert table_of(prior.name) == TABLES[prior.rho_column]
+    assert found[prior.rho_column].tolist() == prior.score(frames[0], labels(5)).rho.tolist()
+    assert prior.measured_columns
+    assert set(prior.measured_columns) <= set(found) - {prior.rho_column}
+
+
+def test_labels_do_not_matter_to_each_other(prior, frames) -> None:
+    """A permutation of the labels permutes the evidence; a part of them has its part of it."""
+    found = labels(50)
+    whole = columns(prior.score(frames[0], found))
+    order = np.random.default_rng(1).permutation(50)
+    for index in (order, order[:7]):
+        part = columns(prior.score(frames[0], found.select(index)))
+        for name, column in part.items():
+            np.testing.assert_array_equal(column, whole[name][index], err_msg=name)
+
+
+def test_the_order_of_the_points_does_not_matter(prior, frames) -> None:
+    """A sweep is a set."""
+    frame = frames[0]
+    shuffled = frame.with_points(np.random.default_rng(0).permutation(frame.points))
+    assert_same(prior.score(shuffled, labels(50)), prior.score(frame, labels(50)))
+
+
+def test_evidence_does_not_depend_on_what_was_asked_before(prior, frames) -> None:
+    """Asked again, in another order, or of another instance: the same, to the last bit."""
+    before = [prior.score(frame, labels(20)) for frame in frames]
+    other = build(prior.name)
+    for frame, expected in reversed(list(zip(frames, before, strict=True))):
+        assert_same(other.score(frame, labels(20)), expected)
+        assert_same(prior.score(frame, labels(20)), expected)
+
+
+def test_rating_what_was_measured_is_scoring(prior, frames) -> None:
+    """Also by a prior that could not measure, from numbers that have been in a database."""
+    found = labels(40)
+    measured = prior.measure(frames[0], found)
+    assert set(measured) == set(prior.measured_columns)
+    expected = prior.score(frames[0], found)
+    assert_same(prior.rate(found, measured), expected)
+    stored = {name: np.array(column.tolist()) for name, column in measured.items()}
+    assert_same(build(prior.name, measures=False).rate(found, stored), expected)
+
+
+def test_frame_and_labels_are_left_as_they_are(prior, frames) -> None:
+    """The next prior sees the same."""
+    frame = replace(frames[0], points=frames[0].points.copy(), image=frames[0].image.copy())
+    found = labels(30)
+    for array in (frame.points, frame.image, found.boxes, found.scores, found.categories):
+        array.flags.writeable = False
+    prior.score(frame, found)
+    np.testing.assert_array_equal(frame.points, frames[0].points)
+    assert_same(found, labels(30))
+
+
+def test_a_sweep_without_points_is_no_failure(prior, frames) -> None:
+    """Every label has its evidence."""
+    found = prior.score(frames[0].with_points(frames[0].points[:0]), labels(9))
+    assert ((found.rho >= 0) & (found.rho <= 1)).all()
+
+
+def test_the_image_is_read_only_where_it_is_needed(prior, frames) -> None:
+    """Who does not need it must do without."""
+    assert isinstance(prior.needs_image, bool)
+    if not prior.needs_image:
+        bare = replace(frames[0], image=None)
+        assert_same(prior.score(bare, labels(9)), prior.score(frames[0], labels(9)))

@@ -1,0 +1,119 @@
+"""What every registered segmenter promises."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from contracts.samples import assert_one_line, sample_of
+
+from curate.detections import CATEGORIES
+from curate.errors import DataError, ModelError
+from curate.frames import Frame
+from curate.segmenters.classes import class_map
+from pipelines.assembly import SHIPPED_SEGMENTER
+from pipelines.registry import SEGMENTERS
+
+
+def write_maps(folder: Path, frames: Sequence[Frame]) -> Path:
+    """A semantic map per frame: rectangles of all classes."""
+    for number, frame in enumerate(frames):
+        width, height = frame.image_size
+        class_ids = np.zeros((height, width), dtype=np.uint8)
+        for class_id in (1, 2, 3):
+            left = 30 * class_id + 5 * number
+            class_ids[5:35, left : left + 20] = class_id
+        cv2.imwrite(str(folder / f"{frame.frame_id}.png"), class_ids)
+    return folder
+
+
+# Gives the file or folder from which the segmenter is made, fit for some frames.
+SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
+    "onnx": lambda folder, frames: SHIPPED_SEGMENTER,
+    "saved": write_maps,
+    "degraded": write_maps,
+}
+
+
+def build(name: str, path: Path):
+    """A segmenter as the pipeline builds it."""
+    offered = {"classes": lambda: class_map("simulated"), "seed": lambda: 0}
+    return SEGMENTERS.build(name, path, offered=offered, options={})
+
+
+@pytest.fixture(scope="module", params=sorted(SEGMENTERS.classes))
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, frames):
+    """Name and file of every registered segmenter."""
+    wanted = "a function that gives a small file or folder from which the segmenter can be made"
+    prepare = sample_of(SAMPLES, request.param, wanted)
+    return request.param, prepare(tmp_path_factory.mktemp(request.param), frames)
+
+
+@pytest.fixture(scope="module")
+def segmenter(made):
+    """Every registered segmenter with its default settings."""
+    return build(*made)
+
+
+def seen_by(segmenter, frame: Frame) -> Frame:
+    """The frame as the pipeline reads it for a segmenter."""
+    return frame if segmenter.needs_image else replace(frame, image=None)
+
+
+def test_a_map_has_a_class_for_every_pixel(segmenter, frames) -> None:
+    """uint8, rows by columns, in the size of the image."""
+    assert isinstance(segmenter.needs_image, bool)
+    for frame in frames:
+        width, height = frame.image_size
+        found = segmenter.segment(seen_by(segmenter, frame))
+        assert (found.class_ids.shape, found.class_ids.dtype) == ((height, width), np.uint8)
+
+
+def test_every_category_has_its_classes(segmenter, frames) -> None:
+    """At least one id of 0 to 255 each, in tuples."""
+    classes = segmenter.segment(seen_by(segmenter, frames[0])).category_classes
+    for category in CATEGORIES:
+        ids = classes[category]
+        assert isinstance(ids, tuple)
+        assert ids
+        assert all(isinstance(one, int) and 0 <= one <= 255 for one in ids)
+
+
+def test_maps_do_not_depend_on_what_was_asked_before(made, segmenter, frames) -> None:
+    """Asked again, in another order, or of another instance: the same pixels."""
+    seen = [seen_by(segmenter, frame) for frame in frames]
+    before = [segmenter.segment(frame).class_ids.copy() for frame in seen]
+    other = build(*made)
+    for frame, expected in reversed(list(zip(seen, before, strict=True))):
+        np.testing.assert_array_equal(other.segment(frame).class_ids, expected)
+        np.testing.assert_array_equal(segmenter.segment(frame).class_ids, expected)
+
+
+def test_a_frame_is_left_as_it_is_and_its_points_do_not_matter(segmenter, frames) -> None:
+    """The image cannot be written to, and there are no points."""
+    image = frames[0].image.copy()
+    image.flags.writeable = False
+    frame = replace(frames[0].with_points(frames[0].points[:0]), image=image)
+    found = segmenter.segment(frame).class_ids
+    np.testing.assert_array_equal(found, segmenter.segment(seen_by(segmenter, frames[0])).class_ids)
+    np.testing.assert_array_equal(image, frames[0].image)
+
+
+def test_a_frame_without_what_is_needed_is_named(segmenter, frames) -> None:
+    """No image, or no saved map: one line with the frame's name."""
+    with pytest.raises((ModelError, DataError), match="999999") as caught:
+        segmenter.segment(replace(frames[0], frame_id="999999", image=None))
+    assert_one_line(caught.value)
+
+
+@pytest.mark.parametrize("content", [None, b"no model \x00\xff\n"])
+def test_what_is_no_segmenter_is_named(made, tmp_path: Path, content: bytes | None) -> None:
+    """Missing, or a file of garbage: one line of the right class."""
+    broken = tmp_path / "broken.onnx"
+    if content is not None:
+        broken.write_bytes(content)
+    with pytest.raises((ModelError, DataError), match=r"broken\.onnx") as caught:
+        build(made[0], broken)
+    assert_one_line(caught.value)
