@@ -95,9 +95,10 @@ class TrainSection(Section):
     preset: Literal["small", "kitti"] = "small"
     pretrain_steps: AtLeastOne = 1200
     round_steps: AtLeastOne = 1200
-    batch_size: AtLeastOne = 2
-    learning_rate: Positive = 2e-3  # peak, from scratch
-    round_learning_rate: Positive = 1e-3  # peak, from the teacher
+    batch_size: AtLeastOne = 2  # frames of X_l per step
+    unlabeled_batch_size: Annotated[int, Field(ge=0)] = 2  # frames of X_u per step, besides
+    learning_rate: Positive = 5e-3  # peak, from scratch
+    round_learning_rate: Positive = 3e-3  # peak, from the teacher
     threads: AtLeastOne = 1
     zero_weight: Literal["ignore", "background"] = "ignore"
     start: Literal["teacher", "scratch"] = "teacher"

@@ -86,12 +86,12 @@ class Batches:
 
     def _chosen(self, step: int) -> list[int]:
         """The frames of a step: X_l and X_u each run through in an order new for every pass."""
-        size = self._settings.batch_size
-        of_labeled = size
-        if len(self.unlabeled):
-            of_labeled = min(size, max(1, round(size * self._settings.labeled_share)))
+        of_unlabeled = self._settings.unlabeled_batch_size if len(self.unlabeled) else 0
         chosen = []
-        for pool, count in ((self.labeled, of_labeled), (self.unlabeled, size - of_labeled)):
+        for pool, count in (
+            (self.labeled, self._settings.batch_size),
+            (self.unlabeled, of_unlabeled),
+        ):
             for turn in range(step * count, (step + 1) * count):
                 seed = [self._settings.seed, turn // len(pool), int(pool is self.labeled)]
                 order = np.random.default_rng(seed).permutation(len(pool))

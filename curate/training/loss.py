@@ -106,6 +106,6 @@ def weighted_loss(logits: Tensor, codes: Tensor, targets: BatchTargets, objects:
         logits: (b, x cells, y cells, categories).
         codes: (b, x cells, y cells, BOX_CODE).
         targets: of the same b frames.
-        objects: n, how many objects b fully labeled frames are expected to hold.
+        objects: n, how many objects the batch's frames of X_l are expected to hold.
     """
     return (heatmap_loss(logits, targets) + BOX_WEIGHT * box_loss(codes, targets)) / objects

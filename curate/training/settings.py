@@ -19,9 +19,10 @@ class TrainingSettings:
     Attributes:
         preset: size of the detector, `small` or `kitti`.
         steps: optimiser steps.
-        batch_size: frames per step.
+        batch_size: frames of X_l per step.
+        unlabeled_batch_size: frames of X_u per step, besides: Eq. 6 adds the two sums, so pseudo-
+            labels never take the place of ground truth.
         learning_rate: peak of the one-cycle schedule; about half of it suits fine-tuning.
-        labeled_share: share of each batch that is drawn from X_l where there is an X_u.
         flip_probability: see `Augmentation`.
         rotation_limit_rad: see `Augmentation`.
         scale_range: see `Augmentation`.
@@ -38,8 +39,8 @@ class TrainingSettings:
     preset: str = "small"
     steps: int = 1200
     batch_size: int = 2
-    learning_rate: float = 2e-3
-    labeled_share: float = 0.5
+    unlabeled_batch_size: int = 2
+    learning_rate: float = 5e-3
     flip_probability: float = 0.5
     rotation_limit_rad: float = math.pi / 4
     scale_range: tuple[float, float] = (0.95, 1.05)
@@ -57,16 +58,12 @@ class TrainingSettings:
         preset_named(self.preset)
         for name, least in (
             ("steps", 1), ("batch_size", 1), ("threads", 1), ("pasted", 0), ("seed", 0),
-            ("fewest_points", 0),
+            ("fewest_points", 0), ("unlabeled_batch_size", 0),
         ):  # fmt: skip
             if getattr(self, name) < least:
                 raise ConfigError(f"training: {name} is {getattr(self, name)}, least is {least}")
         if not self.learning_rate > 0:
             raise ConfigError(f"training: learning_rate is {self.learning_rate}, must be above 0")
-        if not 0 < self.labeled_share <= 1:
-            raise ConfigError(
-                f"training: labeled_share is {self.labeled_share}, must be above 0 and at most 1"
-            )
         if not 0 < self.scale_range[0] <= self.scale_range[1]:
             raise ConfigError(f"training: scale_range {self.scale_range} is no range above 0")
         if self.zero_weight not in get_args(ZeroWeight):

@@ -120,7 +120,8 @@ def _learn(
         group["lr"] = one_cycle(step, settings.steps, settings.learning_rate)
     batch = batches[step]
     logits, codes = network(batch.features, batch.slots, batch.frames)
-    loss = weighted_loss(logits, codes, batch.targets, batch.frames * batches.objects_per_frame)
+    objects = settings.batch_size * batches.objects_per_frame
+    loss = weighted_loss(logits, codes, batch.targets, objects)
     optimizer.zero_grad(set_to_none=True)
     torch.autograd.backward(loss)
     torch.nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)

@@ -29,7 +29,14 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
     if not labeled:
         raise WorkspaceError("no labeled frames to learn from; `curate init --labeled` takes some")
     settings = config.train.model_dump(
-        mode="json", exclude={"round_steps", "round_learning_rate", "threads", "start"}
+        mode="json",
+        exclude={
+            "round_steps",
+            "round_learning_rate",
+            "unlabeled_batch_size",
+            "threads",
+            "start",
+        },
     )
     key = [
         settings,

@@ -75,6 +75,7 @@ def training_settings(
         preset=section.preset,
         steps=steps,
         batch_size=section.batch_size,
+        unlabeled_batch_size=section.unlabeled_batch_size,
         learning_rate=learning_rate,
         threads=section.threads,
         zero_weight=section.zero_weight,

@@ -161,16 +161,17 @@ def test_the_result_depends_on_the_seed_only(make_labels, tiny, tmp_path):
     assert not np.array_equal(weights_of(paths[0])[name], weights_of(paths[2])[name])
 
 
-def test_batches_hold_the_share_of_labeled_frames(make_labels, tiny):
-    """Half of each batch is labeled; without an unlabeled split all of it is."""
-    mixed = Batches(WeightedLabels(make_labels(2, 6)), quick(tiny, batch_size=4))
+def test_frames_of_x_u_come_besides_those_of_x_l(make_labels, tiny):
+    """Each step sees as many labeled frames with an unlabeled split as without one."""
+    settings = quick(tiny, batch_size=2, unlabeled_batch_size=3)
+    mixed = Batches(WeightedLabels(make_labels(2, 6)), settings)
     for step in range(5):
         chosen = mixed._chosen(step)
-        assert sum(index in mixed.labeled for index in chosen) == 2
+        assert [index in mixed.labeled for index in chosen] == [True] * 2 + [False] * 3
     seen = {index for step in range(3) for index in mixed._chosen(step)}
     assert seen == set(range(8))
-    alone = Batches(WeightedLabels(make_labels(2, name="b.sqlite")), quick(tiny, batch_size=4))
-    assert all(index in alone.labeled for index in alone._chosen(7))
+    alone = Batches(WeightedLabels(make_labels(2, name="b.sqlite")), settings)
+    assert [index in alone.labeled for index in alone._chosen(7)] == [True] * 2
 
 
 def test_labels_of_weight_zero_can_become_background(make_labels, tiny):
@@ -233,7 +234,7 @@ def test_the_rate_rises_and_falls():
         ({"preset": "huge"}, "unknown preset 'huge'"),
         ({"steps": 0}, "steps is 0"),
         ({"learning_rate": 0.0}, "learning_rate"),
-        ({"labeled_share": 0.0}, "labeled_share"),
+        ({"unlabeled_batch_size": -1}, "unlabeled_batch_size"),
         ({"scale_range": (0.0, 1.0)}, "scale_range"),
         ({"zero_weight": "perhaps"}, "choose ignore or background"),
     ],
