@@ -179,7 +179,7 @@ def test_labels_of_weight_zero_can_become_background(make_labels, tiny):
     labels = WeightedLabels(make_labels(labeled=1, unlabeled=1, weight=0.0))
     blank = {
         zero: Batches(labels, quick(tiny, pasted=0, zero_weight=zero))[0]
-        .targets.background[1]
+        .targets.background[-1]
         .eq(0)
         .sum()
         for zero in ("ignore", "background")
