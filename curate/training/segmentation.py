@@ -25,6 +25,7 @@ from torch.nn import functional
 from curate.atomic import replace_file
 from curate.datasets.images import decode_image, read_image
 from curate.datasets.synthetic import SEMANTIC_CLASSES, SEMANTIC_FOLDER, simulate
+from curate.training.segmentation_graph import build_graph
 
 _log = logging.getLogger(__name__)
 
@@ -106,19 +107,6 @@ class _Residual(nn.Module):
         """Features of the same shape."""
         out: torch.Tensor = features + self.body(features)
         return out
-
-
-class _ClassIds(nn.Module):
-    """The model as it is shipped: class ids instead of logits."""
-
-    def __init__(self, net: SegmentationNet) -> None:
-        super().__init__()
-        self.net = net
-
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """(b, h, w) uint8 class ids of (b, h, w, 3) uint8 RGB images."""
-        logits: torch.Tensor = self.net(images)
-        return logits.argmax(dim=1).to(torch.uint8)
 
 
 def train_segmentation(out: Path, settings: SegmentationSettings) -> dict[str, float]:
@@ -227,11 +215,11 @@ def _intersection_over_union(
     net: SegmentationNet, images: np.ndarray, truth: list[np.ndarray]
 ) -> dict[str, float]:
     """By class, over all pixels of all images in full size; NaN for a class that has none."""
-    model = _ClassIds(net)
     counts = np.zeros((_CLASSES, _CLASSES))
     for image, expected in zip(images, truth, strict=True):
         with torch.no_grad():
-            answer = model(torch.from_numpy(image[None]))[0].numpy()
+            logits = net(torch.from_numpy(image[None]))
+        answer = logits[0].argmax(dim=0).numpy().astype(np.uint8)
         found = cv2.resize(answer, expected.shape[::-1], interpolation=cv2.INTER_NEAREST)
         pairs = expected.ravel().astype(np.int64) * _CLASSES + found.ravel()
         counts += np.bincount(pairs, minlength=_CLASSES**2).reshape(_CLASSES, _CLASSES)
@@ -243,21 +231,8 @@ def _intersection_over_union(
 
 def _exported(net: SegmentationNet) -> bytes:
     """The ONNX model."""
-    width, height = INPUT_SIZE
-    example = torch.zeros((1, height, width, 3), dtype=torch.uint8)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.onnx"
-        torch.onnx.export(
-            _ClassIds(net).eval(),
-            (example,),
-            path,
-            input_names=["image"],
-            output_names=["class_ids"],
-            dynamo=True,
-            external_data=False,
-            verbose=False,
-        )
-        return path.read_bytes()
+    weights = {name: tensor.detach().numpy() for name, tensor in net.state_dict().items()}
+    return bytes(build_graph(weights, *INPUT_SIZE).SerializeToString())
 
 
 def main() -> None:

@@ -1,0 +1,107 @@
+"""The trained segmentation network as an ONNX graph, written node by node from its tensors.
+
+Batch norms are folded into the convolutions before them. The general exporter of torch would need
+two more packages for this one network.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from onnx import ModelProto, TensorProto, checker, helper, numpy_helper
+
+_OPSET = 18
+_IR_VERSION = 10
+# Of torch's BatchNorm2d.
+_EPSILON = 1e-5
+
+
+def build_graph(weights: Mapping[str, np.ndarray], width: int, height: int) -> ModelProto:
+    """The graph of `segmentation.SegmentationNet` with its state `weights`.
+
+    Input `image` (1, height, width, 3) uint8 RGB, output `class_ids` (1, height, width) uint8.
+    """
+    graph = _Graph(weights)
+    sharp = graph.convolution(graph.image("image"), "sharp")
+    fine = graph.convolution(sharp, "fine", stride=2)
+    middle = graph.residual(graph.convolution(fine, "middle.0", stride=2), "middle.1", 1)
+    deep = graph.convolution(middle, "deep.0", stride=2)
+    deep = graph.residual(graph.residual(deep, "deep.1", 2), "deep.2", 4)
+    for below, above, level in (
+        ("deep", middle, "middle"), ("middle", fine, "fine"), ("fine", sharp, "sharp"),
+    ):  # fmt: skip
+        deep = graph.enlarged(graph.pointwise(deep, f"{below}_to_{level}"), above)
+        deep = graph.convolution(graph.node("Add", above, deep), f"mix_{level}")
+    graph.class_ids(graph.pointwise(deep, "answer"), "class_ids")
+    return graph.model((1, height, width))
+
+
+class _Graph:
+    """Collects nodes and constants; methods take and return names of values."""
+
+    def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
+        self._weights = weights
+        self._nodes: list = []
+        self._constants: list = []
+
+    def node(self, operator: str, *inputs: str, **attributes: Any) -> str:
+        """Adds an operator with one output."""
+        name = f"value{len(self._nodes)}"
+        self._nodes.append(helper.make_node(operator, inputs, [name], **attributes))
+        return name
+
+    def constant(self, array: np.ndarray) -> str:
+        """Adds a constant."""
+        name = f"constant{len(self._constants)}"
+        self._constants.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return name
+
+    def image(self, name: str) -> str:
+        """The input as maps (1, 3, height, width) from -1 to 1."""
+        pixels = self.node("Cast", name, to=TensorProto.FLOAT)
+        maps = self.node("Transpose", pixels, perm=[0, 3, 1, 2])
+        half, one = (self.constant(np.array(value, np.float32)) for value in (127.5, 1.0))
+        return self.node("Sub", self.node("Div", maps, half), one)
+
+    def convolution(self, maps: str, name: str, *, stride: int = 1, dilation: int = 1) -> str:
+        """ReLU of a normalised 3 x 3 convolution."""
+        mean, variance = (self._weights[f"{name}.1.running_{part}"] for part in ("mean", "var"))
+        scale = self._weights[f"{name}.1.weight"] / np.sqrt(variance + _EPSILON)
+        kernel = self.constant(self._weights[f"{name}.0.weight"] * scale[:, None, None, None])
+        shift = self.constant(self._weights[f"{name}.1.bias"] - mean * scale)
+        attributes = {"pads": [dilation] * 4, "strides": [stride] * 2, "dilations": [dilation] * 2}
+        return self.node("Relu", self.node("Conv", maps, kernel, shift, **attributes))
+
+    def residual(self, maps: str, name: str, dilation: int) -> str:
+        """Two convolutions around which the input is carried."""
+        body = self.convolution(maps, f"{name}.body.0")
+        return self.node("Add", maps, self.convolution(body, f"{name}.body.1", dilation=dilation))
+
+    def pointwise(self, maps: str, name: str) -> str:
+        """A 1 x 1 convolution with bias and nothing after it."""
+        parts = (self._weights[f"{name}.{part}"] for part in ("weight", "bias"))
+        return self.node("Conv", maps, *map(self.constant, parts))
+
+    def enlarged(self, maps: str, like: str) -> str:
+        """Maps in the height and width of others, interpolated."""
+        size = self.node("Shape", like, start=2)
+        channels = self.node("Shape", maps, end=2)
+        sizes = self.node("Concat", channels, size, axis=0)
+        modes = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
+        return self.node("Resize", maps, "", "", sizes, **modes)
+
+    def class_ids(self, logits: str, name: str) -> None:
+        """Names the classes of the highest logits an output."""
+        best = self.node("ArgMax", logits, axis=1, keepdims=0)
+        self._nodes.append(helper.make_node("Cast", [best], [name], to=TensorProto.UINT8))
+
+    def model(self, shape: tuple[int, ...]) -> ModelProto:
+        """The finished and checked model."""
+        describe = helper.make_tensor_value_info
+        image = describe("image", TensorProto.UINT8, (*shape, 3))
+        answer = describe("class_ids", TensorProto.UINT8, shape)
+        graph = helper.make_graph(self._nodes, "segmentation", [image], [answer], self._constants)
+        opsets = [helper.make_opsetid("", _OPSET)]
+        model = helper.make_model(graph, opset_imports=opsets, ir_version=_IR_VERSION)
+        checker.check_model(model, full_check=True)
+        return model
