@@ -26,7 +26,8 @@ class Calibration:
     @property
     def lidar_to_image(self) -> np.ndarray:
         """(3, 4) LiDAR frame to homogeneous image pixels."""
-        return self.projection @ self.lidar_to_camera
+        matrix: np.ndarray = self.projection @ self.lidar_to_camera
+        return matrix
 
 
 @dataclass(frozen=True)

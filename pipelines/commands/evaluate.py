@@ -75,7 +75,7 @@ def evaluate(
         from curate.evaluation.kitti_ap import evaluate as compare
         from curate.evaluation.kitti_folders import read_folders
 
-        _, truth, answers = read_folders(labels, results, frames and _read_ids(frames))
+        _, truth, answers = read_folders(labels, results, _read_ids(frames) if frames else None)
         found = compare(truth, answers)
     else:
         if round_number is not None and checkpoint is not None:

@@ -277,6 +277,16 @@ def test_a_bad_list_of_frames_is_one_line(
     assert not (tmp_path / "w").exists()
 
 
+def test_a_workspace_whose_init_was_killed_is_no_empty_success(curate: Curate, made: Path) -> None:
+    """Settings without frames: the remedy is named, and no empty export passes for labels."""
+    for path in made.glob("curate.db*"):
+        path.unlink()
+    code, out, err = curate("run")
+    assert (code, out) == (WorkspaceError.exit_code, "")
+    assert "run `curate init` again" in err
+    assert not (made / "exports" / "labels.sqlite").exists()
+
+
 def test_relative_paths_in_the_settings_are_taken_from_the_workspace(
     curate: Curate, made: Path, toy_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
