@@ -9,10 +9,10 @@ from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, Engine, create_engine, event, make_url
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
+from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
-from curate.errors import DatabaseError, LeakageError
+from curate.errors import ConfigError, DatabaseError, LeakageError
 from db.views import create_views
 
 # A writer that finds another one waits this long before it gives up.
@@ -26,12 +26,13 @@ class Database:
         url: an SQLAlchemy URL, e.g. "sqlite:////data/run/curate.db".
 
     Raises:
+        ConfigError: the URL is none, or its driver is not installed.
         DatabaseError: it cannot be opened, is damaged, or a newer curate has written it.
     """
 
-    def __init__(self, url: str) -> None:
-        self.url = make_url(url)
-        self.engine = _engine(url)
+    def __init__(self, url: str | URL) -> None:
+        self.url = parse_url(url) if isinstance(url, str) else url
+        self.engine = _engine(self.url)
         with _own_words(self.url.database):
             self._migrate()
 
@@ -70,8 +71,31 @@ class Database:
             create_views(connection)
 
 
-def _engine(url: str) -> Engine:
-    engine = create_engine(url)
+def parse_url(text: str) -> URL:
+    """An SQLAlchemy URL.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        return make_url(text)
+    except ArgumentError as error:
+        raise ConfigError(
+            f"database {text!r}: no SQLAlchemy URL; write postgresql+psycopg://USER@HOST/NAME, or "
+            "leave it out for curate.db in the workspace"
+        ) from error
+
+
+def _engine(url: URL) -> Engine:
+    try:
+        engine = create_engine(url)
+    except NoSuchModuleError as error:
+        raise ConfigError(f"database {url!r}: {error}") from error
+    except ImportError as error:
+        raise ConfigError(
+            f"database {url!r}: {error}; for PostgreSQL, "
+            "pip install 'curate-pseudo-labels[postgres]'"
+        ) from error
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_pragmas)
         event.listen(engine, "begin", _begin)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import create_engine, make_url
+from sqlalchemy import URL, create_engine
 from sqlalchemy.exc import DBAPIError
 
 from curate.errors import ConfigError, DatabaseError
@@ -18,15 +18,15 @@ ALLOWED = frozenset(
 FORBIDDEN_FUNCTIONS = frozenset({"load_extension", "readfile", "writefile", "edit"})
 
 
-def ask(url: str, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
+def ask(url: URL, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
     """The columns and the rows of a question.
 
     Raises:
         ConfigError: the SQL is wrong, or does more than read.
         DatabaseError: the database cannot be opened.
     """
-    if make_url(url).get_backend_name() == "sqlite":
-        return _ask_sqlite(Path(str(make_url(url).database)), sql)
+    if url.get_backend_name() == "sqlite":
+        return _ask_sqlite(Path(str(url.database)), sql)
     return _ask_server(url, sql)
 
 
@@ -55,7 +55,7 @@ def _authorize(action: int, _first: str | None, second: str | None, *_: str | No
     return sqlite3.SQLITE_OK if action in ALLOWED else sqlite3.SQLITE_DENY
 
 
-def _ask_server(url: str, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
+def _ask_server(url: URL, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
     connection = create_engine(url).connect().execution_options(postgresql_readonly=True)
     try:
         result = connection.exec_driver_sql(sql)

@@ -5,15 +5,30 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from curate.atomic import replace_file
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
 AtLeastOne = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Options = dict[str, Any]
+
+
+def _each_once(names: tuple[str, ...]) -> tuple[str, ...]:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ValueError(f"{repeated[0]} is named twice")
+    return names
+
+
+def _rising(limits: tuple[float, float]) -> tuple[float, float]:
+    if limits[0] > limits[1]:
+        raise ValueError("the lower limit comes first")
+    return limits
 
 
 class Section(BaseModel):
@@ -27,7 +42,9 @@ class DatasetSection(Section):
 
     kind: str = "kitti"
     root: Path
-    categories: tuple[str, ...] = CATEGORIES
+    categories: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_each_once)] = (
+        CATEGORIES
+    )
     options: Options = {}
 
 
@@ -57,11 +74,11 @@ class RepredictSection(Section):
     views: AtLeastOne = 1
     flip_probability: Share = 0.5
     rotation_limit_rad: Annotated[float, Field(ge=0)] = 0.7853981633974483
-    scale_range: tuple[Positive, Positive] = (0.95, 1.05)
+    scale_range: Annotated[tuple[Positive, Positive], AfterValidator(_rising)] = (0.95, 1.05)
     score_weight: Annotated[float, Field(ge=0)] = 1.0
     box_weight: Annotated[float, Field(ge=0)] = 2.0
     beta: Positive = 1 / 9
-    minimum_iou: Share = 0.1
+    minimum_iou: Annotated[float, Field(ge=0, lt=1)] = 0.1
 
 
 class PointsSection(Section):
@@ -109,8 +126,8 @@ class RunSection(Section):
     """How the work is organised."""
 
     rounds: AtLeastOne = 3
-    seed: int = 0
-    priors: tuple[str, ...] = ("points", "semantic")
+    seed: Seed = 0
+    priors: Annotated[tuple[str, ...], AfterValidator(_each_once)] = ("points", "semantic")
     prior_options: dict[str, Options] = {}  # of your own priors, by name
     executor: str = "serial"
     workers: AtLeastOne = 1
@@ -138,11 +155,13 @@ def read_config(path: Path) -> Config:
         ConfigError: the file is not TOML, or some settings are wrong; all of them are named.
     """
     try:
-        return make_config(tomllib.loads(path.read_text()), str(path))
+        return make_config(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file; `curate init` makes a workspace") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not TOML: {error}") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def make_config(document: Mapping[str, Any], source: str) -> Config:
@@ -167,7 +186,7 @@ def write_config(path: Path, config: Config) -> None:
     for section, settings in document.items():
         lines += [f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in settings.items())]
         lines.append("")
-    path.write_text("\n".join(lines))
+    replace_file(path, "\n".join(lines).encode())
 
 
 def _toml(value: Any) -> str:

@@ -181,7 +181,7 @@ def _train_student(workspace: Workspace, policy: str) -> None:
 def _print_query(workspace: Workspace) -> None:
     from pipelines.asking import ask
 
-    columns, rows = ask(str(workspace.database.url), QUERY)
+    columns, rows = ask(workspace.database.url, QUERY)
     print_table(columns, rows)
 
 

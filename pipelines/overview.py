@@ -9,7 +9,7 @@ from curate.errors import WorkspaceError
 from db import bulk
 from pipelines import plan
 from pipelines.round import active
-from pipelines.rounds import find_teacher, peek_round
+from pipelines.rounds import find_teacher, is_trainable, peek_round
 from pipelines.stage import FrameStage, RoundContext, RoundStage
 from pipelines.workspace import Workspace
 
@@ -24,7 +24,9 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
             row[0]
             for row in bulk.select(connection, select(table.c.number).order_by(table.c.number))
         ]
-    rows: list[tuple[Any, ...]] = [_pretrain_row(workspace)]
+    # A detector that the user brings is not trained here: nothing would ever come of these rows.
+    trainable = is_trainable(workspace)
+    rows: list[tuple[Any, ...]] = [_pretrain_row(workspace)] if trainable else []
     for number in numbers:
         context = peek_round(workspace, number)
         if context is None:
@@ -33,7 +35,7 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
         for stage in active(workspace.config.run.priors):
             if isinstance(stage, FrameStage):
                 rows += _frame_rows(workspace, context, stage)
-            else:
+            elif trainable or stage.name != "train-round":
                 rows += _round_rows(workspace, context, stage)
     return COLUMNS, rows
 

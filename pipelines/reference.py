@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import db.models
+from curate.errors import CurateError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db.models import Base
 from pipelines.config import Config, write_config
@@ -44,7 +45,25 @@ def cli_page() -> str:
     for name in ("", *COMMANDS):
         shown = CliRunner().invoke(app, [*name.split(), "--help"], prog_name="curate").output
         parts.append(f"## curate {name}".rstrip() + f"\n\n```text\n{_trimmed(shown)}\n```\n")
-    return "\n".join(parts)
+    return "\n".join([*parts, *_exit_codes()])
+
+
+def _exit_codes() -> list[str]:
+    """The exit status of each class of error."""
+    kinds = sorted(CurateError.__subclasses__(), key=lambda kind: kind.exit_code)
+    return [
+        "## Exit codes",
+        "",
+        "An error is one line on standard error; its class is the exit code.",
+        "",
+        "| code | meaning |",
+        "|---|---|",
+        "| 0 | all is well |",
+        f"| {CurateError.exit_code} | any other error |",
+        *(f"| {kind.exit_code} | {inspect.getdoc(kind)} |" for kind in kinds),
+        "| 130 | interrupted with Ctrl-C; the same command continues |",
+        "",
+    ]
 
 
 def schema_page() -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from curate.errors import ConfigError
+from curate.errors import ConfigError, CurateError
 
 
 @dataclass(frozen=True)
@@ -19,17 +19,20 @@ class Registry:
     kind: str
     classes: Mapping[str, str]
 
+    def refuse_unknown(self, name: str, *others: str) -> None:
+        """ConfigError for a name that is neither registered, nor module:Class, nor in `others`."""
+        if name not in (*self.classes, *others) and not name.partition(":")[2]:
+            known = ", ".join(sorted((*self.classes, *others)))
+            raise ConfigError(f"unknown {self.kind} '{name}': use one of {known}, or module:Class")
+
     def load(self, name: str) -> Any:
         """The class behind a name.
 
         Raises:
             ConfigError: nobody knows the name, or what it names cannot be imported.
         """
-        target = self.classes.get(name, name)
-        module_name, _, class_name = target.partition(":")
-        if not class_name:
-            known = ", ".join(sorted(self.classes))
-            raise ConfigError(f"unknown {self.kind} '{name}': use one of {known}, or module:Class")
+        self.refuse_unknown(name)
+        module_name, _, class_name = self.classes.get(name, name).partition(":")
         try:
             return getattr(importlib.import_module(module_name), class_name)
         except (ImportError, AttributeError) as error:
@@ -55,7 +58,8 @@ class Registry:
             options: the user's keyword arguments, all of which the constructor must know.
 
         Raises:
-            ConfigError: the constructor does not know an option, or needs one that is missing.
+            ConfigError: the constructor does not know an option, needs one that is missing, or
+                raises; every error of `CurateError` passes as it is.
         """
         factory = self.load(name)
         signature = inspect.signature(factory)
@@ -64,7 +68,13 @@ class Registry:
             signature.bind(*given, **(keywords := keywords | dict(options)))
         except TypeError as error:
             raise ConfigError(f"{self.kind} '{name}': {error}; takes {signature}") from error
-        return factory(*given, **keywords)
+        try:
+            return factory(*given, **keywords)
+        except CurateError:
+            raise
+        except Exception as error:  # the class may be the user's, and raise anything
+            words = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ConfigError(f"{self.kind} '{name}' cannot be made: {words}") from error
 
 
 DATASETS = Registry(

@@ -10,7 +10,7 @@ from curate.errors import WorkspaceError
 from db import bulk
 from pipelines.registry import TRAINABLE
 from pipelines.stage import RoundContext, Teacher
-from pipelines.workspace import Workspace, sha256
+from pipelines.workspace import SPLITS, Workspace, sha256
 
 
 def is_trainable(workspace: Workspace) -> bool:
@@ -29,8 +29,14 @@ def open_round(
         rounds: E for a round that has no student yet; None for the configured number.
 
     Raises:
-        WorkspaceError: the detector that would answer in the round does not exist yet.
+        WorkspaceError: the detector that would answer in the round does not exist yet, or the
+            workspace has no frames.
     """
+    if not workspace.frames(*SPLITS):
+        raise WorkspaceError(
+            f"{workspace.root}: holds no frames, its init was interrupted; "
+            "run `curate init` again with the same arguments"
+        )
     students = _students(workspace)
     wanted = rounds or workspace.config.run.rounds
     if number is None:

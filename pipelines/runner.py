@@ -81,7 +81,7 @@ def run_frames(
     """Brings a stage up to date for every frame of a split that can be worked on."""
     start = time.perf_counter()
     waiting = plan.waiting_frames(workspace, context, stage, split)
-    total = len(workspace.frames(split))
+    before = plan.counts(workspace, context, stage, split)
     writer = _Writer(workspace, context, stage)
     with progress.track(stage.name, len(waiting)) as advance:
         writer.skip([key for key, _, empty in waiting if empty])
@@ -98,7 +98,7 @@ def run_frames(
         done=writer.done,
         empty=writer.empty,
         failed=writer.failed,
-        kept=total - len(waiting),
+        kept=before.done + before.empty,
         labels=writer.labels,
         seconds=time.perf_counter() - start,
         errors=tuple(writer.errors),

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from pipelines.assembly import open_policy
 from pipelines.progress import Progress
 from pipelines.round import active
 from pipelines.rounds import is_trainable, open_round
@@ -25,10 +26,11 @@ def run_all(
         train: whether students are trained; without them only the first round can be run.
     """
     trainable = is_trainable(workspace)
+    policy = workspace.config.solve.policy
+    open_policy(workspace.config, policy)  # a wrong one is better known before hours of work
     if trainable:
         yield pretrain(workspace, progress)
     total = (rounds or workspace.config.run.rounds) if trainable and train else 1
-    policy = workspace.config.solve.policy
     with open_executor(workspace) as executor:
         for number in range(1, total + 1):
             context = open_round(workspace, number, rounds)

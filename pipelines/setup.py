@@ -11,6 +11,7 @@ from curate.datasets.base import Dataset
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from db import bulk
+from pipelines import registry
 from pipelines.config import Config
 from pipelines.workspace import Workspace, open_dataset
 
@@ -43,10 +44,11 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
         val: likewise, of the frames outside the data set's own val list; "" for that list.
 
     Raises:
-        ConfigError: a share or a list is wrong.
+        ConfigError: a share or a list is wrong, or a detector or segmenter is not there.
         DataError: a label or calibration file of X_l or val is damaged.
         WorkspaceError: the workspace exists with other frames or settings.
     """
+    _refuse_absent(config)
     dataset = open_dataset(config)
     split = choose_split(dataset, labeled, val, config.run.seed)
     truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
@@ -62,6 +64,19 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
     return workspace
 
 
+def _refuse_absent(config: Config) -> None:
+    """ConfigError for a detector or segmenter that nobody knows or whose file is not there."""
+    registry.DETECTORS.refuse_unknown(config.detector.name)
+    registry.SEGMENTERS.refuse_unknown(config.segmenter.name, "none", "simulated")
+    needs_path = {"detector": ("recorded",), "segmenter": tuple(registry.SEGMENTERS.classes)}
+    for section, names in needs_path.items():
+        name, path = getattr(config, section).name, getattr(config, section).path
+        if path is None and name in names:
+            raise ConfigError(f"{section} '{name}' needs a path: give --{section}-path")
+        if path is not None and not path.exists():
+            raise ConfigError(f"--{section}-path {path}: no such file")
+
+
 def choose_split(dataset: Dataset, labeled: str, val: str, seed: int) -> Split:
     """Which frames are labeled, unlabeled and val."""
     lists = dataset.splits()
@@ -70,6 +85,12 @@ def choose_split(dataset: Dataset, labeled: str, val: str, seed: int) -> Split:
         raise DataError("the data set holds no frames; --root should hold velodyne/ or training/")
     generator = np.random.default_rng(seed)
     held_out = _choose(dataset, frames, val, generator, "val") if val else lists.get("val", ())
+    bare = [frame for frame in held_out if not dataset.files(frame).label]
+    if bare:
+        raise ConfigError(
+            f"val frame {bare[0]} has no label file; give --val 0 for no val frames, or a list of "
+            "frames that have one"
+        )
     pool = [frame for frame in frames if frame not in set(held_out)]
     chosen = _choose(dataset, pool, labeled, generator, "labeled")
     rest = sorted(set(pool) - set(chosen))
@@ -81,11 +102,7 @@ def _choose(
 ) -> list[str]:
     """Frames by share or by list; only frames with a label file can be chosen."""
     if Path(wish).is_file():
-        names = Path(wish).read_text().split()
-        unknown = sorted(set(names) - set(pool))
-        if unknown:
-            raise ConfigError(f"{wish}: frame {unknown[0]} is not among the training frames")
-        return names
+        return _listed(dataset, pool, Path(wish), split)
     try:
         share = float(wish)
     except ValueError:
@@ -102,6 +119,21 @@ def _choose(
             "have a label file; give a smaller share (0 for none)"
         )
     return list(generator.permutation(with_label)[:count].tolist())
+
+
+def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
+    """The frames that a file names, each once."""
+    try:
+        names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--{split} {path}: no list of frame ids: {error}") from error
+    unknown = sorted(set(names) - set(pool))
+    if unknown:
+        raise ConfigError(f"--{split} {path}: frame {unknown[0]} is not among the training frames")
+    bare = [name for name in names if not dataset.files(name).label]
+    if bare:
+        raise ConfigError(f"--{split} {path}: frame {bare[0]} has no label file")
+    return names
 
 
 def _store(

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sqlalchemy import select
+from sqlalchemy import URL, select
 
 from curate.datasets.base import Dataset
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError, WorkspaceError
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
-from db.session import Database
+from db.session import Database, parse_url
 from pipelines import registry
 from pipelines.config import Config, read_config, write_config
 
@@ -48,7 +48,7 @@ class Workspace:
         root = folder.resolve() if folder else _find(Path.cwd())
         if not (root / CONFIG_NAME).is_file():
             raise WorkspaceError(f"{root}: no workspace here; make one with `curate init {root}`")
-        config = read_config(root / CONFIG_NAME)
+        config = _anchored(root, read_config(root / CONFIG_NAME))
         return cls(root, config, Database(_url(root, config)))
 
     @classmethod
@@ -147,6 +147,17 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
+def _anchored(root: Path, config: Config) -> Config:
+    """The configuration with relative paths taken from the workspace, not the current folder."""
+    changes: dict[str, Any] = {}
+    for name, key in (("dataset", "root"), ("detector", "path"), ("segmenter", "path")):
+        section = getattr(config, name)
+        path = getattr(section, key)
+        if path is not None:
+            changes[name] = section.model_copy(update={key: root / path})
+    return config.model_copy(update=changes)
+
+
 def _find(start: Path) -> Path:
     for folder in (start, *start.parents):
         if (folder / CONFIG_NAME).is_file():
@@ -157,8 +168,11 @@ def _find(start: Path) -> Path:
     )
 
 
-def _url(root: Path, config: Config) -> str:
-    return config.run.database or f"sqlite:///{root / 'curate.db'}"
+def _url(root: Path, config: Config) -> URL:
+    if config.run.database is not None:
+        return parse_url(config.run.database)
+    # Made from its parts: in a string, a ? or % of the folder's name would mean something else.
+    return URL.create("sqlite", database=str(root / "curate.db"))
 
 
 def _annotations(rows: Sequence[Sequence[Any]]) -> Annotations:
@@ -176,7 +190,7 @@ def _annotations(rows: Sequence[Sequence[Any]]) -> Annotations:
     )
 
 
-def database_url(folder: Path | None) -> str:
+def database_url(folder: Path | None) -> URL:
     """The URL of a workspace's database, without opening or migrating it."""
     root = folder.resolve() if folder else _find(Path.cwd())
     if not (root / CONFIG_NAME).is_file():

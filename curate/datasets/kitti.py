@@ -6,7 +6,7 @@ flat ROOT/{velodyne,image_2,calib,label_2}; label_2 and ROOT/ImageSets/*.txt are
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 
@@ -55,7 +55,7 @@ class KittiDataset:
 
     @cached_property
     def _frame_ids(self) -> tuple[str, ...]:
-        return tuple(sorted(path.stem for path in (self._home / "velodyne").glob("*.bin")))
+        return tuple(sorted(path.stem for path in _visible(self._home / "velodyne", "*.bin")))
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """The lists of ROOT/ImageSets, by file name; they may name frames that are not there.
@@ -66,7 +66,7 @@ class KittiDataset:
         Raises:
             DataError: a list names something that is no frame id.
         """
-        lists = {path.stem: path for path in sorted((self.root / "ImageSets").glob("*.txt"))}
+        lists = {path.stem: path for path in sorted(_visible(self.root / "ImageSets", "*.txt"))}
         if self._home != self.root and "test" in lists:
             _log.info("%s: left out, it names frames of testing/", lists.pop("test"))
         return {name: _read_frame_list(path) for name, path in lists.items()}
@@ -189,6 +189,11 @@ def _parse_matrix(entries: str, shape: tuple[int, int], place: str) -> np.ndarra
     if not np.isfinite(numbers).all():
         raise DataError(f"{place}: holds NaN or infinite numbers")
     return numbers.reshape(shape)
+
+
+def _visible(folder: Path, pattern: str) -> Iterator[Path]:
+    """The files of a folder without hidden ones: macOS strews ._ files over foreign disks."""
+    return (path for path in folder.glob(pattern) if not path.name.startswith("."))
 
 
 def _read_frame_list(path: Path) -> tuple[str, ...]:

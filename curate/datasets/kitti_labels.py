@@ -269,7 +269,7 @@ def _format(objects: KittiObjects, index: int) -> str:
 def _read_lines(path: Path) -> list[str]:
     """The lines of a text file; DataError where there is none."""
     try:
-        return path.read_bytes().decode().splitlines()
+        return path.read_bytes().decode("utf-8-sig").splitlines()
     except FileNotFoundError:
         raise DataError(f"{path}: no such label file") from None
     except OSError as error:

@@ -45,7 +45,8 @@ def _frame_ids(folder: Path) -> set[str]:
     """The names of the text files in a folder."""
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; name one with a text file per frame")
-    found = {path.stem for path in folder.glob("*.txt")}
+    # macOS strews hidden ._ files over foreign disks.
+    found = {path.stem for path in folder.glob("*.txt") if not path.name.startswith(".")}
     if not found:
         raise DataError(f"{folder}: holds no .txt files; name a folder with one per frame")
     return found
@@ -57,5 +58,5 @@ def _refuse_missing(missing: set[str], folder: Path, kind: str) -> None:
         return
     first = min(missing)
     others = f" and {len(missing) - 1} other frames" if len(missing) > 1 else ""
-    remedy = "write an empty one for a frame without objects, or name the frames to evaluate"
+    remedy = "write an empty one for a frame without objects, or name the frames with --frames"
     raise DataError(f"{folder / first}.txt: no {kind} file for frame {first}{others}; {remedy}")

@@ -17,7 +17,7 @@ def demo(
     ] = 0.06,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds.")] = 1,
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 700,
-    seed: Annotated[int, typer.Option(help="Of simulation, split and training.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of simulation, split and training.")] = 0,
     workers: Annotated[
         Optional[int],  # noqa: UP045
         typer.Option(min=1, help="Processes; default: all cores."),

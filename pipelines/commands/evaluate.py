@@ -31,6 +31,10 @@ def evaluate(
         Optional[Path],  # noqa: UP045
         typer.Option(help="Folder of KITTI result files, one per label file."),
     ] = None,
+    frames: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="File of the frame ids to compare; default: all of --labels."),
+    ] = None,
     round_number: Annotated[
         Optional[int],  # noqa: UP045
         typer.Option("--round", min=1, help="The round's stored val predictions."),
@@ -49,7 +53,8 @@ def evaluate(
 ) -> None:
     """Evaluate as the KITTI benchmark does: image, aos, bev and 3d AP, R40 and R11, and recall.
 
-    Every frame needs both files, an empty one where it has nothing. Equal scores enter together.
+    Every frame needs both files, an empty one where it has nothing; --frames takes a list such as
+    ImageSets/val.txt. Equal scores enter together.
     Without objects, or without detections, AP is 0.
 
     With --store, ask which objects were missed: curate query "SELECT frame, category, x, y,
@@ -62,13 +67,15 @@ def evaluate(
 
     if (labels is None) != (results is None):
         raise ConfigError("evaluate: --labels and --results go together")
+    if frames is not None and labels is None:
+        raise ConfigError("evaluate: --frames goes with --labels and --results")
     if labels is not None and results is not None:
         if store:
             raise ConfigError("evaluate: --store needs a workspace, not --labels and --results")
         from curate.evaluation.kitti_ap import evaluate as compare
         from curate.evaluation.kitti_folders import read_folders
 
-        _, truth, answers = read_folders(labels, results)
+        _, truth, answers = read_folders(labels, results, _read_ids(frames) if frames else None)
         found = compare(truth, answers)
     else:
         if round_number is not None and checkpoint is not None:
@@ -83,10 +90,24 @@ def evaluate(
         _print(found.as_dict())
 
 
+def _read_ids(path: Path) -> list[str]:
+    """The frame ids in a file such as ImageSets/val.txt."""
+    from curate.errors import DataError
+
+    try:
+        found = path.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: no list of frame ids: {error}") from error
+    if not found:
+        raise DataError(f"{path}: names no frames")
+    return found
+
+
 def _evaluate_val(
     workspace: "Workspace", round_number: int | None, checkpoint: Path | None, *, store: bool
 ) -> "tuple[KittiEvaluation, str]":
     """The evaluation on the val frames, and what to say of it."""
+    from curate.errors import WorkspaceError
     from pipelines.evaluation import detect_val, evaluate_detections, stored_val
     from pipelines.progress import Bar
     from pipelines.rounds import newest_checkpoint
@@ -97,6 +118,8 @@ def _evaluate_val(
         answers = stored_val(workspace, round_number)
     else:
         path = checkpoint or newest_checkpoint(workspace)
+        if not path.exists():
+            raise WorkspaceError(f"--checkpoint {path}: no such file")
         source = workspace.relative(path)
         answers = detect_val(workspace, path, Bar())
     found = evaluate_detections(workspace, answers)

@@ -16,7 +16,7 @@ def init(
     val: Annotated[
         str, typer.Option(help="Likewise for validation; default: the data set's own val list.")
     ] = "",
-    seed: Annotated[int, typer.Option(help="Of the split and of every later draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the split and of every later draw.")] = 0,
     detector: Annotated[str, typer.Option(help="pillars, recorded or module:Class.")] = "pillars",
     detector_path: Annotated[
         Optional[Path],  # noqa: UP045

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -60,14 +61,18 @@ def open_workspace(
 
 
 def print_json(value: Any) -> None:
-    """Prints a value, a dataclass or a list of them as JSON."""
-    typer.echo(json.dumps(value, indent=1, default=_plain))
+    """Prints a value, a dataclass or a list of them as JSON; NaN and infinity as null."""
+    typer.echo(json.dumps(_plain(value), indent=1, default=str, allow_nan=False))
 
 
 def _plain(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
-        return asdict(value)
-    return str(value)
+        return _plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return None if isinstance(value, float) and not isfinite(value) else value
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], title: str = "") -> None:

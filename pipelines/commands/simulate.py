@@ -9,7 +9,7 @@ import typer
 def simulate(
     directory: Annotated[Path, typer.Argument(help="Folder for the data set.")],
     frames: Annotated[int, typer.Option(min=1, help="How many frames, val included.")] = 400,
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes.")] = 0,
     val: Annotated[
         Optional[int],  # noqa: UP045
         typer.Option(help="How many of them are for validation; default: a quarter."),

@@ -173,6 +173,179 @@ def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> Non
 
 
 @pytest.mark.parametrize(
+    ("former", "later", "message"),
+    [
+        ('priors = ["points", "semantic"]', 'priors = ["pointz"]', "run.priors.0"),
+        ('priors = ["points", "semantic"]', 'priors = ["points", "points"]', "named twice"),
+        ('categories = ["Car", "Pedestrian", "Cyclist"]', "categories = []", "dataset.categories"),
+        ("scale_range = [0.95, 1.05]", "scale_range = [1.2, 0.8]", "lower limit"),
+        ("minimum_iou = 0.1", "minimum_iou = 1.0", "repredict.minimum_iou"),
+        ("seed = 0", "seed = -1", "run.seed"),
+        ("seed = 0", "seed = 99999999999999999999", "run.seed"),
+        ('policy = "pspsl"', 'policy = "nope"', "unknown policy 'nope'"),
+        ("[run]", '[run]\ndatabase = "nonsense"', "'nonsense': no SQLAlchemy URL"),
+        ("[run]", '[run]\ndatabase = "oracle9://x"', "oracle9"),
+    ],
+)
+def test_a_setting_without_meaning_is_refused_before_any_work(
+    curate: Curate, made: Path, former: str, later: str, message: str
+) -> None:
+    """It costs one line, not a failed frame each."""
+    path = made / "curate.toml"
+    assert former in path.read_text()
+    path.write_text(path.read_text().replace(former, later))
+    code, out, err = curate("run")
+    assert (code, out) == (ConfigError.exit_code, "")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_a_policy_option_of_another_type_is_one_line(curate: Curate, made: Path) -> None:
+    """A class may raise anything for what it is given; it is named, without a traceback."""
+    path = made / "curate.toml"
+    options = 'options = {threshold = {threshold = "high"}}'
+    path.write_text(path.read_text().replace("options = {}\n\n[train]", f"{options}\n\n[train]"))
+    curate("run")
+    code, _, err = curate("solve", "--policy", "threshold")
+    assert code == ConfigError.exit_code
+    assert "policy 'threshold' cannot be made" in err
+    assert err.count("\n") == 1
+
+
+def test_frames_that_an_earlier_stage_lost_are_not_counted_as_done(
+    curate: Curate, made: Path, toy_kitti: Path
+) -> None:
+    """A later stage says nothing of a frame that it never got."""
+    name = json.loads(
+        curate("query", "SELECT frame FROM frame WHERE split='unlabeled'", "--json")[1]
+    )
+    (toy_kitti / "training" / "calib" / f"{name[0]['frame']}.txt").unlink()
+    reports = json.loads(curate("run", "--json")[1])
+    assert [report["kept"] for report in reports if report["stage"] == "repredict"] == [0]
+
+
+def test_status_leaves_out_what_never_happens_to_a_brought_detector(
+    curate: Curate, made: Path
+) -> None:
+    """Only a detector that curate trains waits for a training."""
+    curate("run")
+    states = {row["stage"]: row["state"] for row in json.loads(curate("status", "--json")[1])}
+    assert set(states.values()) == {"done"}
+    assert not {"pretrain", "train-round"} & set(states)
+
+
+def test_json_holds_no_word_that_json_does_not_know(curate: Curate, made: Path) -> None:
+    """Infinity is null."""
+    _, out, _ = curate("query", "SELECT 1e400 AS far, 2 AS near", "--json")
+    assert out.count("null") == 1
+    assert json.loads(out) == [{"far": None, "near": 2}]
+
+
+@pytest.mark.parametrize("option", ["--labeled", "--val"])
+def test_a_list_may_name_a_frame_twice(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, option: str
+) -> None:
+    """It is one frame all the same."""
+    (tmp_path / "ids.txt").write_text("000001\n000003\n000001\n")
+    code, out, err = curate(
+        "init", tmp_path / "w", "--root", toy_kitti, option, tmp_path / "ids.txt"
+    )
+    assert code == 0, err
+    assert f"2 {option.removeprefix('--')}" in out
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\x90\xff\x00", "no list of frame ids"),
+        (b"000099\n", "not among the training frames"),
+        (b"000002\n", "000002 has no label file"),
+    ],
+)
+def test_a_bad_list_of_frames_is_one_line(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, content: bytes, message: str
+) -> None:
+    """A binary file, a stranger, a frame without a label."""
+    (toy_kitti / "training" / "label_2" / "000002.txt").unlink()
+    (tmp_path / "ids.txt").write_bytes(content)
+    code, _, err = curate(
+        "init", tmp_path / "w", "--root", toy_kitti, "--labeled", tmp_path / "ids.txt"
+    )
+    assert code == ConfigError.exit_code
+    assert message in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "w").exists()
+
+
+def test_a_workspace_whose_init_was_killed_is_no_empty_success(curate: Curate, made: Path) -> None:
+    """Settings without frames: the remedy is named, and no empty export passes for labels."""
+    for path in made.glob("curate.db*"):
+        path.unlink()
+    code, out, err = curate("run")
+    assert (code, out) == (WorkspaceError.exit_code, "")
+    assert "run `curate init` again" in err
+    assert not (made / "exports" / "labels.sqlite").exists()
+
+
+def test_relative_paths_in_the_settings_are_taken_from_the_workspace(
+    curate: Curate, made: Path, toy_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever the command is typed, and after data and workspace have moved together."""
+    path = made / "curate.toml"
+    path.write_text(path.read_text().replace(f'"{tmp_path}/', '"../'))
+    assert 'root = "../' in path.read_text()
+    monkeypatch.chdir(toy_kitti)
+    assert curate("run", "-w", made)[0] == 0
+    (tmp_path / "home").mkdir()
+    for name in ("kitti", "detector.txt", "work"):
+        (tmp_path / name).rename(tmp_path / "home" / name)
+    code, _, err = curate("score", "-w", tmp_path / "home" / "work")
+    assert (code, err) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--detector", "nope"), "unknown detector 'nope'"),
+        (("--detector", "recorded"), "give --detector-path"),
+        (("--detector", "recorded", "--detector-path", "a.csv"), "a.csv: no such file"),
+        (("--segmenter", "nope"), "unknown segmenter 'nope'"),
+        (("--segmenter", "onnx"), "give --segmenter-path"),
+        (("--segmenter", "onnx", "--segmenter-path", "a.onnx"), "a.onnx: no such file"),
+    ],
+)
+def test_a_workspace_is_not_made_over_what_is_not_there(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, options: tuple[str, ...], message: str
+) -> None:
+    """Not hours later, when the stage comes that needs it."""
+    code, _, err = curate("init", tmp_path / "w", "--root", toy_kitti, *options)
+    assert code == ConfigError.exit_code
+    assert message in err
+    assert not (tmp_path / "w").exists()
+
+
+def test_val_frames_without_labels_name_the_way_out(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """The data set's own val list may name frames that nobody labeled."""
+    (toy_kitti / "training" / "label_2" / "000010.txt").unlink()
+    code, _, err = curate("init", tmp_path / "w", "--root", toy_kitti, "--labeled", "0.25")
+    assert code == ConfigError.exit_code
+    assert "val frame 000010 has no label file; give --val 0" in err
+
+
+def test_a_workspace_may_lie_in_a_folder_of_any_name(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """What means something in a URL or in TOML means nothing in a folder's name."""
+    folder = tmp_path / 'a "b" ü %41?c=d#e'
+    assert curate("init", folder, "--root", toy_kitti, "--labeled", "0.25")[0] == 0
+    code, out, err = curate("query", "SELECT count(*) FROM frame", "--csv", "-w", folder)
+    assert (code, out.split()[-1], err) == (0, "12", "")
+    assert (folder / "curate.db").is_file()
+
+
+@pytest.mark.parametrize(
     ("line", "message"),
     [
         ("Car 0.00 0 1.0 1 2 3 4", "label_2"),

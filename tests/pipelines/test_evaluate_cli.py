@@ -78,6 +78,37 @@ def test_it_shows_r40_and_r11_side_by_side(curate: Curate, folders: tuple[Path, 
     assert "recall 3d > 0.7" in out
 
 
+def test_a_list_names_the_frames_to_compare(
+    curate: Curate, folders: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Labels of a whole data set, results of its val split."""
+    (folders[0] / "000003.txt").write_text(LINE + "\n")
+    assert evaluate(curate, folders)[0] == DataError.exit_code
+    (tmp_path / "val.txt").write_text("000001\r\n000002\r\n")
+    code, out, _ = evaluate(curate, folders, "--frames", tmp_path / "val.txt", "--json")
+    assert code == 0
+    assert json.loads(out)["objects"]["Car"] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\x00"])
+def test_a_list_of_frames_without_frames_is_refused(
+    curate: Curate, folders: tuple[Path, Path], tmp_path: Path, content: bytes
+) -> None:
+    """In one line that names the file."""
+    (tmp_path / "val.txt").write_bytes(content)
+    code, _, err = evaluate(curate, folders, "--frames", tmp_path / "val.txt")
+    assert code == DataError.exit_code
+    assert "val.txt: " in err
+    assert err.count("\n") == 1
+
+
+def test_a_checkpoint_that_is_not_there_is_one_line(curate: Curate, workspace: Workspace) -> None:
+    """Whatever the detector would make of it."""
+    code, _, err = curate("evaluate", "-w", workspace.root, "--checkpoint", "nowhere")
+    assert code == WorkspaceError.exit_code
+    assert err == "error: --checkpoint nowhere: no such file\n"
+
+
 @pytest.mark.parametrize(
     ("file", "text", "place", "message"),
     [

@@ -20,6 +20,8 @@ from curate.errors import ModelError
 
 FORMAT = "curate-pillars"
 FORMAT_VERSION = "1"
+_LENGTH_BYTES = 8  # of the number before a safetensors header, and the header's alignment
+
 # Key in the graph's metadata of the digest of the checkpoint that it was made from. The number
 # grows with every change of what a graph answers, so that older ones are made again.
 GRAPH_DIGEST = "checkpoint_sha256_2"
@@ -49,9 +51,22 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "categories": json.dumps(list(checkpoint.categories)),
     }
     tensors = {name: np.ascontiguousarray(array) for name, array in checkpoint.weights.items()}
-    content = save(tensors, metadata)
+    content = _canonical(save(tensors, metadata))
     write_graph(path, checkpoint, hashlib.sha256(content).hexdigest())
     replace_file(path, content)
+
+
+def _canonical(content: bytes) -> bytes:
+    """The same safetensors file with its header sorted.
+
+    The library writes the metadata in an order that it draws anew in every process. Equal weights
+    must have equal bytes: what a teacher has said is kept as long as its hash is the same.
+    """
+    start = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
+    entries = json.loads(content[_LENGTH_BYTES:start])
+    header = json.dumps(entries, sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % _LENGTH_BYTES)  # tensors stay aligned
+    return len(header).to_bytes(_LENGTH_BYTES, "little") + header + content[start:]
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

@@ -45,6 +45,15 @@ def test_lists_the_frames_that_have_points(toy_kitti):
     assert list(KittiDataset(toy_kitti).frame_ids()) == expected
 
 
+def test_hidden_files_are_no_frames_and_no_lists(toy_kitti):
+    """Those beginning with ._ that macOS leaves beside the files that it copies."""
+    (toy_kitti / "training" / "velodyne" / "._000003.bin").write_bytes(b"\x00\x05\x16\x07")
+    (toy_kitti / "ImageSets" / "._train.txt").write_bytes(b"\x00\x05/\x07")
+    dataset = KittiDataset(toy_kitti)
+    assert list(dataset.frame_ids()) == [f"{i:06d}" for i in range(12)]
+    assert set(dataset.splits()) == {"train", "val"}
+
+
 def test_reads_a_frame_with_and_without_its_image(toy_kitti):
     """Size and points are the same either way; pixels only where asked for."""
     dataset = KittiDataset(toy_kitti)

@@ -96,6 +96,16 @@ def test_reads_scores_of_results(tmp_path):
     assert read_objects(path, scored=True).scores.tolist() == [0.5, -3.25]
 
 
+def test_files_of_other_systems_read_alike(tmp_path):
+    """A byte order mark, carriage returns, tabs and spare spaces mean nothing."""
+    (tmp_path / "a.txt").write_text(f"{CAR}\n{CAR}\n")
+    foreign = CAR.replace(" ", " \t ") + " \r\n"
+    (tmp_path / "b.txt").write_bytes(b"\xef\xbb\xbf" + foreign.encode() * 2 + b"\r\n")
+    ours, theirs = read_objects(tmp_path / "a.txt"), read_objects(tmp_path / "b.txt")
+    assert theirs.categories.tolist() == ours.categories.tolist()
+    assert theirs.locations.tolist() == ours.locations.tolist()
+
+
 @pytest.mark.parametrize("text", ["", "\n", "  \n\n"])
 def test_an_empty_file_holds_no_objects(tmp_path, text):
     """No lines, or only empty ones, are no objects, with the shapes of any other file."""

@@ -7,6 +7,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from curate.detectors.pillars import PillarDetector
+from curate.detectors.pillars import checkpoint as module
 from curate.detectors.pillars.checkpoint import load_checkpoint, save_checkpoint
 from curate.detectors.pillars.network import PillarNetwork, checkpoint_of, network_of
 from curate.detectors.pillars.presets import PRESETS
@@ -35,6 +36,17 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path, checkpoint):
         "teacher.onnx",
         "teacher.safetensors",
     ]
+
+
+def test_equal_weights_have_equal_bytes(tmp_path, checkpoint, monkeypatch):
+    """A training done again with the same seed is the same teacher: nothing becomes stale."""
+    monkeypatch.setattr(module, "write_graph", lambda *_: None)
+    path = tmp_path / "teacher.safetensors"
+    contents = set()
+    for _ in range(8):
+        save_checkpoint(path, checkpoint)
+        contents.add(path.read_bytes())
+    assert len(contents) == 1
 
 
 class Bomb:

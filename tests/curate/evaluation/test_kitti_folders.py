@@ -35,6 +35,12 @@ def test_only_the_named_frames_are_read(folders):
     assert read_folders(*folders, ["000002"])[0] == ("000002",)
 
 
+def test_hidden_files_are_no_frames(folders):
+    """Those beginning with ._ that macOS leaves beside the files that it copies."""
+    (folders[0] / "._000002.txt").write_bytes(b"\x00\x05\x16\x07")
+    assert read_folders(*folders)[0] == ("000001", "000002", "000007")
+
+
 def test_a_missing_result_file_is_an_error(folders):
     """It names the first file and the remedy; a partial run is not scored as a whole one."""
     (folders[1] / "000002.txt").unlink()
