@@ -175,7 +175,7 @@ def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> Non
 @pytest.mark.parametrize(
     ("former", "later", "message"),
     [
-        ('priors = ["points", "semantic"]', 'priors = ["pointz"]', "run.priors.0"),
+        ('priors = ["points", "semantic"]', 'priors = ["pointz"]', "unknown prior 'pointz'"),
         ('priors = ["points", "semantic"]', 'priors = ["points", "points"]', "named twice"),
         ('categories = ["Car", "Pedestrian", "Cyclist"]', "categories = []", "dataset.categories"),
         ("scale_range = [0.95, 1.05]", "scale_range = [1.2, 0.8]", "lower limit"),
