@@ -177,6 +177,11 @@ class Prediction(Box, Base):
     k: Mapped[Key]
     category: Mapped[Name]
     score: Mapped[Share]
+    iou: Mapped[float | None] = mapped_column(
+        Float(53),
+        sort_order=1,
+        comment="the detector's estimate of its 3D IoU with the object; null = it makes none",
+    )
 
 
 class RepredictionView(Base):

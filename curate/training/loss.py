@@ -3,10 +3,11 @@
     L = 1/n * sum over X_l of L_3d + 1/n * sum over X_u of v * L_3d
 
 L_3d is the penalty-reduced focal loss of the heatmap (Law and Deng, CornerNet, ECCV 2018) plus an
-L1 loss of the box code. v multiplies all that an object says: that its centre is a centre, what its
-box is, and that the cells around its centre are not centres. v = 0 leaves its region without
-gradient: it is neither object nor background. n is a constant of the training, never a sum of
-weights, which would cancel them.
+L1 loss of the box code plus the cross-entropy of the estimated 3D IoU of the answered box, after
+AFDetV2 (Hu et al., AAAI 2022). v multiplies all that an object says: that its centre is a centre,
+what its box is, how good the answer is, and that the cells around its centre are not centres. v = 0
+leaves its region without gradient: it is neither object nor background. n is a constant of the
+training, never a sum of weights, which would cancel them.
 """
 
 from collections.abc import Sequence
@@ -17,10 +18,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from curate.detectors.pillars.encoding import Targets
+from curate.detectors.pillars.encoding import Targets, code_ious
+from curate.detectors.pillars.network import Answers
+from curate.detectors.pillars.presets import Preset
 
 # Weight of the box term against the classification term.
 BOX_WEIGHT = 1.0
+# Weight of the IoU term.
+IOU_WEIGHT = 1.0
 
 
 @dataclass(frozen=True)
@@ -99,13 +104,40 @@ def box_loss(codes: Tensor, targets: BatchTargets) -> Tensor:
     return (targets.code_weights[:, None] * (answered - targets.codes).abs()).sum()
 
 
-def weighted_loss(logits: Tensor, codes: Tensor, targets: BatchTargets, objects: float) -> Tensor:
+def iou_loss(iou_logits: Tensor, codes: Tensor, targets: BatchTargets, preset: Preset) -> Tensor:
+    """Sum of the IoU terms: how well each answered box knows its overlap with the object.
+
+    The overlap itself is exact and has no gradient.
+
+    Args:
+        iou_logits: (b, x cells, y cells).
+        codes: (b, x cells, y cells, BOX_CODE).
+        targets: of the same b frames.
+        preset: the grid.
+    """
+    cells = targets.code_cells
+    answered, true = codes.detach().flatten(0, 2)[cells].cpu(), targets.codes.cpu()
+    in_frame = cells.cpu().numpy() % (preset.cells[0] * preset.cells[1])
+    overlap = code_ious(answered.numpy(), true.numpy(), in_frame, preset)
+    estimated = iou_logits.flatten()[cells]
+    exact = torch.from_numpy(overlap).to(estimated)
+    return functional.binary_cross_entropy_with_logits(
+        estimated, exact, targets.code_weights, reduction="sum"
+    )
+
+
+def weighted_loss(
+    answers: Answers, targets: BatchTargets, preset: Preset, objects: float
+) -> Tensor:
     """The loss of a batch.
 
     Args:
-        logits: (b, x cells, y cells, categories).
-        codes: (b, x cells, y cells, BOX_CODE).
+        answers: of the network for b frames.
         targets: of the same b frames.
+        preset: the grid.
         objects: n, how many objects b fully labeled frames are expected to hold.
     """
-    return (heatmap_loss(logits, targets) + BOX_WEIGHT * box_loss(codes, targets)) / objects
+    logits, codes, iou_logits = answers
+    box = BOX_WEIGHT * box_loss(codes, targets)
+    iou = IOU_WEIGHT * iou_loss(iou_logits, codes, targets, preset)
+    return (heatmap_loss(logits, targets) + box + iou) / objects

@@ -119,8 +119,9 @@ def _learn(
     for group in optimizer.param_groups:
         group["lr"] = one_cycle(step, settings.steps, settings.learning_rate)
     batch = batches[step]
-    logits, codes = network(batch.features, batch.slots, batch.frames)
-    loss = weighted_loss(logits, codes, batch.targets, batch.frames * batches.objects_per_frame)
+    answers = network(batch.features, batch.slots, batch.frames)
+    expected = batch.frames * batches.objects_per_frame
+    loss = weighted_loss(answers, batch.targets, network.preset, expected)
     optimizer.zero_grad(set_to_none=True)
     torch.autograd.backward(loss)
     torch.nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)

@@ -2,6 +2,7 @@
 
 from sqlalchemy import Connection
 
+from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError, WorkspaceError
 from pipelines import plan
 from pipelines.progress import Progress
@@ -37,6 +38,7 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
         config.run.seed,
         config.detector.device,
         config.dataset.categories,
+        FORMAT_VERSION,
     ]
     path = workspace.root / "checkpoints" / "round-00.safetensors"
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection
 
+from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError
 from curate.frames import Frame
 from pipelines.assembly import device
@@ -24,7 +25,12 @@ def settings(workspace: Workspace, context: RoundContext, _policy: str) -> Setti
     section = workspace.config.train.model_dump(
         mode="json", exclude={"pretrain_steps", "learning_rate", "threads"}
     )
-    return {**section, "seed": context.seed, "device": workspace.config.detector.device}
+    return {
+        **section,
+        "seed": context.seed,
+        "device": workspace.config.detector.device,
+        "checkpoint": FORMAT_VERSION,
+    }
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:

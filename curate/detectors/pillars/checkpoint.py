@@ -19,10 +19,11 @@ from curate.detectors.pillars.presets import PRESETS, Preset
 from curate.errors import ModelError
 
 FORMAT = "curate-pillars"
-FORMAT_VERSION = "1"
+# Version 2 added the estimate of the IoU.
+FORMAT_VERSION = "2"
 # Key in the graph's metadata of the digest of the checkpoint that it was made from. The number
 # grows with every change of what a graph answers, so that older ones are made again.
-GRAPH_DIGEST = "checkpoint_sha256_2"
+GRAPH_DIGEST = "checkpoint_sha256_3"
 
 
 @dataclass(frozen=True)
