@@ -268,7 +268,10 @@ class SemanticPrior(Base):
 
 
 class Weight(Base):
-    """The reliability weight v that one policy gives a label; policies stand side by side."""
+    """The reliability weight v that one policy gives a label; policies stand side by side.
+
+    v = 0 marks a region to ignore. A label that a policy drops has no row of that policy.
+    """
 
     __tablename__ = "weight"
     __table_args__ = _evidence(Index("ix_weight_policy_v", "round", "policy", "v"))

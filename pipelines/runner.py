@@ -173,7 +173,7 @@ class _Writer:
         self.workspace = workspace
         self.context = context
         self.stage = stage
-        prints = plan.fingerprints(workspace, context, workspace.config.solve.policy)
+        prints = plan.fingerprints(workspace, context, workspace.config.run.method)
         self.fingerprint = prints[stage.name]
         self.done = self.empty = self.failed = self.labels = 0
         self.errors: list[tuple[str, str]] = []

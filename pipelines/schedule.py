@@ -28,7 +28,7 @@ def run_all(
     if trainable:
         yield pretrain(workspace, progress)
     total = (rounds or workspace.config.run.rounds) if trainable and train else 1
-    policy = workspace.config.solve.policy
+    policy = workspace.config.run.method
     with open_executor(workspace) as executor:
         for number in range(1, total + 1):
             context = open_round(workspace, number, rounds)

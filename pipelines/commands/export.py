@@ -35,7 +35,7 @@ def export(
 
         opened = open_workspace(workspace)
         context = open_round(opened, round_number)
-        chosen = policy or opened.config.solve.policy
+        chosen = policy or opened.config.run.method
         folder = output or opened.root / "exports" / "kitti"
         labels = export_kitti_files(opened, context.number, chosen, folder)
         typer.echo(f"{labels} labels in {folder}")

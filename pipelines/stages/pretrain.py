@@ -30,7 +30,16 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
     if not labeled:
         raise WorkspaceError("no labeled frames to learn from; `curate init --labeled` takes some")
     settings = config.train.model_dump(
-        mode="json", exclude={"round_steps", "round_learning_rate", "threads", "start"}
+        mode="json",
+        exclude={
+            "round_steps",
+            "round_learning_rate",
+            "threads",
+            "start",
+            "zero_weight",
+            "teacher",
+            "ema_decay",
+        },
     )
     key = [
         settings,
@@ -49,7 +58,7 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
             labels=labels,
             output=path,
             settings=training_settings(
-                workspace, config.train.pretrain_steps, config.train.learning_rate, 0
+                workspace, config.train.pretrain_steps, config.train.learning_rate, 0, "student"
             ),
             start=None,
             read=workspace.dataset.read,
