@@ -82,9 +82,11 @@ def test_the_iou_term_is_least_at_the_true_overlap():
     moved[:, 0] += straight[3] / 2 / PRESET.cell_m
     codes.flatten(0, 2)[targets.code_cells] = moved
 
+    silent = torch.full((1, *PRESET.cells, 1), -9.0)
+
     def loss(said):
         logits = torch.full((1, *PRESET.cells), math.log(said / (1 - said)), dtype=torch.float64)
-        return float(iou_loss(logits, codes, targets, PRESET))
+        return float(iou_loss(Answers(silent, codes, logits), targets, PRESET))
 
     entropy = -(math.log(1 / 3) / 3 + 2 * math.log(2 / 3) / 3)
     assert loss(1 / 3) == pytest.approx(0.5 * entropy, rel=1e-4)
@@ -95,9 +97,23 @@ def test_the_iou_term_does_not_move_the_box():
     """The overlap is a target: the gradient reaches the estimate alone, in every frame."""
     targets = targets_of([(CAR, 1.0)], [(CAR, 1.0)])
     given = answers(2)
-    iou_loss(given.iou_logits, given.codes, targets, PRESET).backward()
+    iou_loss(given, targets, PRESET).backward()
     assert given.codes.grad is None
+    assert given.logits.grad is None
     assert (given.iou_logits.grad.flatten(1).abs().sum(1) > 0).all()
+
+
+def test_what_is_found_beside_all_objects_overlaps_none():
+    """A cell that finds something there costs ln 2 / 9 at IoU 1/2; in an ignored region nothing."""
+    silent = torch.full((1, *PRESET.cells, 1), -9.0)
+    codes, undecided = torch.zeros(1, *PRESET.cells, BOX_CODE), torch.zeros(1, *PRESET.cells)
+    ignored = targets_of([(CAR, 0.0)])
+    far = (2, 2)
+    for cell, expected in ((far, math.log(2) / 9), (divmod(int(ignored.centres[0]), 32), 0.0)):
+        found = silent.clone()
+        found[0, *cell, 0] = 0.0
+        cost = iou_loss(Answers(found, codes, undecided), ignored, PRESET)
+        assert float(cost) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("v", [0.1, 0.5])
@@ -110,9 +126,9 @@ def test_the_gradient_of_an_object_is_v_times_that_of_a_sure_one(v):
     torch.testing.assert_close(logits_unsure[0][region], v * logits_sure[0][region])
     torch.testing.assert_close(logits_unsure[0][~region], logits_sure[0][~region])
     torch.testing.assert_close(codes_unsure, v * codes_sure)
-    torch.testing.assert_close(ious_unsure, v * ious_sure)
+    torch.testing.assert_close(ious_unsure[0][region], v * ious_sure[0][region])
     assert codes_sure.abs().sum() > 0
-    assert ious_sure.abs().sum() > 0
+    assert ious_sure[0][region].abs().sum() > 0
 
 
 def test_an_ignored_region_has_no_gradient():
@@ -124,7 +140,7 @@ def test_an_ignored_region_has_no_gradient():
     assert not logits[0][region].any()
     assert logits[0][~region].abs().min() > 0
     assert not codes.any()
-    assert not ious.any()
+    assert not ious[0][region].any()
 
 
 def test_the_weights_of_other_objects_do_not_matter():
