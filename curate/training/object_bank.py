@@ -152,6 +152,17 @@ class _Outlines:
             (boxes[:, 2] - boxes[:, 5] / 2 + _GROUND_METRES) / nearest,
         )
 
+    def cover(self, which: list[int], seen: "_Seen") -> np.ndarray:
+        """(p,) bool, whether a point appears within one of some outlines, whatever its distance."""
+        within = [
+            (values >= bounds[which, :1].T) & (values <= bounds[which, 1:].T)
+            for values, bounds in (
+                (seen.azimuth[:, None], self.azimuth),
+                (seen.slope[:, None], self.slope),
+            )
+        ]
+        return np.asarray((within[0] & within[1]).any(axis=1))
+
 
 class _Scene:
     """The points of a frame as the sensor sees them; what is pasted hides others and is hidden."""
@@ -159,11 +170,12 @@ class _Scene:
     def __init__(self, points: np.ndarray) -> None:
         self._points, self._seen = points, _Seen.of(points)
         self._kept = np.ones(len(points), dtype=bool)
+        self._pasted: list[int] = []
         azimuth = self._seen.azimuth
         self.azimuths = (float(azimuth.min()), float(azimuth.max()))
 
     def insert(self, outlines: _Outlines, k: int, points: np.ndarray) -> bool:
-        """Puts the points of object k in, unless it would be hidden or cut off."""
+        """Puts the points of object k in that are seen, unless it would be hidden or cut off."""
         low, high = outlines.azimuth[k]
         if low < self.azimuths[0] or high > self.azimuths[1]:
             return False
@@ -175,10 +187,14 @@ class _Scene:
         hiding = covered & before & (slope > outlines.above_ground[k])
         if np.count_nonzero(hiding) > _HIDDEN_SHARE * len(points):
             return False
+        own = _Seen.of(points)
+        nearer = [j for j in self._pasted if outlines.distance[j] < outlines.distance[k]]
+        hidden = outlines.cover(nearer, own)
         self._kept[in_sector[covered & ~before]] = False
         self._points = np.concatenate([self._points, points])
-        self._seen = self._seen.and_also(_Seen.of(points))
-        self._kept = np.concatenate([self._kept, np.ones(len(points), dtype=bool)])
+        self._seen = self._seen.and_also(own)
+        self._kept = np.concatenate([self._kept, ~hidden])
+        self._pasted.append(k)
         return True
 
     def left(self) -> np.ndarray:
