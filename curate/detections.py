@@ -5,7 +5,7 @@ and yaw in radians, counter-clockwise from the x axis in (-pi, pi], all in the L
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -31,26 +31,41 @@ class Detections:
         boxes: (n, 7) in the LiDAR frame.
         scores: (n,) float64 in [0, 1].
         categories: (n,) str.
+        iou: (n,) float64 in [0, 1], the detector's own estimate of the 3D IoU of its box with the
+            object; NaN where it makes none, and everywhere if left out.
     """
 
     boxes: np.ndarray
     scores: np.ndarray
     categories: np.ndarray
+    iou: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        """Fills in estimates that were left out."""
+        if len(self.iou) == 0:
+            object.__setattr__(self, "iou", np.full(len(self.boxes), np.nan))
 
     def __len__(self) -> int:
         return len(self.boxes)
 
     def select(self, index: np.ndarray) -> Self:
         """The detections at `index` (integers or a mask), in that order."""
-        return type(self)(self.boxes[index], self.scores[index], self.categories[index])
+        return type(self)(
+            self.boxes[index], self.scores[index], self.categories[index], self.iou[index]
+        )
 
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[Any]]) -> Self:
-        """From rows of category, score, and the seven numbers of the box."""
+        """From rows of category, score, the seven numbers of the box, and IoU estimate or None."""
         if not rows:
             return cls.empty()
-        categories, scores, *box = zip(*rows, strict=True)
-        return cls(np.array(box, dtype=np.float64).T, np.array(scores), as_categories(categories))
+        categories, scores, *box, iou = zip(*rows, strict=True)
+        return cls(
+            np.array(box, dtype=np.float64).T,
+            np.array(scores),
+            as_categories(categories),
+            np.array(iou, dtype=np.float64),
+        )
 
     @classmethod
     def empty(cls) -> Self:

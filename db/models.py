@@ -177,6 +177,11 @@ class Prediction(Box, Base):
     k: Mapped[Key]
     category: Mapped[Name]
     score: Mapped[Share]
+    iou: Mapped[float | None] = mapped_column(
+        Float(53),
+        sort_order=1,
+        comment="the detector's estimate of its 3D IoU with the object; null = it makes none",
+    )
 
 
 class RepredictionView(Base):
@@ -263,7 +268,10 @@ class SemanticPrior(Base):
 
 
 class Weight(Base):
-    """The reliability weight v that one policy gives a label; policies stand side by side."""
+    """The reliability weight v that one policy gives a label; policies stand side by side.
+
+    v = 0 marks a region to ignore. A label that a policy drops has no row of that policy.
+    """
 
     __tablename__ = "weight"
     __table_args__ = _evidence(Index("ix_weight_policy_v", "round", "policy", "v"))

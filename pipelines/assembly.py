@@ -84,7 +84,11 @@ def open_policy(config: Config, name: str) -> Policy:
     section = config.solve
     policy: Policy = registry.POLICIES.build(
         name,
-        offered={"scope": lambda: section.scope, "quantile": lambda: section.quantile},
+        offered={
+            "scope": lambda: section.scope,
+            "quantile": lambda: section.quantile,
+            "self_paced": lambda: section.self_paced,
+        },
         options=section.options.get(name, {}),
     )
     return policy

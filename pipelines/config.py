@@ -5,7 +5,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from curate.atomic import replace_file
 from curate.detections import CATEGORIES
@@ -98,12 +105,19 @@ class SemanticSection(Section):
 
 
 class SolveSection(Section):
-    """Which policy weighs the labels that the trainer sees, and its settings."""
+    """The settings of policies; which of them weighs is `run.method`."""
 
-    policy: str = "pspsl"
     scope: Literal["round", "category", "frame"] = "round"  # which labels share one lambda
     quantile: Annotated[float, Field(gt=0, le=1)] | None = None  # in place of Eq. 4's maximum
+    self_paced: bool = True  # false: pspsl weighs by the priors alone
     options: dict[str, Options] = {}  # by policy, e.g. options.threshold.threshold = 0.3
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_the_new_place(cls, section: Any) -> Any:
+        if isinstance(section, Mapping) and "policy" in section:
+            raise ValueError(f'policy has moved: write method = "{section["policy"]}" in [run]')
+        return section
 
 
 class TrainSection(Section):
@@ -119,12 +133,16 @@ class TrainSection(Section):
     threads: AtLeastOne = 1
     zero_weight: Literal["ignore", "background"] = "ignore"
     start: Literal["teacher", "scratch"] = "teacher"
+    teacher: Literal["method", "student", "ema"] = "method"  # what teaches the next round
+    ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999  # per 1/10,000 of the training
+    pasted: Annotated[int, Field(ge=0)] = 4  # of the object bank, per category; 0 = no bank
     options: Options = {}
 
 
 class RunSection(Section):
-    """How the work is organised."""
+    """Which method learns, and how the work is organised."""
 
+    method: str = "pspsl"  # see docs/methods.md
     rounds: AtLeastOne = 3
     seed: Seed = 0
     priors: Annotated[tuple[str, ...], AfterValidator(_each_once)] = ("points", "semantic")

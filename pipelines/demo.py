@@ -112,7 +112,7 @@ def run_demo(demo: Demo, say: Say) -> None:
     for report in run_all(workspace, demo.rounds, Bar()):
         if report.done:
             print_report(report)
-    for policy, how in {workspace.config.solve.policy: LEARNED, **OTHERS}.items():
+    for policy, how in {workspace.config.run.method: LEARNED, **OTHERS}.items():
         say(f"   {policy:<9} {how}")
     say("\n4. How good are the labels? Judged by the truth that the simulation knows.\n")
     _print_quality(workspace)
@@ -157,13 +157,13 @@ def _weigh_for_others(workspace: Workspace) -> None:
     for name, policies in (("solve", (*JUDGED, *OTHERS)), ("export", tuple(OTHERS))):
         for policy in dict.fromkeys(policies):
             found = stage(name)
-            if isinstance(found, RoundStage) and policy != workspace.config.solve.policy:
+            if isinstance(found, RoundStage) and policy != workspace.config.run.method:
                 run_round(workspace, context, found, policy, Bar())
 
 
 def _train_students(workspace: Workspace, demo: Demo) -> None:
     """One process of one thread per student; more threads hardly help so small a network."""
-    policies = (workspace.config.solve.policy, *OTHERS)
+    policies = (workspace.config.run.method, *OTHERS)
     with ThreadPoolExecutor(len(policies) if demo.processes > 1 else 1) as pool:
         list(pool.map(lambda policy: _train_student(workspace, policy), policies))
 
@@ -209,7 +209,7 @@ def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:
     """The detectors to compare, with their checkpoints."""
     rounds = workspace.config.run.rounds
     first = open_round(workspace, 1)
-    policy = workspace.config.solve.policy
+    policy = workspace.config.run.method
     students = [
         (f"{policy} student, round {number}", train_round.file(workspace, context, policy))
         for number in range(1, rounds + 1)

@@ -70,8 +70,9 @@ def _label(
         row = connection.execute(query).fetchone()
     if row is None:
         raise WorkspaceError(
-            f"round {round_number or 1} has no label {k} of frame {frame} weighted by {policy}; "
-            "the view weighted_labels lists what there is, see `curate query --help`"
+            f"round {round_number or 1} has no label {k} of frame {frame} weighted by {policy}, or "
+            "the policy dropped it; the view weighted_labels lists what there is, see "
+            "`curate query --help`"
         )
     return dict(row._mapping)  # noqa: SLF001 - its public name
 
@@ -92,11 +93,16 @@ def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple
 
 
 def _weight(label: dict[str, Any]) -> float | None:
-    """The weight by Eqs. 7 and 11; None for policies that do not use them."""
+    """The weight by Eqs. 7 and 11; None for policies that do not use them.
+
+    A label that matched has a lambda unless the policy was told to do without: it weighs rho_det.
+    """
     if label["policy"] not in {"spsl", "pspsl"}:
         return None
-    if label["loss"] is None or label["lambda_u"] is None:
+    if label["loss"] is None:
         return 0.0
+    if label["lambda_u"] is None:
+        return float(label["rho_det"])
     import numpy as np
 
     v = float(easiness(np.array([label["loss"]]), np.array([label["lambda_u"]]))[0])
@@ -138,6 +144,8 @@ def _lines(
     lines.append("  priors         rho_det = {rho_det}".format(**number))
     lines.append("  age, Eq. 4     lambda = {lambda_u}".format(**number))
     formulas = {"spsl": "1 - L / lambda, Eq. 7", "pspsl": "rho_det (1 - L / lambda), Eq. 11"}
+    if label["lambda_u"] is None and label["loss"] is not None:
+        formulas["pspsl"] = "rho_det, without the self-paced term"
     formula = formulas.get(label["policy"], "see curate solve --help")
     lines.append(f"  policy         {label['policy']}: v = {formula}")
     lines.append(f"  weight         {number['weight']}")

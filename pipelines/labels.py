@@ -57,7 +57,7 @@ def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterato
         counts = [row[-1] for row in own]
         yield FrameLabels(
             frame,
-            Detections.from_rows([row[1:10] for row in own]),
+            Detections.from_rows([(*row[1:10], None) for row in own]),
             np.array([row[10] for row in own], dtype=np.float64),
             None if None in counts else np.array(counts),
         )

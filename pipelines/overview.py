@@ -80,7 +80,7 @@ def _round_rows(
     )
     with workspace.database.reading() as connection:
         policies = {row[0] for row in bulk.select(connection, query)}
-    for policy in sorted(policies | {workspace.config.solve.policy}):
+    for policy in sorted(policies | {workspace.config.run.method}):
         state = plan.round_state(workspace, context, stage, policy)
         done = int(state == "done")
         yield (context.number, stage.name, "", policy, state, done, 0, 0, 1 - done)

@@ -13,7 +13,7 @@ from pipelines.workspace import Workspace
 
 def draw_telling_frame(workspace: Workspace, round_number: int) -> list[Path]:
     """A bird's eye view and an image overlay of the frame that shows most of all weights."""
-    policy = workspace.config.solve.policy
+    policy = workspace.config.run.method
     frames = list(read_labels(workspace, round_number, policy))
     shown = max(frames, key=_variety)
     return draw_labels(workspace, round_number, shown)
@@ -31,7 +31,7 @@ def draw_labels(workspace: Workspace, round_number: int, shown: FrameLabels) -> 
         shown.weights,
         shown.points,
     )
-    title = f"frame {shown.frame}, round {round_number}, weights by {workspace.config.solve.policy}"
+    title = f"frame {shown.frame}, round {round_number}, weights by {workspace.config.run.method}"
     stem = f"round-{round_number:02d}-{shown.frame}"
     pictures = {
         f"{stem}-bird-eye.png": draw_bird_eye(frame.points, labels, title=title),

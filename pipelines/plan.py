@@ -92,7 +92,7 @@ def waiting_frames(
     They are those of the split that all earlier stages have finished and this one has not, or not
     with its current fingerprint.
     """
-    prints = fingerprints(workspace, context, workspace.config.solve.policy)
+    prints = fingerprints(workspace, context, workspace.config.run.method)
     frame = bulk.table("frame")
     query = select(frame.c.id, frame.c.frame).where(frame.c.split == split).order_by(frame.c.frame)
     with workspace.database.reading() as connection:
@@ -111,7 +111,7 @@ def waiting_frames(
 
 def measured_frames(workspace: Workspace, context: RoundContext, of: FrameStage) -> set[int]:
     """The frames whose stored measurements still hold, though what follows from them may not."""
-    current = fingerprints(workspace, context, workspace.config.solve.policy)[of.name]
+    current = fingerprints(workspace, context, workspace.config.run.method)[of.name]
     task = bulk.table("task")
     query = select(task.c.frame_id).where(
         task.c.round == context.number,
@@ -125,7 +125,7 @@ def measured_frames(workspace: Workspace, context: RoundContext, of: FrameStage)
 
 def counts(workspace: Workspace, context: RoundContext, of: FrameStage, split: str) -> Counts:
     """How far a stage is with a split."""
-    prints = fingerprints(workspace, context, workspace.config.solve.policy)
+    prints = fingerprints(workspace, context, workspace.config.run.method)
     frames = set(workspace.frames(split).values())
     with workspace.database.reading() as connection:
         own = _states(connection, context.number, of.name, prints[of.name])
@@ -142,7 +142,7 @@ def complete_frames(
     Raises:
         WorkspaceError: some frames wait; failed ones do not count as waiting, they are left out.
     """
-    prints = fingerprints(workspace, context, workspace.config.solve.policy)
+    prints = fingerprints(workspace, context, workspace.config.run.method)
     needed = frames_before(stage("solve"), workspace.config.run.priors)
     frames = workspace.frames(split).values()
     with workspace.database.reading() as connection:

@@ -80,7 +80,7 @@ def find_teacher(workspace: Workspace, number: int) -> tuple[int, Teacher]:
     if not is_trainable(workspace):
         return _brought(workspace)
     table = bulk.table("checkpoint")
-    policy = workspace.config.solve.policy if number > 1 else ""
+    policy = workspace.config.run.method if number > 1 else ""
     query = select(table.c.id, table.c.path, table.c.sha256).where(
         table.c.round == number - 1, table.c.policy == policy
     )
@@ -145,7 +145,7 @@ def _brought(workspace: Workspace) -> tuple[int, Teacher]:
 def _students(workspace: Workspace) -> set[int]:
     """The rounds that have trained a student with the configured policy."""
     table = bulk.table("checkpoint")
-    query = select(table.c.round).where(table.c.policy == workspace.config.solve.policy)
+    query = select(table.c.round).where(table.c.policy == workspace.config.run.method)
     with workspace.database.reading() as connection:
         return {row[0] for row in bulk.select(connection, query)}
 

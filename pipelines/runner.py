@@ -192,7 +192,7 @@ class _Writer:
         self.workspace = workspace
         self.context = context
         self.stage = stage
-        prints = plan.fingerprints(workspace, context, workspace.config.solve.policy)
+        prints = plan.fingerprints(workspace, context, workspace.config.run.method)
         self.fingerprint = prints[stage.name]
         self.unaffected = unaffected(stage, workspace.config.run.priors)
         self.done = self.empty = self.failed = self.labels = 0

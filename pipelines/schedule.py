@@ -26,7 +26,7 @@ def run_all(
         train: whether students are trained; without them only the first round can be run.
     """
     trainable = is_trainable(workspace)
-    policy = workspace.config.solve.policy
+    policy = workspace.config.run.method
     open_policy(workspace.config, policy)  # a wrong one is better known before hours of work
     if trainable:
         yield pretrain(workspace, progress)

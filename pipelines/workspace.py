@@ -111,7 +111,10 @@ class Workspace:
         table = bulk.table("prediction")
         query = (
             select(
-                table.c.frame_id, table.c.category, table.c.score, *map(table.c.get, BOX_COLUMNS)
+                table.c.frame_id,
+                table.c.category,
+                table.c.score,
+                *(table.c[name] for name in (*BOX_COLUMNS, "iou")),
             )
             .where(table.c.round == round_number, table.c.frame_id.in_(frame_ids))
             .order_by(table.c.frame_id, table.c.k)

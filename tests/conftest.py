@@ -1,6 +1,7 @@
 """Data that tests share: real KITTI frames where they are, and small handmade ones otherwise."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,3 +35,23 @@ def toy_kitti(tmp_path: Path) -> Path:
     root = tmp_path / "kitti"
     write_toy_kitti(root, frames=12, val=4)
     return root
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> str:
+    """The name of a preset of a tenth of the size, which covers the toy frames."""
+    from curate.detectors.pillars import presets
+
+    small = presets.PRESETS["small"]
+    preset = replace(
+        small,
+        name="tiny",
+        x_range=(0.0, 30.72),
+        y_range=(-15.36, 15.36),
+        pillar_channels=8,
+        channels=(16, 16, 32),
+        depths=(1, 1, 1),
+        head_channels=16,
+    )
+    monkeypatch.setitem(presets.PRESETS, "tiny", preset)
+    return "tiny"

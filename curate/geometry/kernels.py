@@ -185,6 +185,16 @@ def iou_matrix(a: np.ndarray, b: np.ndarray, order: np.ndarray, with_height: boo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def paired_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n,) 3D IoU of row i of the (n, 10) rectangle table a with row i of b."""
+    overlaps = np.zeros(len(a))
+    for i in range(len(a)):
+        if _near(a, i, b, i):
+            overlaps[i] = _iou_3d(a, i, b, i)
+    return overlaps
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def grouped_iou(
     a: np.ndarray, starts_a: np.ndarray, b: np.ndarray, starts_b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ overlaps nothing, itself included.
 import numpy as np
 
 from curate.geometry.boxes import as_boxes
-from curate.geometry.kernels import grouped_iou, iou_matrix, rectangle_table
+from curate.geometry.kernels import grouped_iou, iou_matrix, paired_iou, rectangle_table
 
 
 def bev_iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
@@ -19,6 +19,11 @@ def bev_iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
 def iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     """(n, m) volume IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
     return _iou(boxes_a, boxes_b, with_height=True)
+
+
+def paired_iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+    """(n,) volume IoU in [0, 1] of each of (n, 7) boxes with the other's box in the same row."""
+    return paired_iou(_table(boxes_a), _table(boxes_b))
 
 
 def overlapping_pairs(

@@ -1,6 +1,6 @@
 """The batches of a training: which frames meet in a step, augmented and encoded."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -103,14 +103,6 @@ class Batches:
         if index in self._cache:
             return self._cache[index]
         sample = self._labels[index]
-        if not sample.labeled and self._settings.zero_weight == "background":
-            learned = ~sample.ignored
-            sample = replace(
-                sample,
-                boxes=sample.boxes[learned],
-                categories=sample.categories[learned],
-                weights=sample.weights[learned],
-            )
         if sample.points.nbytes <= self._room:
             self._room -= sample.points.nbytes
             self._cache[index] = sample

@@ -3,10 +3,12 @@
     L = 1/n * sum over X_l of L_3d + 1/n * sum over X_u of v * L_3d
 
 L_3d is the penalty-reduced focal loss of the heatmap (Law and Deng, CornerNet, ECCV 2018) plus an
-L1 loss of the box code. v multiplies all that an object says: that its centre is a centre, what its
-box is, and that the cells around its centre are not centres. v = 0 leaves its region without
-gradient: it is neither object nor background. n is a constant of the training, never a sum of
-weights, which would cancel them.
+L1 loss of the box code plus the cross-entropy of the estimated 3D IoU of the answered box, after
+AFDetV2 (Hu et al., AAAI 2022), which is also taught that what it finds beside all objects overlaps
+none. v multiplies all that an object says: that its centre is a centre,
+what its box is, how good the answer is, and that the cells around its centre are not centres. v = 0
+leaves its region without gradient: it is neither object nor background. n is a constant of the
+training, never a sum of weights, which would cancel them.
 """
 
 from collections.abc import Sequence
@@ -17,10 +19,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from curate.detectors.pillars.encoding import Targets
+from curate.detectors.pillars.encoding import Targets, code_ious
+from curate.detectors.pillars.network import Answers
+from curate.detectors.pillars.presets import Preset
 
 # Weight of the box term against the classification term.
 BOX_WEIGHT = 1.0
+# Weight of the IoU term.
+IOU_WEIGHT = 1.0
+# A cell beside all objects that answers with a higher score has found something that is not there.
+_FOUND_SCORE = 0.1
+# An object's nine cells share one weight; so do, roughly, those that find the same false one.
+_FALSE_SHARE = 1 / 9
 
 
 @dataclass(frozen=True)
@@ -99,13 +109,48 @@ def box_loss(codes: Tensor, targets: BatchTargets) -> Tensor:
     return (targets.code_weights[:, None] * (answered - targets.codes).abs()).sum()
 
 
-def weighted_loss(logits: Tensor, codes: Tensor, targets: BatchTargets, objects: float) -> Tensor:
+def iou_loss(answers: Answers, targets: BatchTargets, preset: Preset) -> Tensor:
+    """Sum of the IoU terms: how well each answered box knows its overlap with the object.
+
+    The overlap itself is exact and has no gradient; beside all objects it is 0.
+
+    Args:
+        answers: of the network for b frames.
+        targets: of the same b frames.
+        preset: the grid.
+    """
+    cells = targets.code_cells
+    answered, true = answers.codes.detach().flatten(0, 2)[cells].cpu(), targets.codes.cpu()
+    in_frame = cells.cpu().numpy() % (preset.cells[0] * preset.cells[1])
+    overlap = code_ious(answered.numpy(), true.numpy(), in_frame, preset)
+    estimated = answers.iou_logits.flatten()[cells]
+    exact = torch.from_numpy(overlap).to(estimated)
+    right = functional.binary_cross_entropy_with_logits(
+        estimated, exact, targets.code_weights, reduction="sum"
+    )
+    false = answers.iou_logits[_found_beside(answers.logits, targets)]
+    return right + _FALSE_SHARE * functional.softplus(false).sum()
+
+
+def _found_beside(logits: Tensor, targets: BatchTargets) -> Tensor:
+    """(b, x cells, y cells) bool, cells beside all objects and ignored regions that find one."""
+    # The gaussian does not reach the corners of its box; one cell more does.
+    near = functional.max_pool2d(targets.heatmap.amax(-1), 3, stride=1, padding=1)
+    beside = (near == 0) & (targets.background[..., 0] == 1)
+    return beside & (torch.sigmoid(logits.detach()).amax(-1) > _FOUND_SCORE)
+
+
+def weighted_loss(
+    answers: Answers, targets: BatchTargets, preset: Preset, objects: float
+) -> Tensor:
     """The loss of a batch.
 
     Args:
-        logits: (b, x cells, y cells, categories).
-        codes: (b, x cells, y cells, BOX_CODE).
+        answers: of the network for b frames.
         targets: of the same b frames.
+        preset: the grid.
         objects: n, how many objects the batch's frames of X_l are expected to hold.
     """
-    return (heatmap_loss(logits, targets) + BOX_WEIGHT * box_loss(codes, targets)) / objects
+    box = BOX_WEIGHT * box_loss(answers.codes, targets)
+    iou = IOU_WEIGHT * iou_loss(answers, targets, preset)
+    return (heatmap_loss(answers.logits, targets) + box + iou) / objects

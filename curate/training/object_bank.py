@@ -1,8 +1,9 @@
 """Cut-and-paste: objects of the labeled frames, set into other frames (SECOND, Sensors 2018).
 
 An object keeps its distance to the sensor, so that its points stay as dense as the sensor would
-have seen them, and is turned about the sensor's vertical axis to a place that is free and open to
-view. There it stands on the ground as it stood before, and hides what lies behind it.
+have seen them, and is turned about the sensor's vertical axis to a place that is open to view and
+free: no box overlaps it, also none of weight 0, and no point lies in it but of the ground. There it
+stands on the ground as it stood before, and hides what lies behind it.
 """
 
 from collections.abc import Iterable
@@ -15,7 +16,7 @@ from curate.detections import as_categories
 from curate.errors import LeakageError
 from curate.geometry.boxes import box_corners
 from curate.geometry.overlap import bev_iou
-from curate.geometry.points_in_boxes import box_of_points
+from curate.geometry.points_in_boxes import box_of_points, count_points_in_boxes
 from curate.geometry.similarity import Similarity
 from curate.training.ground import GroundMap
 from curate.training.labels import Sample
@@ -24,10 +25,8 @@ from curate.training.labels import Sample
 _TRIES = 2
 # The place is hidden where scene points before it outnumber this share of the object's own points.
 _HIDDEN_SHARE = 0.3
-# The lowest part of an object is not looked at for that: the ground is in front of everything.
+# The lowest part of an object is not looked at: ground is before everything and in every place.
 _GROUND_METRES = 0.25
-
-
 # A place this much higher or lower than where the object stood is a roof or a wall, not ground.
 _HIGHEST_STEP_METRES = 0.7
 
@@ -103,21 +102,22 @@ def paste_objects(
     outlines = _Outlines.of(boxes)
     blocked = np.any(bev_iou(boxes, sample.boxes) > 0, axis=1)
     blocked |= np.abs(lifts) > _HIGHEST_STEP_METRES
+    blocked |= _occupied(boxes, sample.points)
     meets = np.greater(bev_iou(boxes, boxes), 0)
     wanted = dict.fromkeys(bank.objects, count)
     accepted: list[int] = []
     for k, found in enumerate(drawn):
         if blocked[k] or not wanted[found.category]:
             continue
-        if scene.insert(outlines, k, len(found.points)):
+        points = _lifted(turns[k].apply_to_points(found.points), lifts[k])
+        if scene.insert(outlines, k, points):
             accepted.append(k)
             blocked |= meets[k]
             wanted[found.category] -= 1
-    pasted = [_lifted(turns[k].apply_to_points(drawn[k].points), lifts[k]) for k in accepted]
     names = [drawn[k].category for k in accepted]
     return replace(
         sample,
-        points=np.concatenate([scene.left(), *pasted]),
+        points=scene.left(),
         boxes=np.concatenate([sample.boxes, boxes[accepted]]),
         categories=as_categories([*sample.categories.tolist(), *names]),
         weights=np.concatenate([sample.weights, np.ones(len(accepted))]),
@@ -152,36 +152,83 @@ class _Outlines:
             (boxes[:, 2] - boxes[:, 5] / 2 + _GROUND_METRES) / nearest,
         )
 
+    def cover(self, which: list[int], seen: "_Seen") -> np.ndarray:
+        """(p,) bool, whether a point appears within one of some outlines, whatever its distance."""
+        within = [
+            (values >= bounds[which, :1].T) & (values <= bounds[which, 1:].T)
+            for values, bounds in (
+                (seen.azimuth[:, None], self.azimuth),
+                (seen.slope[:, None], self.slope),
+            )
+        ]
+        return np.asarray((within[0] & within[1]).any(axis=1))
+
 
 class _Scene:
-    """The points of a frame as the sensor sees them; pasted objects take points away."""
+    """The points of a frame as the sensor sees them; what is pasted hides others and is hidden."""
 
     def __init__(self, points: np.ndarray) -> None:
-        self._points = points
-        self._azimuth = np.arctan2(points[:, 1], points[:, 0])
-        self._distance = np.hypot(points[:, 0], points[:, 1])
-        self._slope = points[:, 2] / np.maximum(self._distance, 1e-3)
+        self._points, self._seen = points, _Seen.of(points)
         self._kept = np.ones(len(points), dtype=bool)
-        self.azimuths = (float(self._azimuth.min()), float(self._azimuth.max()))
+        self._pasted: list[int] = []
+        azimuth = self._seen.azimuth
+        self.azimuths = (float(azimuth.min()), float(azimuth.max()))
 
-    def insert(self, outlines: _Outlines, k: int, points: int) -> bool:
-        """Makes room for object k with so many points, unless it would be hidden or cut off."""
+    def insert(self, outlines: _Outlines, k: int, points: np.ndarray) -> bool:
+        """Puts the points of object k in that are seen, unless it would be hidden or cut off."""
         low, high = outlines.azimuth[k]
         if low < self.azimuths[0] or high > self.azimuths[1]:
             return False
-        in_sector = np.flatnonzero((self._azimuth >= low) & (self._azimuth <= high) & self._kept)
-        slope, distance = self._slope[in_sector], self._distance[in_sector]
+        azimuth = self._seen.azimuth
+        in_sector = np.flatnonzero((azimuth >= low) & (azimuth <= high) & self._kept)
+        slope, distance = self._seen.slope[in_sector], self._seen.distance[in_sector]
         covered = (slope >= outlines.slope[k, 0]) & (slope <= outlines.slope[k, 1])
         before = distance < outlines.distance[k]
         hiding = covered & before & (slope > outlines.above_ground[k])
-        if np.count_nonzero(hiding) > _HIDDEN_SHARE * points:
+        if np.count_nonzero(hiding) > _HIDDEN_SHARE * len(points):
             return False
+        own = _Seen.of(points)
+        nearer = [j for j in self._pasted if outlines.distance[j] < outlines.distance[k]]
+        hidden = outlines.cover(nearer, own)
         self._kept[in_sector[covered & ~before]] = False
+        self._points = np.concatenate([self._points, points])
+        self._seen = self._seen.and_also(own)
+        self._kept = np.concatenate([self._kept, ~hidden])
+        self._pasted.append(k)
         return True
 
     def left(self) -> np.ndarray:
         """The points that no pasted object has taken the place of or hidden."""
         return self._points[self._kept]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Where n points appear to the sensor: azimuth, slope and distance over the ground."""
+
+    azimuth: np.ndarray
+    slope: np.ndarray
+    distance: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> Self:
+        """Of (n, >=3) points."""
+        distance = np.hypot(points[:, 0], points[:, 1])
+        slope = points[:, 2] / np.maximum(distance, 1e-3)
+        return cls(np.arctan2(points[:, 1], points[:, 0]), slope, distance)
+
+    def and_also(self, more: Self) -> Self:
+        """These points, then more."""
+        names = ("azimuth", "slope", "distance")
+        return type(self)(*(np.append(getattr(self, of), getattr(more, of)) for of in names))
+
+
+def _occupied(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n,) bool, whether there is more than ground where (n, 7) boxes would stand."""
+    above_ground = boxes.copy()
+    above_ground[:, 2] += _GROUND_METRES / 2
+    above_ground[:, 5] -= _GROUND_METRES
+    return np.asarray(count_points_in_boxes(points, above_ground) > 0)
 
 
 def _lifted(points: np.ndarray, lift: float) -> np.ndarray:

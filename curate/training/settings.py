@@ -10,6 +10,7 @@ from curate.errors import ConfigError
 from curate.training.augmentation import Augmentation
 
 ZeroWeight = Literal["ignore", "background"]
+Teacher = Literal["student", "ema"]
 
 
 @dataclass(frozen=True)
@@ -26,12 +27,15 @@ class TrainingSettings:
         flip_probability: see `Augmentation`.
         rotation_limit_rad: see `Augmentation`.
         scale_range: see `Augmentation`.
-        pasted: see `Augmentation`.
+        pasted: see `Augmentation`; 0 does without the object bank.
         fewest_points: see `Augmentation`; also of the objects of the bank.
         seed: of the first weights, the order of the frames and the augmentation.
         threads: of torch, on CPU.
         device: "cpu", or a torch device such as "cuda".
         zero_weight: what a label of weight 0 is: a region to "ignore", or "background".
+        teacher: what the training leaves: the "student", or the moving average of its weights,
+            "ema".
+        ema_decay: see `MovingAverage`.
         cache_bytes: of points kept in memory between the steps.
         snapshot_seconds: between two snapshots from which a killed training goes on.
     """
@@ -50,6 +54,8 @@ class TrainingSettings:
     threads: int = 1
     device: str = "cpu"
     zero_weight: ZeroWeight = "ignore"
+    teacher: Teacher = "student"
+    ema_decay: float = 0.999
     cache_bytes: int = 1 << 30
     snapshot_seconds: float = 20.0
 
@@ -66,10 +72,16 @@ class TrainingSettings:
             raise ConfigError(f"training: learning_rate is {self.learning_rate}, must be above 0")
         if not 0 < self.scale_range[0] <= self.scale_range[1]:
             raise ConfigError(f"training: scale_range {self.scale_range} is no range above 0")
-        if self.zero_weight not in get_args(ZeroWeight):
+        if not 0 <= self.ema_decay < 1:
             raise ConfigError(
-                f"training: unknown zero_weight {self.zero_weight!r}; choose ignore or background"
+                f"training: ema_decay is {self.ema_decay}, must be at least 0 and below 1"
             )
+        for name, choices in (("zero_weight", ZeroWeight), ("teacher", Teacher)):
+            if getattr(self, name) not in get_args(choices):
+                known = " or ".join(get_args(choices))
+                raise ConfigError(
+                    f"training: unknown {name} {getattr(self, name)!r}; choose {known}"
+                )
 
     def augmentation(self) -> Augmentation:
         """The augmentation that these settings describe."""
@@ -79,6 +91,7 @@ class TrainingSettings:
             self.scale_range,
             self.pasted,
             self.fewest_points,
+            self.zero_weight,
         )
 
 

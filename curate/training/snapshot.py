@@ -5,6 +5,7 @@ import io
 import json
 import logging
 import pickle
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ def snapshot_path(output: Path) -> Path:
 def save_snapshot(
     output: Path,
     mark: str,
-    network: torch.nn.Module,
+    networks: Sequence[torch.nn.Module],
     optimizer: torch.optim.Optimizer,
     progress: dict[str, Any],
 ) -> None:
@@ -46,14 +47,14 @@ def save_snapshot(
     Args:
         output: checkpoint that the training will write.
         mark: its `fingerprint`.
-        network: its present weights are kept.
-        optimizer: of the network.
+        networks: the student and, where there is one, its average; their weights are kept.
+        optimizer: of the student.
         progress: plain numbers and lists.
     """
     buffer = io.BytesIO()
     state = {
         "fingerprint": mark,
-        "network": network.state_dict(),
+        "networks": [network.state_dict() for network in networks],
         "optimizer": optimizer.state_dict(),
         "progress": progress,
     }
@@ -62,7 +63,10 @@ def save_snapshot(
 
 
 def load_snapshot(
-    output: Path, mark: str, network: torch.nn.Module, optimizer: torch.optim.Optimizer
+    output: Path,
+    mark: str,
+    networks: Sequence[torch.nn.Module],
+    optimizer: torch.optim.Optimizer,
 ) -> dict[str, Any] | None:
     """Takes up the snapshot of a killed training, and gives its progress.
 
@@ -82,6 +86,7 @@ def load_snapshot(
     if not own:
         _log.info("%s is of another training; starting anew", path)
         return None
-    network.load_state_dict(state["network"])
+    for network, weights in zip(networks, state["networks"], strict=True):
+        network.load_state_dict(weights)
     optimizer.load_state_dict(state["optimizer"])
     return dict(state["progress"])

@@ -16,6 +16,7 @@ from curate.frames import Frame
 from curate.training.batches import Batches
 from curate.training.labels import WeightedLabels
 from curate.training.loss import weighted_loss
+from curate.training.moving_average import MovingAverage
 from curate.training.settings import TrainingReport, TrainingSettings
 from curate.training.snapshot import fingerprint, load_snapshot, save_snapshot, snapshot_path
 
@@ -42,7 +43,7 @@ def train(
     read: Callable[[str], Frame] | None = None,
     progress: Progress | None = None,
 ) -> TrainingReport:
-    """Trains a detector and writes its checkpoint and ONNX graph.
+    """Trains a detector and writes its checkpoint and ONNX graph, or those of its moving average.
 
     A killed training, called again with the same arguments, goes on from its last snapshot and ends
     with the weights that it would have had.
@@ -73,19 +74,23 @@ def train(
         network.parameters(), weight_decay=_WEIGHT_DECAY, betas=(0.9, 0.99)
     )
     mark = fingerprint(labels, settings, start)
-    state = load_snapshot(output, mark, network, optimizer) or {"step": 0, "losses": []}
+    average = _average_of(network, settings)
+    networks = [network, average.network] if average else [network]
+    state = load_snapshot(output, mark, networks, optimizer) or {"step": 0, "losses": []}
     resumed_at, losses = state["step"], state["losses"]
     saved = time.monotonic()
     network.train()
     for step in range(resumed_at, settings.steps):
         losses = [*losses[1 - _RECENT_STEPS :], _learn(network, optimizer, batches, step, settings)]
+        if average:
+            average.follow(network)
         if progress:
             progress(step + 1, settings.steps, losses[-1])
         if time.monotonic() - saved >= settings.snapshot_seconds:
             state = {"step": step + 1, "losses": losses}
-            save_snapshot(output, mark, network, optimizer, state)
+            save_snapshot(output, mark, networks, optimizer, state)
             saved = time.monotonic()
-    save_checkpoint(output, checkpoint_of(network, samples.categories))
+    save_checkpoint(output, checkpoint_of(networks[-1], samples.categories))
     snapshot_path(output).unlink(missing_ok=True)
     return TrainingReport(
         checkpoint=output,
@@ -108,6 +113,13 @@ def one_cycle(step: int, steps: int, peak: float) -> float:
     return peak * (1 + math.cos(math.pi * (step - rising) / max(1.0, steps - rising))) / 2
 
 
+def _average_of(network: PillarNetwork, settings: TrainingSettings) -> MovingAverage | None:
+    """What follows the student, if its average is to be left."""
+    if settings.teacher == "student":
+        return None
+    return MovingAverage(network, settings.ema_decay, settings.steps)
+
+
 def _learn(
     network: PillarNetwork,
     optimizer: torch.optim.Optimizer,
@@ -119,9 +131,9 @@ def _learn(
     for group in optimizer.param_groups:
         group["lr"] = one_cycle(step, settings.steps, settings.learning_rate)
     batch = batches[step]
-    logits, codes = network(batch.features, batch.slots, batch.frames)
-    objects = settings.batch_size * batches.objects_per_frame
-    loss = weighted_loss(logits, codes, batch.targets, objects)
+    answers = network(batch.features, batch.slots, batch.frames)
+    expected = settings.batch_size * batches.objects_per_frame
+    loss = weighted_loss(answers, batch.targets, network.preset, expected)
     optimizer.zero_grad(set_to_none=True)
     torch.autograd.backward(loss)
     torch.nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)

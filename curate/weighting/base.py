@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from curate.detections import empty_boxes
 from curate.errors import ConfigError, DataError
 
 
@@ -37,6 +38,27 @@ class Age:
 
 
 @dataclass(frozen=True)
+class Memory:
+    """The n labels of the previous round that the same policy did not drop, as aligned columns.
+
+    Attributes:
+        frame_index: (n,) integer, in the numbering of the evidence.
+        category: (n,) str.
+        score: (n,) in [0, 1].
+        iou: (n,) as in `Evidence`.
+        boxes: (n, 7) in the LiDAR frame.
+        v: (n,) the weight that the policy gave.
+    """
+
+    frame_index: np.ndarray
+    category: np.ndarray
+    score: np.ndarray
+    iou: np.ndarray
+    boxes: np.ndarray
+    v: np.ndarray
+
+
+@dataclass(frozen=True)
 class Evidence:
     """What is known of the n labels of a round, over all its frames, as aligned columns.
 
@@ -47,6 +69,11 @@ class Evidence:
         loss: (n,) consistency loss L, not negative; NaN where no reprediction matched.
         rho: (n,) trust of each prior by column name ("rho_diff", "rho_anno"), in [0, 1];
             NaN where a prior has not scored a label.
+        iou: (n,) the detector's own estimate of the label's 3D IoU with its object, in [0, 1]; NaN
+            where it makes none, and everywhere if left out.
+        boxes: (n, 7) in the LiDAR frame; needed beside a memory only.
+        memory: what the policy thought of the previous round, for policies that remember; None in
+            the first round.
     """
 
     frame_index: np.ndarray
@@ -54,9 +81,16 @@ class Evidence:
     score: np.ndarray
     loss: np.ndarray
     rho: Mapping[str, np.ndarray] = field(default_factory=dict)
+    iou: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    boxes: np.ndarray = field(default_factory=empty_boxes)
+    memory: Memory | None = None
 
     def __post_init__(self) -> None:
         """Raises DataError where a column is not aligned or out of its range."""
+        if len(self.iou) == 0:
+            object.__setattr__(self, "iou", np.full(len(self.loss), np.nan))
+        if self.memory is not None and len(self.boxes) != len(self.loss):
+            raise DataError("evidence: a memory needs the boxes of the labels beside it")
         columns = {"frame_index": self.frame_index, "category": self.category, **self._numbers()}
         for name, column in columns.items():
             if column.shape != (len(self.loss),):
@@ -91,7 +125,7 @@ class Evidence:
 
     def _numbers(self) -> dict[str, np.ndarray]:
         """The columns that have a range."""
-        return {"score": self.score, "loss": self.loss, **self.rho}
+        return {"score": self.score, "loss": self.loss, "iou": self.iou, **self.rho}
 
 
 @dataclass(frozen=True)
@@ -102,10 +136,18 @@ class Weights:
         v: (n,) float64 weight in [0, 1]; 0 means ignore.
         lambda_u: (n,) the age parameter that the label was held against; NaN where the policy has
             none, or where no label of the label's group matched.
+        dropped: (n,) bool, labels that are not even to be ignored: they leave no label, and their
+            region is background. None, if left out; v is 0 where a label is dropped.
     """
 
     v: np.ndarray
     lambda_u: np.ndarray
+    dropped: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def __post_init__(self) -> None:
+        """Fills in what was left out."""
+        if len(self.dropped) == 0:
+            object.__setattr__(self, "dropped", np.zeros(len(self.v), dtype=bool))
 
     @classmethod
     def without_age(cls, v: np.ndarray) -> "Weights":
@@ -114,7 +156,10 @@ class Weights:
 
 
 class Policy(Protocol):
-    """Weighs the labels of a round."""
+    """Weighs the labels of a round.
+
+    A policy that wants `Evidence.memory` has a further attribute, `remembers`, that is true.
+    """
 
     @property
     def name(self) -> str:

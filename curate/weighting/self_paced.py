@@ -48,10 +48,13 @@ class PSPSL:
     Attributes:
         scope: as in `SPSL`.
         quantile: as in `SPSL`.
+        self_paced: false leaves the factor 1 - L / lambda out: v = rho_det of every label that
+            matched, to see what the schedule is good for.
     """
 
     scope: Scope = "round"
     quantile: float | None = None
+    self_paced: bool = True
     name: ClassVar[str] = "pspsl"
     uses_unlabeled: ClassVar[bool] = True
 
@@ -61,6 +64,8 @@ class PSPSL:
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
         """The weight of every label; 0 where no reprediction matched."""
+        if not self.self_paced:
+            return Weights.without_age(np.where(evidence.matched, evidence.rho_det, 0.0))
         lambda_u = age_parameter(evidence, age, self.scope, self.quantile)
         return Weights(evidence.rho_det * easiness(evidence.loss, lambda_u), lambda_u)
 

@@ -26,15 +26,26 @@ class Threshold:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a threshold that is no score."""
-        for category, value in {"every category": self.threshold, **self.per_category}.items():
-            if not 0 <= value <= 1:
-                raise ConfigError(
-                    f"policy threshold: the threshold for {category} must be in [0, 1], not {value}"
-                )
+        check_share(self.name, "threshold", {"every category": self.threshold, **self.per_category})
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
         """1 or 0 for every label."""
-        threshold = np.full(len(evidence), self.threshold)
-        for category, value in self.per_category.items():
-            threshold[evidence.category == category] = value
+        threshold = by_category(evidence, self.threshold, self.per_category)
         return Weights.without_age((evidence.score >= threshold).astype(np.float64))
+
+
+def by_category(evidence: Evidence, every: float, own: Mapping[str, float]) -> np.ndarray:
+    """(n,) the threshold that holds for each label."""
+    threshold = np.full(len(evidence), every)
+    for category, value in own.items():
+        threshold[evidence.category == category] = value
+    return threshold
+
+
+def check_share(policy: str, setting: str, values: Mapping[str, float]) -> None:
+    """Raises ConfigError for a value outside [0, 1]."""
+    for category, value in values.items():
+        if not 0 <= value <= 1:
+            raise ConfigError(
+                f"policy {policy}: {setting} for {category} must be in [0, 1], not {value}"
+            )

@@ -1,4 +1,8 @@
-"""Every label weighs 1: unfiltered pseudo-labels, as in UDA."""
+"""Every label weighs 1: unfiltered pseudo-labels, as in UDA, and in SESS with an averaged teacher.
+
+Sources: Xie et al., "Unsupervised Data Augmentation for Consistency Training", NeurIPS 2020; Zhao
+et al., "SESS: Self-Ensembling Semi-Supervised 3D Object Detection", CVPR 2020.
+"""
 
 from dataclasses import dataclass
 from typing import ClassVar

@@ -29,7 +29,7 @@ def explain(
     from pipelines.explanation import explain_label
 
     opened = open_workspace(workspace)
-    found = explain_label(opened, frame, k, round_number, policy or opened.config.solve.policy)
+    found = explain_label(opened, frame, k, round_number, policy or opened.config.run.method)
     if as_json:
         print_json(found)
     else:

@@ -38,7 +38,7 @@ def export(
     opened = open_workspace(workspace)
     path = output or opened.root / "exports" / f"{exporter.name}{exporter.suffix}"
     context = open_round(opened, round_number)
-    chosen = policy or opened.config.solve.policy
+    chosen = policy or opened.config.run.method
     labels = export_as(opened, exporter, context.number, chosen, path)
     typer.echo(f"{labels} labels in {path}")
 

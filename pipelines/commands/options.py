@@ -23,7 +23,7 @@ RoundOption = Annotated[
 ]
 PolicyOption = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option("--policy", help="Policy; default: solve.policy of curate.toml."),
+    typer.Option("--policy", help="Policy; default: run.method of curate.toml."),
 ]
 ExecutorOption = Annotated[
     Optional[str],  # noqa: UP045

@@ -20,6 +20,10 @@ def run(
         Optional[int],  # noqa: UP045
         typer.Option(min=1, help="E; default: run.rounds of curate.toml."),
     ] = None,
+    method: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="See docs/methods.md; default: run.method of curate.toml."),
+    ] = None,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
@@ -29,12 +33,20 @@ def run(
 
     With a detector that you bring, there is one round and it ends with the export.
 
-    Example: curate run --rounds 3
+    Methods: pspsl, spsl, uda, uda-cl, sess, 3dioumatch, st3d, hssda, threshold, baseline, or a
+    policy module:Class.
+
+    Example: curate run --rounds 3 --method pspsl
     """
+    from dataclasses import replace
+
+    from pipelines.methods import with_method
     from pipelines.progress import Bar
     from pipelines.schedule import run_all
 
     opened = open_workspace(workspace, executor, workers)
+    if method is not None:
+        opened = replace(opened, config=with_method(opened.config, method))
     reports = []
     for report in run_all(opened, rounds, Bar()):
         reports.append(report)

@@ -14,7 +14,8 @@ def solve(
 ) -> None:
     """Weigh every label of a round under a policy; policies stand side by side.
 
-    Policies: pspsl, spsl, uniform, threshold, baseline, or module:Class.
+    Policies: pspsl, spsl, uda, uda-cl, sess, 3dioumatch, st3d, hssda, threshold, baseline, or
+    module:Class.
 
     Example: curate solve --policy spsl
     """

@@ -66,7 +66,7 @@ def run_round_command(
     if not isinstance(found, RoundStage):
         raise TypeError(name)
     context = open_round(workspace, round_number)
-    report = run_round(workspace, context, found, policy or workspace.config.solve.policy, Bar())
+    report = run_round(workspace, context, found, policy or workspace.config.run.method, Bar())
     if not as_json:
         print_report(report)
     end([report], as_json=as_json)

@@ -37,7 +37,7 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     path = file(workspace, job.context, job.policy)
     unlabeled = open_policy(workspace.config, job.policy).uses_unlabeled
     labels = write_label_file(workspace, path, job.context.number, job.policy if unlabeled else "")
-    if job.policy == workspace.config.solve.policy:
+    if job.policy == workspace.config.run.method:
         partial = path.with_suffix(".partial")
         shutil.copyfile(path, partial)
         partial.replace(path.with_name(CURRENT))

@@ -31,7 +31,8 @@ class Predict:
     def __call__(self, job: FrameJob) -> FrameRows:
         """The rows of `prediction`."""
         found = self.detect(job.frame)
-        return {"prediction": [(k, *row) for k, row in enumerate(prediction_rows(found))]}
+        rows = zip(prediction_rows(found), _or_none(found.iou), strict=True)
+        return {"prediction": [(k, *row, iou) for k, (row, iou) in enumerate(rows)]}
 
     def detect(self, frame_id: str) -> Detections:
         """The boxes of a frame, by falling score."""
@@ -69,6 +70,11 @@ def prediction_rows(found: Detections) -> list[tuple[object, ...]]:
     """Category, score and box of each detection."""
     columns = [found.categories.tolist(), found.scores.tolist(), *found.boxes.T.tolist()]
     return list(zip(*columns, strict=True))
+
+
+def _or_none(numbers: np.ndarray) -> list[float | None]:
+    """The numbers as the database stores them: null, not NaN."""
+    return [None if np.isnan(number) else number for number in numbers.tolist()]
 
 
 def settings(workspace: Workspace, _context: RoundContext) -> Settings:

@@ -2,6 +2,7 @@
 
 from sqlalchemy import Connection
 
+from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError, WorkspaceError
 from pipelines import plan
 from pipelines.progress import Progress
@@ -36,6 +37,9 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
             "unlabeled_batch_size",
             "threads",
             "start",
+            "zero_weight",
+            "teacher",
+            "ema_decay",
         },
     )
     key = [
@@ -44,6 +48,7 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
         config.run.seed,
         config.detector.device,
         config.dataset.categories,
+        FORMAT_VERSION,
     ]
     path = workspace.root / "checkpoints" / "round-00.safetensors"
 
@@ -54,7 +59,7 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
             labels=labels,
             output=path,
             settings=training_settings(
-                workspace, config.train.pretrain_steps, config.train.learning_rate, 0
+                workspace, config.train.pretrain_steps, config.train.learning_rate, 0, "student"
             ),
             start=None,
             read=workspace.dataset.read,

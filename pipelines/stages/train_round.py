@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection
 
+from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError
 from curate.frames import Frame
 from pipelines.assembly import device
+from pipelines.methods import TeacherMode, teacher_mode
 from pipelines.progress import Progress
 from pipelines.rounds import is_trainable, register_checkpoint
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
@@ -19,19 +21,26 @@ if TYPE_CHECKING:
     from curate.training.settings import TrainingReport, TrainingSettings
 
 
-def settings(workspace: Workspace, context: RoundContext, _policy: str) -> Settings:
+def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
     """What a student depends on beside teacher and labels."""
-    section = workspace.config.train.model_dump(
-        mode="json", exclude={"pretrain_steps", "learning_rate", "threads"}
-    )
-    return {**section, "seed": context.seed, "device": workspace.config.detector.device}
+    section = workspace.config.train
+    teacher = teacher_mode(workspace.config, policy)
+    return {
+        **section.model_dump(
+            mode="json", exclude={"pretrain_steps", "learning_rate", "threads", "ema_decay"}
+        ),
+        "teacher": teacher,
+        "ema_decay": section.ema_decay if teacher == "ema" else None,
+        "seed": context.seed,
+        "device": workspace.config.detector.device,
+        "checkpoint": FORMAT_VERSION,
+    }
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
-    """The student's checkpoint."""
-    plain = policy == workspace.config.solve.policy
-    name = f"round-{context.number:02d}" if plain else f"round-{context.number:02d}-{policy}"
-    return workspace.root / "checkpoints" / f"{name}.safetensors"
+    """The checkpoint of the next teacher: the student, or the average of its weights."""
+    name = f"round-{context.number:02d}-{policy}.safetensors"
+    return workspace.root / "checkpoints" / name
 
 
 def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
@@ -51,7 +60,11 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
         labels=export.file(workspace, job.context, job.policy),
         output=path,
         settings=training_settings(
-            workspace, section.round_steps, section.round_learning_rate, job.context.number
+            workspace,
+            section.round_steps,
+            section.round_learning_rate,
+            job.context.number,
+            teacher_mode(workspace.config, job.policy),
         ),
         start=job.context.teacher.path if section.start == "teacher" else None,
         read=workspace.dataset.read,
@@ -65,24 +78,39 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
 
 
 def training_settings(
-    workspace: Workspace, steps: int, learning_rate: float, round_number: int
+    workspace: Workspace,
+    steps: int,
+    learning_rate: float,
+    round_number: int,
+    teacher: TeacherMode,
 ) -> "TrainingSettings":
-    """The trainer's settings."""
+    """The trainer's settings.
+
+    Raises:
+        ConfigError: train.options holds what the trainer does not know, or cannot use.
+    """
     from curate.training.settings import TrainingSettings
 
     section = workspace.config.train
-    return TrainingSettings(
-        preset=section.preset,
-        steps=steps,
-        batch_size=section.batch_size,
-        unlabeled_batch_size=section.unlabeled_batch_size,
-        learning_rate=learning_rate,
-        threads=section.threads,
-        zero_weight=section.zero_weight,
-        seed=workspace.config.run.seed + round_number,
-        device=device(workspace.config),
-        **section.options,
-    )
+    known = {
+        "preset": section.preset,
+        "steps": steps,
+        "batch_size": section.batch_size,
+        "unlabeled_batch_size": section.unlabeled_batch_size,
+        "learning_rate": learning_rate,
+        "threads": section.threads,
+        "zero_weight": section.zero_weight,
+        "pasted": section.pasted,
+        "teacher": teacher,
+        "ema_decay": section.ema_decay,
+        "seed": workspace.config.run.seed + round_number,
+        "device": device(workspace.config),
+    }
+    try:
+        return TrainingSettings(**{**known, **section.options})
+    except TypeError as error:
+        reason = str(error).rpartition(") ")[-1]
+        raise ConfigError(f"train.options of curate.toml: {reason}") from None
 
 
 def train_with_progress(

@@ -51,7 +51,7 @@ def predictions():
     place = {name: position for position, name in enumerate(bulk.columns("prediction"))}
     rows = []
     for i, (box, score, category) in enumerate(zip(boxes, scores, categories, strict=True)):
-        row = [1, 1 + i // EACH, i % EACH, *[None] * 9]
+        row = [1, 1 + i // EACH, i % EACH, *[None] * (len(place) - 3)]
         row[place["category"]], row[place["score"]] = category, score
         row[place["x"] : place["yaw"] + 1] = box
         rows.append(tuple(row))

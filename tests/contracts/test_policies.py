@@ -5,23 +5,38 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from curate.weighting.base import Age, Evidence
+from curate.weighting.base import Age, Evidence, Memory
 from pipelines.registry import POLICIES
 
 AGES = [Age(1, 1), Age(1, 3), Age(3, 3)]
 
 
-def evidence(n: int, seed: int = 0) -> Evidence:
+def columns(n: int, seed: int) -> dict:
+    """What labels of this round and of the one before have in common."""
+    rng = np.random.default_rng([seed, n])
+    boxes = np.column_stack([rng.uniform(0, 10, (n, 3)), rng.uniform(1, 4, (n, 3)), np.zeros(n)])
+    return {
+        "frame_index": rng.integers(0, max(n // 4, 1), n),
+        "category": rng.choice(["Car", "Pedestrian", "Cyclist"], n),
+        "score": rng.random(n),
+        "iou": rng.random(n),
+        "boxes": boxes,
+    }
+
+
+def evidence(n: int, seed: int = 0, *, remembered: int | None = None) -> Evidence:
     """So many labels of a few frames and categories, a fifth of them without a match."""
     rng = np.random.default_rng(seed)
     loss = rng.exponential(size=n)
     loss[rng.random(n) < 0.2] = np.nan
+    memory = None
+    if remembered is not None:
+        memory = Memory(**columns(remembered, seed + 1), v=rng.random(remembered))
     return Evidence(
-        frame_index=rng.integers(0, max(n // 4, 1), n),
-        category=rng.choice(["Car", "Pedestrian", "Cyclist"], n),
-        score=rng.random(n),
+        **columns(n, seed),
         loss=loss,
         rho={"rho_diff": rng.random(n), "rho_anno": rng.random(n)},
+        memory=memory,
     )
 
 
@@ -33,16 +48,18 @@ def policy(request: pytest.FixtureRequest):
 
 @pytest.mark.parametrize("age", AGES)
 @pytest.mark.parametrize("n", [0, 1, 200])
-def test_weights_are_finite_and_between_0_and_1(policy, age: Age, n: int) -> None:
-    """One weight per label, whatever the evidence."""
-    weights = policy.weigh(evidence(n), age)
-    assert weights.v.shape == weights.lambda_u.shape == (n,)
+@pytest.mark.parametrize("remembered", [None, 0, 150])
+def test_weights_are_finite_and_between_0_and_1(policy, age: Age, n: int, remembered) -> None:
+    """One weight per label, whatever the evidence; 0 for those that are dropped."""
+    weights = policy.weigh(evidence(n, remembered=remembered), age)
+    assert weights.v.shape == weights.lambda_u.shape == weights.dropped.shape == (n,)
     assert ((weights.v >= 0) & (weights.v <= 1)).all()
+    assert not weights.v[weights.dropped].any()
 
 
 def test_weights_do_not_depend_on_the_order_of_the_labels(policy) -> None:
     """A permutation of the labels permutes the weights."""
-    labels = evidence(100)
+    labels = evidence(100, remembered=80)
     order = np.random.default_rng(1).permutation(100)
     shuffled = Evidence(
         labels.frame_index[order],
@@ -50,9 +67,13 @@ def test_weights_do_not_depend_on_the_order_of_the_labels(policy) -> None:
         labels.score[order],
         labels.loss[order],
         {name: rho[order] for name, rho in labels.rho.items()},
+        labels.iou[order],
+        labels.boxes[order],
+        labels.memory,
     )
-    expected = policy.weigh(labels, Age(1, 2)).v[order]
-    assert policy.weigh(shuffled, Age(1, 2)).v == pytest.approx(expected)
+    expected, got = policy.weigh(labels, Age(1, 2)), policy.weigh(shuffled, Age(1, 2))
+    assert got.v == pytest.approx(expected.v[order])
+    assert got.dropped.tolist() == expected.dropped[order].tolist()
 
 
 def test_a_policy_goes_by_its_registered_name(policy, request: pytest.FixtureRequest) -> None:

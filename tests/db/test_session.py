@@ -119,7 +119,7 @@ def test_evidence_leaves_with_its_prediction(database: Database) -> None:
     frame_id = _frame(database, "unlabeled")
     with database.writing() as connection:
         bulk.insert(connection, "round", [(1, 1, None, "{}", "0", 0)])
-        bulk.insert(connection, "prediction", [(1, frame_id, 0, "Car", 0.5, *[1.0] * 7)])
+        bulk.insert(connection, "prediction", [(1, frame_id, 0, "Car", 0.5, *[1.0] * 7, None)])
         bulk.insert(connection, "weight", [(1, frame_id, 0, "spsl", 1.0, 1.0, 0.5)])
         bulk.delete_frames(connection, "prediction", 1, [frame_id])
         assert connection.exec_driver_sql("SELECT count(*) FROM weight").scalar_one() == 0

@@ -19,12 +19,13 @@ from curate.detectors.pillars.presets import PRESETS, Preset
 from curate.errors import ModelError
 
 FORMAT = "curate-pillars"
-FORMAT_VERSION = "1"
+# Version 2 added the estimate of the IoU.
+FORMAT_VERSION = "2"
 _LENGTH_BYTES = 8  # of the number before a safetensors header, and the header's alignment
 
 # Key in the graph's metadata of the digest of the checkpoint that it was made from. The number
 # grows with every change of what a graph answers, so that older ones are made again.
-GRAPH_DIGEST = "checkpoint_sha256_2"
+GRAPH_DIGEST = "checkpoint_sha256_3"
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
 
-# Scores and box codes of one frame.
-_Answers = tuple[np.ndarray, np.ndarray]
+# Scores, box codes and estimated IoU of one frame.
+_Answers = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class PillarDetector:
@@ -67,8 +67,8 @@ class PillarDetector:
         pillars = encode_points(frame.points, preset)
         if len(pillars.slots) == 0:
             return Detections.empty()
-        scores, codes = self._answers(pillars)
-        found = decode(scores, codes, self.categories, preset, self._minimum_score)
+        answers = self._answers(pillars)
+        found = decode(*answers, self.categories, preset, self._minimum_score)
         kept = [np.zeros(0, dtype=np.int64)]
         for category in self.categories:
             of_category = np.flatnonzero(found.categories == category)
@@ -112,8 +112,8 @@ def _onnx_answers(
 
     def answers(pillars: Pillars) -> _Answers:
         inputs = {"features": pillars.features, "slots": pillars.slots[:, None]}
-        scores, codes = session.run(["scores", "codes"], inputs)
-        return scores, codes
+        scores, codes, ious = session.run(["scores", "codes", "ious"], inputs)
+        return scores, codes, ious[..., 0]
 
     return answers
 
@@ -138,7 +138,7 @@ def _torch_answers(
     def answers(pillars: Pillars) -> _Answers:
         with torch.inference_mode():
             features = torch.from_numpy(pillars.features).to(place)
-            scores, codes = network(features, torch.from_numpy(pillars.slots).to(place))
-        return scores.cpu().numpy(), codes.cpu().numpy()
+            scores, codes, ious = network(features, torch.from_numpy(pillars.slots).to(place))
+        return scores.cpu().numpy(), codes.cpu().numpy(), ious.cpu().numpy()
 
     return answers

@@ -5,6 +5,9 @@ on pillars after Lang et al., "PointPillars", CVPR 2019. Two things differ. The 
 heatmap is as long, wide and turned as the object, not round. And the yaw has two codes, its doubled
 angle and the angle itself: where front and back of an object look alike the second averages out to
 nothing, the first still holds the axis.
+
+Beside score and box each cell estimates the 3D IoU of its box with the object, after Hu et al.,
+"AFDetV2", AAAI 2022; 3DIoUMatch (Wang et al., CVPR 2021) filters pseudo-labels by such an estimate.
 """
 
 from dataclasses import dataclass
@@ -13,6 +16,7 @@ import numpy as np
 
 from curate.detections import Detections, as_categories
 from curate.detectors.pillars.presets import Preset
+from curate.geometry.overlap import paired_iou_3d
 from curate.geometry.similarity import wrap_angle
 
 POINT_FEATURES = 9
@@ -146,6 +150,7 @@ def encode_boxes(
 def decode(
     scores: np.ndarray,
     codes: np.ndarray,
+    ious: np.ndarray,
     categories: tuple[str, ...],
     preset: Preset,
     minimum_score: float,
@@ -157,6 +162,7 @@ def decode(
             not only local maxima: two pedestrians can stand in adjacent cells, and cells that see
             the same object answer the same box, of which suppression leaves one.
         codes: (x cells, y cells, BOX_CODE).
+        ious: (x cells, y cells) estimated 3D IoU of each cell's box with the object.
         categories: their names.
         preset: the grid.
         minimum_score: lower scores are left out.
@@ -171,6 +177,7 @@ def decode(
         decode_boxes(chosen, cells, preset),
         flat[candidates].astype(np.float64),
         as_categories(np.asarray(categories)[category_ids]),
+        ious.reshape(-1)[cells].astype(np.float64),
     )
 
 
@@ -189,6 +196,16 @@ def decode_boxes(codes: np.ndarray, cells: np.ndarray, preset: Preset) -> np.nda
             yaw,
         ]
     )
+
+
+def code_ious(
+    answered: np.ndarray, codes: np.ndarray, cells: np.ndarray, preset: Preset
+) -> np.ndarray:
+    """(n,) 3D IoU of the boxes of (n, BOX_CODE) answers with those of the codes at their cells."""
+    boxes, objects = (
+        decode_boxes(of.astype(np.float64), cells, preset) for of in (answered, codes)
+    )
+    return paired_iou_3d(boxes, objects)
 
 
 def _within(values: np.ndarray, bounds: tuple[float, float]) -> np.ndarray:

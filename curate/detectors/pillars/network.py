@@ -1,6 +1,6 @@
-"""The pillar network: points to pillars, three scales over the ground, a heatmap and box codes."""
+"""The pillar network: points to pillars, three scales over the ground, boxes and scores."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,8 +15,22 @@ from curate.errors import ModelError
 _PRIOR = 0.02
 
 
+class Answers(NamedTuple):
+    """What the network says of every cell of b frames.
+
+    Attributes:
+        logits: (b, x cells, y cells, categories).
+        codes: (b, x cells, y cells, BOX_CODE).
+        iou_logits: (b, x cells, y cells) of the 3D IoU of the cell's box with its object.
+    """
+
+    logits: Tensor
+    codes: Tensor
+    iou_logits: Tensor
+
+
 class PillarNetwork(nn.Module):
-    """Maps the pillar features of b frames to logits and box codes.
+    """Maps the pillar features of b frames to logits, box codes and estimates of the boxes' IoU.
 
     All maps are channels-last: on CPU, convolutions and their gradients are about twice as fast
     that way, and 1 x 1 convolutions are plain matrix products.
@@ -42,7 +56,7 @@ class PillarNetwork(nn.Module):
         self.up2 = _Pointwise(second, head)
         self.side1 = _Pointwise(first, head)
         self.head = _convolution(head, head)
-        self.answer = nn.Linear(head, categories + BOX_CODE)
+        self.answer = nn.Linear(head, categories + BOX_CODE + 1)
         for parameter in self.parameters():
             if parameter.dim() == 4:
                 parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
@@ -51,16 +65,13 @@ class PillarNetwork(nn.Module):
             bias.zero_()
             bias[:categories] = torch.logit(torch.tensor(_PRIOR))
 
-    def forward(self, features: Tensor, slots: Tensor, frames: int) -> tuple[Tensor, Tensor]:
+    def forward(self, features: Tensor, slots: Tensor, frames: int) -> Answers:
         """The answers for a batch.
 
         Args:
             features: (n, POINT_FEATURES) of the points of all frames.
             slots: (n,) row of each point's pillar in the canvas of all frames.
             frames: b.
-
-        Returns:
-            (b, x cells, y cells, categories) logits and (b, x cells, y cells, BOX_CODE) codes.
         """
         cells_x, cells_y = self.preset.cells
         canvas: Tensor = _SlotMaximum.apply(  # type: ignore[no-untyped-call]
@@ -73,20 +84,24 @@ class PillarNetwork(nn.Module):
         middle = middle + functional.interpolate(self.up3(coarse), scale_factor=2.0)
         fine = self.side1(fine) + functional.interpolate(self.up2(middle), scale_factor=2.0)
         answers = self.answer(self.head(fine).permute(0, 2, 3, 1))
-        return answers[..., : self.categories], answers[..., self.categories :]
+        return Answers(
+            answers[..., : self.categories],
+            answers[..., self.categories : -1],
+            answers[..., -1],
+        )
 
 
 class SingleFrame(nn.Module):
-    """The network as it is used after training: one frame in, scores and box codes out."""
+    """The network as it is used after training: one frame in, scores, boxes, IoU out."""
 
     def __init__(self, network: PillarNetwork) -> None:
         super().__init__()
         self.network = network
 
-    def forward(self, features: Tensor, slots: Tensor) -> tuple[Tensor, Tensor]:
-        """(x cells, y cells, categories) scores and (x cells, y cells, BOX_CODE) codes."""
-        logits, codes = self.network(features, slots, 1)
-        return torch.sigmoid(logits[0]), codes[0]
+    def forward(self, features: Tensor, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(x cells, y cells, categories) scores, (.., BOX_CODE) codes, (x cells, y cells) IoU."""
+        logits, codes, iou_logits = self.network(features, slots, 1)
+        return torch.sigmoid(logits[0]), codes[0], torch.sigmoid(iou_logits[0])
 
 
 class _SlotMaximum(torch.autograd.Function):

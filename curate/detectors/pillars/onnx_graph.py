@@ -24,7 +24,8 @@ def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: i
     """The graph of `network.SingleFrame` with the state `weights` of its `PillarNetwork`.
 
     Inputs `features` (n, POINT_FEATURES) float32 and `slots` (n, 1) int64, n > 0; outputs `scores`
-    (x cells, y cells, categories) and `codes` (x cells, y cells, BOX_CODE).
+    (x cells, y cells, categories), `codes` (x cells, y cells, BOX_CODE) and `ious` (x cells,
+    y cells, 1).
     """
     graph = _Graph(weights)
     cells_x, cells_y = preset.cells
@@ -44,13 +45,12 @@ def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: i
         "Add", [graph.pointwise(fine, "side1"), graph.doubled(graph.pointwise(middle, "up2"))]
     )
     answers = graph.answers(graph.convolution(fine, "head.0", "head.1"), "answer")
-    parts = graph.constant(np.array([categories, BOX_CODE]))
-    logits, codes = graph.split(answers, parts)
+    channels = {"scores": categories, "codes": BOX_CODE, "ious": 1}
+    logits, codes, ious = graph.split(answers, list(channels.values()))
     graph.output(graph.node("Sigmoid", [logits]), "scores")
     graph.output(codes, "codes")
-    return graph.model(
-        {"scores": (cells_x, cells_y, categories), "codes": (cells_x, cells_y, BOX_CODE)}
-    )
+    graph.output(graph.node("Sigmoid", [ious]), "ious")
+    return graph.model({name: (cells_x, cells_y, count) for name, count in channels.items()})
 
 
 class _Graph:
@@ -67,10 +67,11 @@ class _Graph:
         self._nodes.append(helper.make_node(operator, inputs, [name], **attributes))
         return name
 
-    def split(self, value: str, sizes: str) -> tuple[str, str]:
-        """The channels of a map in two parts."""
-        names = (f"{value}.first", f"{value}.second")
-        self._nodes.append(helper.make_node("Split", [value, sizes], names, axis=1))
+    def split(self, value: str, sizes: list[int]) -> list[str]:
+        """The channels of a map in parts of these sizes."""
+        names = [f"{value}.{part}" for part in range(len(sizes))]
+        inputs = [value, self.constant(np.array(sizes))]
+        self._nodes.append(helper.make_node("Split", inputs, names, axis=1))
         return names
 
     def constant(self, array: np.ndarray) -> str:

@@ -59,16 +59,17 @@ def small(tmp_path_factory):
     ("preset", "count"), [("small", 1), ("small", 3), ("small", 4000), ("kitti", 4000)]
 )
 def test_onnx_runtime_and_torch_agree(tmp_path, preset, count):
-    """Scores and codes of the two agree to 1e-4, for any number of points."""
+    """Scores, codes and IoU of the two agree to 1e-4, for any number of points."""
     path, checkpoint = tmp_path / "net.safetensors", lively(preset)
     save_checkpoint(path, checkpoint)
     pillars = encode_points(cloud(count), PRESETS[preset])
-    onnx_scores, onnx_codes = _onnx_answers(path, checkpoint, 1)(pillars)
-    torch_scores, torch_codes = _torch_answers(path, checkpoint, "cpu")(pillars)
-    assert onnx_scores.shape == (*PRESETS[preset].cells, 3)
-    assert np.ptp(torch_codes) > 0.1
-    np.testing.assert_allclose(onnx_codes, torch_codes, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(onnx_scores, torch_scores, rtol=1e-4, atol=1e-4)
+    by_onnx = _onnx_answers(path, checkpoint, 1)(pillars)
+    by_torch = _torch_answers(path, checkpoint, "cpu")(pillars)
+    assert by_onnx[0].shape == (*PRESETS[preset].cells, 3)
+    assert by_onnx[2].shape == PRESETS[preset].cells
+    assert np.ptp(by_torch[1]) > 0.1
+    for ours, theirs in zip(by_onnx, by_torch, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
 def test_an_empty_frame_has_no_detections(small):

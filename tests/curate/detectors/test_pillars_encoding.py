@@ -191,7 +191,10 @@ def test_decode_takes_what_reaches_the_threshold_best_first():
     codes = np.zeros((*SMALL.cells, BOX_CODE), dtype=np.float32)
     codes[..., 7] = codes[..., 9] = 1.0
     scores[10, 60, 2], scores[20, 50, 0], scores[30, 50, 1] = 0.5, 0.9, 0.09
-    found = decode(scores, codes, NAMES, SMALL, 0.1)
+    ious = np.full(SMALL.cells, 0.25, dtype=np.float32)
+    ious[20, 50] = 0.75
+    found = decode(scores, codes, ious, NAMES, SMALL, 0.1)
+    assert found.iou.tolist() == [0.75, 0.25]
     assert found.categories.tolist() == ["Car", "Cyclist"]
     assert found.scores == pytest.approx([0.9, 0.5])
     assert found.boxes[0] == pytest.approx([20.5 * 0.64, 0.5 * 0.64, 0, 1, 1, 1, 0])
@@ -202,13 +205,14 @@ def test_decode_answers_neighbouring_cells_too():
     scores = np.zeros((*SMALL.cells, 3), dtype=np.float32)
     codes = np.zeros((*SMALL.cells, BOX_CODE), dtype=np.float32)
     scores[20, 50, 1], scores[20, 51, 1] = 0.9, 0.8
-    assert decode(scores, codes, NAMES, SMALL, 0.1).scores == pytest.approx([0.9, 0.8])
+    found = decode(scores, codes, scores[..., 0], NAMES, SMALL, 0.1)
+    assert found.scores == pytest.approx([0.9, 0.8])
 
 
 def test_decode_of_silence_is_empty():
     """No peak at all, even at threshold 0, is an empty answer of the right shapes."""
     zeros = np.zeros((*SMALL.cells, 3), dtype=np.float32)
     codes = np.zeros((*SMALL.cells, BOX_CODE), dtype=np.float32)
-    found = decode(zeros, codes, NAMES, SMALL, 0.0)
+    found = decode(zeros, codes, zeros[..., 0], NAMES, SMALL, 0.0)
     assert found.boxes.shape == (0, 7)
     assert found.categories.shape == (0,)

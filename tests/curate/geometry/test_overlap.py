@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from oracles import clipping
 from strategies import angles, box_arrays
 
-from curate.geometry.overlap import bev_iou, iou_3d, overlapping_pairs
+from curate.geometry.overlap import bev_iou, iou_3d, overlapping_pairs, paired_iou_3d
 
 CAR = np.array([12.3, -4.7, -0.8, 4.2, 1.7, 1.55, 0.3])
 
@@ -27,6 +27,15 @@ def test_iou_equals_polygon_clipping(boxes_a, boxes_b):
     assert np.allclose(bev_iou(boxes_a, boxes_b), expected, rtol=0, atol=1e-6)
     expected = by_clipping(clipping.iou_3d, boxes_a, boxes_b)
     assert np.allclose(iou_3d(boxes_a, boxes_b), expected, rtol=0, atol=1e-6)
+
+
+@settings(max_examples=150, deadline=None)
+@given(box_arrays(), box_arrays())
+def test_paired_iou_is_the_diagonal(boxes_a, boxes_b):
+    """Row by row the same as all against all."""
+    n = min(len(boxes_a), len(boxes_b))
+    expected = np.diagonal(iou_3d(boxes_a[:n], boxes_b[:n]))
+    assert np.array_equal(paired_iou_3d(boxes_a[:n], boxes_b[:n]), expected)
 
 
 @settings(max_examples=150, deadline=None)

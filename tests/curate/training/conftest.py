@@ -1,12 +1,10 @@
-"""Label files over small frames, and a detector so small that tests can train it."""
+"""Label files over small frames."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from curate.datasets.kitti import KittiDataset
-from curate.detectors.pillars import presets
 from curate.exporters.base import LabelFileDescription
 from curate.exporters.sqlite import write_labels
 
@@ -41,21 +39,3 @@ def make_labels(toy_kitti, tmp_path):
         return tmp_path / name
 
     return make
-
-
-@pytest.fixture
-def tiny(monkeypatch):
-    """The name of a preset of a tenth of the size, which covers the toy frames."""
-    small = presets.PRESETS["small"]
-    preset = replace(
-        small,
-        name="tiny",
-        x_range=(0.0, 30.72),
-        y_range=(-15.36, 15.36),
-        pillar_channels=8,
-        channels=(16, 16, 32),
-        depths=(1, 1, 1),
-        head_channels=16,
-    )
-    monkeypatch.setitem(presets.PRESETS, "tiny", preset)
-    return "tiny"

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from curate.detectors.pillars.encoding import BOX_CODE, encode_boxes
+from curate.detectors.pillars.network import Answers
 from curate.detectors.pillars.presets import PRESETS
-from curate.training.loss import BatchTargets, box_loss, heatmap_loss, weighted_loss
+from curate.training.loss import BatchTargets, box_loss, heatmap_loss, iou_loss, weighted_loss
 
 PRESET = replace(PRESETS["small"], x_range=(0.0, 20.48), y_range=(-10.24, 10.24))
 CAR = [10.0, 0.0, -0.8, 4.0, 1.6, 1.5, 0.3]
@@ -32,18 +33,20 @@ def targets_of(*frames):
 
 
 def answers(frames=1, seed=0):
-    """Random logits and codes that ask for gradients."""
+    """Random answers that ask for gradients."""
     generator = torch.Generator().manual_seed(seed)
-    logits = torch.randn(frames, *PRESET.cells, 1, generator=generator, dtype=torch.float64)
-    codes = torch.randn(frames, *PRESET.cells, BOX_CODE, generator=generator, dtype=torch.float64)
-    return logits.requires_grad_(), codes.requires_grad_()
+    parts = [
+        torch.randn(frames, *PRESET.cells, *more, generator=generator, dtype=torch.float64)
+        for more in ((1,), (BOX_CODE,), ())
+    ]
+    return Answers(*(part.requires_grad_() for part in parts))
 
 
 def gradients(targets, seed=0, frames=1):
     """Of the whole loss."""
-    logits, codes = answers(frames, seed)
-    weighted_loss(logits, codes, targets, 1.0).backward()
-    return logits.grad, codes.grad
+    given = answers(frames, seed)
+    weighted_loss(given, targets, PRESET, 1.0).backward()
+    return Answers(*(part.grad for part in given))
 
 
 def test_background_alone():
@@ -70,28 +73,74 @@ def test_the_box_term_is_l1_times_v():
     assert float(box_loss(codes, targets)) == pytest.approx(0.25 * BOX_CODE / 2, rel=1e-5)
 
 
+def test_the_iou_term_is_least_at_the_true_overlap():
+    """A box moved half its length along itself overlaps by 1/3; saying 1/3 costs its entropy."""
+    straight = [*CAR[:6], 0.0]
+    targets = targets_of([(straight, 0.5)])
+    codes = torch.zeros(1, *PRESET.cells, BOX_CODE, dtype=torch.float64)
+    moved = targets.codes.double().clone()
+    moved[:, 0] += straight[3] / 2 / PRESET.cell_m
+    codes.flatten(0, 2)[targets.code_cells] = moved
+
+    silent = torch.full((1, *PRESET.cells, 1), -9.0)
+
+    def loss(said):
+        logits = torch.full((1, *PRESET.cells), math.log(said / (1 - said)), dtype=torch.float64)
+        return float(iou_loss(Answers(silent, codes, logits), targets, PRESET))
+
+    entropy = -(math.log(1 / 3) / 3 + 2 * math.log(2 / 3) / 3)
+    assert loss(1 / 3) == pytest.approx(0.5 * entropy, rel=1e-4)
+    assert loss(0.3) > loss(1 / 3) < loss(0.36)
+
+
+def test_the_iou_term_does_not_move_the_box():
+    """The overlap is a target: the gradient reaches the estimate alone, in every frame."""
+    targets = targets_of([(CAR, 1.0)], [(CAR, 1.0)])
+    given = answers(2)
+    iou_loss(given, targets, PRESET).backward()
+    assert given.codes.grad is None
+    assert given.logits.grad is None
+    assert (given.iou_logits.grad.flatten(1).abs().sum(1) > 0).all()
+
+
+def test_what_is_found_beside_all_objects_overlaps_none():
+    """A cell that finds something there costs ln 2 / 9 at IoU 1/2; in an ignored region nothing."""
+    silent = torch.full((1, *PRESET.cells, 1), -9.0)
+    codes, undecided = torch.zeros(1, *PRESET.cells, BOX_CODE), torch.zeros(1, *PRESET.cells)
+    ignored = targets_of([(CAR, 0.0)])
+    far = (2, 2)
+    for cell, expected in ((far, math.log(2) / 9), (divmod(int(ignored.centres[0]), 32), 0.0)):
+        found = silent.clone()
+        found[0, *cell, 0] = 0.0
+        cost = iou_loss(Answers(found, codes, undecided), ignored, PRESET)
+        assert float(cost) == pytest.approx(expected, abs=1e-6)
+
+
 @pytest.mark.parametrize("v", [0.1, 0.5])
 def test_the_gradient_of_an_object_is_v_times_that_of_a_sure_one(v):
     """In the object's region every gradient is scaled by v, outside nothing changes."""
     sure, unsure = targets_of([(CAR, 1.0)]), targets_of([(CAR, v)])
     region = (unsure.background < 1)[0, ..., 0]
-    logits_sure, codes_sure = gradients(sure)
-    logits_unsure, codes_unsure = gradients(unsure)
+    logits_sure, codes_sure, ious_sure = gradients(sure)
+    logits_unsure, codes_unsure, ious_unsure = gradients(unsure)
     torch.testing.assert_close(logits_unsure[0][region], v * logits_sure[0][region])
     torch.testing.assert_close(logits_unsure[0][~region], logits_sure[0][~region])
     torch.testing.assert_close(codes_unsure, v * codes_sure)
+    torch.testing.assert_close(ious_unsure[0][region], v * ious_sure[0][region])
     assert codes_sure.abs().sum() > 0
+    assert ious_sure[0][region].abs().sum() > 0
 
 
 def test_an_ignored_region_has_no_gradient():
     """A label of weight 0 says nothing: neither object nor background where it lies."""
     targets = targets_of([(CAR, 0.0)])
-    logits, codes = gradients(targets)
+    logits, codes, ious = gradients(targets)
     region = (targets.background == 0)[0, ..., 0]
     assert int(region.sum()) >= 15
     assert not logits[0][region].any()
     assert logits[0][~region].abs().min() > 0
     assert not codes.any()
+    assert not ious[0][region].any()
 
 
 def test_the_weights_of_other_objects_do_not_matter():
@@ -106,10 +155,10 @@ def test_the_weights_of_other_objects_do_not_matter():
 def test_frames_of_a_batch_do_not_mix():
     """The loss of a batch is the sum of the losses of its frames."""
     frames = ([(CAR, 1.0)], [], [([5.0, -3.0, *CAR[2:]], 0.4), (CAR, 0.9)])
-    logits, codes = answers(3)
-    together = weighted_loss(logits, codes, targets_of(*frames), 2.0)
+    given = answers(3)
+    together = weighted_loss(given, targets_of(*frames), PRESET, 2.0)
     alone = [
-        weighted_loss(logits[i : i + 1], codes[i : i + 1], targets_of(frame), 2.0)
+        weighted_loss(Answers(*(part[i : i + 1] for part in given)), targets_of(frame), PRESET, 2.0)
         for i, frame in enumerate(frames)
     ]
     torch.testing.assert_close(together, sum(alone))

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from curate.errors import LeakageError
 from curate.geometry.overlap import bev_iou
-from curate.geometry.points_in_boxes import count_points_in_boxes
+from curate.geometry.points_in_boxes import box_of_points, count_points_in_boxes
 from curate.training.augmentation import Augmentation
 from curate.training.labels import Sample
 from curate.training.object_bank import ObjectBank, paste_objects
@@ -124,6 +126,106 @@ def test_nothing_is_pasted_onto_a_box_or_onto_another_pasted_object(bank):
         overlap = bev_iou(result.boxes, result.boxes)
         np.fill_diagonal(overlap, 0)
         assert overlap.max() == 0
+
+
+def test_nothing_is_pasted_into_what_stands_there(bank):
+    """A thicket of posts that no box tells of leaves no place; its stumps on the ground do."""
+    x, y = np.meshgrid(np.arange(5, 40, 0.7), np.arange(-30, 30, 0.7))
+    for top, possible in ((CAR[2], False), (CAR[2] - CAR[5] / 2 + 0.2, True)):
+        posts = np.stack([x, y, np.full(x.shape, top), np.zeros(x.shape)], axis=-1)
+        ground = posts.copy()
+        ground[..., 2] = CAR[2] - CAR[5] / 2
+        points = np.concatenate([posts, ground]).reshape(-1, 4).astype(np.float32)
+        seen = points[np.abs(points[:, 1]) < 0.8 * points[:, 0]]
+        assert bool(paste(sample_of(seen), bank)) is possible
+
+
+@st.composite
+def streets(draw):
+    """A narrow view of bare ground, some posts, and boxes of any weight."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    bottom = CAR[2] - CAR[5] / 2
+    ground = np.column_stack([rng.uniform(4, 45, 3000), rng.uniform(-12, 12, 3000)])
+    feet = np.column_stack([rng.uniform(6, 45, 12), rng.uniform(-10, 10, 12)])
+    posts = np.repeat(feet, 15, axis=0)
+    heights = np.concatenate([np.full(3000, bottom), bottom + rng.uniform(0, 3, len(posts))])
+    places = np.concatenate([ground, posts])
+    points = np.column_stack([places, heights, np.zeros(len(places))]).astype(np.float32)
+    count = draw(st.integers(0, 6))
+    standing = np.column_stack([
+        rng.uniform(8, 40, count), rng.uniform(-10, 10, count), np.full(count, CAR[2]),
+        np.tile(CAR[3:6], (count, 1)), rng.uniform(-3, 3, count),
+    ])  # fmt: skip
+    weights = rng.choice([0.0, 0.4, 1.0], count)
+    seen = np.abs(points[:, 1]) < 0.4 * points[:, 0]
+    return sample_of(points[seen], standing, weights=weights), int(rng.integers(2**32))
+
+
+def bank_of_three():
+    """A near car, a far one and a farther one, so that one can hide another."""
+    samples = []
+    for distance in (9.0, 18.0, 27.0):
+        box, points = list(CAR), car_points(120)
+        box[0] += distance - CAR[0]
+        points[:, 0] += distance - CAR[0]
+        samples.append(sample_of(points, [box]))
+    return ObjectBank.build(samples, ("Car",))
+
+
+@settings(max_examples=60, deadline=None)
+@given(streets())
+def test_what_a_paste_may_and_may_not_do(street):
+    """No overlap with any box, nothing but ground in the place, nothing seen through an object."""
+    sample, seed = street
+    result = paste_objects(sample, bank_of_three(), 3, np.random.default_rng(seed))
+    old, new = result.boxes[: len(sample.boxes)], result.boxes[len(sample.boxes) :]
+    np.testing.assert_array_equal(old, sample.boxes)
+    assert result.weights[len(old) :].tolist() == [1.0] * len(new)
+    if not len(new):
+        return
+    assert not bev_iou(new, old).any()
+    assert not bev_iou(new, new)[~np.eye(len(new), dtype=bool)].any()
+    above_ground = new + np.array([0, 0, 0.15, 0, 0, -0.3, 0])
+    assert not count_points_in_boxes(sample.points, above_ground).any()
+    azimuth, distance = (
+        of(result.points[:, 1], result.points[:, 0]) for of in (np.arctan2, np.hypot)
+    )
+    slope = result.points[:, 2] / distance
+    owner = box_of_points(result.points, new + GROWTH)
+    for k in range(len(new)):
+        own = (owner == k) & (result.points[:, 3] > 0)
+        if own.sum() < 10:
+            continue  # itself hidden by another
+        sides = [np.percentile(of[own], (5, 95)) for of in (azimuth, slope)]
+        through = distance > distance[own].max() + 0.1
+        for of, (low, high) in zip((azimuth, slope), sides, strict=True):
+            through &= (of > low) & (of < high)
+        assert not through.any()
+
+
+def test_one_pasted_object_hides_another():
+    """In a view just wide enough for one car some paste puts one behind another, unseen."""
+    ground = wall(60, half_width=60.0)
+    narrow = ground[np.abs(ground[:, 1]) < 0.3 * ground[:, 0]]
+    hidden = 0
+    for result in paste(sample_of(narrow), bank_of_three(), seeds=range(40)):
+        seen = count_points_in_boxes(result.points, result.boxes + GROWTH)
+        hidden += int((seen < 60).sum())
+    assert hidden > 0
+
+
+def test_a_place_of_weight_zero_is_taken_even_where_it_counts_as_background(bank):
+    """The ignored label is no target, and yet nothing is pasted onto it."""
+    standing = [[15.0, y, -0.9, 4.0, 4.0, 1.5, 0.0] for y in np.arange(-9, 10, 4.5)]
+    sample = sample_of(wall(40), standing, labeled=False, weights=np.zeros(5))
+    for zero, boxes in (("ignore", 5), ("background", 0)):
+        augmentation = Augmentation(0.0, 0.0, (1.0, 1.0), 3, 0, zero)
+        for seed in range(8):
+            changed = augmentation.apply(sample, bank, np.random.default_rng(seed))
+            pasted = changed.boxes[boxes:]
+            assert len(changed.boxes) == boxes + len(pasted)
+            assert changed.weights.tolist() == [0.0] * boxes + [1.0] * len(pasted)
+            assert not bev_iou(pasted, np.array(standing)).any()
 
 
 def test_a_pasted_object_stands_on_the_ground(bank):

@@ -13,6 +13,7 @@ from curate.datasets.kitti import KittiDataset
 from curate.detectors.pillars import PillarDetector
 from curate.detectors.pillars.checkpoint import load_checkpoint
 from curate.errors import ConfigError, DataError, ModelError
+from curate.geometry.overlap import iou_3d
 from curate.training.batches import Batches
 from curate.training.labels import WeightedLabels
 from curate.training.settings import TrainingSettings
@@ -70,6 +71,8 @@ def test_a_training_learns_its_frames(make_labels, tiny, toy_kitti, tmp_path):
         for box, category in zip(truth.boxes, truth.categories, strict=True):
             away = found.boxes[found.categories == category] - box
             assert np.abs(away[:, :2]).max(axis=1).min() < 0.4, (frame_id, category)
+        overlap = iou_3d(found.boxes, truth.boxes).max(axis=1)
+        assert np.abs(found.iou - overlap)[overlap > 0.5].max() < 0.4
 
 
 def test_a_labeled_frame_without_objects_is_all_background(make_labels, tiny, tmp_path):
@@ -86,9 +89,10 @@ def test_a_labeled_frame_without_objects_is_all_background(make_labels, tiny, tm
     assert train(labels, tmp_path / "out.safetensors", settings).labeled_frames == 2
 
 
-def test_a_killed_training_ends_with_the_same_weights(make_labels, tiny, tmp_path):
+@pytest.mark.parametrize("teacher", ["student", "ema"])
+def test_a_killed_training_ends_with_the_same_weights(make_labels, tiny, tmp_path, teacher):
     """Killed after step 4 and called again, it goes on there and ends as if nothing happened."""
-    labels, settings = make_labels(labeled=3, unlabeled=2), quick(tiny)
+    labels, settings = make_labels(labeled=3, unlabeled=2), quick(tiny, teacher=teacher)
     whole, killed = tmp_path / "whole.safetensors", tmp_path / "killed.safetensors"
     whole_report = train(labels, whole, settings)
     with pytest.raises(Killed):
@@ -131,6 +135,20 @@ def test_fine_tuning_begins_with_the_teacher(make_labels, tiny, tmp_path):
     for name, array in weights_of(teacher).items():
         if "running" not in name and "num_batches" not in name:
             np.testing.assert_allclose(weights_of(student)[name], array, atol=1e-6)
+
+
+def test_the_average_of_the_student_is_what_is_left(make_labels, tiny, tmp_path):
+    """After one step with half of the start kept: the mean of the start and the plain student."""
+    labels = make_labels(labeled=2)
+    start, student, average = (tmp_path / f"{name}.safetensors" for name in ("start", "one", "ema"))
+    train(labels, start, quick(tiny))
+    train(labels, student, quick(tiny, steps=1), start=start)
+    settings = quick(tiny, steps=1, teacher="ema", ema_decay=0.5**1e-4)
+    train(labels, average, settings, start=start)
+    for name, array in weights_of(average).items():
+        one, other = weights_of(start)[name], weights_of(student)[name]
+        expected = other if "num_batches" in name else (one + other) / 2
+        np.testing.assert_allclose(array, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_a_start_that_does_not_fit_is_refused(make_labels, tiny, tmp_path):

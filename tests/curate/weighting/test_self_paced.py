@@ -218,3 +218,22 @@ def test_settings_without_meaning_are_refused(policy, wrong, said):
     """The error names the policy and the setting."""
     with pytest.raises(ConfigError, match=rf"{policy.name}.*{said}"):
         policy(**wrong)
+
+
+def test_without_the_self_paced_term_the_priors_alone_decide():
+    """It is rho_det where a reprediction matched, in every round, and no lambda."""
+    labels = evidence([0.2, 9.0, np.nan], [[0.5, 0.4, 1.0], [0.5, 1.0, 1.0]])
+    for e in (1, 3):
+        weights = PSPSL(self_paced=False).weigh(labels, Age(e, 3))
+        assert weights.v.tolist() == [0.25, 0.4, 0.0]
+        assert np.isnan(weights.lambda_u).all()
+
+
+@pytest.mark.parametrize("name", ["rho_diff", "rho_anno"])
+def test_each_prior_alone(name):
+    """The other one is not asked, so it does not count."""
+    labels = evidence([0.0, 2.0])
+    labels = Evidence(
+        labels.frame_index, labels.category, labels.score, labels.loss, {name: np.array([0.5, 1.0])}
+    )
+    assert PSPSL().weigh(labels, Age(1, 1)).v.tolist() == [0.5, 0.0]

@@ -1,0 +1,57 @@
+"""3DIoUMatch: a label counts where both its score and its estimated IoU are high enough.
+
+Source: Wang et al., "3DIoUMatch: Leveraging IoU Prediction for Semi-Supervised 3D Object
+Detection", CVPR 2021. The authors' thresholds for KITTI are a class probability of 0.4, and an IoU
+of 0.5 for cars, 0.25 for pedestrians and cyclists. A detector of one stage has one score per
+category, which stands for both objectness and class probability.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from curate.errors import ConfigError
+from curate.weighting.base import Age, Evidence, Weights
+from curate.weighting.threshold import by_category, check_share
+
+
+@dataclass(frozen=True)
+class IoUMatch:
+    """v = 1 where the score and the IoU estimate reach their thresholds, else 0.
+
+    Attributes:
+        score: least score, in [0, 1].
+        iou: least estimate of the 3D IoU, in [0, 1].
+        score_per_category: of the categories that have their own.
+        iou_per_category: likewise.
+    """
+
+    score: float = 0.4
+    iou: float = 0.25
+    score_per_category: Mapping[str, float] = field(default_factory=dict)
+    iou_per_category: Mapping[str, float] = field(default_factory=lambda: {"Car": 0.5})
+    name: ClassVar[str] = "3dioumatch"
+    uses_unlabeled: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for a threshold that is no share."""
+        check_share(self.name, "score", {"every category": self.score, **self.score_per_category})
+        check_share(self.name, "iou", {"every category": self.iou, **self.iou_per_category})
+
+    def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
+        """1 or 0 for every label.
+
+        Raises:
+            ConfigError: the detector estimates no IoU.
+        """
+        unknown = int(np.isnan(evidence.iou).sum())
+        if unknown:
+            raise ConfigError(
+                f"policy {self.name}: {unknown} of {len(evidence)} labels have no estimate of "
+                "their IoU; use a detector that makes one, such as pillars, or another policy"
+            )
+        kept = evidence.score >= by_category(evidence, self.score, self.score_per_category)
+        kept &= evidence.iou >= by_category(evidence, self.iou, self.iou_per_category)
+        return Weights.without_age(kept.astype(np.float64))
