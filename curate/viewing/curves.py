@@ -14,10 +14,11 @@ _PANEL_WIDTH, _PANEL_HEIGHT = 560, 430
 _LEFT, _TOP, _RIGHT, _BOTTOM = 56, 52, 150, 48  # of the plot within its panel
 _LABEL_HEIGHT = 16.0
 _BAND_OPACITY = 0.16
-# Told apart by hue and by lightness; the last methods of a grid are usually the ones to look at.
+# Told apart by hue and by lightness.
 _COLOURS: tuple[Colour, ...] = (
     (139, 150, 165), (222, 120, 92), (214, 164, 64), (92, 148, 222), (164, 118, 214),
-    (66, 190, 168), (250, 222, 72), (226, 120, 178), (150, 200, 96), (110, 205, 235),
+    (66, 190, 168), (226, 120, 178), (250, 222, 72), (150, 200, 96), (110, 205, 235),
+    (240, 240, 240),
 )  # fmt: skip
 
 
@@ -150,7 +151,7 @@ class _Plot:
 
     def _draw_whiskers(self, curve: Curve, colour: Colour) -> None:
         """The band of a single share, where it has no width."""
-        if np.isnan(curve.stds).any():
+        if np.isnan([curve.means[0], curve.stds[0]]).any():
             return
         across = self._across(self.panel.shares[0])
         ends = [self._down(curve.means[0] + sign * curve.stds[0]) for sign in (-1, 1)]

@@ -1,6 +1,7 @@
 """What a job will cost: its work times the rates that finished jobs were measured at."""
 
 from collections.abc import Iterable, Mapping
+from statistics import median
 from types import MappingProxyType
 
 from pipelines.bench.grid import EVALUATE, TRAIN
@@ -50,6 +51,6 @@ class Costs:
 
     def seconds(self, work: Mapping[str, int]) -> float:
         """What a job is expected to take."""
-        count = len(self._overheads)
-        overhead = sum(self._overheads) / count if count else OVERHEAD_S
+        # The first job compiles kernels that later ones find on disk: no mean.
+        overhead = median(self._overheads) if self._overheads else OVERHEAD_S
         return overhead + sum(units * self.rate(kind) for kind, units in work.items())

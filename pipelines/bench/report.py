@@ -19,7 +19,7 @@ from curate.viewing.canvas import save_png
 from curate.viewing.curves import Curve, CurvePanel, draw_curves
 from pipelines.bench.results import OVERLAPS, JobResult, read_results
 from pipelines.bench.settings import SYNTHETIC, Bench
-from pipelines.bench.tables import Entry, Finished, Table, Value, all_tables
+from pipelines.bench.tables import Entry, Finished, Table, Value, all_tables, signed
 from pipelines.methods import METHODS
 from pipelines.workspace import open_dataset
 
@@ -83,7 +83,7 @@ class BenchReport:
         if self.finished.methods:
             lines += ["", f"![Mean AP over labeled ratio]({PICTURE})"]
         for table in self.tables:
-            lines += ["", f"**{table.title}**", ""]
+            lines += ["", f"## {table.title[0].upper()}{table.title[1:]}", ""]
             lines.append("| " + " | ".join(table.columns) + " |")
             lines.append("|---" + "|---:" * (len(table.columns) - 1) + "|")
             lines += [
@@ -143,7 +143,10 @@ class BenchReport:
             curves = [Curve(str(name), *columns.T) for name, columns in values.items()]
             title = self._summary(overlaps).title
             panels.append(CurvePanel(title, np.array(self.finished.ratios), curves))
-        note = "line: mean over seeds; band: standard deviation; mean over categories, difficulties"
+        note = (
+            "line: mean over seeds; band: standard deviation; AP R40, mean over categories and "
+            "difficulties; teacher: on X_l once, baseline: on X_l as long as the other methods"
+        )
         return draw_curves(panels, "AP over labeled ratio", note)
 
     def _summary(self, overlaps: str) -> Table:
@@ -211,8 +214,8 @@ def shown(value: Value, *, full: bool = False) -> str:
     if isinstance(value, PairedDifference):
         if math.isnan(value.mean):
             return "-"
-        interval = "" if math.isnan(value.low) else f" [{value.low:+.1f}, {value.high:+.1f}]"
-        return f"{value.mean:+.1f}{interval}"
+        ends = f" [{signed(value.low)}, {signed(value.high)}]"
+        return signed(value.mean) + ("" if math.isnan(value.low) else ends)
     return str(value)
 
 

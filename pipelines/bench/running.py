@@ -44,11 +44,13 @@ def run_grid(bench: Bench, run_job: RunJob, workers: int, say: Say, progress: Pr
     waiting = grid.waiting(bench.axes, bench.root)
     cells = [job for job in grid.jobs(bench.axes) if job.method is not None]
     done = sum(job.is_done(bench.root) for job in cells)
-    say(f"{len(cells)} cells, {done} of them finished before" if done else f"{len(cells)} cells")
+    known = f"{len(cells)} cells" + (f", {done} of them finished before" if done else "")
     if not waiting:
+        say(known)
         return
     with progress.track("grid", _PARTS) as advance:
         run = _GridRun(bench, waiting, say, advance)
+        say(f"{known}: about {_minutes(run.total / workers)} with {workers} at once")
         failed = run.go(run_job, workers)
     if failed:
         raise CellsFailed(
@@ -87,6 +89,7 @@ class _GridRun:
         self.sizes = Sizes(len(lists["train"]), len(lists["val"]))
         seconds = {job: self.costs.seconds(self.work(job)) for job in waiting}
         rates = {kind: self.costs.rate(kind) for kind in FIRST_GUESS}
+        self.total = sum(seconds.values())
         self._bar = _GridBar(seconds, rates, advance)
 
     def work(self, job: Job) -> Mapping[str, int]:

@@ -29,20 +29,26 @@ class Entry:
 
     spread: Spread
     gain: float = math.nan
+    digits: int = 1
 
     @property
     def short(self) -> str:
         """Mean and standard deviation."""
         if math.isnan(self.spread.mean):
             return "-"
-        std = "" if math.isnan(self.spread.std) else f"±{self.spread.std:.1f}"
-        return f"{self.spread.mean:.1f}{std}"
+        std = "" if math.isnan(self.spread.std) else f"±{self.spread.std:.{self.digits}f}"
+        return f"{self.spread.mean:.{self.digits}f}{std}"
 
     @property
     def full(self) -> str:
         """With the gain."""
         text = self.short.replace("±", " ± ")
-        return text if math.isnan(self.gain) else f"{text} ({self.gain:+.1f})"
+        return text if math.isnan(self.gain) else f"{text} ({signed(self.gain)})"
+
+
+def signed(points: float) -> str:
+    """A difference with its sign; 0 has none below it."""
+    return f"{round(points, 1) + 0.0:+.1f}"
 
 
 Value = Entry | PairedDifference | str | int | float
@@ -146,10 +152,10 @@ def _of_ratio(finished: Finished, ratio: float, overlaps: str, figure: str) -> T
             for mine, base in zip(columns[0].T, columns[1].T, strict=True)
         ]
         mean = _entry(values.mean(axis=(1, 2)), baseline.mean(axis=(1, 2)), compared=compared)
-        gain = "" if math.isnan(mean.gain) else f"{mean.gain:+.1f}"
+        gain = "" if math.isnan(mean.gain) else signed(mean.gain)
         rows.append((method or TEACHER, mean.spread.count, *entries, mean, gain))
     levels = ("easy", "mod.", "hard")
-    names = [f"{category} {level}" for category in finished.categories for level in levels]
+    names = [f"{category[:3]} {level}" for category in finished.categories for level in levels]
     overlap = _overlaps(finished, overlaps)
     return Table(
         f"{NAMES[figure]}, IoU {overlap}: {_ratio(finished, ratio)}",
@@ -214,7 +220,10 @@ def _labels(finished: Finished, ratio: float) -> Iterator[Table]:
             [each.recall for each in last],
             [None if each.auroc is None else 100 * each.auroc for each in last],
         )
-        rows.append((method, *(Entry(spread(_numbers(values))) for values in figures)))
+        digits = (0, 0, 1, 1, 1)
+        spreads = [spread(_numbers(values)) for values in figures]
+        entries = [Entry(of, digits=d) for of, d in zip(spreads, digits, strict=True)]
+        rows.append((method, *entries))
     if rows:
         yield Table(
             f"pseudo-labels of the last round, percent: {_ratio(finished, ratio)}",

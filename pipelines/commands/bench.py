@@ -90,7 +90,7 @@ def bench(
 
     Example: curate bench bench --methods baseline,pspsl --ratios 0.08 --seeds 0 --steps 300
     """
-    from curate.errors import ConfigError
+    from curate.errors import CellsFailed, ConfigError
     from pipelines.bench.report import BenchReport
 
     if overlaps not in {"kitti", "loose", "all"}:
@@ -109,9 +109,10 @@ def bench(
     try:
         if not report:
             _run(chosen, workers or os.cpu_count() or 1, quiet=as_json)
-    finally:
-        # What is finished is told even where some of it failed.
+    except CellsFailed:
         _tell(BenchReport(chosen), overlaps, as_json=as_json)
+        raise
+    _tell(BenchReport(chosen), overlaps, as_json=as_json)
 
 
 def bench_cell(
