@@ -14,6 +14,7 @@ from bench_results import made_up, make_bench
 from pipelines_cli import Curate
 
 from curate.errors import CellsFailed, ConfigError, DataError, WorkspaceError
+from db import bulk
 from pipelines import plan
 from pipelines.bench.cell import run_job
 from pipelines.bench.grid import Job, jobs
@@ -29,7 +30,7 @@ GIVE_UP_S = 600
 # Two rounds of few steps, snapshots that a kill finds, and labels although nothing was learned yet.
 OPTIONS = (
     *("--methods", "baseline,pspsl", "--ratios", "0.25", "--seeds", "3"),
-    *("--steps", "6", "--rounds", "2", "--workers", "1"),
+    *("--steps", "4", "--rounds", "2", "--workers", "1"),
     *("--set", "train.options.snapshot_seconds=0.01", "--set", "detector.minimum_score=0.02"),
 )
 
@@ -61,10 +62,23 @@ def weights(root: Path, job: Job) -> list[tuple]:
         return database.execute("SELECT * FROM weight ORDER BY 1, 2, 3, 4").fetchall()
 
 
+def first_round(root: Path, job: Job) -> list[tuple]:
+    """What a cell has of the shared work, with the times at which and in which it was done."""
+    folder = job.folder(root)
+    written = (folder / "checkpoints" / "round-00.safetensors").stat().st_mtime_ns
+    query = (
+        "SELECT stage, frame_id, fingerprint, seconds FROM task "
+        "WHERE round < 2 AND stage NOT IN ('solve', 'export', 'train-round') ORDER BY 1, 2"
+    )
+    with sqlite3.connect(folder / "curate.db") as database:
+        return [(written,), *database.execute(query)]
+
+
 def test_a_killed_grid_goes_on_and_ends_as_if_it_had_not_been(
     toy_kitti: Path, tmp_path: Path
 ) -> None:
     """SIGKILL while a cell trains: its process ends too, and nothing finished is redone."""
+    (toy_kitti / "simulation.json").write_text("{}")  # so that its labels are judged
     folder = tmp_path / "killed"
     process = start(folder, "--data", toy_kitti, *OPTIONS)
     wait_for(lambda: list(folder.glob("cells/*/checkpoints/.*.training")), process)
@@ -91,6 +105,10 @@ def test_a_killed_grid_goes_on_and_ends_as_if_it_had_not_been(
         assert figures(read_result(folder, job)) == figures(read_result(whole.root, job))
     assert weights(folder, Job(0.25, 3, "pspsl")) == weights(whole.root, Job(0.25, 3, "pspsl"))
     assert any(read_result(folder, job).resumed for job in jobs(whole.axes))
+    for method in whole.axes.methods:
+        assert first_round(folder, Job(0.25, 3, method)) == first_round(folder, shared)
+        labels = read_result(folder, Job(0.25, 3, method)).labels
+        assert [each.round for each in labels] == [1, 2]
 
 
 def make_whole(root: Path, like: Path) -> Bench:
@@ -107,10 +125,9 @@ def test_methods_share_the_teacher_and_its_evidence(toy_kitti: Path, tmp_path: P
     """No method's settings make stale what was prepared once for all of them."""
     bench = make_bench(tmp_path, toy_kitti)
     workspace = initialise(tmp_path / "work", bench.config(0), "0.25", "")
-    from db import bulk
-
+    checkpoint = (0, "", "pillars", "curate.toml", "0" * 64, "2023-02-01 00:00:00")
     with workspace.database.writing() as connection:
-        bulk.insert(connection, "checkpoint", [(0, "", "pillars", "curate.toml", "0" * 64, None)])
+        bulk.insert(connection, "checkpoint", [checkpoint])
     context = open_round(workspace, 1)
     stages = ("predict", "repredict", "points")
     prints = {}
