@@ -20,6 +20,7 @@ from pipelines.bench.settings import Bench
 from pipelines.config import write_config
 from pipelines.evaluation import detect_val, evaluate_detections
 from pipelines.label_quality import label_quality
+from pipelines.methods import METHODS
 from pipelines.round import active
 from pipelines.rounds import newest_checkpoint, open_round
 from pipelines.runner import Report, open_executor, run_frames
@@ -57,7 +58,9 @@ def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
         frames={split: len(workspace.frames(split)) for split in SPLITS},
         ap=found.ap,
         recall=found.recall,
-        labels=_labels(workspace) if job.method is not None and bench.simulated else (),
+        labels=_labels(workspace, METHODS[job.method].policy)
+        if job.method is not None and bench.simulated
+        else (),
         failed_frames=sum(report.failed for report in reports),
         seconds=time.monotonic() - start,
         resumed=resumed,
@@ -150,11 +153,11 @@ def _recalls(evaluation: KittiEvaluation) -> dict[str, tuple[float, float, float
     }
 
 
-def _labels(workspace: Workspace) -> tuple[LabelFigures, ...]:
-    """The labels of every round under the cell's policy, judged by the simulation's truth."""
+def _labels(workspace: Workspace, policy: str) -> tuple[LabelFigures, ...]:
+    """The labels of every round under a policy, judged by the simulation's truth."""
     rows = []
     for number in range(1, workspace.config.run.rounds + 1):
-        [found] = label_quality(workspace, number, (workspace.config.solve.policy,))
+        [found] = label_quality(workspace, number, (policy,))
         _, labels, trusted, *figures = found
         precision, recall, auroc = (None if math.isnan(value) else value for value in figures)
         rows.append(

@@ -68,7 +68,7 @@ class BenchReport:
                 {
                     "title": table.title,
                     "overlaps": table.overlaps,
-                    "columns": list(table.columns),
+                    "columns": [name.replace("\n", " ") for name in table.columns],
                     "rows": [[_plain(value) for value in row] for row in table.rows],
                 }
                 for table in self.tables
@@ -84,7 +84,8 @@ class BenchReport:
             lines += ["", f"![Mean AP over labeled ratio]({PICTURE})"]
         for table in self.tables:
             lines += ["", f"## {table.title[0].upper()}{table.title[1:]}", ""]
-            lines.append("| " + " | ".join(table.columns) + " |")
+            names = [name.replace("\n", " ") for name in table.columns]
+            lines.append("| " + " | ".join(names) + " |")
             lines.append("|---" + "|---:" * (len(table.columns) - 1) + "|")
             lines += [
                 "| " + " | ".join(shown(v, full=True) for v in row) + " |" for row in table.rows
@@ -113,9 +114,9 @@ class BenchReport:
         )
         yield (
             "KITTI AP, 40 recall positions, in percent; mean is over categories and difficulties; "
-            "± is the standard deviation over seeds, (+) the gain over the baseline"
+            "± is the standard deviation over n seeds, (+) the gain over the baseline"
         )
-        yield "the last round's student is evaluated on val, which nothing was chosen on"
+        yield "what the last round trained is evaluated on val, on which no training was chosen"
         for about in {tuple(sorted(result.about.items())) for result in self.results}:
             versions = dict(about)
             yield (
@@ -184,8 +185,9 @@ class BenchReport:
         yield Table(
             f"how hard the data is: objects of the {len(names)} val frames",
             (
-                *("category", "objects", "per frame", "count at easy", "at moderate", "at hard"),
-                *("occluded", "mostly", "truncated > 15 %", f"metres, {quantiles} % quantile"),
+                *("category", "objects", "per\nframe", "count at\neasy", "at\nmod.", "at\nhard"),
+                *("occluded", "mostly\noccluded", "truncated\n> 15 %"),
+                f"metres, quantiles\n{quantiles} %",
             ),
             tuple(rows),
         )

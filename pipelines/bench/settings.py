@@ -23,6 +23,7 @@ OWN = {
     "dataset.kind": "--data",
     "dataset.root": "--data",
     "solve.policy": "--methods",
+    "run.method": "--methods",
     "train.pretrain_steps": "--steps",
     "train.round_steps": "--steps",
     "train.threads": "--workers",

@@ -60,7 +60,7 @@ class Table:
 
     Attributes:
         title: what it shows.
-        columns: their names, the first is that of the row.
+        columns: their names, of one or two lines; the first is that of the row.
         rows: one value per column.
         overlaps: "kitti" or "loose".
     """
@@ -126,7 +126,7 @@ def all_tables(finished: Finished) -> list[Table]:
         return []
     return [
         *(_summary(finished, *what) for what in SUMMARISED),
-        *(_differences(finished, *what) for what in SUMMARISED if BASELINE in finished.methods),
+        *(table for what in SUMMARISED for table in _differences(finished, *what)),
         *(
             table
             for ratio in finished.ratios
@@ -155,11 +155,11 @@ def _of_ratio(finished: Finished, ratio: float, overlaps: str, figure: str) -> T
         gain = "" if math.isnan(mean.gain) else signed(mean.gain)
         rows.append((method or TEACHER, mean.spread.count, *entries, mean, gain))
     levels = ("easy", "mod.", "hard")
-    names = [f"{category[:3]} {level}" for category in finished.categories for level in levels]
+    names = [f"{category[:3]}\n{level}" for category in finished.categories for level in levels]
     overlap = _overlaps(finished, overlaps)
     return Table(
         f"{NAMES[figure]}, IoU {overlap}: {_ratio(finished, ratio)}",
-        ("method", "seeds", *names, "mean", "gain"),
+        ("method", "n", *names, "mean", "gain"),
         tuple(rows),
         overlaps,
     )
@@ -182,27 +182,41 @@ def _summary(finished: Finished, overlaps: str, figure: str) -> Table:
     )
 
 
-def _differences(finished: Finished, overlaps: str, figure: str) -> Table:
-    """Mean AP less the baseline's, paired by seed, with its interval."""
-    rows: list[tuple[Value, ...]] = []
-    for method in finished.methods:
-        if method == BASELINE:
-            continue
-        mine, base = (
-            np.array([finished.means(each, r, overlaps, figure) for r in finished.ratios])
-            for each in (method, BASELINE)
+def _differences(finished: Finished, overlaps: str, figure: str) -> Iterator[Table]:
+    """Differences of mean AP between methods, paired by seed, with their intervals."""
+    means = {
+        method: np.array(
+            [finished.means(method, ratio, overlaps, figure) for ratio in finished.ratios]
         )
+        for method in finished.methods
+    }
+    rows: list[tuple[Value, ...]] = []
+    for better, other in _compared(finished.methods):
+        mine, base = means[better], means[other]
         pairs = [paired_difference(*of) for of in zip(mine, base, strict=True)]
         # A seed's differences at all ratios are not independent; its mean over them is one pair.
         pooled = paired_difference(mine.mean(axis=0), base.mean(axis=0))
-        rows.append((method, *pairs, pooled))
-    return Table(
-        f"mean {NAMES[figure]} less the baseline's, paired by seed, with the 95 % t interval; "
-        f"IoU {_overlaps(finished, overlaps)}",
-        ("method", *(f"{100 * ratio:g} %" for ratio in finished.ratios), "all ratios"),
-        tuple(rows),
-        overlaps,
-    )
+        rows.append((f"{better} - {other}", *pairs, pooled))
+    if rows:
+        yield Table(
+            f"differences of mean {NAMES[figure]}, IoU {_overlaps(finished, overlaps)}, paired by "
+            "seed, with their 95 % t intervals",
+            ("methods", *(f"{100 * ratio:g} %" for ratio in finished.ratios), "all ratios"),
+            tuple(rows),
+            overlaps,
+        )
+
+
+def _compared(methods: Sequence[str]) -> list[tuple[str, str]]:
+    """Every method with the baseline, and the paper's two with all that are not theirs."""
+    pairs = [(method, BASELINE) for method in methods if BASELINE in methods]
+    pairs += [
+        (own, other)
+        for own, but in (("pspsl", ()), ("spsl", ("pspsl",)))
+        for other in methods
+        if own in methods and other not in (*but, BASELINE)
+    ]
+    return [(one, other) for one, other in pairs if one != other]
 
 
 def _labels(finished: Finished, ratio: float) -> Iterator[Table]:

@@ -30,7 +30,7 @@ GIVE_UP_S = 600
 # Two rounds of few steps, snapshots that a kill finds, and labels although nothing was learned yet.
 OPTIONS = (
     *("--methods", "baseline,pspsl", "--ratios", "0.25", "--seeds", "3"),
-    *("--steps", "4", "--rounds", "2", "--workers", "1"),
+    *("--steps", "3", "--rounds", "2", "--workers", "1"),
     *("--set", "train.options.snapshot_seconds=0.01", "--set", "detector.minimum_score=0.02"),
 )
 
@@ -134,7 +134,7 @@ def test_methods_share_the_teacher_and_its_evidence(toy_kitti: Path, tmp_path: P
     for method in METHODS:
         config = bench.config(0, method)
         under = type(workspace)(workspace.root, config, workspace.database)
-        found = plan.fingerprints(under, context, config.solve.policy)
+        found = plan.fingerprints(under, context, METHODS[method].policy)
         prints[method] = [found[stage] for stage in stages]
     assert len({tuple(each) for each in prints.values()}) == 1, prints
 

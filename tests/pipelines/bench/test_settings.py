@@ -7,7 +7,7 @@ from bench_results import make_bench
 
 from curate.errors import ConfigError, DataError, WorkspaceError
 from pipelines.bench.settings import Axes, Bench, BenchSettings, check_axes, claim, read_bench
-from pipelines.methods import METHODS
+from pipelines.methods import with_method
 
 AXES = Axes(methods=("baseline",), ratios=(0.5,), seeds=(0,))
 
@@ -34,7 +34,7 @@ def test_overrides_reach_every_methods_configuration(toy_kitti: Path, tmp_path: 
         assert config.run.priors == ("points",)
         assert config.solve.options == {"threshold": {"threshold": 0.4}}
         assert config.run.seed == 3
-        assert config.solve.policy == METHODS[method].policy
+        assert config == with_method(config, method)
 
 
 @pytest.mark.parametrize(

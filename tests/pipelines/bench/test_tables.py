@@ -41,7 +41,7 @@ def table(finished: Finished, title: str) -> Table:
 def test_the_table_of_a_ratio(finished: Finished) -> None:
     """Easy cars: 49, 62 are 55.5 ± 9.2, 13.5 above 40, 44; a third of the gain in the mean."""
     found = table(finished, "3D AP, IoU 0.7/0.5/0.5: 25 % labeled (2 of 8 frames)")
-    assert found.columns[2:5] == ("Car easy", "Car mod.", "Car hard")
+    assert found.columns[2:5] == ("Car\neasy", "Car\nmod.", "Car\nhard")
     assert row(found, "pspsl")[:3] == ["2", "55.5±9.2", "45.5±9.2"]
     assert row(found, "pspsl")[-2:] == ["15.2±3.1", "+4.5"]
     assert row(found, "baseline")[1] == "42.0±2.8"
@@ -62,11 +62,21 @@ def test_the_summary_has_a_column_per_ratio(finished: Finished) -> None:
 
 def test_differences_are_paired_by_seed(finished: Finished) -> None:
     """(9 / 3, 18 / 3) = (3, 6) at 25 %: 4.5 ± 12.71 * 2.12 / sqrt 2; one pair at 50 %."""
-    found = table(finished, "mean 3D AP less the baseline's")
-    assert row(found, "pspsl")[:2] == ["+4.5 [-14.6, +23.6]", "+2.0"]
+    found = table(finished, "differences of mean 3D AP")
+    assert row(found, "pspsl - baseline")[:2] == ["+4.5 [-14.6, +23.6]", "+2.0"]
     # Only seed 0 has both ratios: (3 + 2) / 2.
-    assert row(found, "pspsl")[2] == "+2.5"
-    assert [name for name, *_ in found.rows] == ["pspsl"]
+    assert row(found, "pspsl - baseline")[2] == "+2.5"
+
+
+def test_the_papers_methods_are_compared_with_all_others() -> None:
+    """The others with the baseline alone; no pair twice."""
+    methods = ("baseline", "uda", "spsl", "pspsl")
+    cells = [made_up(Job(0.1, 0, method), 50.0) for method in methods]
+    found = table(Finished(cells), "differences of mean BEV AP")
+    assert [name for name, *_ in found.rows] == [
+        "uda - baseline", "spsl - baseline", "pspsl - baseline",
+        "pspsl - uda", "pspsl - spsl", "spsl - uda",
+    ]  # fmt: skip
 
 
 def test_labels_and_times(finished: Finished) -> None:
@@ -80,7 +90,7 @@ def test_labels_and_times(finished: Finished) -> None:
 def test_without_a_baseline_there_are_no_gains() -> None:
     """And nothing breaks."""
     tables = all_tables(Finished([made_up(Job(0.1, 0, "pspsl"), 50.0)]))
-    assert not any("baseline" in each.title for each in tables)
+    assert not any(each.title.startswith("differences") for each in tables)
     assert row(tables[0], "pspsl") == ["13.3"]
     assert all_tables(Finished([])) == []
 
