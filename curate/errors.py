@@ -7,7 +7,8 @@ CurateError (1)
 ├── LeakageError (5)     ground truth would reach a place where it must not be
 ├── WorkspaceError (6)   a workspace or a stage's input is not there
 ├── DatabaseError (7)    the database refuses, is damaged, or is of another version
-└── FramesFailed (8)     the command ended, but some frames failed; they are recorded
+├── FramesFailed (8)     the command ended, but some frames failed; they are recorded
+└── CellsFailed (9)      the grid ended, but some of its cells failed; the others are kept
 
 Each message is one line: what is wrong, in which file and where, what to do.
 """
@@ -59,3 +60,9 @@ class FramesFailed(CurateError):  # noqa: N818 - it reports frames, it is not it
     """The command ended, but some frames failed; each is recorded with its error."""
 
     exit_code = 8
+
+
+class CellsFailed(CurateError):  # noqa: N818 - it reports cells, it is not itself a fault
+    """The grid ended, but some of its cells failed; the others are kept."""
+
+    exit_code = 9

@@ -9,6 +9,7 @@ import typer
 from curate.errors import CurateError
 from pipelines.commands import (
     audit,
+    bench,
     demo,
     evaluate,
     explain,
@@ -53,10 +54,13 @@ for command in (
     explain,
     evaluate,
     audit,
+    bench,
 ):
     command.register(app)
 COMMANDS = tuple(
-    command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands
+    command.name or getattr(command.callback, "__name__", "")
+    for command in app.registered_commands
+    if not command.hidden
 )
 
 

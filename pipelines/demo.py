@@ -18,6 +18,7 @@ import typer
 from curate.detections import CATEGORIES
 from curate.errors import CurateError
 from curate.evaluation.kitti_ap import FIGURES
+from curate.evaluation.kitti_rules import LOOSE_OVERLAPS
 from pipelines.commands.options import print_report, print_table
 from pipelines.config import Config, make_config
 from pipelines.evaluation import detect_val, evaluate_detections
@@ -40,8 +41,6 @@ OTHERS = {
     "baseline": "from X_l alone, as long again",
     "uniform": "from X_l and all pseudo-labels, unweighted",
 }
-# A detector of few labels finds objects before it measures them to KITTI's overlaps.
-LOOSE = {"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25}
 JUDGED = ("uniform", "threshold", "spsl", "pspsl")
 QUERY = (
     "SELECT frame, k, category, score, loss, points, rho_det, weight FROM weighted_labels "
@@ -195,13 +194,13 @@ def _print_detectors(workspace: Workspace) -> None:
     for name, path in _detectors(workspace):
         found = detect_val(workspace, path, Bar())
         strict = evaluate_detections(workspace, found).ap_r40[:, :, 1]
-        loose = evaluate_detections(workspace, found, LOOSE).ap_r40[:, :, 1]
+        loose = evaluate_detections(workspace, found, LOOSE_OVERLAPS).ap_r40[:, :, 1]
         bev, box = FIGURES.index("bev"), FIGURES.index("3d")
         means = (loose[:, box], loose[:, bev], strict[:, box], strict[:, bev])
         rows.append((name, *map(float, loose[:, box]), *(float(mean.mean()) for mean in means)))
     columns = ("detector", *CATEGORIES, "3D mean", "BEV mean", "3D strict", "BEV strict")
     print_table(columns, rows, title="AP R40, moderate, percent")
-    overlaps = ", ".join(f"{name} {overlap}" for name, overlap in LOOSE.items())
+    overlaps = ", ".join(f"{name} {overlap}" for name, overlap in LOOSE_OVERLAPS.items())
     typer.echo(f"   IoU above {overlaps}; strict is KITTI's own 0.7, 0.5, 0.5.")
 
 

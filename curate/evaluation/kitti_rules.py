@@ -20,6 +20,9 @@ MAX_TRUNCATIONS = (0.15, 0.3, 0.5)
 MIN_OVERLAPS = MappingProxyType({"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5})
 """Overlap that a detection must exceed to find an object; the same in image, BEV and 3D."""
 
+LOOSE_OVERLAPS = MappingProxyType({"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25})
+"""For detectors of few labels, which find objects before they measure them to KITTI's overlaps."""
+
 NEIGHBOURS = MappingProxyType({"Car": "Van", "Pedestrian": "Person_sitting"})
 """Categories that are alike: their objects are ignored, not counted as background."""
 

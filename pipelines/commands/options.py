@@ -75,13 +75,25 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not isfinite(value) else value
 
 
-def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], title: str = "") -> None:
-    """Prints rows as a table; numbers are aligned to the right."""
+def print_table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[Any]],
+    title: str = "",
+    *,
+    dense: bool = False,
+) -> None:
+    """Prints rows as a table, dense where many columns share a line; numbers to the right."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(
+        title=title or None,
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 0 if dense else 1),
+    )
     cells = [[_cell(value) for value in row] for row in rows]
     numeric = [
         all(_is_number(row[i]) for row in cells) and bool(cells) for i in range(len(columns))

@@ -1,0 +1,182 @@
+"""A job of the grid, as its own process does it: a workspace brought up to date and evaluated."""
+
+import math
+import os
+import shutil
+import sqlite3
+import time
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import curate
+from curate.evaluation.kitti_ap import KittiEvaluation
+from curate.evaluation.kitti_rules import LOOSE_OVERLAPS, MIN_OVERLAPS
+from pipelines.assembly import device
+from pipelines.bench.grid import Job
+from pipelines.bench.metered import Metered
+from pipelines.bench.results import JobResult, LabelFigures, write_result
+from pipelines.bench.settings import Bench
+from pipelines.config import write_config
+from pipelines.evaluation import detect_val, evaluate_detections
+from pipelines.label_quality import label_quality
+from pipelines.methods import METHODS
+from pipelines.round import active
+from pipelines.rounds import newest_checkpoint, open_round
+from pipelines.runner import Report, open_executor, run_frames
+from pipelines.schedule import run_all
+from pipelines.setup import initialise
+from pipelines.stage import FrameStage
+from pipelines.stages.pretrain import pretrain
+from pipelines.workspace import CONFIG_NAME, SPLITS, Workspace
+
+DATABASE = "curate.db"
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """A detector's figures in the form of `JobResult`."""
+
+    ap: dict[str, dict[str, dict[str, tuple[float, float, float]]]]
+    recall: dict[str, tuple[float, float, float]]
+
+
+def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
+    """Does a job, or what an earlier run has left of it, and writes its result."""
+    start = time.monotonic()
+    resumed = job.folder(bench.root).exists()
+    workspace = _prepared(bench, job) if job.method is None else _copied(bench, job)
+    if job.method is None:
+        reports = _share(workspace, progress)
+    else:
+        reports = list(run_all(workspace, None, progress))
+    found = _evaluate(workspace, newest_checkpoint(workspace), progress)
+    result = JobResult(
+        ratio=job.ratio,
+        seed=job.seed,
+        method=job.method,
+        frames={split: len(workspace.frames(split)) for split in SPLITS},
+        ap=found.ap,
+        recall=found.recall,
+        labels=_labels(workspace, METHODS[job.method].policy)
+        if job.method is not None and bench.simulated
+        else (),
+        failed_frames=sum(report.failed for report in reports),
+        seconds=time.monotonic() - start,
+        resumed=resumed,
+        timings=dict(progress.timings),
+        about=_about(workspace),
+    )
+    workspace.database.close()
+    write_result(bench.root, result)
+    return result
+
+
+def _prepared(bench: Bench, job: Job) -> Workspace:
+    """The workspace with its draw of labeled frames."""
+    config = bench.config(job.seed)
+    root = job.folder(bench.root)
+    if (root / CONFIG_NAME).exists():
+        write_config(root / CONFIG_NAME, config)  # the bench may have been moved
+    return initialise(root, config, str(job.ratio), "")
+
+
+def _share(workspace: Workspace, progress: Metered) -> list[Report]:
+    """The teacher, and what round 1 asks of it whatever the method."""
+    reports = [pretrain(workspace, progress)]
+    context = open_round(workspace, 1)
+    with open_executor(workspace) as executor:
+        reports += [
+            run_frames(workspace, context, stage, executor, progress)
+            for stage in active(workspace.config.run.priors)
+            if isinstance(stage, FrameStage)
+        ]
+    return reports
+
+
+def _copied(bench: Bench, job: Job) -> Workspace:
+    """The method's workspace, which starts as a copy of the shared one.
+
+    Whatever of the copy does not fit the method's settings is stale and done again.
+    """
+    root = job.folder(bench.root)
+    if not root.exists():
+        source = job.shared.folder(bench.root)
+        partial = root.with_name(f".{root.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.copytree(source / "checkpoints", partial / "checkpoints")
+        _copy_database(source / DATABASE, partial / DATABASE)
+        partial.rename(root)
+    config = bench.config(job.seed, job.method)
+    for folder in ("exports", "pictures", "reports"):
+        (root / folder).mkdir(exist_ok=True)
+    write_config(root / CONFIG_NAME, config)
+    return Workspace.open(root)
+
+
+def _copy_database(source: Path, target: Path) -> None:
+    """SQLite's own backup, which is whole whatever lies in the write-ahead log."""
+    with closing(sqlite3.connect(source)) as old, closing(sqlite3.connect(target)) as new:
+        old.backup(new)
+
+
+def _evaluate(workspace: Workspace, checkpoint: Path, progress: Metered) -> Evaluated:
+    """How good a detector is on val, at KITTI's overlaps and at loose ones."""
+    found = detect_val(workspace, checkpoint, progress)
+    categories = [name for name in workspace.config.dataset.categories if name in MIN_OVERLAPS]
+    rules = {"kitti": MIN_OVERLAPS, "loose": LOOSE_OVERLAPS}
+    figures = {
+        name: evaluate_detections(workspace, found, {each: rule[each] for each in categories})
+        for name, rule in rules.items()
+    }
+    return Evaluated(
+        {name: _averages(evaluation) for name, evaluation in figures.items()},
+        _recalls(figures["kitti"]),
+    )
+
+
+def _averages(evaluation: KittiEvaluation) -> dict[str, dict[str, tuple[float, float, float]]]:
+    """AP R40 by figure and category."""
+    plain = evaluation.as_dict()["AP_R40"]
+    return {
+        figure: {category: tuple(by_figure[figure]) for category, by_figure in plain.items()}
+        for figure in ("3d", "bev")
+    }
+
+
+def _recalls(evaluation: KittiEvaluation) -> dict[str, tuple[float, float, float]]:
+    """Recall by category, at the overlap at which its AP is computed."""
+    plain = evaluation.as_dict()["recall_3d"]
+    return {
+        category: tuple(plain[category][f"{overlap:g}"])
+        for category, overlap in evaluation.min_overlaps.items()
+    }
+
+
+def _labels(workspace: Workspace, policy: str) -> tuple[LabelFigures, ...]:
+    """The labels of every round under a policy, judged by the simulation's truth."""
+    rows = []
+    for number in range(1, workspace.config.run.rounds + 1):
+        [found] = label_quality(workspace, number, (policy,))
+        _, labels, trusted, *figures = found
+        precision, recall, auroc = (None if math.isnan(value) else value for value in figures)
+        rows.append(
+            LabelFigures(
+                round=number,
+                labels=labels,
+                trusted=trusted,
+                precision=precision,
+                recall=recall,
+                auroc=auroc,
+            )
+        )
+    return tuple(rows)
+
+
+def _about(workspace: Workspace) -> dict[str, str]:
+    """What the figures may depend on beside the settings."""
+    import torch
+
+    on = device(workspace.config)
+    name = torch.cuda.get_device_name() if on == "cuda" else f"{os.cpu_count()} CPU cores"
+    return {"curate": curate.__version__, "torch": torch.__version__, "device": name}

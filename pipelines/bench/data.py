@@ -1,0 +1,42 @@
+"""The data set that all cells of a bench share."""
+
+from curate.errors import DataError
+from pipelines.bench.running import Say
+from pipelines.bench.settings import SYNTHETIC, Bench
+from pipelines.progress import Progress
+from pipelines.workspace import open_dataset
+
+
+def make_data(bench: Bench, workers: int, say: Say, progress: Progress) -> None:
+    """Simulates the frames that are not there yet, or looks whether a folder can be used.
+
+    Raises:
+        DataError: the folder has no lists of training and validation frames.
+    """
+    settings = bench.settings
+    if settings.data == SYNTHETIC and settings.frames and settings.val:
+        _simulate(bench, settings.frames, settings.val, workers, say, progress)
+    splits = open_dataset(bench.config(0)).splits()
+    for name in ("train", "val"):
+        if not splits.get(name):
+            raise DataError(
+                f"{bench.data}: ImageSets/{name}.txt names no frames; a bench needs train and val"
+            )
+
+
+def _simulate(
+    bench: Bench, frames: int, val: int, workers: int, say: Say, progress: Progress
+) -> None:
+    from curate.datasets.synthetic import simulate
+
+    with progress.track("simulate", frames + val) as advance:
+        done = 0
+
+        def show(now: int, _total: int) -> None:
+            nonlocal done
+            advance(now - done, "")
+            done = now
+
+        seed = bench.settings.data_seed or 0
+        simulate(bench.data, frames + val, seed, val_frames=val, workers=workers, progress=show)
+    say(f"{frames} simulated training frames and {val} for validation in {bench.data}")

@@ -1,0 +1,237 @@
+"""What a bench found: terminal tables, results.md, results.json and curve.png."""
+
+import json
+import math
+import platform
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curate.atomic import replace_file
+from curate.datasets.kitti_labels import from_annotations
+from curate.evaluation.comparison import PairedDifference
+from curate.evaluation.object_statistics import QUANTILES, object_statistics
+from curate.viewing.canvas import save_png
+from curate.viewing.curves import Curve, CurvePanel, draw_curves
+from pipelines.bench.results import OVERLAPS, JobResult, read_results
+from pipelines.bench.settings import SYNTHETIC, Bench
+from pipelines.bench.tables import Entry, Finished, Table, Value, all_tables, signed
+from pipelines.methods import METHODS
+from pipelines.workspace import open_dataset
+
+MARKDOWN, NUMBERS, PICTURE = "results.md", "results.json", "curve.png"
+
+
+@dataclass(frozen=True)
+class BenchReport:
+    """The state of a bench."""
+
+    bench: Bench
+
+    @cached_property
+    def results(self) -> list[JobResult]:
+        """Of all finished jobs."""
+        return read_results(self.bench.root)
+
+    @cached_property
+    def finished(self) -> Finished:
+        """The same by method, ratio and seed."""
+        return Finished(self.results)
+
+    @cached_property
+    def tables(self) -> list[Table]:
+        """All tables, and first how hard the data is."""
+        return [*self._hardness(), *all_tables(self.finished)]
+
+    def write(self) -> list[Path]:
+        """Writes results.md, results.json and, where a cell is finished, curve.png."""
+        root = self.bench.root
+        replace_file(root / MARKDOWN, self.markdown().encode())
+        replace_file(root / NUMBERS, (json.dumps(self.numbers(), indent=1) + "\n").encode())
+        written = [root / MARKDOWN, root / NUMBERS]
+        if self.finished.methods:
+            save_png(root / PICTURE, self.picture())
+            written.append(root / PICTURE)
+        return written
+
+    def numbers(self) -> dict[str, Any]:
+        """Everything as plain numbers."""
+        return {
+            "settings": self.bench.settings.model_dump(mode="json"),
+            "grid": self.bench.axes.model_dump(mode="json"),
+            "conditions": list(self.conditions()),
+            "tables": [
+                {
+                    "title": table.title,
+                    "overlaps": table.overlaps,
+                    "columns": [name.replace("\n", " ") for name in table.columns],
+                    "rows": [[_plain(value) for value in row] for row in table.rows],
+                }
+                for table in self.tables
+            ],
+            "jobs": [result.model_dump(mode="json") for result in self.results],
+        }
+
+    def markdown(self) -> str:
+        """The document."""
+        lines = ["# The methods, compared by `curate bench`", ""]
+        lines += [f"- {condition}" for condition in self.conditions()]
+        if self.finished.methods:
+            lines += ["", f"![Mean AP over labeled ratio]({PICTURE})"]
+        for table in self.tables:
+            lines += ["", f"## {table.title[0].upper()}{table.title[1:]}", ""]
+            names = [name.replace("\n", " ") for name in table.columns]
+            lines.append("| " + " | ".join(names) + " |")
+            lines.append("|---" + "|---:" * (len(table.columns) - 1) + "|")
+            lines += [
+                "| " + " | ".join(shown(v, full=True) for v in row) + " |" for row in table.rows
+            ]
+        return "\n".join([*lines, ""])
+
+    def conditions(self) -> Iterator[str]:
+        """What the figures hold for, a sentence each."""
+        settings, finished = self.bench.settings, self.finished
+        yield f"command: `{command(self.bench)}`"
+        cells = sum(result.method is not None for result in self.results)
+        yield f"{cells} finished cells: {len(finished.methods)} methods, seeds " + ", ".join(
+            map(str, finished.seeds)
+        )
+        for name in finished.methods:
+            if name in METHODS:
+                yield f"`{name}`: {METHODS[name].note}"
+        yield (
+            f"equal optimiser steps: every method trains {settings.rounds} x {settings.steps} "
+            f"steps from the same teacher, itself {settings.steps} steps on X_l; batches, "
+            "augmentation and learning rates are the same"
+        )
+        yield (
+            "a seed draws the labeled frames (those of a ratio are among those of a greater one), "
+            "the training and the augmented views; all cells share one data set and its val frames"
+        )
+        yield (
+            "KITTI AP, 40 recall positions, in percent; mean is over categories and difficulties; "
+            "± is the standard deviation over n seeds, (+) the gain over the baseline"
+        )
+        yield "what the last round trained is evaluated on val, on which no training was chosen"
+        for about in {tuple(sorted(result.about.items())) for result in self.results}:
+            versions = dict(about)
+            yield (
+                f"curate {versions['curate']}, torch {versions['torch']}, {versions['device']}, "
+                f"Python {platform.python_version()}, {platform.machine()}"
+            )
+        failed = sum(result.failed_frames for result in self.results)
+        if failed:
+            yield f"{failed} results of single frames failed and were left out"
+
+    def picture(self) -> np.ndarray:
+        """Mean 3D AP over the labeled ratio, at KITTI's overlaps and at loose ones."""
+        panels = []
+        for overlaps in OVERLAPS:
+            values = {
+                method: np.array(
+                    [
+                        [entry.spread.mean, entry.spread.std]
+                        for entry in row[1:]
+                        if isinstance(entry, Entry)
+                    ]
+                )
+                for method, *row in ((r[0], *r) for r in self._summary(overlaps).rows)
+            }
+            curves = [Curve(str(name), *columns.T) for name, columns in values.items()]
+            title = self._summary(overlaps).title
+            panels.append(CurvePanel(title, np.array(self.finished.ratios), curves))
+        note = (
+            "line: mean over seeds; band: standard deviation; AP R40, mean over categories and "
+            "difficulties; teacher: on X_l once, baseline: on X_l as long as the other methods"
+        )
+        return draw_curves(panels, "AP over labeled ratio", note)
+
+    def _summary(self, overlaps: str) -> Table:
+        return next(
+            table
+            for table in self.tables
+            if table.overlaps == overlaps and table.title.startswith("mean 3D AP, IoU")
+        )
+
+    def _hardness(self) -> Iterator[Table]:
+        """How hard the val frames are; their ground truth is no secret."""
+        config = self.bench.config(0)
+        if not (self.bench.data / "ImageSets" / "val.txt").is_file():
+            return
+        dataset = open_dataset(config)
+        names = dataset.splits()["val"]
+        frames = [
+            from_annotations(
+                dataset.annotations(name), dataset.read(name, points=False).calibration
+            )
+            for name in names
+        ]
+        rows: list[tuple[Value, ...]] = []
+        for category, found in object_statistics(frames, config.dataset.categories).items():
+            shares = (found.occluded, found.mostly_occluded, found.truncated)
+            rows.append(
+                (
+                    *(category, found.objects, f"{found.per_frame:.2f}"),
+                    *(f"{number:.2f}" for number in found.counted),
+                    *(f"{100 * share:.0f} %" for share in shares),
+                    " / ".join(f"{distance:.0f}" for distance in found.distances),
+                )
+            )
+        quantiles = "/".join(f"{100 * share:.0f}" for share in QUANTILES)
+        yield Table(
+            f"how hard the data is: objects of the {len(names)} val frames",
+            (
+                *("category", "objects", "per\nframe", "count at\neasy", "at\nmod.", "at\nhard"),
+                *("occluded", "mostly\noccluded", "truncated\n> 15 %"),
+                f"metres, quantiles\n{quantiles} %",
+            ),
+            tuple(rows),
+        )
+
+
+def command(bench: Bench) -> str:
+    """The command that makes the bench, for the folder DIR."""
+    settings, axes = bench.settings, bench.axes
+    words = ["curate bench DIR", f"--data {settings.data}"]
+    if settings.data == SYNTHETIC:
+        words.append(
+            f"--frames {settings.frames} --val {settings.val} --data-seed {settings.data_seed}"
+        )
+    words.append(f"--methods {','.join(axes.methods)}")
+    words.append(f"--ratios {','.join(f'{ratio:g}' for ratio in axes.ratios)}")
+    words.append(f"--seeds {','.join(map(str, axes.seeds))}")
+    words.append(f"--steps {settings.steps} --rounds {settings.rounds}")
+    words += [f"--set {override}" for override in settings.overrides]
+    return " ".join(words)
+
+
+def shown(value: Value, *, full: bool = False) -> str:
+    """A value as a table shows it."""
+    if isinstance(value, Entry):
+        return value.full if full else value.short
+    if isinstance(value, PairedDifference):
+        if math.isnan(value.mean):
+            return "-"
+        ends = f" [{signed(value.low)}, {signed(value.high)}]"
+        return signed(value.mean) + ("" if math.isnan(value.low) else ends)
+    return str(value)
+
+
+def _plain(value: Value) -> Any:
+    """A value for JSON, which knows no NaN."""
+    if isinstance(value, Entry):
+        return {**_finite(asdict(value.spread)), **_finite({"gain": value.gain})}
+    if isinstance(value, PairedDifference):
+        return _finite(asdict(value))
+    return value
+
+
+def _finite(numbers: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: None if isinstance(number, float) and math.isnan(number) else number
+        for name, number in numbers.items()
+    }

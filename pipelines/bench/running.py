@@ -1,0 +1,192 @@
+"""Runs the grid: several jobs at once, shared work first; no failure stops the others."""
+
+import fcntl
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol
+
+from curate.errors import CellsFailed, WorkspaceError
+from pipelines.bench import grid
+from pipelines.bench.costs import FIRST_GUESS, Costs
+from pipelines.bench.grid import Job, Sizes
+from pipelines.bench.processes import Told
+from pipelines.bench.results import read_result, read_results
+from pipelines.bench.settings import Bench
+from pipelines.progress import Advance, Progress
+from pipelines.workspace import open_dataset
+
+Say = Callable[[str], None]
+
+_PARTS = 1000  # of the grid's bar
+
+
+class RunJob(Protocol):
+    """Where jobs are done."""
+
+    def __call__(self, job: Job, told: Told) -> str | None:
+        """Runs a job to its end; gives None, or in one line why it failed."""
+        ...
+
+    def end(self) -> None:
+        """Ends what runs, because the grid was interrupted."""
+        ...
+
+
+def run_grid(bench: Bench, run_job: RunJob, workers: int, say: Say, progress: Progress) -> None:
+    """Does every job that is not done.
+
+    Raises:
+        CellsFailed: some cells failed; the others are done.
+    """
+    waiting = grid.waiting(bench.axes, bench.root)
+    cells = [job for job in grid.jobs(bench.axes) if job.method is not None]
+    done = sum(job.is_done(bench.root) for job in cells)
+    known = f"{len(cells)} cells" + (f", {done} of them finished before" if done else "")
+    if not waiting:
+        say(known)
+        return
+    with progress.track("grid", _PARTS) as advance:
+        run = _GridRun(bench, waiting, say, advance)
+        say(f"{known}: about {_minutes(run.total / workers)} with {workers} at once")
+        failed = run.go(run_job, workers)
+    if failed:
+        raise CellsFailed(
+            f"{failed} of {len(cells)} cells failed; the others are kept. Mend the cause and run "
+            "the same command again: finished cells are not redone"
+        )
+
+
+@contextmanager
+def alone(root: Path) -> Iterator[None]:
+    """Holds the bench's folder; the operating system lets go of it with the process.
+
+    Raises:
+        WorkspaceError: another process holds it.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    with (root / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise WorkspaceError(
+                f"{root}: another `curate bench` works here; wait for it or end it"
+            ) from error
+        yield
+
+
+class _GridRun:
+    """One run over the waiting jobs."""
+
+    def __init__(self, bench: Bench, waiting: list[Job], say: Say, advance: Advance) -> None:
+        self.bench, self.say = bench, say
+        self.waiting = waiting
+        self.failed: dict[Job, str] = {}
+        self.costs = Costs(read_results(bench.root))
+        lists = open_dataset(bench.config(0)).splits()
+        self.sizes = Sizes(len(lists["train"]), len(lists["val"]))
+        seconds = {job: self.costs.seconds(self.work(job)) for job in waiting}
+        rates = {kind: self.costs.rate(kind) for kind in FIRST_GUESS}
+        self.total = sum(seconds.values())
+        self._bar = _GridBar(seconds, rates, advance)
+
+    def work(self, job: Job) -> Mapping[str, int]:
+        """The units of work of a job."""
+        return grid.work(job, self.bench.config(job.seed, job.method), self.sizes)
+
+    def go(self, run_job: RunJob, workers: int) -> int:
+        """Runs all jobs; gives how many cells failed."""
+        running: dict[Future[str | None], Job] = {}
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                while self.waiting or running:
+                    for job in self._ready()[: workers - len(running)]:
+                        self.waiting.remove(job)
+                        self._announce(job)
+                        running[pool.submit(run_job, job, self._bar.teller(job))] = job
+                    ended, _ = wait(running, return_when=FIRST_COMPLETED)
+                    for future in ended:
+                        self._end(running.pop(future), future.result())
+            finally:
+                if running:
+                    run_job.end()
+        return sum(job.method is not None for job in self.failed)
+
+    def _ready(self) -> list[Job]:
+        """The waiting jobs whose shared work is done."""
+        root = self.bench.root
+        return [job for job in self.waiting if job.method is None or job.shared.is_done(root)]
+
+    def _announce(self, job: Job) -> None:
+        work = self.work(job)
+        frames = sum(units for kind, units in work.items() if kind != grid.TRAIN)
+        guess = "" if self.costs.measured else ", a first guess"
+        self.say(
+            f"{job}: about {_minutes(self.costs.seconds(work))} ({work[grid.TRAIN]} steps, "
+            f"{frames} frame passes{guess})"
+        )
+
+    def _end(self, job: Job, fault: str | None) -> None:
+        """Takes a job's end into account, and says how it went."""
+        self._bar.finish(job)
+        if fault is None:
+            result = read_result(self.bench.root, job)
+            self.costs.learn(result)
+            strict, loose = (result.mean(overlaps, "3d") for overlaps in ("kitti", "loose"))
+            notes = f", {result.failed_frames} frame results failed" if result.failed_frames else ""
+            self.say(
+                f"{job}: mean 3D AP {strict:.1f}, at loose overlaps {loose:.1f}, in "
+                f"{_minutes(result.seconds)}{notes}"
+            )
+            return
+        self.failed[job] = fault
+        dependent = [other for other in self.waiting if other.shared == job]
+        for other in dependent:
+            self.waiting.remove(other)
+            self.failed[other] = fault
+            self._bar.finish(other)
+        without = f" (so {len(dependent)} cells cannot run)" if dependent else ""
+        self.say(f"{job}: failed{without}: {fault}")
+
+
+class _GridBar:
+    """Turns units of work of many jobs into one bar, weighed by what they are expected to cost."""
+
+    def __init__(
+        self, seconds: Mapping[Job, float], rates: Mapping[str, float], advance: Advance
+    ) -> None:
+        self._seconds, self._rates = seconds, rates
+        self._total = sum(seconds.values())
+        self._done = dict.fromkeys(seconds, 0.0)
+        self._finished = self._shown = 0
+        self._advance = advance
+        self._lock = threading.Lock()
+
+    def teller(self, job: Job) -> Told:
+        """Takes a job's finished units."""
+
+        def told(kind: str, units: int) -> None:
+            with self._lock:
+                now = self._done[job] + units * self._rates.get(kind, 0.0)
+                self._done[job] = min(now, self._seconds[job])
+                self._show()
+
+        return told
+
+    def finish(self, job: Job) -> None:
+        """Counts a job as done, however it ended."""
+        with self._lock:
+            self._done[job] = self._seconds[job]
+            self._finished += 1
+            self._show()
+
+    def _show(self) -> None:
+        now = int(_PARTS * sum(self._done.values()) / self._total + 1e-6)
+        self._advance(now - self._shown, f"{self._finished} of {len(self._done)} jobs")
+        self._shown = now
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.1f} min"

@@ -1,0 +1,284 @@
+"""The tables of a bench, from the results of its finished cells."""
+
+import math
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from curate.evaluation.comparison import PairedDifference, Spread, paired_difference, spread
+from curate.evaluation.kitti_rules import DIFFICULTIES, LOOSE_OVERLAPS, MIN_OVERLAPS
+from pipelines.bench.grid import Job
+from pipelines.bench.results import JobResult, Levels
+from pipelines.methods import METHODS
+
+BASELINE = "baseline"
+TEACHER = "teacher"
+RULES = {"kitti": MIN_OVERLAPS, "loose": LOOSE_OVERLAPS}
+NAMES = {"3d": "3D AP", "bev": "BEV AP", "recall": "recall, 3D"}
+# What is tabulated per ratio: overlaps and figure.
+PER_RATIO = (
+    ("kitti", "3d"), ("kitti", "bev"), ("kitti", "recall"), ("loose", "3d"), ("loose", "bev"),
+)  # fmt: skip
+SUMMARISED = (("kitti", "3d"), ("loose", "3d"), ("kitti", "bev"), ("loose", "bev"))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A figure over the seeds, and by how much it is above the baseline's on the same seeds."""
+
+    spread: Spread
+    gain: float = math.nan
+    digits: int = 1
+
+    @property
+    def short(self) -> str:
+        """Mean and standard deviation."""
+        if math.isnan(self.spread.mean):
+            return "-"
+        std = "" if math.isnan(self.spread.std) else f"±{self.spread.std:.{self.digits}f}"
+        return f"{self.spread.mean:.{self.digits}f}{std}"
+
+    @property
+    def full(self) -> str:
+        """With the gain."""
+        text = self.short.replace("±", " ± ")
+        return text if math.isnan(self.gain) else f"{text} ({signed(self.gain)})"
+
+
+def signed(points: float) -> str:
+    """A difference with its sign; 0 has none below it."""
+    return f"{round(points, 1) + 0.0:+.1f}"
+
+
+Value = Entry | PairedDifference | str | int | float
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; `overlaps` is None where none is meant.
+
+    Attributes:
+        title: what it shows.
+        columns: their names, of one or two lines; the first is that of the row.
+        rows: one value per column.
+        overlaps: "kitti" or "loose".
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Value, ...], ...]
+    overlaps: str | None = None
+
+
+class Finished:
+    """Results by method, ratio and seed.
+
+    Args:
+        results: of all finished jobs.
+
+    Attributes:
+        methods: that have results, in the order of `METHODS`.
+        ratios: rising.
+        seeds: rising.
+    """
+
+    def __init__(self, results: Sequence[JobResult]) -> None:
+        self._by_job = {result.job: result for result in results}
+        cells = [job for job in self._by_job if job.method is not None]
+        found = {job.method for job in cells if job.method is not None}
+        known = [name for name in METHODS if name in found]
+        self.methods = (*known, *sorted(found - set(known)))
+        self.ratios = tuple(sorted({job.ratio for job in cells}))
+        self.seeds = tuple(sorted({job.seed for job in cells}))
+
+    @property
+    def results(self) -> Collection[JobResult]:
+        """Of all finished jobs."""
+        return self._by_job.values()
+
+    def result(self, method: str | None, ratio: float, seed: int) -> JobResult | None:
+        """A job's result, where it is finished; no method means the teacher."""
+        return self._by_job.get(Job(ratio, seed, method))
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The evaluated categories."""
+        return tuple(next(iter(self.results)).recall) if self.results else ()
+
+    def values(self, method: str | None, ratio: float, overlaps: str, figure: str) -> np.ndarray:
+        """(seeds, categories, 3) percent; NaN where a cell is not finished."""
+        missing: dict[str, Levels] = dict.fromkeys(self.categories, (math.nan,) * 3)
+        results = [self.result(method, ratio, seed) for seed in self.seeds]
+        tables = [missing if each is None else each.table(overlaps, figure) for each in results]
+        values = [[table[category] for category in self.categories] for table in tables]
+        return np.array(values, dtype=np.float64).reshape(len(self.seeds), -1, len(DIFFICULTIES))
+
+    def means(self, method: str | None, ratio: float, overlaps: str, figure: str) -> np.ndarray:
+        """(seeds,) means over categories and difficulties."""
+        means: np.ndarray = self.values(method, ratio, overlaps, figure).mean(axis=(1, 2))
+        return means
+
+
+def all_tables(finished: Finished) -> list[Table]:
+    """Every table: the summary first, then those of each ratio."""
+    if not finished.methods:
+        return []
+    return [
+        *(_summary(finished, *what) for what in SUMMARISED),
+        *(table for what in SUMMARISED for table in _differences(finished, *what)),
+        *(
+            table
+            for ratio in finished.ratios
+            for table in (
+                *(_of_ratio(finished, ratio, *what) for what in PER_RATIO),
+                *_labels(finished, ratio),
+            )
+        ),
+        _times(finished),
+    ]
+
+
+def _of_ratio(finished: Finished, ratio: float, overlaps: str, figure: str) -> Table:
+    """The paper's table of a ratio: categories and difficulties, their mean, and the gains."""
+    baseline = finished.values(BASELINE, ratio, overlaps, figure)
+    rows: list[tuple[Value, ...]] = []
+    for method in (None, *finished.methods):
+        values = finished.values(method, ratio, overlaps, figure)
+        compared = method not in (None, BASELINE)
+        columns = (values.reshape(len(values), -1), baseline.reshape(len(values), -1))
+        entries = [
+            _entry(mine, base, compared=compared)
+            for mine, base in zip(columns[0].T, columns[1].T, strict=True)
+        ]
+        mean = _entry(values.mean(axis=(1, 2)), baseline.mean(axis=(1, 2)), compared=compared)
+        gain = "" if math.isnan(mean.gain) else signed(mean.gain)
+        rows.append((method or TEACHER, mean.spread.count, *entries, mean, gain))
+    levels = ("easy", "mod.", "hard")
+    names = [f"{category[:3]}\n{level}" for category in finished.categories for level in levels]
+    overlap = _overlaps(finished, overlaps)
+    return Table(
+        f"{NAMES[figure]}, IoU {overlap}: {_ratio(finished, ratio)}",
+        ("method", "n", *names, "mean", "gain"),
+        tuple(rows),
+        overlaps,
+    )
+
+
+def _summary(finished: Finished, overlaps: str, figure: str) -> Table:
+    """The mean over categories and difficulties, by ratio."""
+    rows: list[tuple[Value, ...]] = []
+    for method in (None, *finished.methods):
+        entries = []
+        for ratio in finished.ratios:
+            values = [finished.means(each, ratio, overlaps, figure) for each in (method, BASELINE)]
+            entries.append(_entry(*values, compared=method not in (None, BASELINE)))
+        rows.append((method or TEACHER, *entries))
+    return Table(
+        f"mean {NAMES[figure]}, IoU {_overlaps(finished, overlaps)}, by labeled ratio",
+        ("method", *(f"{100 * ratio:g} %" for ratio in finished.ratios)),
+        tuple(rows),
+        overlaps,
+    )
+
+
+def _differences(finished: Finished, overlaps: str, figure: str) -> Iterator[Table]:
+    """Differences of mean AP between methods, paired by seed, with their intervals."""
+    means = {
+        method: np.array(
+            [finished.means(method, ratio, overlaps, figure) for ratio in finished.ratios]
+        )
+        for method in finished.methods
+    }
+    rows: list[tuple[Value, ...]] = []
+    for better, other in _compared(finished.methods):
+        mine, base = means[better], means[other]
+        pairs = [paired_difference(*of) for of in zip(mine, base, strict=True)]
+        # A seed's differences at all ratios are not independent; its mean over them is one pair.
+        pooled = paired_difference(mine.mean(axis=0), base.mean(axis=0))
+        rows.append((f"{better} - {other}", *pairs, pooled))
+    if rows:
+        yield Table(
+            f"differences of mean {NAMES[figure]}, IoU {_overlaps(finished, overlaps)}, paired by "
+            "seed, with their 95 % t intervals",
+            ("methods", *(f"{100 * ratio:g} %" for ratio in finished.ratios), "all ratios"),
+            tuple(rows),
+            overlaps,
+        )
+
+
+def _compared(methods: Sequence[str]) -> list[tuple[str, str]]:
+    """Every method with the baseline, and the paper's two with all that are not theirs."""
+    pairs = [(method, BASELINE) for method in methods if BASELINE in methods]
+    pairs += [
+        (own, other)
+        for own, but in (("pspsl", ()), ("spsl", ("pspsl",)))
+        for other in methods
+        if own in methods and other not in (*but, BASELINE)
+    ]
+    return [(one, other) for one, other in pairs if one != other]
+
+
+def _labels(finished: Finished, ratio: float) -> Iterator[Table]:
+    """The labels of the last round, judged by the simulation's truth."""
+    rows: list[tuple[Value, ...]] = []
+    for method in finished.methods:
+        results = [finished.result(method, ratio, seed) for seed in finished.seeds]
+        last = [result.labels[-1] for result in results if result is not None and result.labels]
+        if not last:
+            continue
+        figures = (
+            [each.labels for each in last],
+            [each.trusted for each in last],
+            [each.precision for each in last],
+            [each.recall for each in last],
+            [None if each.auroc is None else 100 * each.auroc for each in last],
+        )
+        digits = (0, 0, 1, 1, 1)
+        spreads = [spread(_numbers(values)) for values in figures]
+        entries = [Entry(of, digits=d) for of, d in zip(spreads, digits, strict=True)]
+        rows.append((method, *entries))
+    if rows:
+        yield Table(
+            f"pseudo-labels of the last round, percent: {_ratio(finished, ratio)}",
+            ("method", "labels", "weight > 0", "weighted precision", "weighted recall", "AUROC"),
+            tuple(rows),
+        )
+
+
+def _times(finished: Finished) -> Table:
+    """What a job took, where one run did all of it."""
+    rows: list[tuple[Value, ...]] = []
+    for method in (None, *finished.methods):
+        minutes = [
+            result.seconds / 60
+            for result in finished.results
+            if result.method == method and not result.resumed
+        ]
+        rows.append((method or TEACHER, len(minutes), Entry(spread(_numbers(minutes)))))
+    return Table(
+        "minutes per cell, one process of one thread; the teacher's once for all methods",
+        ("method", "cells", "minutes"),
+        tuple(rows),
+    )
+
+
+def _entry(values: np.ndarray, baseline: np.ndarray, *, compared: bool) -> Entry:
+    """Values over the seeds; the gain is over the seeds that both have."""
+    gain = spread(values - baseline).mean if compared else math.nan
+    return Entry(spread(values), gain)
+
+
+def _numbers(values: Sequence[float | None]) -> np.ndarray:
+    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def _overlaps(finished: Finished, overlaps: str) -> str:
+    return "/".join(f"{RULES[overlaps][category]:g}" for category in finished.categories)
+
+
+def _ratio(finished: Finished, ratio: float) -> str:
+    """A ratio with its frames, which are as many for every seed and method."""
+    frames = next(result.frames for result in finished.results if result.ratio == ratio)
+    train = frames["labeled"] + frames["unlabeled"]
+    return f"{100 * ratio:g} % labeled ({frames['labeled']} of {train} frames)"

@@ -1,0 +1,238 @@
+"""curate bench: every method of the paper on the same data, and the tables that compare them."""
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+from pipelines.commands.options import JsonOption, print_json, print_table
+
+if TYPE_CHECKING:
+    from pipelines.bench.report import BenchReport
+    from pipelines.bench.settings import Bench
+
+# The paper's seven, its ratios, and a size of which two cores make a cell in some ten minutes.
+METHODS = "baseline,uda,uda-cl,sess,3dioumatch,spsl,pspsl"
+RATIOS = "0.04,0.08,0.16,0.32,0.64"
+SEEDS = "0,1,2"
+FRAMES, VAL = 600, 300
+
+
+def bench(
+    directory: Annotated[Path, typer.Argument(help="Folder of the bench.")],
+    data: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="synthetic, or a folder in KITTI's layout. Default: synthetic."),
+    ] = None,
+    methods: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Methods, with commas. Default: the paper's seven."),
+    ] = None,
+    ratios: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help=f"Labeled shares of the training frames. Default: {RATIOS}."),
+    ] = None,
+    seeds: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help=f"Of labeled draw, training and views. Default: {SEEDS}."),
+    ] = None,
+    frames: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=2, help=f"Training frames to simulate. Default: {FRAMES}."),
+    ] = None,
+    val: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=1, help=f"Validation frames to simulate. Default: {VAL}."),
+    ] = None,
+    data_seed: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=0, help="Of the simulation. Default: 0."),
+    ] = None,
+    steps: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(
+            min=1, help="Optimiser steps of the teacher and of each round. Default: 1200."
+        ),
+    ] = None,
+    rounds: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=1, help="Rounds of every method. Default: 2."),
+    ] = None,
+    override: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--set", help="Any setting of curate.toml, section.key=value; repeat it for several."
+        ),
+    ] = None,
+    workers: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=1, help="Cells at once, a thread each; default: all cores."),
+    ] = None,
+    report: Annotated[
+        bool, typer.Option("--report", help="Run nothing; print what is finished.")
+    ] = False,
+    overlaps: Annotated[
+        str, typer.Option(help="The tables to print: kitti, loose or all.")
+    ] = "kitti",
+    as_json: JsonOption = False,
+) -> None:
+    """Compare methods: methods x labeled ratios x seeds, on simulated data or on yours.
+
+    Every cell of the grid is a workspace in DIR/cells. All methods start from the same teacher and
+    take equally many optimiser steps. Finished cells are never redone, a killed bench continues;
+    options that you leave out are those of the bench in DIR. The grid may grow, what its cells
+    share may not change. Ablations: --set train.zero_weight=background, --set solve.scope=frame.
+
+    Prints tables (AP R40, recall, labels) and leaves results.md, results.json, curve.png in DIR.
+    On KITTI: --data KITTI --set segmenter.name=onnx --set segmenter.path=deeplab.onnx.
+
+    Example: curate bench bench --methods baseline,pspsl --ratios 0.08 --seeds 0 --steps 300
+    """
+    from curate.errors import CellsFailed, ConfigError
+    from pipelines.bench.report import BenchReport
+
+    if overlaps not in {"kitti", "loose", "all"}:
+        raise ConfigError(f"--overlaps {overlaps}: use kitti, loose or all")
+    asked = {
+        "data": data,
+        "frames": frames,
+        "val": val,
+        "data_seed": data_seed,
+        "steps": steps,
+        "rounds": rounds,
+        "overrides": tuple(map(_absolute, override)) if override else None,
+    }
+    grid = {"methods": methods, "ratios": ratios, "seeds": seeds}
+    chosen = _open(directory) if report else _choose(directory, asked, grid)
+    try:
+        if not report:
+            _run(chosen, workers or os.cpu_count() or 1, quiet=as_json)
+    except CellsFailed:
+        _tell(BenchReport(chosen), overlaps, as_json=as_json)
+        raise
+    _tell(BenchReport(chosen), overlaps, as_json=as_json)
+
+
+def bench_cell(
+    directory: Annotated[Path, typer.Argument()],
+    ratio: Annotated[float, typer.Option()],
+    seed: Annotated[int, typer.Option()],
+    method: Annotated[Optional[str], typer.Option()] = None,  # noqa: UP045
+) -> None:
+    """Do one job of a bench and tell its parent process how far it is; it ends with it."""
+    from pipelines.bench.cell import run_job
+    from pipelines.bench.grid import Job
+    from pipelines.bench.metered import Metered
+    from pipelines.bench.processes import end_with_parent
+
+    end_with_parent()
+    run_job(_open(directory), Job(ratio, seed, method), Metered(sys.stdout))
+
+
+def _open(directory: Path) -> "Bench":
+    """The bench in a folder."""
+    from curate.errors import WorkspaceError
+    from pipelines.bench.settings import read_bench
+
+    found = read_bench(directory)
+    if found is None:
+        raise WorkspaceError(f"{directory}: no bench here; start one with `curate bench DIR`")
+    return found
+
+
+def _choose(directory: Path, asked: dict[str, Any], grid: dict[str, str | None]) -> "Bench":
+    """The bench as it is asked for; what is not asked is as it was, or the default."""
+    from curate.errors import ConfigError
+    from pipelines.bench.settings import SYNTHETIC, Bench, BenchSettings, check_axes, read_bench
+
+    stored = read_bench(directory)
+    given = {name: value for name, value in asked.items() if value is not None}
+    if stored is not None:
+        given = {**stored.settings.model_dump(), **given}
+    if given.get("data", SYNTHETIC) == SYNTHETIC:
+        given = {"frames": FRAMES, "val": VAL, "data_seed": 0, **given}
+    else:
+        for name in ("frames", "val", "data_seed"):
+            if asked[name] is not None:
+                raise ConfigError(f"--{name.replace('_', '-')}: only simulated data has a choice")
+        given["data"] = str(Path(given["data"]).resolve())
+        if not Path(given["data"]).is_dir():
+            raise ConfigError(f"--data {given['data']}: no such folder, nor 'synthetic'")
+    axes = check_axes(_axes(grid, stored))
+    chosen = Bench(directory.resolve(), BenchSettings(**given), axes)
+    for method in axes.methods:
+        chosen.config(axes.seeds[0], method)
+    return chosen
+
+
+def _absolute(override: str) -> str:
+    """An override whose path holds wherever the bench is continued."""
+    key, _, value = override.partition("=")
+    return f"{key}={Path(value).resolve()}" if key.endswith(".path") else override
+
+
+def _axes(grid: dict[str, str | None], stored: "Bench | None") -> Any:
+    """The axes of the grid from the words of the command line."""
+    from curate.errors import ConfigError
+    from pipelines.bench.settings import Axes
+    from pipelines.methods import METHODS as KNOWN
+
+    paper = ",".join(name for name in METHODS.split(",") if name in KNOWN)
+    axes: dict[str, Any] = {}
+    for name, default, kind in (
+        ("methods", paper, str), ("ratios", RATIOS, float), ("seeds", SEEDS, int),
+    ):  # fmt: skip
+        text = grid[name]
+        if text is None and stored is not None:
+            axes[name] = getattr(stored.axes, name)
+            continue
+        words = (default if text is None else text).split(",")
+        try:
+            axes[name] = tuple(kind(word.strip()) for word in words if word.strip())
+        except ValueError as error:
+            raise ConfigError(f"--{name} {text}: numbers with commas between them") from error
+    return Axes(**axes)
+
+
+def _run(bench: "Bench", workers: int, *, quiet: bool) -> None:
+    """Simulates what is to be simulated and runs the grid; in JSON mode it talks on stderr."""
+    from pipelines.bench.data import make_data
+    from pipelines.bench.processes import JobProcesses
+    from pipelines.bench.running import alone, run_grid
+    from pipelines.bench.settings import claim
+    from pipelines.progress import Bar
+
+    def say(line: str) -> None:
+        typer.echo(line, err=quiet)
+
+    with alone(bench.root):
+        claim(bench)
+        make_data(bench, workers, say, Bar())
+        run_grid(bench, JobProcesses(bench.root), workers, say, Bar())
+
+
+def _tell(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
+    """Writes the files, and prints the tables."""
+    from pipelines.bench.report import shown
+
+    if not report.results:
+        typer.echo("no cell is finished yet", err=True)
+        return
+    written = report.write()
+    if as_json:
+        print_json(report.numbers())
+        return
+    for table in report.tables:
+        if overlaps == "all" or table.overlaps in {None, overlaps}:
+            rows = [[shown(value) for value in row] for row in table.rows]
+            typer.echo(table.title)  # by itself, so that a narrow table does not break it
+            print_table(table.columns, rows, dense=True)
+    typer.echo("\n".join(str(path) for path in written))
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the commands."""
+    app.command()(bench)
+    app.command(name="bench-cell", hidden=True)(bench_cell)

@@ -1,0 +1,139 @@
+"""Running the grid with stand-ins for its jobs: order, resuming, failures, one at a time."""
+
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+from bench_results import ToyJobs, made_up, make_bench
+
+from curate.errors import CellsFailed, WorkspaceError
+from pipelines.bench.grid import Job
+from pipelines.bench.processes import JobProcesses
+from pipelines.bench.results import write_result
+from pipelines.bench.running import alone, run_grid
+from pipelines.bench.settings import Bench
+from pipelines.progress import Silent
+
+GRID = {"ratios": (0.25, 0.5), "seeds": (0, 1)}
+
+
+def run(bench: Bench, jobs: ToyJobs, workers: int = 1) -> list[str]:
+    """Runs a grid; gives what it says."""
+    said: list[str] = []
+    run_grid(bench, jobs, workers, said.append, Silent())
+    return said
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_every_job_runs_once_and_after_what_it_needs(
+    toy_kitti: Path, tmp_path: Path, workers: int
+) -> None:
+    """However many run at once."""
+    bench = make_bench(tmp_path, toy_kitti, **GRID)
+    jobs = ToyJobs(tmp_path)
+    run(bench, jobs, workers)
+    assert len(jobs.done) == len(set(jobs.done)) == 12
+    for job in jobs.done:
+        assert jobs.done.index(job.shared) <= jobs.done.index(job)
+
+
+def test_finished_cells_are_never_redone(toy_kitti: Path, tmp_path: Path) -> None:
+    """A second run finds nothing to do; a grown grid does what is new."""
+    run(make_bench(tmp_path, toy_kitti), ToyJobs(tmp_path))
+    jobs = ToyJobs(tmp_path)
+    assert run(make_bench(tmp_path, toy_kitti), jobs) == ["2 cells, 2 of them finished before"]
+    assert jobs.done == []
+    run(make_bench(tmp_path, toy_kitti, methods=("baseline", "pspsl", "spsl")), jobs)
+    assert jobs.done == [Job(0.25, 0, "spsl")]
+
+
+def test_a_jobs_cost_is_told_before_it_starts(toy_kitti: Path, tmp_path: Path) -> None:
+    """From the times of those that are finished: 98 s, 2 s per step, 0.5 s per val frame."""
+    bench = make_bench(tmp_path, toy_kitti, steps=60)
+    write_result(tmp_path, made_up(Job(0.25, 0), 50.0))
+    said = run(bench, ToyJobs(tmp_path))
+    assert said[1] == "ratio 0.25, seed 0, baseline: about 3.7 min (60 steps, 4 frame passes)"
+    assert said[2].startswith("ratio 0.25, seed 0, baseline: mean 3D AP 13.3")
+
+
+def test_the_first_cost_is_called_a_guess(toy_kitti: Path, tmp_path: Path) -> None:
+    """Nothing has been measured yet."""
+    said = run(make_bench(tmp_path, toy_kitti), ToyJobs(tmp_path))
+    assert said[1].endswith("a first guess)")
+    assert not any("guess" in line for line in said[2:])
+
+
+def test_a_failed_cell_costs_no_other(toy_kitti: Path, tmp_path: Path) -> None:
+    """One line for it, the others go on, and in the end an error with the count."""
+    bench = make_bench(tmp_path, toy_kitti, **GRID)
+    bad = Job(0.25, 1, "baseline")
+    jobs = ToyJobs(tmp_path, lambda job: "out of memory" if job == bad else None)
+    said: list[str] = []
+    with pytest.raises(CellsFailed, match="1 of 8 cells failed"):
+        run_grid(bench, jobs, 2, said.append, Silent())
+    assert f"{bad}: failed: out of memory" in said
+    assert len(jobs.done) == 12
+    again = ToyJobs(tmp_path)
+    run(bench, again)
+    assert again.done == [bad]
+
+
+def test_without_what_they_share_cells_cannot_run(toy_kitti: Path, tmp_path: Path) -> None:
+    """They count as failed; other draws go on."""
+    bench = make_bench(tmp_path, toy_kitti, **GRID)
+    bad = Job(0.25, 0)
+    jobs = ToyJobs(tmp_path, lambda job: "no labels" if job == bad else None)
+    said: list[str] = []
+    with pytest.raises(CellsFailed, match="2 of 8 cells failed"):
+        run_grid(bench, jobs, 1, said.append, Silent())
+    assert f"{bad}: failed (so 2 cells cannot run): no labels" in said
+    assert Job(0.25, 0, "pspsl") not in jobs.done
+
+
+def test_the_bar_ends_full(toy_kitti: Path, tmp_path: Path) -> None:
+    """Whatever the jobs told, and also where one failed."""
+    from contextlib import contextmanager
+
+    steps: list[int] = []
+
+    class Counting(Silent):
+        @contextmanager
+        def track(self, what, total):
+            yield lambda step, note: steps.append(step)
+
+    bench = make_bench(tmp_path, toy_kitti, **GRID)
+    jobs = ToyJobs(tmp_path, lambda job: "bad" if job == Job(0.25, 0) else None)
+    with pytest.raises(CellsFailed):
+        run_grid(bench, jobs, 2, lambda line: None, Counting())
+    assert sum(steps) == 1000
+    assert min(steps) >= 0
+
+
+def test_two_benches_do_not_work_in_one_folder(tmp_path: Path) -> None:
+    """The second is refused, until the first is gone."""
+    refused = pytest.raises(WorkspaceError, match="another `curate bench`")
+    with alone(tmp_path), refused, alone(tmp_path):
+        pass
+    with alone(tmp_path):
+        pass
+
+
+def test_a_process_that_fails_says_why_in_one_line(toy_kitti: Path, tmp_path: Path) -> None:
+    """The last line of its log, with the log's path; the same for one that was killed."""
+    bench = make_bench(tmp_path / "bench", toy_kitti)
+    broken = toy_kitti / "training" / "label_2"
+    broken.rename(broken.with_name("label_3"))
+    reason = JobProcesses(bench.root)(Job(0.25, 0), lambda kind, units: None)
+    assert reason is not None
+    assert "label file" in reason
+    assert reason.endswith("logs/ratio-0.25-seed-0.log")
+    assert "\n" not in reason
+
+    jobs = JobProcesses(bench.root)
+    killer = threading.Timer(0.05, jobs.end)
+    killer.start()
+    reason = jobs(Job(0.25, 0), lambda kind, units: None)
+    killer.join()
+    assert reason is not None
+    assert signal.SIGKILL.name in reason or reason == "interrupted"

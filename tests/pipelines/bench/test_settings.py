@@ -1,0 +1,99 @@
+"""What a bench's cells share: how it is read, merged, refused and kept."""
+
+from pathlib import Path
+
+import pytest
+from bench_results import make_bench
+
+from curate.errors import ConfigError, DataError, WorkspaceError
+from pipelines.bench.settings import Axes, Bench, BenchSettings, check_axes, claim, read_bench
+from pipelines.methods import with_method
+
+AXES = Axes(methods=("baseline",), ratios=(0.5,), seeds=(0,))
+
+
+def bench_with(toy_kitti: Path, tmp_path: Path, *overrides: str) -> Bench:
+    """A bench with some overrides."""
+    return Bench(tmp_path, BenchSettings(data=str(toy_kitti), overrides=overrides), AXES)
+
+
+def test_overrides_reach_every_methods_configuration(toy_kitti: Path, tmp_path: Path) -> None:
+    """Numbers, words, lists and tables of options, each in TOML's notation or as a bare word."""
+    bench = bench_with(
+        toy_kitti,
+        tmp_path,
+        "train.zero_weight=background",
+        "points.quantile=0.25",
+        'run.priors=["points"]',
+        "solve.options.threshold.threshold=0.4",
+    )
+    for method in ("baseline", "pspsl"):
+        config = bench.config(3, method)
+        assert config.train.zero_weight == "background"
+        assert config.points.quantile == 0.25
+        assert config.run.priors == ("points",)
+        assert config.solve.options == {"threshold": {"threshold": 0.4}}
+        assert config.run.seed == 3
+        assert config == with_method(config, method)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("train.zero_wight=ignore", "train.zero_wight"),
+        ("train.zero_weight=nothing", "train.zero_weight"),
+        ("run.seed=3", "decided by --seeds"),
+        ("train.round_steps=3", "decided by --steps"),
+        ("zero_weight=ignore", "section.key=value"),
+        ("train.zero_weight", "section.key=value"),
+        ("detector.name=recorded", "trains its detector"),
+    ],
+)
+def test_wrong_overrides_are_refused(
+    toy_kitti: Path, tmp_path: Path, override: str, message: str
+) -> None:
+    """The configuration's own model checks them; the grid keeps what is its own."""
+    with pytest.raises(ConfigError, match=message.replace(".", r"\.")):
+        bench_with(toy_kitti, tmp_path, override).config(0, "baseline")
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        ({"methods": ("pspsll",)}, "--methods pspsll: use some of baseline"),
+        ({"methods": ()}, "--methods : give one or more"),
+        ({"ratios": (0.5, 0.5)}, "--ratios 0.5,0.5: give one or more, each once"),
+        ({"ratios": (4.0,)}, "--ratios 4: a share"),
+        ({"seeds": (-1,)}, "--seeds -1"),
+    ],
+)
+def test_wrong_axes_are_refused(axes: dict, message: str) -> None:
+    """In one line that names the option."""
+    with pytest.raises(ConfigError, match=message):
+        check_axes(AXES.model_copy(update=axes))
+
+
+def test_a_bench_is_read_as_it_was_claimed(toy_kitti: Path, tmp_path: Path) -> None:
+    """And there is none where nobody claimed one."""
+    assert read_bench(tmp_path) is None
+    bench = make_bench(tmp_path, toy_kitti, overrides=("train.batch_size=4",))
+    assert read_bench(tmp_path) == bench
+
+
+def test_a_grid_may_grow_but_its_settings_stay(toy_kitti: Path, tmp_path: Path) -> None:
+    """More seeds are welcome; other steps would make cells that cannot be compared."""
+    make_bench(tmp_path, toy_kitti)
+    make_bench(tmp_path, toy_kitti, seeds=(0, 1))
+    with pytest.raises(WorkspaceError, match=r"steps 4 instead of 5; .* another folder"):
+        make_bench(tmp_path, toy_kitti, steps=5)
+    found = read_bench(tmp_path)
+    assert found is not None
+    assert (found.settings.steps, found.axes.seeds) == (4, (0, 1))
+
+
+def test_damaged_settings_are_named(toy_kitti: Path, tmp_path: Path) -> None:
+    """With the file."""
+    claim(make_bench(tmp_path, toy_kitti))
+    (tmp_path / "bench.json").write_text('{"settings": {"steps": 0}}')
+    with pytest.raises(DataError, match=r"bench\.json: is damaged"):
+        read_bench(tmp_path)
