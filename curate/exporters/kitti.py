@@ -109,7 +109,7 @@ def _weighted_frames(labels: LabelSet) -> Iterator[WeightedFrame]:
         frame = labels.read(frame_id)
         yield WeightedFrame(
             frame_id,
-            Detections.from_rows([row[:-1] for row in rows]),
+            Detections.from_rows([(*row[:-1], None) for row in rows]),
             np.array([row[-1] for row in rows], dtype=np.float64),
             frame.calibration,
             frame.image_size,

@@ -53,7 +53,7 @@ def test_an_unknown_preset_names_the_known_ones():
 def test_points_off_the_grid_are_left_out():
     """Behind, beside, above and beyond the grid nothing is encoded."""
     points = np.array(
-        [[-1, 0, 0, 0], [64, 0, 0, 0], [5, 32, 0, 0], [5, -33, 0, 0], [5, 0, 9, 0], [5, 0, 0, 1]],
+        [[-1, 0, 0, 0], [51.2, 0, 0, 0], [5, 32, 0, 0], [5, -33, 0, 0], [5, 0, 9, 0], [5, 0, 0, 1]],
         dtype=np.float32,
     )
     pillars = encode_points(points, SMALL)
@@ -64,10 +64,10 @@ def test_points_off_the_grid_are_left_out():
 
 def test_the_last_point_below_the_edge_stays_on_the_grid():
     """Rounding does not push a point below the upper edge into a cell that is not there."""
-    edge = np.nextafter(np.float32(64), np.float32(0))
+    edge = np.nextafter(np.float32(SMALL.x_range[1]), np.float32(0))
     side = np.nextafter(np.float32(32), np.float32(0))
     pillars = encode_points(np.array([[edge, side, 0, 0]], dtype=np.float32), SMALL)
-    assert pillars.slots.tolist() == [4 * 100 * 100 - 1]
+    assert pillars.slots.tolist() == [4 * 80 * 100 - 1]
 
 
 def test_the_pillars_of_a_cell_are_neighbours_in_the_canvas():
@@ -92,7 +92,7 @@ def test_features_tell_a_point_from_its_pillar():
             -0.05 / 0.32,
             -0.25,
             np.log(2) / 3,
-            np.hypot(3.3, 0.1) / 64,
+            np.hypot(3.3, 0.1) / 51.2,
         ],
         abs=1e-5,
     )
@@ -153,7 +153,7 @@ def test_objects_off_the_grid_are_left_out():
 
 
 boxes_on_grid = st.tuples(
-    st.floats(0.0, 63.99),
+    st.floats(0.0, 51.19),
     st.floats(-31.99, 31.99),
     st.floats(-3, 2),
     st.floats(0.3, 12),
