@@ -5,9 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from toys import write_toy_kitti
 
 ROOT = Path(__file__).parent.parent
+
+# How long an example takes says nothing on a busy machine.
+settings.register_profile("curate")
+settings.load_profile("curate")
 
 
 def _shared(variable: str, name: str) -> Path:

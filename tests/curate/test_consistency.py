@@ -155,7 +155,7 @@ def test_a_forbidden_pair_does_not_displace_an_allowed_one():
     assert sorted(matched.tolist()) == [-1, 0]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(crowds(), crowds())
 def test_matching_is_one_to_one_and_best(predictions, repredictions):
     """No reprediction serves twice, categories agree, and no assignment has a larger total IoU."""
@@ -171,7 +171,7 @@ def test_matching_is_one_to_one_and_best(predictions, repredictions):
     assert np.nansum(iou) == pytest.approx(best_total(gains.tolist()))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(crowds(8), crowds(8), st.randoms(use_true_random=False))
 def test_matching_does_not_depend_on_the_order(predictions, repredictions, random):
     """Shuffled detections get the same loss, ties included."""
@@ -194,7 +194,7 @@ def test_matching_does_not_depend_on_the_order(predictions, repredictions, rando
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.booleans(),
     st.floats(-np.pi, np.pi),

@@ -195,7 +195,7 @@ def test_a_positive_rotation_y_turns_clockwise_seen_from_above():
 
 
 @given(box_arrays(), calibrations())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_conversions_are_inverse_to_each_other(boxes, calibration):
     """LiDAR to camera and back gives the boxes, with yaw in (-pi, pi]."""
     objects = from_annotations(annotations_of(boxes), calibration)
@@ -208,7 +208,7 @@ def test_the_conversions_are_inverse_to_each_other(boxes, calibration):
 
 
 @given(boxes=box_arrays(), calibration=calibrations())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_file_keeps_boxes_to_a_millimetre(tmp_path_factory, boxes, calibration):
     """LiDAR, file, LiDAR: no coordinate is off by more than 1e-3."""
     path = tmp_path_factory.mktemp("labels") / "a.txt"

@@ -163,7 +163,7 @@ boxes_on_grid = st.tuples(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(boxes_on_grid)
 def test_every_cell_that_learns_a_box_would_answer_that_box(box):
     """Decoding the codes of an object gives the object back, from each of its cells."""

@@ -68,7 +68,7 @@ def test_ground_truth_against_itself_is_100(official):
         assert np.all(evaluation.recall_3d[there[:, :3]] == 1)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seeds)
 def test_crowded_frames_equal_the_slow_oracle(seed):
     """All categories, figures and difficulties of frames with copies, ties and clutter."""
@@ -93,7 +93,7 @@ def test_more_objects_than_positions_equal_the_slow_oracle():
     assert (evaluation.ap_r11[0, 3, 2], evaluation.ap_r40[0, 3, 2]) == pytest.approx(expected)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seeds)
 def test_the_order_of_frames_does_not_matter(seed):
     """AP, counts and recall are the same for shuffled frames."""
@@ -107,7 +107,7 @@ def test_the_order_of_frames_does_not_matter(seed):
     assert np.array_equal(one.recall_3d, other.recall_3d)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seeds)
 def test_a_detection_below_all_scores_never_raises_the_precision_it_joins(seed):
     """A false detection at the bottom changes no precision at any recall."""
@@ -118,7 +118,7 @@ def test_a_detection_below_all_scores_never_raises_the_precision_it_joins(seed):
     assert np.all(after.curves <= before.curves)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seeds)
 def test_figures_are_percentages_and_orientation_is_below_image(seed):
     """Within 0 and 100, never NaN, aos at most the image AP, harder IoU never finds more."""

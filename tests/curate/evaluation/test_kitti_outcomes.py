@@ -73,7 +73,7 @@ def test_detections_below_the_score_threshold_do_not_take_part():
     assert len(of_results) == 0
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from(["image", "bev", "3d"]),

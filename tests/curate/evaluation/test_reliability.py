@@ -156,7 +156,7 @@ def test_unknown_options_are_refused(wrong):
         JudgeSettings(**wrong)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.integers(0, 12), st.sampled_from([0.2, 0.5, 0.9])), max_size=8),
     st.lists(st.integers(0, 12), max_size=6),

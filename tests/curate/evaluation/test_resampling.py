@@ -39,7 +39,7 @@ def test_multiplicities_by_hand():
     assert area == pytest.approx([(1 + 2 / 3) / 2, (1 + 3 / 4 + 3 / 4) / 3, 1])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 25))
 def test_it_equals_the_figures_of_copied_labels(seed, n):
     """Ties, empty frames, draws without a right or without a wrong label."""

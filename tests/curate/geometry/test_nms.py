@@ -10,7 +10,7 @@ from strategies import box_arrays
 from curate.geometry.nms import nms_bev
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     box_arrays(max_size=10),
     st.lists(st.sampled_from([0.1, 0.5, 0.5000001, 0.9]), min_size=10, max_size=10),

@@ -19,7 +19,7 @@ def by_clipping(overlap, boxes_a, boxes_b):
     )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(box_arrays(), box_arrays())
 def test_iou_equals_polygon_clipping(boxes_a, boxes_b):
     """Random and degenerate boxes, seen from above and in space."""
@@ -29,7 +29,7 @@ def test_iou_equals_polygon_clipping(boxes_a, boxes_b):
     assert np.allclose(iou_3d(boxes_a, boxes_b), expected, rtol=0, atol=1e-6)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(box_arrays(), box_arrays())
 def test_paired_iou_is_the_diagonal(boxes_a, boxes_b):
     """Row by row the same as all against all."""
@@ -38,7 +38,7 @@ def test_paired_iou_is_the_diagonal(boxes_a, boxes_b):
     assert np.array_equal(paired_iou_3d(boxes_a[:n], boxes_b[:n]), expected)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(box_arrays(), box_arrays())
 def test_iou_is_symmetric_and_within_0_and_1(boxes_a, boxes_b):
     """Bit for bit the same both ways, never below 0 or above 1, never NaN."""
@@ -48,7 +48,7 @@ def test_iou_is_symmetric_and_within_0_and_1(boxes_a, boxes_b):
         assert np.all((matrix >= 0) & (matrix <= 1))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.tuples(*[st.floats(-80.0, 80.0)] * 3),
     st.tuples(*[st.floats(0.01, 30.0)] * 3),

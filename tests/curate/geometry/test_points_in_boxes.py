@@ -26,7 +26,7 @@ def assert_exact(points, boxes):
         assert np.array_equal(points_in_box_mask(points, box), row)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(box_arrays(), st.integers(0, 2**32 - 1), st.sampled_from([np.float32, np.float64]))
 def test_random_points_are_counted_exactly(boxes, seed, dtype):
     """Random points in and around overlapping, flat and turned boxes."""

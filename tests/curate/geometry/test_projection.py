@@ -80,7 +80,7 @@ def by_sampling(box):
     return pixels.min(axis=0), pixels.max(axis=0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(box_arrays(min_size=1, max_size=3))
 def test_rectangles_hold_all_that_is_seen_of_the_box(boxes):
     """No point of the box before the near plane appears outside the rectangle."""

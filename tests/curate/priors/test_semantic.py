@@ -89,7 +89,7 @@ def test_boxes_that_the_image_does_not_show(mean, outside, expected):
     assert found.rho_anno.tolist() == [expected, 1.0]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.integers(0, 2**32 - 1),
     st.lists(

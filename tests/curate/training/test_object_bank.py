@@ -172,7 +172,7 @@ def bank_of_three():
     return ObjectBank.build(samples, ("Car",))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(streets())
 def test_what_a_paste_may_and_may_not_do(street):
     """No overlap with any box, nothing but ground in the place, nothing seen through an object."""
