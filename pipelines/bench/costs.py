@@ -10,12 +10,12 @@ from pipelines.bench.results import JobResult
 # Seconds per optimiser step of two frames, and per frame, of the small detector on one thread of a
 # laptop: a first guess, until the bench has measured its own.
 FIRST_GUESS: Mapping[str, float] = MappingProxyType({
-    TRAIN: 0.12,
-    "predict": 0.05,
-    "repredict": 0.06,
-    "points": 0.02,
-    "semantic": 0.05,
-    EVALUATE: 0.05,
+    TRAIN: 0.16,
+    "predict": 0.03,
+    "repredict": 0.03,
+    "points": 0.005,
+    "semantic": 0.055,
+    EVALUATE: 0.025,
 })  # fmt: skip
 # Starting a process, loading its libraries, solving, exporting, computing AP.
 OVERHEAD_S = 15.0
