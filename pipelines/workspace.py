@@ -70,7 +70,8 @@ class Workspace:
 
     def with_settings(self, section: str, **changes: Any) -> "Workspace":
         """The same workspace with other settings in a section, for this command only."""
-        changed = getattr(self.config, section).model_copy(update=changes)
+        current = getattr(self.config, section)
+        changed = current.model_validate({**dict(current), **changes})
         return replace(self, config=self.config.model_copy(update={section: changed}))
 
     @cached_property

@@ -182,7 +182,7 @@ def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> Non
         ("minimum_iou = 0.1", "minimum_iou = 1.0", "repredict.minimum_iou"),
         ("seed = 0", "seed = -1", "run.seed"),
         ("seed = 0", "seed = 99999999999999999999", "run.seed"),
-        ('policy = "pspsl"', 'policy = "nope"', "unknown policy 'nope'"),
+        ('method = "pspsl"', 'method = "nope"', "unknown policy 'nope'"),
         ("[run]", '[run]\ndatabase = "nonsense"', "'nonsense': no SQLAlchemy URL"),
         ("[run]", '[run]\ndatabase = "oracle9://x"', "oracle9"),
     ],

@@ -52,9 +52,8 @@ def test_an_unlabeled_frame_whose_labels_all_weigh_nothing_is_exported(
     workspace: Workspace,
 ) -> None:
     """Its labels are regions to leave out; what is around them is background."""
-    strict = workspace.with_settings(
-        "solve", policy="threshold", options={"threshold": {"threshold": 1.0}}
-    )
+    strict = workspace.with_settings("run", method="threshold")
+    strict = strict.with_settings("solve", options={"threshold": {"threshold": 1.0}})
     samples = [sample for sample in WeightedLabels(run(strict)) if not sample.labeled]
     assert len(samples) == 6
     assert all(len(sample.boxes) == 3 for sample in samples)
@@ -99,5 +98,5 @@ def test_a_student_of_labeled_frames_alone_gets_no_others(
     workspace: Workspace,
 ) -> None:
     """Not even as background."""
-    own = workspace.with_settings("solve", policy="baseline")
+    own = workspace.with_settings("run", method="baseline")
     assert WeightedLabels(run(own)).labeled.all()
