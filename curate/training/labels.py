@@ -12,6 +12,7 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +24,7 @@ from curate.errors import DataError
 from curate.exporters.sqlite import FORMAT_VERSION, refuse_leakage
 from curate.frames import Frame
 from curate.geometry.projection import in_view
+from curate.training.ground import GroundMap
 
 # Ground truth that looks like a category without being one: neither object nor background of it.
 NEIGHBOURS: Final = {"Van": "Car", "Person_sitting": "Pedestrian"}
@@ -53,6 +55,11 @@ class Sample:
     def ignored(self) -> np.ndarray:
         """(m,) bool, which boxes are ignore regions."""
         return np.asarray(self.weights == 0)
+
+    @cached_property
+    def ground(self) -> GroundMap:
+        """The height of the ground; a training asks for it in every pass."""
+        return GroundMap.of(self.points)
 
 
 class WeightedLabels(Dataset[Sample]):

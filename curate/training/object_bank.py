@@ -18,7 +18,6 @@ from curate.geometry.boxes import box_corners
 from curate.geometry.overlap import bev_iou
 from curate.geometry.points_in_boxes import box_of_points, count_points_in_boxes
 from curate.geometry.similarity import Similarity
-from curate.training.ground import GroundMap
 from curate.training.labels import Sample
 
 # Tries per object that is asked for; crowded frames get fewer objects.
@@ -96,7 +95,7 @@ def paste_objects(
     boxes = np.concatenate(
         [turn.apply_to_boxes(found.box[None]) for turn, found in zip(turns, drawn, strict=True)]
     )
-    lifts = GroundMap.of(sample.points).at(boxes[:, :2]) - (boxes[:, 2] - boxes[:, 5] / 2)
+    lifts = sample.ground.at(boxes[:, :2]) - (boxes[:, 2] - boxes[:, 5] / 2)
     lifts = np.where(np.isnan(lifts), 0.0, lifts)
     boxes[:, 2] += lifts
     outlines = _Outlines.of(boxes)

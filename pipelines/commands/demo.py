@@ -16,7 +16,7 @@ def demo(
         float, typer.Option(help="Share of the training frames with labels.")
     ] = 0.06,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds.")] = 1,
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 700,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 600,
     seed: Annotated[int, typer.Option(min=0, help="Of simulation, split and training.")] = 0,
     workers: Annotated[
         Optional[int],  # noqa: UP045
