@@ -4,7 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test prove bench lint docs clean
+.PHONY: venv demo test prove bench lint docs clean
+
+venv: $(READY)
 
 demo: $(READY)
 	$(BIN)/curate demo
