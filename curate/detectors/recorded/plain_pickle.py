@@ -124,7 +124,7 @@ def _table() -> Mapping[str, Any]:
         "multiarray.scalar": _scalar,
         "numeric._frombuffer": _array_of_bytes,
     }
-    containers = (set, frozenset, list, dict, tuple, bytearray, complex)
+    containers = (set, frozenset, list, dict, tuple, bytes, bytearray, complex)
     return {
         **{f"numpy.{core}.{name}": of for core in ("core", "_core") for name, of in moved.items()},
         "numpy.ndarray": "numpy.ndarray",  # only ever named, as the first of `_empty_array`
