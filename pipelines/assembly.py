@@ -1,13 +1,14 @@
 """The one place where sections of the configuration become objects of curate."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.consistency import ConsistencySettings
 from curate.detectors.base import Detector
 from curate.errors import ConfigError
+from curate.frames import Calibration
 from curate.priors.base import Prior
 from curate.priors.points import PointSettings
 from curate.priors.semantic import SemanticSettings
@@ -15,6 +16,7 @@ from curate.segmenters.base import Segmenter
 from curate.weighting.base import Policy
 from pipelines import registry
 from pipelines.config import Config
+from pipelines.workspace import open_dataset
 
 Kind = TypeVar("Kind")
 
@@ -32,10 +34,18 @@ def open_detector(config: Config, path: Path) -> Detector:
             "device": lambda: device(config),
             "categories": lambda: config.dataset.categories,
             "threads": lambda: 1,
+            "frame_ids": lambda: open_dataset(config).frame_ids(),
+            "calibration": lambda: _calibrations(config),
         },
         options=section.options,
     )
     return detector
+
+
+def _calibrations(config: Config) -> Callable[[str], Calibration]:
+    """The calibration of a frame by its name."""
+    dataset = open_dataset(config)
+    return lambda frame_id: dataset.read(frame_id, points=False).calibration
 
 
 def device(config: Config) -> str:

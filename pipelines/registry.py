@@ -87,6 +87,7 @@ DETECTORS = Registry(
     "detector",
     {
         "pillars": "curate.detectors.pillars:PillarDetector",
+        "onnx": "curate.detectors.onnx:OnnxDetector",
         "recorded": "curate.detectors.recorded:RecordedDetector",
     },
 )

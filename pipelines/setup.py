@@ -68,7 +68,7 @@ def _refuse_absent(config: Config) -> None:
     """ConfigError for a detector or segmenter that nobody knows or whose file is not there."""
     registry.DETECTORS.refuse_unknown(config.detector.name)
     registry.SEGMENTERS.refuse_unknown(config.segmenter.name, "none", "simulated")
-    needs_path = {"detector": ("recorded",), "segmenter": tuple(registry.SEGMENTERS.classes)}
+    needs_path = {"detector": ("onnx", "recorded"), "segmenter": tuple(registry.SEGMENTERS.classes)}
     for section, names in needs_path.items():
         name, path = getattr(config, section).name, getattr(config, section).path
         if path is None and name in names:

@@ -24,6 +24,7 @@ import numpy as np
 
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
+from curate.onnx_session import first_line, open_session, runtime_errors
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes
 
@@ -77,7 +78,7 @@ class OnnxSegmenter:
         self.classes = checked_classes(classes)
         self.tiles = tiles
         self.scaling = scaling
-        self._session = _open_session(self.model, threads)
+        self._session = open_session(self.model, threads, "segmenter")
         self._input = _describe_input(self._session, self.model)
 
     def segment(self, frame: Frame) -> SemanticMap:
@@ -135,8 +136,8 @@ class OnnxSegmenter:
         blob = np.ascontiguousarray(pixels[None])
         try:
             answer = self._session.run(None, {self._input.name: blob})[0]
-        except _runtime_errors() as error:
-            raise ModelError(f"{self.model}: {_first_line(error)}") from error
+        except runtime_errors() as error:
+            raise ModelError(f"{self.model}: {first_line(error)}") from error
         class_ids = _class_ids(answer, target, self.model)
         return cv2.resize(class_ids, (width, height), interpolation=cv2.INTER_NEAREST)
 
@@ -171,23 +172,6 @@ def cut_along(width: int, crop_width: int, count: int) -> list[Crop]:
         Crop(left, left + crop_width, *own)
         for left, own in zip(lefts.tolist(), pairwise(borders), strict=True)
     ]
-
-
-def _open_session(model: Path, threads: int) -> Any:
-    import onnxruntime
-
-    if not model.is_file():
-        raise ModelError(f"{model}: no such ONNX model; set segmenter.path")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    # Waiting threads would take the cores from the other workers.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
-    except _runtime_errors() as error:
-        raise ModelError(f"{model}: no usable ONNX model: {_first_line(error)}") from error
 
 
 def _describe_input(session: Any, model: Path) -> _Input:
@@ -233,23 +217,3 @@ def _class_ids(answer: np.ndarray, size: tuple[int, int], model: Path) -> np.nda
         raise fault
     class_ids: np.ndarray = scores.astype(np.uint8)
     return class_ids
-
-
-def _runtime_errors() -> tuple[type[Exception], ...]:
-    """What ONNX Runtime raises; its errors have no common root of their own."""
-    from onnxruntime.capi import onnxruntime_pybind11_state as state
-
-    return (
-        state.EPFail,
-        state.Fail,
-        state.InvalidArgument,
-        state.InvalidGraph,
-        state.InvalidProtobuf,
-        state.NoSuchFile,
-        state.NotImplemented,
-        state.RuntimeException,
-    )
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

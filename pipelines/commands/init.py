@@ -17,10 +17,12 @@ def init(
         str, typer.Option(help="Likewise for validation; default: the data set's own val list.")
     ] = "",
     seed: Annotated[int, typer.Option(min=0, help="Of the split and of every later draw.")] = 0,
-    detector: Annotated[str, typer.Option(help="pillars, recorded or module:Class.")] = "pillars",
+    detector: Annotated[
+        str, typer.Option(help="pillars, onnx, recorded or module:Class.")
+    ] = "pillars",
     detector_path: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="File of a detector that you bring."),
+        typer.Option(help="File or folder of a detector that you bring."),
     ] = None,
     segmenter: Annotated[
         str, typer.Option(help="onnx, saved, simulated, degraded, none or module:Class.")

@@ -1,5 +1,6 @@
 """predict: l = f(x; w), the teacher's boxes with low scores too."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from pipelines.assembly import open_detector
 from pipelines.config import Config
 from pipelines.executors.base import FrameJob, FrameRows
 from pipelines.stage import RoundContext, Settings
-from pipelines.workspace import Workspace, open_dataset
+from pipelines.workspace import Workspace, open_dataset, sha256
 
 
 @dataclass
@@ -82,8 +83,30 @@ def settings(workspace: Workspace, _context: RoundContext) -> Settings:
     config = workspace.config
     return {
         "detector": config.detector.model_dump(mode="json", exclude={"path"}),
+        "files": named_files(config),
         "categories": config.dataset.categories,
     }
+
+
+def named_files(config: Config) -> dict[str, str]:
+    """The hashes of the files that the detector's options name beside its own path, by name."""
+    path = config.detector.path
+    if path is None:
+        return {}
+    found = {name: path.parent / name for name in _named_paths(config.detector.options)}
+    return {name: sha256(place) for name, place in found.items() if place.exists()}
+
+
+def _named_paths(options: object) -> Iterator[str]:
+    """Every text within options whose key says that it is a path."""
+    if isinstance(options, Mapping):
+        for key, value in options.items():
+            if key in {"path", "frame_list"} and isinstance(value, str):
+                yield value
+            yield from _named_paths(value)
+    elif isinstance(options, list | tuple):
+        for each in options:
+            yield from _named_paths(each)
 
 
 def function(workspace: Workspace, context: RoundContext) -> Predict:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from contracts.samples import assert_one_line, assert_same, sample_of
+from tiny_onnx import tiny_detector
 
 from curate.detections import CATEGORIES, Detections
 from curate.detectors.base import RecordedViews
@@ -54,10 +55,18 @@ def write_record(folder: Path, frames: Sequence[Frame]) -> Path:
     return path
 
 
+def write_onnx(folder: Path, frames: Sequence[Frame]) -> Path:
+    """A graph that answers two boxes per category around the mean of the points."""
+    path = folder / "model.onnx"
+    tiny_detector(path, boxes_per_category=2)
+    return path
+
+
 # Writes the file from which the detector is made, fit for some frames.
 SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
     "pillars": write_checkpoint,
     "recorded": write_record,
+    "onnx": write_onnx,
 }
 
 

@@ -1,4 +1,4 @@
-"""Any detector's saved answers, in place of the detector.
+"""Detections and augmented views in one CSV file.
 
 The record is a CSV file with a header and one row per box: frame, view, flip_y, rotation_rad,
 scale, category, score, x, y, z, length, width, height, yaw; other columns are ignored. View 0 is
@@ -13,13 +13,13 @@ instead of passing for an empty street; a frame with rows of other views only ha
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from curate.detections import Detections, as_categories
 from curate.errors import DataError
-from curate.frames import Frame
 from curate.geometry.similarity import Similarity, wrap_angle
 
 View = tuple[Similarity, Detections]
@@ -33,51 +33,40 @@ _NUMBERS = (
 _COLUMNS = ("frame", "category", *_NUMBERS)
 
 
-class RecordedDetector:
-    """A `Detector` and `RecordedViews` that answers from a file.
+@dataclass(frozen=True)
+class TableRecord:
+    """A `Record` from a CSV file.
 
-    Args:
-        path: the CSV file.
-        minimum_score: boxes below it are left out.
-
-    Raises:
-        DataError: the file is missing or a row is malformed.
+    Attributes:
+        path: the file.
+        frames: what it holds.
     """
 
-    def __init__(self, path: Path, minimum_score: float = 0.0) -> None:
-        self.path = Path(path)
-        self.minimum_score = minimum_score
-        self._record = read_record(self.path)
+    path: Path
+    frames: Record
+
+    @classmethod
+    def read(cls, path: Path) -> "TableRecord":
+        """The record in a file; see `read_record`."""
+        return cls(path, read_record(path))
 
     def frame_ids(self) -> tuple[str, ...]:
         """The recorded frames, in sorted order."""
-        return tuple(sorted(self._record))
+        return tuple(sorted(self.frames))
 
-    def predict(self, frame: Frame) -> Detections:
-        """What was recorded for the frame as it is; `frame.points` are not looked at.
-
-        Raises:
-            DataError: nothing was recorded for the frame.
-        """
-        _, detections = self._views(frame.frame_id).get(0, (Similarity(), Detections.empty()))
-        return self._kept(detections)
+    def answer(self, frame_id: str) -> Detections:
+        """What was recorded for the frame as it is; DataError where nothing was recorded."""
+        _, found = self._views(frame_id).get(0, (Similarity(), Detections.empty()))
+        return found
 
     def views(self, frame_id: str) -> Sequence[View]:
-        """The recorded augmented copies of the frame, in the order of their numbers.
-
-        Raises:
-            DataError: nothing was recorded for the frame.
-        """
-        views = sorted(self._views(frame_id).items())
-        return [(similarity, self._kept(found)) for number, (similarity, found) in views if number]
+        """The augmented copies in the order of their numbers; DataError like `answer`."""
+        return [view for number, view in sorted(self._views(frame_id).items()) if number]
 
     def _views(self, frame_id: str) -> Mapping[int, View]:
-        if frame_id not in self._record:
+        if frame_id not in self.frames:
             raise DataError(f"no recorded detections for frame {frame_id} in {self.path}")
-        return self._record[frame_id]
-
-    def _kept(self, detections: Detections) -> Detections:
-        return detections.select(detections.scores >= self.minimum_score)
+        return self.frames[frame_id]
 
 
 def read_record(path: Path) -> Record:

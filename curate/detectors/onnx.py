@@ -1,0 +1,253 @@
+"""Any 3D detector that was exported to ONNX, by a small declared mapping of inputs and outputs.
+
+The model takes the points of a sweep, [n, 3 or 4] or [1, n, 3 or 4] float32 (x, y, z,
+intensity), and answers boxes [n, >=7] or [1, n, >=7] with either scores and labels [n], or scores per class
+[n, classes]. Voxels before and anchors after it, where the export left them out, are the business
+of two functions that the user names as `package.module:function`.
+"""
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curate.detections import Detections, as_categories
+from curate.detectors.conventions import BoxConvention
+from curate.errors import ConfigError, ModelError
+from curate.frames import Frame
+from curate.geometry.nms import nms_bev
+from curate.onnx_session import first_line, open_session, runtime_errors
+
+_KEYS = ("boxes", "scores", "labels")
+
+
+class OnnxDetector:
+    """A `Detector` that runs an ONNX model on the CPU.
+
+    Args:
+        model: the .onnx file.
+        classes: the categories in the order of the model's labels or score columns.
+        minimum_score: boxes with a lower score are left out.
+        points: name of the input that takes the points; needless where there is one input.
+        outputs: names of the outputs `boxes`, `scores` and, where scores are not per class,
+            `labels`; needless where the model names them so.
+        convention: what the numbers of a box mean, see `BoxConvention`.
+        intensity_scale: factor from [0, 1] to the intensity that the model knows, e.g. 255.
+        first_label: the number of the first class.
+        sigmoid: whether scores are logits.
+        nms_iou: BEV IoU above which the better box of a category suppresses the other; None where
+            the model does it.
+        preprocess: `package.module:function` from (n, 4) points to the model's inputs by name.
+        postprocess: likewise from the outputs by name to `boxes`, `scores` and `labels` by name.
+        threads: of ONNX Runtime.
+
+    Raises:
+        ModelError: the file is missing or no ONNX model, or its inputs or outputs do not fit.
+        ConfigError: an option is wrong, or a function cannot be imported.
+    """
+
+    def __init__(
+        self,
+        model: Path,
+        *,
+        classes: Sequence[str] | None = None,
+        categories: Sequence[str] = (),
+        minimum_score: float = 0.1,
+        points: str | None = None,
+        outputs: Mapping[str, str] | None = None,
+        convention: Mapping[str, Any] | None = None,
+        intensity_scale: float = 1.0,
+        first_label: int = 0,
+        sigmoid: bool = False,
+        nms_iou: float | None = None,
+        preprocess: str | None = None,
+        postprocess: str | None = None,
+        threads: int = 1,
+    ) -> None:
+        self.model = Path(model)
+        self.classes = tuple(classes or categories)
+        self.minimum_score = minimum_score
+        self.convention = _convention(convention or {})
+        self.intensity_scale = intensity_scale
+        self.first_label = first_label
+        self.sigmoid = sigmoid
+        self.nms_iou = nms_iou
+        self._preprocess = _function(preprocess) if preprocess else None
+        self._postprocess = _function(postprocess) if postprocess else None
+        self._session = open_session(self.model, threads, "detector")
+        if not self._preprocess:
+            self._input, self._shape = self._find_input(points)
+        self._names = {} if self._postprocess else self._find_outputs(outputs or {})
+
+    def predict(self, frame: Frame) -> Detections:
+        """See `curate.detectors.base.Detector`; a sweep without points has no boxes.
+
+        Raises:
+            ModelError: the model fails, or answers what was not declared.
+        """
+        if len(frame.points) == 0:
+            return Detections.empty()
+        answers = self._run(self._inputs(frame.points))
+        if self._postprocess:
+            named = _called(self._postprocess, answers, self.model)
+        else:
+            named = {key: answers[name] for key, name in self._names.items()}
+        found = self._detections(named)
+        found = found.select(np.flatnonzero(found.scores >= self.minimum_score))
+        if self.nms_iou is not None:
+            found = _suppressed(found, self.nms_iou)
+        return found.select(np.argsort(-found.scores, kind="stable"))
+
+    def _inputs(self, points: np.ndarray) -> Mapping[str, np.ndarray]:
+        """What the model is fed."""
+        scaled = points.astype(np.float32)  # a copy
+        scaled[:, 3] *= self.intensity_scale
+        if self._preprocess:
+            return _called(self._preprocess, scaled, self.model)
+        columns = self._shape[-1] if isinstance(self._shape[-1], int) else 4
+        rows = np.ascontiguousarray(scaled[:, :columns])
+        return {self._input: rows[None] if len(self._shape) == 3 else rows}
+
+    def _run(self, inputs: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """The model's outputs by name."""
+        names = [one.name for one in self._session.get_outputs()]
+        try:
+            return dict(zip(names, self._session.run(None, dict(inputs)), strict=True))
+        except (*runtime_errors(), ValueError) as error:
+            raise ModelError(f"{self.model}: {first_line(error)}") from error
+
+    def _detections(self, named: Mapping[str, np.ndarray]) -> Detections:
+        """The answer as detections; ModelError where its shapes do not fit."""
+        boxes, scores = (_without_batch(np.asarray(named[key]), key) for key in ("boxes", "scores"))
+        labels = named.get("labels")
+        if scores.ndim == 2 and scores.shape[1] == 1 and labels is not None:
+            scores = scores[:, 0]
+        if labels is None and scores.ndim == 2:
+            labels, scores = scores.argmax(axis=1) + self.first_label, scores.max(axis=1)
+        shapes = {"boxes": boxes.shape, "scores": scores.shape, "labels": np.shape(labels)}
+        labels = np.asarray(labels).reshape(-1)
+        if (
+            boxes.ndim != 2
+            or boxes.shape[1] < 7
+            or scores.shape != boxes.shape[:1]
+            or labels.shape != scores.shape
+        ):
+            told = ", ".join(f"{key} {list(shape)}" for key, shape in shapes.items())
+            raise ModelError(
+                f"{self.model}: answers {told}; expected boxes [n, 7 or more] with scores [n] and "
+                "labels [n], or scores [n, classes]"
+            )
+        scores = scores.astype(np.float64)
+        if self.sigmoid:
+            scores = 0.5 * (1 + np.tanh(scores / 2))  # does not overflow
+        self._refuse_impossible(scores, labels)
+        boxes = self.convention.to_boxes(boxes)
+        index = labels.astype(np.int64) - self.first_label
+        return Detections(boxes, scores, as_categories([self.classes[i] for i in index.tolist()]))
+
+    def _refuse_impossible(self, scores: np.ndarray, labels: np.ndarray) -> None:
+        """ModelError for scores and labels that no declared class can have."""
+        if len(scores) == 0:
+            return
+        if not (scores.min() >= 0 and scores.max() <= 1):
+            raise ModelError(
+                f"{self.model}: scores from {scores.min():.3g} to {scores.max():.3g} are not in "
+                "[0, 1]; set detector.options.sigmoid = true where they are logits"
+            )
+        last = self.first_label + len(self.classes) - 1
+        if not (labels.min() >= self.first_label and labels.max() <= last):
+            raise ModelError(
+                f"{self.model}: labels {labels.min()} to {labels.max()}, but classes "
+                f"{', '.join(self.classes)} are {self.first_label} to {last}; set classes and "
+                "first_label in detector.options"
+            )
+
+    def _find_input(self, wanted: str | None) -> tuple[str, Sequence[int | str | None]]:
+        """Name and shape of the input that takes the points."""
+        inputs = self._session.get_inputs()
+        told = ", ".join(f"{one.name} {one.type}{one.shape}" for one in inputs)
+        one = next((one for one in inputs if wanted in {None, one.name}), None)
+        if one is None:
+            raise ModelError(f"{self.model}: takes {told}; no input is named {wanted}")
+        shape = one.shape
+        fits = len(shape) in {2, 3} and (
+            len(shape) == 2 or shape[0] in {1, None} or _free(shape[0])
+        )
+        if (
+            len(inputs) != 1
+            or not fits
+            or one.type != "tensor(float)"
+            or not _free(shape[-2])
+            or not (_free(shape[-1]) or shape[-1] in {3, 4})
+        ):
+            raise ModelError(
+                f"{self.model}: takes {told}; expected one tensor(float)[n, 4] of points with a "
+                "free n: name what makes the inputs in detector.options.preprocess"
+            )
+        return one.name, shape
+
+    def _find_outputs(self, mapping: Mapping[str, str]) -> Mapping[str, str]:
+        """The names of boxes, scores and, where there are any, labels."""
+        unknown = sorted(set(mapping) - set(_KEYS))
+        if unknown:
+            raise ConfigError(f"detector.options.outputs: {unknown[0]}: use {', '.join(_KEYS)}")
+        offered = {one.name for one in self._session.get_outputs()}
+        names = {key: mapping.get(key, key) for key in _KEYS}
+        if "labels" not in mapping and "labels" not in offered:
+            del names["labels"]
+        missing = [name for name in names.values() if name not in offered]
+        if missing:
+            raise ModelError(
+                f"{self.model}: answers {', '.join(sorted(offered))}; no output is named "
+                f"{missing[0]}: name boxes, scores and labels in detector.options.outputs"
+            )
+        return names
+
+
+def _free(size: int | str | None) -> bool:
+    """Whether a dimension of a shape is not fixed."""
+    return not isinstance(size, int)
+
+
+def _without_batch(answer: np.ndarray, key: str) -> np.ndarray:
+    """An output without its leading batch of one."""
+    batched = answer.ndim == 3 or (key == "scores" and answer.ndim == 2 and answer.shape[0] == 1)
+    return answer[0] if batched and answer.shape[0] == 1 else answer
+
+
+def _convention(options: Mapping[str, Any]) -> BoxConvention:
+    try:
+        return BoxConvention(**options)
+    except TypeError as error:
+        raise ConfigError(f"detector.options.convention: {error}") from None
+
+
+def _function(name: str) -> Callable[[Any], Any]:
+    """The function that `package.module:function` names."""
+    module_name, _, function_name = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module_name), function_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"detector.options: '{name}' cannot be imported: {error}") from error
+    if not callable(found):
+        raise ConfigError(f"detector.options: '{name}' is no function")
+    return found  # type: ignore[no-any-return]
+
+
+def _called(function: Callable[[Any], Any], given: Any, model: Path) -> Mapping[str, np.ndarray]:
+    """What the user's function makes; ModelError where it is no mapping."""
+    made = function(given)
+    if not isinstance(made, Mapping):
+        raise ModelError(f"{model}: {function.__name__} answers no dict but {type(made).__name__}")
+    return made
+
+
+def _suppressed(found: Detections, nms_iou: float) -> Detections:
+    """The detections that no better one of their category suppresses."""
+    kept = [np.zeros(0, dtype=np.int64)]
+    for category in np.unique(found.categories):
+        index = np.flatnonzero(found.categories == category)
+        kept.append(index[nms_bev(found.boxes[index], found.scores[index], nms_iou)])
+    return found.select(np.sort(np.concatenate(kept)))

@@ -1,0 +1,73 @@
+"""What a record holds of each frame, and what no detector can have answered."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curate.datasets.kitti_labels import KittiObjects
+from curate.detections import Detections, as_categories
+from curate.errors import DataError
+from curate.geometry.similarity import wrap_angle
+
+Answer = Detections | KittiObjects
+"""Of one frame; objects in KITTI's form wait for the frame's calibration."""
+
+Answers = Mapping[str, Answer]
+"""Of one pass of a detector over a data set, by frame."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What some formats leave to the reader.
+
+    Attributes:
+        classes: the names behind numbered labels, in the order of the model's configuration.
+        frame_list: a text file with one frame id per line, for results that are only in order.
+    """
+
+    classes: Sequence[str] = ()
+    frame_list: Path | None = None
+
+
+def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections:
+    """The answers for one frame as `Detections`.
+
+    Args:
+        place: file and entry, for messages.
+        boxes: (n, >=7) centre boxes in the LiDAR frame; further columns (velocities) are left out.
+        scores: (n,) in [0, 1].
+        names: (n,) of the categories.
+
+    Raises:
+        DataError: the lengths differ, a number is not finite, a size not positive, or a score is
+            out of range.
+    """
+    try:
+        boxes = np.array(boxes, dtype=np.float64)
+        scores = np.array(scores, dtype=np.float64).reshape(-1)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{place}: boxes and scores must be numbers: {error}") from None
+    categories = as_categories(names)
+    if boxes.size == 0:
+        boxes = boxes.reshape(0, 7)
+    if boxes.ndim != 2 or boxes.shape[1] < 7 or len({*map(len, (boxes, scores, categories))}) > 1:
+        raise DataError(
+            f"{place}: boxes {list(boxes.shape)}, scores {list(scores.shape)} and "
+            f"{len(categories)} names do not fit; expected [n, 7], [n] and n"
+        )
+    boxes = boxes[:, :7]
+    faults = {
+        "a number is NaN or infinite": ~np.isfinite(np.column_stack([boxes, scores])).all(axis=1),
+        "length, width or height is not positive": (boxes[:, 3:6] <= 0).any(axis=1),
+        "the score is not in [0, 1]": (scores < 0) | (scores > 1),
+    }
+    for fault, rows in faults.items():
+        if rows.any():
+            k = int(np.argmax(rows))
+            numbers = np.round([*boxes[k], scores[k]], 3).tolist()
+            raise DataError(f"{place}: box {k}: {fault}: {numbers} (x, y, z, l, w, h, yaw, score)")
+    boxes[:, 6] = wrap_angle(boxes[:, 6])
+    return Detections(boxes, scores, categories)

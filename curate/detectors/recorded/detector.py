@@ -1,0 +1,166 @@
+"""The detector that answers from a record."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from curate.datasets.kitti_labels import KittiObjects, to_detections
+from curate.detections import Detections, as_categories
+from curate.detectors.recorded.answers import Answer, Reading, as_detections
+from curate.detectors.recorded.formats import refuse_unknown_kind, tell_kind
+from curate.detectors.recorded.passes import PassesRecord
+from curate.detectors.recorded.table import TableRecord
+from curate.errors import ConfigError, DataError
+from curate.frames import Calibration, Frame
+from curate.geometry.similarity import Similarity
+
+_log = logging.getLogger(__name__)
+
+
+class Record(Protocol):
+    """The answers for frames, and for augmented copies of them."""
+
+    def frame_ids(self) -> tuple[str, ...]:
+        """The recorded frames, in sorted order."""
+        ...
+
+    def answer(self, frame_id: str) -> Answer:
+        """For the frame as it is; DataError where nothing was recorded."""
+        ...
+
+    def views(self, frame_id: str) -> Sequence[tuple[Similarity, Answer]]:
+        """For each augmented copy, in its own frame of reference."""
+        ...
+
+
+class RecordedDetector:
+    """A `Detector` and `RecordedViews` that answers from files.
+
+    Args:
+        path: a CSV file, a folder of KITTI result files, OpenPCDet's result.pkl, or mmdetection3d's
+            results (pickle of arrays, JSON, or folder of JSON).
+        minimum_score: boxes below it are left out.
+        kind: of the format: csv, kitti, openpcdet, mmdetection3d, or auto to tell it by suffix and
+            contents.
+        passes: of other formats than CSV, the passes over augmented copies; see `PassesRecord`.
+        classes: the names behind numbered labels, in the order of the model.
+        frame_list: a file of frame ids (relative to the folder of `path`) for results that name no
+            frames.
+        rename: the record's names of categories and ours, e.g. {"car": "Car"}; names that are not
+            in it stay.
+        frame_ids: of the data set; recorded frames that are not among them are reported.
+        calibration: of a frame of the data set, by its name, for views in KITTI's form.
+
+    Raises:
+        DataError: a file is missing or malformed, or none of its frames is in the data set.
+        ConfigError: an option is wrong or missing.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        minimum_score: float = 0.0,
+        *,
+        kind: str = "auto",
+        passes: Sequence[Mapping[str, Any]] = (),
+        classes: Sequence[str] = (),
+        frame_list: str | None = None,
+        rename: Mapping[str, str] | None = None,
+        frame_ids: Sequence[str] = (),
+        calibration: Callable[[str], Calibration] | None = None,
+    ) -> None:
+        refuse_unknown_kind(kind)
+        self.path = Path(path)
+        self.minimum_score = minimum_score
+        self.rename = dict(rename or {})
+        self._calibration = calibration
+        listed = self.path.parent / frame_list if frame_list else None
+        self._record = _open(self.path, kind, Reading(tuple(classes), listed), passes)
+        if frame_ids:
+            self._report_strays(frame_ids)
+
+    def frame_ids(self) -> tuple[str, ...]:
+        """The recorded frames, in sorted order."""
+        return self._record.frame_ids()
+
+    def predict(self, frame: Frame) -> Detections:
+        """What was recorded for the frame as it is; `frame.points` are not looked at.
+
+        Raises:
+            DataError: nothing was recorded for the frame, or what was is malformed.
+        """
+        answer = self._record.answer(frame.frame_id)
+        return self._detections(frame.frame_id, answer, lambda _: frame.calibration)
+
+    def views(self, frame_id: str) -> Sequence[tuple[Similarity, Detections]]:
+        """The recorded augmented copies of the frame, in the order of their numbers.
+
+        Raises:
+            DataError: nothing was recorded for the frame, or what was is malformed.
+        """
+        views = self._record.views(frame_id)
+        if isinstance(self._record, PassesRecord) and not views:
+            _warn_once(
+                f"{self.path}: no second pass over augmented copies, so no label has a consistency "
+                "loss, and methods that need one weigh every label 0: name passes in "
+                "detector.options, or set solve.self_paced = false"
+            )
+        return [
+            (similarity, self._detections(frame_id, answer, self._calibration))
+            for similarity, answer in views
+        ]
+
+    def _detections(
+        self,
+        frame_id: str,
+        answer: Answer,
+        calibration: Callable[[str], Calibration] | None,
+    ) -> Detections:
+        """The answer in the LiDAR frame, with our names, from the lowest score on."""
+        if isinstance(answer, KittiObjects):
+            if calibration is None:
+                raise ConfigError(f"{self.path}: KITTI results need the calibration of the frames")
+            found = to_detections(answer, calibration(frame_id))
+            place = f"{self.path}: frame {frame_id}"
+            answer = as_detections(place, found.boxes, found.scores, found.categories)
+        if self.rename:
+            names = [self.rename.get(name, name) for name in answer.categories.tolist()]
+            answer = replace(answer, categories=as_categories(names))
+        return answer.select(np.flatnonzero(answer.scores >= self.minimum_score))
+
+    def _report_strays(self, frame_ids: Sequence[str]) -> None:
+        """Says which recorded frames the data set does not have; DataError where it has none."""
+        recorded = self.frame_ids()
+        known = set(frame_ids)
+        strays = [name for name in recorded if name not in known]
+        few = ", ".join(strays[:3]) + (", ..." if len(strays) > 3 else "")
+        if strays and len(strays) == len(recorded):
+            raise DataError(
+                f"{self.path}: results for frames that do not exist ({few}); the data set's are "
+                f"named like {frame_ids[0]}"
+            )
+        if strays:
+            _warn_once(
+                f"{self.path}: {len(strays)} of {len(recorded)} results are for frames that the "
+                f"data set does not have ({few}); they are left out"
+            )
+
+
+def _open(path: Path, kind: str, reading: Reading, passes: Sequence[Mapping[str, Any]]) -> Record:
+    told = tell_kind(path) if kind == "auto" else kind
+    if told != "csv":
+        return PassesRecord.read(path, told, reading, passes)
+    if passes:
+        raise ConfigError(f"{path}: a CSV holds its augmented copies itself, as views 1, 2, ...")
+    return TableRecord.read(path)
+
+
+@cache
+def _warn_once(message: str) -> None:
+    """Once per process, whatever the number of stages and frames."""
+    _log.warning(message)

@@ -1,0 +1,108 @@
+"""Which format a record is in, by its suffix and contents, and its reader."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from curate.detectors.recorded.answers import Answers, Reading
+from curate.detectors.recorded.kitti_results import KittiResults
+from curate.detectors.recorded.mmdetection3d import holds_boxes, read_mmdetection3d
+from curate.detectors.recorded.openpcdet import read_openpcdet
+from curate.detectors.recorded.plain_pickle import read_plain_pickle
+from curate.errors import ConfigError, DataError
+
+_LISTS: Mapping[str, Callable[[Path, Sequence[Any], Reading], Answers]] = {
+    "openpcdet": read_openpcdet,
+    "mmdetection3d": read_mmdetection3d,
+}
+KINDS = ("csv", "kitti", *_LISTS)
+_EXPECTED = (
+    "a .csv file, a folder of KITTI result files, OpenPCDet's result.pkl, or mmdetection3d's "
+    "results as .pkl, .json or a folder of .json"
+)
+
+
+def tell_kind(path: Path) -> str:
+    """The kind of a record by its suffix: of `KINDS`, or "list" where only the contents tell.
+
+    Raises:
+        DataError: the path is missing or of no kind that can be read.
+    """
+    if not path.exists():
+        raise DataError(f"{path}: no such file of recorded detections")
+    if path.is_dir():
+        return "mmdetection3d" if any(path.glob("*.json")) else "kitti"
+    kinds = {".csv": "csv", ".pkl": "list", ".pickle": "list", ".json": "list"}
+    if path.suffix.lower() not in kinds:
+        raise DataError(f"{path}: no known record of detections; expected {_EXPECTED}")
+    return kinds[path.suffix.lower()]
+
+
+def read_answers(path: Path, kind: str, reading: Reading) -> Answers:
+    """The answers of one pass in any format but CSV.
+
+    Args:
+        path: file or folder.
+        kind: one of `KINDS`, or "list".
+        reading: see there.
+
+    Raises:
+        ConfigError: an option that the format needs is not given.
+        DataError: the file is missing, damaged or of another format.
+    """
+    if kind == "kitti":
+        return KittiResults(path)
+    entries = _read_list(path)
+    if kind == "list":
+        kind = _tell_list(path, entries)
+    return _LISTS[kind](path, entries, reading)
+
+
+def _tell_list(path: Path, entries: Sequence[Any]) -> str:
+    """The kind of a list by its first entry."""
+    if not entries:
+        raise DataError(f"{path}: holds no frames")
+    first = entries[0]
+    if holds_boxes(first):
+        return "mmdetection3d"
+    if isinstance(first, Mapping) and "boxes_lidar" in first:
+        return "openpcdet"
+    keys = ", ".join(map(str, first)) if isinstance(first, Mapping) else type(first).__name__
+    raise DataError(f"{path}: entries of no known format ({keys}); expected {_EXPECTED}")
+
+
+def _read_list(path: Path) -> Sequence[Any]:
+    """The entries of a pickle, a JSON file or a folder of JSON files."""
+    if path.is_dir():
+        entries = []
+        for file in sorted(path.glob("*.json")):
+            entry = _read_json(file)
+            if not isinstance(entry, dict):
+                raise DataError(f"{file}: holds no results of a frame")
+            entries.append({"frame_id": file.stem, **entry})
+        return entries
+    held = _read_json(path) if path.suffix.lower() == ".json" else read_plain_pickle(path)
+    if isinstance(held, Mapping) and "results" in held:
+        raise DataError(
+            f"{path}: nuScenes results are in the global frame and need its ego poses; save the "
+            f"detector's boxes in the LiDAR frame instead: {_EXPECTED}"
+        )
+    if not isinstance(held, list | tuple):
+        raise DataError(f"{path}: holds a {type(held).__name__}, not a list of frames")
+    return held
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as JSON: {error}") from None
+
+
+def refuse_unknown_kind(kind: str) -> None:
+    """ConfigError for a kind that nobody reads."""
+    if kind not in (*KINDS, "auto"):
+        raise ConfigError(f"detector.options.kind '{kind}': use one of auto, {', '.join(KINDS)}")

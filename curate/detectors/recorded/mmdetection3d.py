@@ -1,0 +1,107 @@
+"""mmdetection3d's results (1.0 or newer): boxes at the centre of their bottom, numbered labels.
+
+A list, in a pickle of arrays or in JSON, with boxes_3d (or bboxes_3d), scores_3d and labels_3d of
+each frame; or the folder of FRAME.json that its inferencer writes. `boxes_3d` is (n, 7): x, y and
+z of the bottom's centre, length, width, height, yaw counter-clockwise from x, in the LiDAR frame.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curate.detections import Detections
+from curate.detectors.recorded.answers import Answers, Reading, as_detections
+from curate.errors import ConfigError, DataError
+
+# An entry may hold its boxes one level deeper, and names them in one of two ways.
+HOLDERS = ("pred_instances_3d", "pts_bbox")
+BOX_KEYS = ("boxes_3d", "bboxes_3d")
+_FRAME_KEYS = ("frame_id", "sample_idx", "lidar_path")
+
+
+def read_mmdetection3d(path: Path, entries: Sequence[Any], reading: Reading) -> Answers:
+    """The detections of each frame.
+
+    Args:
+        path: the file or folder, for messages.
+        entries: what it holds, a dict per frame.
+        reading: `classes` behind the labels; `frame_list` where the entries do not name frames.
+
+    Raises:
+        ConfigError: the classes are not given, or the frames not named.
+        DataError: an entry lacks a key or holds what cannot be, or a frame comes twice.
+    """
+    if not reading.classes:
+        raise ConfigError(
+            f"{path}: labels_3d are numbers: give detector.options.classes in the order of the "
+            'model, e.g. classes = ["Pedestrian", "Cyclist", "Car"]'
+        )
+    frames = _frames(path, entries, reading.frame_list)
+    found: dict[str, Detections] = {}
+    for number, (frame_id, entry) in enumerate(zip(frames, entries, strict=True)):
+        if frame_id in found:
+            raise DataError(f"{path}: entry {number}: a second one of frame {frame_id}")
+        place = f"{path}: entry {number} (frame {frame_id})"
+        found[frame_id] = _detections(place, entry, reading.classes)
+    return found
+
+
+def holds_boxes(entry: Any) -> bool:
+    """Whether an entry looks like one of mmdetection3d's."""
+    return isinstance(entry, Mapping) and any(key in _inner(entry) for key in BOX_KEYS)
+
+
+def _inner(entry: Mapping[str, Any]) -> Mapping[str, Any]:
+    held = (entry[key] for key in HOLDERS if isinstance(entry.get(key), Mapping))
+    return next(held, entry)
+
+
+def _detections(place: str, entry: Any, classes: Sequence[str]) -> Detections:
+    inner = _inner(entry) if isinstance(entry, Mapping) else {}
+    box_key = next((key for key in BOX_KEYS if key in inner), BOX_KEYS[0])
+    missing = [key for key in (box_key, "scores_3d", "labels_3d") if key not in inner]
+    if missing:
+        raise DataError(f"{place}: no {', '.join(missing)}")
+    if inner.get("box_type_3d", "LiDAR") != "LiDAR":
+        raise DataError(f"{place}: boxes are of type {inner['box_type_3d']}, not LiDAR")
+    labels = np.asarray(inner["labels_3d"]).reshape(-1)
+    if len(labels) and (labels.dtype.kind not in "iu" or not 0 <= labels.min() <= labels.max()):
+        raise DataError(f"{place}: labels_3d are not the numbers of classes: {labels[:5].tolist()}")
+    if len(labels) and labels.max() >= len(classes):
+        raise DataError(
+            f"{place}: label {labels.max()}, but detector.options.classes names {len(classes)}"
+        )
+    names = [classes[label] for label in labels.tolist()]
+    found = as_detections(place, inner[box_key], inner["scores_3d"], names)
+    found.boxes[:, 2] += found.boxes[:, 5] / 2
+    return found
+
+
+def _frames(path: Path, entries: Sequence[Any], frame_list: Path | None) -> list[str]:
+    """The frame of each entry: from the list, else as the entries name it."""
+    if frame_list is None:
+        named = [_frame_of(entry) for entry in entries]
+        if None in named:
+            raise ConfigError(
+                f"{path}: entry {named.index(None)} names no frame: give detector.options."
+                "frame_list, a file with the frame ids in the order of the results, one per line"
+            )
+        return [str(frame_id) for frame_id in named]
+    try:
+        listed = frame_list.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{frame_list}: no list of frame ids: {error}") from None
+    if len(listed) != len(entries):
+        raise DataError(f"{frame_list}: {len(listed)} frame ids for {len(entries)} in {path}")
+    return listed
+
+
+def _frame_of(entry: Any) -> str | None:
+    if not isinstance(entry, Mapping):
+        return None
+    key = next((key for key in _FRAME_KEYS if key in entry), None)
+    if key is None:
+        return None
+    return Path(entry[key]).stem if key == "lidar_path" else str(entry[key])

@@ -1,0 +1,38 @@
+"""OpenPCDet's result.pkl: a list with frame_id, name, score and boxes_lidar of each frame.
+
+`boxes_lidar` is (n, 7): box centre, length, width, height, yaw counter-clockwise from x, in the
+LiDAR frame, as here; two further columns of velocities are left out.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from curate.detectors.recorded.answers import Answer, Answers, Reading, as_detections
+from curate.errors import DataError
+
+KEYS = ("frame_id", "name", "score", "boxes_lidar")
+
+
+def read_openpcdet(path: Path, entries: Sequence[Any], _reading: Reading) -> Answers:
+    """The detections of each frame.
+
+    Args:
+        path: the file, for messages.
+        entries: what it holds.
+
+    Raises:
+        DataError: an entry lacks a key or holds what cannot be, or a frame comes twice.
+    """
+    found: dict[str, Answer] = {}
+    for number, entry in enumerate(entries):
+        place = f"{path}: entry {number}"
+        missing = [key for key in KEYS if not isinstance(entry, dict) or key not in entry]
+        if missing:
+            raise DataError(f"{place}: no {', '.join(missing)}; expected a dict with {KEYS}")
+        frame_id = str(entry["frame_id"])
+        if frame_id in found:
+            raise DataError(f"{place}: a second one of frame {frame_id}")
+        place = f"{place} (frame {frame_id})"
+        found[frame_id] = as_detections(place, entry["boxes_lidar"], entry["score"], entry["name"])
+    return found

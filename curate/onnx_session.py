@@ -1,0 +1,54 @@
+"""Sessions of ONNX Runtime on the CPU for models that users bring, and their errors."""
+
+from pathlib import Path
+from typing import Any
+
+from curate.errors import ModelError
+
+
+def open_session(model: Path, threads: int, section: str) -> Any:
+    """A session.
+
+    Args:
+        model: the .onnx file.
+        threads: of ONNX Runtime.
+        section: of the configuration that names the model, for messages.
+
+    Raises:
+        ModelError: the file is missing or no usable ONNX model.
+    """
+    import onnxruntime
+
+    if not model.is_file():
+        raise ModelError(f"{model}: no such ONNX model; set {section}.path")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    # Waiting threads would take the cores from the other workers.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
+    except runtime_errors() as error:
+        raise ModelError(f"{model}: no usable ONNX model: {first_line(error)}") from error
+
+
+def runtime_errors() -> tuple[type[Exception], ...]:
+    """What ONNX Runtime raises; its errors have no common root of their own."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as state
+
+    return (
+        state.EPFail,
+        state.Fail,
+        state.InvalidArgument,
+        state.InvalidGraph,
+        state.InvalidProtobuf,
+        state.NoSuchFile,
+        state.NotImplemented,
+        state.RuntimeException,
+    )
+
+
+def first_line(error: Exception) -> str:
+    """What an error says first."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,291 @@
+"""Tests of records in the formats of other projects: the same boxes, whatever the file."""
+
+import json
+import logging
+import pickle
+
+import numpy as np
+import pytest
+from toys import toy_calibration
+
+from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti_labels import from_detections, write_objects
+from curate.detections import Detections, as_categories
+from curate.detectors.recorded import RecordedDetector, detector
+from curate.errors import ConfigError, DataError
+from curate.frames import Calibration, Frame
+from curate.geometry.similarity import Similarity
+
+BOXES = np.array([
+    [12.0, 4.2, -0.8, 3.9, 1.6, 1.5, -3.0],
+    [20.0, -5.0, -0.6, 0.8, 0.6, 1.8, 0.4],
+])  # fmt: skip
+FOUND = Detections(BOXES, np.array([0.9, 0.25]), as_categories(["Car", "Pedestrian"]))
+CLASSES = ("Pedestrian", "Cyclist", "Car")
+FRAMES = {"000001": FOUND, "000002": Detections.empty()}
+
+
+def tilted_calibration():
+    """A camera that stands apart from the LiDAR, so that a forgotten calibration is seen."""
+    plain = toy_calibration()
+    moved = plain.lidar_to_camera.copy()
+    moved[:3, 3] = [0.3, -0.1, -0.27]
+    return Calibration(plain.projection, moved)
+
+
+def frame(frame_id):
+    """A frame of which only name and calibration matter."""
+    return Frame(frame_id, np.zeros((0, 4), np.float32), tilted_calibration(), (120, 40))
+
+
+def write_kitti(folder, frames=FRAMES):
+    """KITTI result files."""
+    folder.mkdir()
+    for frame_id, found in frames.items():
+        objects = from_detections(found, tilted_calibration(), (120, 40))
+        write_objects(folder / f"{frame_id}.txt", objects)
+    return folder
+
+
+def write_openpcdet(path, frames=FRAMES):
+    """OpenPCDet's result.pkl."""
+    entries = [
+        {
+            "frame_id": frame_id,
+            "name": found.categories,
+            "score": found.scores.astype(np.float32),
+            "boxes_lidar": found.boxes.astype(np.float32),
+            "alpha": np.zeros(len(found)),
+        }
+        for frame_id, found in frames.items()
+    ]
+    path.write_bytes(pickle.dumps(entries))
+    return path
+
+
+def mmdetection3d(frames=FRAMES):
+    """mmdetection3d's entries: z at the bottom."""
+    down = np.array([0, 0, 0.5, 0, 0, 0, 0])
+    return {
+        frame_id: {
+            "boxes_3d": found.boxes - down * found.boxes[:, 5:6],
+            "scores_3d": found.scores,
+            "labels_3d": np.array([CLASSES.index(name) for name in found.categories], dtype=int),
+        }
+        for frame_id, found in frames.items()
+    }
+
+
+def write_mmdetection3d(path, frames=FRAMES):
+    """A pickle of arrays, in order only, with the order beside it."""
+    path.write_bytes(pickle.dumps(list(mmdetection3d(frames).values())))
+    (path.parent / "order.txt").write_text("\n".join(frames) + "\n")
+    return path
+
+
+def write_inferencer(folder, frames=FRAMES):
+    """The folder of the inferencer."""
+    folder.mkdir()
+    for frame_id, entry in mmdetection3d(frames).items():
+        held = {key: value.tolist() for key, value in entry.items()}
+        held["bboxes_3d"] = held.pop("boxes_3d")
+        (folder / f"{frame_id}.json").write_text(json.dumps(held | {"box_type_3d": "LiDAR"}))
+    return folder
+
+
+FORMATS = {
+    "kitti": (write_kitti, {}),
+    "openpcdet.pkl": (write_openpcdet, {}),
+    "mmdetection3d.pkl": (
+        write_mmdetection3d,
+        {"classes": CLASSES, "frame_list": "order.txt"},
+    ),
+    "preds": (write_inferencer, {"classes": CLASSES}),
+}
+
+
+@pytest.fixture(params=FORMATS)
+def written(request, tmp_path):
+    """Path, its writer, and the options that it needs."""
+    write, options = FORMATS[request.param]
+    return write(tmp_path / request.param), write, options
+
+
+def test_every_format_says_the_same(written):
+    """Boxes at their centre in the LiDAR frame, to what the file's decimals hold."""
+    path, _, options = written
+    record = RecordedDetector(path, **options)
+    found = record.predict(frame("000001"))
+    np.testing.assert_allclose(found.boxes, BOXES, atol=1e-4)
+    np.testing.assert_allclose(found.scores, FOUND.scores, atol=1e-6)
+    assert found.categories.tolist() == ["Car", "Pedestrian"]
+    assert record.predict(frame("000002")).boxes.shape == (0, 7)
+    assert record.frame_ids() == ("000001", "000002")
+
+
+def test_low_scores_are_left_out_and_names_translated(written):
+    """As the options say."""
+    path, _, options = written
+    record = RecordedDetector(path, 0.5, rename={"Car": "car"}, **options)
+    assert record.predict(frame("000001")).categories.tolist() == ["car"]
+
+
+def test_a_second_pass_gives_views(written):
+    """Its boxes stay in the frame of the copy; without one there are no views, and a warning."""
+    path, write, options = written
+    similarity = Similarity(flip_y=True, rotation_rad=0.1, scale=1.02)
+    moved = Detections(similarity.apply_to_boxes(BOXES), FOUND.scores, FOUND.categories)
+    second = write(path.with_name(f"second{path.suffix}"), {**FRAMES, "000001": moved})
+    passes = [{"path": second.name, "flip_y": True, "rotation_rad": 0.1, "scale": 1.02}]
+    record = RecordedDetector(
+        path, passes=passes, calibration=lambda _: tilted_calibration(), **options
+    )
+    [(found_similarity, found)] = record.views("000001")
+    assert found_similarity == similarity
+    np.testing.assert_allclose(similarity.invert_boxes(found.boxes), BOXES, atol=2e-4)
+
+
+def test_without_a_second_pass_the_user_is_told_once(tmp_path, caplog):
+    """Weights of 0 everywhere would be a riddle."""
+    detector._warn_once.cache_clear()
+    record = RecordedDetector(write_openpcdet(tmp_path / "a.pkl"))
+    with caplog.at_level(logging.WARNING):
+        assert list(record.views("000001")) == list(record.views("000002")) == []
+    assert len(caplog.messages) == 1
+    assert "no second pass" in caplog.messages[0]
+
+
+@pytest.mark.parametrize(
+    ("one", "message"),
+    [
+        ({"path": "a.pkl"}, "name what was done"),
+        ({"flip_y": True}, "takes path"),
+        ({"path": "a.pkl", "flip": True}, "takes path"),
+        ({"path": "a.pkl", "scale": "big"}, "could not convert"),
+        ({"path": "a.pkl", "scale": -1}, "positive scale"),
+    ],
+)
+def test_a_pass_says_what_was_done_to_the_points(tmp_path, one, message):
+    """Exactly, or it is refused."""
+    with pytest.raises(ConfigError, match=message):
+        RecordedDetector(write_openpcdet(tmp_path / "a.pkl"), passes=[one])
+
+
+def test_a_frame_without_result_is_an_error(written):
+    """It becomes a failed frame."""
+    path, _, options = written
+    with pytest.raises(DataError, match="no recorded detections for frame 000007"):
+        RecordedDetector(path, **options).predict(frame("000007"))
+
+
+def test_a_result_for_a_frame_that_does_not_exist_is_reported(written, caplog):
+    """Some: a warning that names them. All: an error that shows how frames are named."""
+    path, _, options = written
+    detector._warn_once.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        RecordedDetector(path, frame_ids=("000001", "000007"), **options)
+    assert "1 of 2 results are for frames that the data set does not have (000002)" in caplog.text
+    with pytest.raises(DataError, match=r"frames that do not exist .*named like 1"):
+        RecordedDetector(path, frame_ids=("1", "2"), **options)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"score": np.array([12.0, -3.0])}, "box 0: the score is not in"),
+        ({"boxes_lidar": BOXES * [1, 1, 1, 1, -1, 1, 1]}, "box 0: length, width or height"),
+        ({"boxes_lidar": BOXES * np.nan}, "box 0: a number is NaN"),
+        ({"boxes_lidar": BOXES[:, :5]}, r"boxes \[2, 5\]"),
+        ({"boxes_lidar": BOXES[:1]}, r"boxes \[1, 7\]"),
+        ({"boxes_lidar": "far"}, "must be numbers"),
+    ],
+)
+def test_impossible_answers_are_named(tmp_path, change, message):
+    """With the entry and the frame."""
+    entry = {"frame_id": "7", "name": FOUND.categories, "score": FOUND.scores, "boxes_lidar": BOXES}
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps([entry | change]))
+    with pytest.raises(DataError, match=message) as caught:
+        RecordedDetector(path)
+    assert f"{path}: entry 0 (frame 7)" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_numbered_labels_need_their_names(tmp_path):
+    """The order of classes is the model's, and a wrong one would go unseen."""
+    path = write_mmdetection3d(tmp_path / "a.pkl")
+    with pytest.raises(ConfigError, match=r"give detector\.options\.classes"):
+        RecordedDetector(path, frame_list="order.txt")
+    with pytest.raises(DataError, match="label 2, but"):
+        RecordedDetector(path, frame_list="order.txt", classes=["Pedestrian", "Cyclist"])
+    with pytest.raises(ConfigError, match="frame_list"):
+        RecordedDetector(path, classes=CLASSES)
+    (tmp_path / "order.txt").write_text("000001\n")
+    with pytest.raises(DataError, match="1 frame ids for 2"):
+        RecordedDetector(path, frame_list="order.txt", classes=CLASSES)
+
+
+@pytest.mark.parametrize(
+    ("name", "held", "message"),
+    [
+        ("a.json", {"meta": {}, "results": {}}, "nuScenes results are in the global frame"),
+        ("a.json", {"a": 1}, "holds a dict, not a list of frames"),
+        ("a.json", [], "holds no frames"),
+        ("a.json", [{"a": 1}], r"no known format \(a\)"),
+        ("a.json", [3], r"no known format \(int\)"),
+        ("a.json", [{"boxes_lidar": []}], "no frame_id, name, score"),
+        ("a.parquet", [], "no known record of detections; expected a .csv file"),
+    ],
+)
+def test_other_contents_are_refused_by_name(tmp_path, name, held, message):
+    """With what would be read."""
+    (tmp_path / name).write_text(json.dumps(held))
+    with pytest.raises(DataError, match=message):
+        RecordedDetector(tmp_path / name)
+
+
+def test_boxes_of_the_camera_are_refused(tmp_path):
+    """mmdetection3d says so in its files."""
+    entry = {"frame_id": "1", "bboxes_3d": [], "scores_3d": [], "labels_3d": []}
+    (tmp_path / "a.json").write_text(json.dumps([entry | {"box_type_3d": "Camera"}]))
+    with pytest.raises(DataError, match="of type Camera, not LiDAR"):
+        RecordedDetector(tmp_path / "a.json", classes=CLASSES)
+
+
+def test_the_format_can_be_named(tmp_path):
+    """An unknown name is refused, and so is a folder without results."""
+    path = write_openpcdet(tmp_path / "a.pkl")
+    assert len(RecordedDetector(path, kind="openpcdet").frame_ids()) == 2
+    with pytest.raises(ConfigError, match="'yolo': use one of auto, csv, kitti, openpcdet"):
+        RecordedDetector(path, kind="yolo")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="holds no KITTI result files"):
+        RecordedDetector(tmp_path / "empty")
+
+
+def test_a_bad_result_file_fails_its_frame_alone(tmp_path):
+    """The others are read."""
+    folder = write_kitti(tmp_path / "results")
+    (folder / "000003.txt").write_text("Car 0 0\n")
+    record = RecordedDetector(folder)
+    with pytest.raises(DataError, match=r"000003\.txt:1: 3 fields"):
+        record.predict(frame("000003"))
+    assert len(record.predict(frame("000001"))) == 2
+
+
+@pytest.mark.kitti
+def test_real_results_in_kittis_form_are_the_record(kitti_root, tmp_path):
+    """A real detector's boxes, written as result files with the real calibration, come back."""
+    dataset = KittiDataset(kitti_root)
+    record = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv")
+    (tmp_path / "results").mkdir()
+    frames = [dataset.read(name, points=False) for name in record.frame_ids()]
+    for each in frames:
+        objects = from_detections(record.predict(each), each.calibration, each.image_size)
+        write_objects(tmp_path / "results" / f"{each.frame_id}.txt", objects)
+    read = RecordedDetector(tmp_path / "results", frame_ids=dataset.frame_ids())
+    for each in frames:
+        expected, found = record.predict(each), read.predict(each)
+        np.testing.assert_allclose(found.boxes[:, :6], expected.boxes[:, :6], atol=2e-4)
+        turn = np.abs(np.sin((found.boxes[:, 6] - expected.boxes[:, 6]) / 2))
+        assert turn.max(initial=0) < 1e-4

@@ -1,0 +1,131 @@
+"""Tests of the reader of pickles that runs nothing."""
+
+import collections
+import os
+import pickle
+import sys
+
+import numpy as np
+import pytest
+
+from curate.detectors.recorded.plain_pickle import read_plain_pickle
+from curate.errors import DataError
+
+HELD = [
+    {
+        "frame_id": np.str_("000001"),
+        "name": np.array(["Car", "Van"]),
+        "boxes": np.arange(14.0).reshape(2, 7),
+        "turned": np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3)),
+        "swapped": np.array([1.5, 2.5], dtype=">f8"),
+        "objects": np.array(["a", None, 3], dtype=object),
+        "none": np.zeros((0, 7), dtype=np.float32),
+        "score": np.float32(0.5),
+        "plain": (1, 2.5, "x", b"y", None, True, {1}, collections.OrderedDict(a=1)),
+    }
+]
+
+
+class Runs:
+    """Whoever unpickles it in the usual way calls a function."""
+
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+def written(path, value, protocol=4):
+    """A pickle of a value."""
+    path.write_bytes(pickle.dumps(value, protocol))
+    return path
+
+
+@pytest.mark.parametrize("protocol", range(2, 6))
+def test_arrays_and_containers_come_back(tmp_path, protocol):
+    """In every protocol, with their shapes and types."""
+    [found] = read_plain_pickle(written(tmp_path / "a.pkl", HELD, protocol))
+    [expected] = HELD
+    assert list(found) == list(expected)
+    for key, value in expected.items():
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(found[key], value)
+            assert found[key].dtype.newbyteorder("=") == value.dtype.newbyteorder("=")
+        else:
+            assert found[key] == value
+
+
+def test_names_of_numpy_1_are_known(tmp_path):
+    """What numpy 1 wrote says numpy.core where numpy 2 says numpy._core."""
+    content = pickle.dumps(np.arange(3.0), 2).replace(b"numpy._core", b"numpy.core")
+    assert b"numpy.core.multiarray" in content
+    (tmp_path / "a.pkl").write_bytes(content)
+    assert read_plain_pickle(tmp_path / "a.pkl").tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("protocol", range(5))
+def test_a_pickle_that_tries_to_run_code_is_refused_and_nothing_runs(tmp_path, protocol):
+    """The usual reader would make the folder; here the refused name is given, in one line."""
+    path = written(tmp_path / "evil.pkl", [Runs(os.mkdir, str(tmp_path / "pwned"))], protocol)
+    with pytest.raises(DataError) as caught:
+        read_plain_pickle(path)
+    assert not (tmp_path / "pwned").exists()
+    assert f"evil.pkl: refused, the pickle names {os.mkdir.__module__}.mkdir;" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    pickle.loads(path.read_bytes())  # noqa: S301 - the proof that it was armed
+    assert (tmp_path / "pwned").exists()
+
+
+def test_a_module_that_a_pickle_names_is_not_even_imported(tmp_path, monkeypatch):
+    """Import runs code too."""
+    (tmp_path / "bad_module.py").write_text("import os\nos.mkdir('pwned')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "a.pkl").write_bytes(b"cbad_module\nthing\n.")
+    with pytest.raises(DataError, match=r"names bad_module\.thing"):
+        read_plain_pickle(tmp_path / "a.pkl")
+    assert "bad_module" not in sys.modules
+    assert not (tmp_path / "pwned").exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"cbuiltins\neval\n.",
+        b"cbuiltins\ngetattr\n.",
+        b"cnumpy\nload\n.",
+        b"cnumpy.testing\nmeasure\n.",
+        b"ctorch._utils\n_rebuild_tensor_v2\n.",
+        b"\x80\x04\x8c\x05numpy\x8c\x11ndarray.__class__\x93.",
+    ],
+)
+def test_other_names_are_refused(tmp_path, content):
+    """Those of numpy that do more than hold values too, and ways through an admitted one."""
+    (tmp_path / "a.pkl").write_bytes(content)
+    with pytest.raises(DataError, match="refused, the pickle names"):
+        read_plain_pickle(tmp_path / "a.pkl")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"no pickle",
+        pickle.dumps(HELD)[:-40],
+        b"cnumpy\nndarray\n)R.",  # calls what may only be named
+        b"\x80\x02U\x01aQ.",  # a persistent id
+    ],
+)
+def test_a_damaged_pickle_is_one_line(tmp_path, content):
+    """Never another exception."""
+    (tmp_path / "a.pkl").write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.pkl: no pickle, or a damaged one") as caught:
+        read_plain_pickle(tmp_path / "a.pkl")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    """Before anything is read."""
+    with pytest.raises(DataError, match=r"b\.pkl: no such file"):
+        read_plain_pickle(tmp_path / "b.pkl")

@@ -1,0 +1,144 @@
+"""Tests of the detector that runs any exported model."""
+
+import numpy as np
+import pytest
+from tiny_onnx import tiny_detector
+from toys import toy_calibration
+
+from curate.detections import CATEGORIES
+from curate.detectors.onnx import OnnxDetector
+from curate.errors import ConfigError, ModelError
+from curate.frames import Frame
+
+POINTS = np.array([[9.0, 1, -1, 0.2], [11.0, 3, -1, 0.4]], dtype=np.float32)
+
+
+def frame(points=POINTS):
+    """Two points around (10, 2, -1)."""
+    return Frame("000001", points, toy_calibration(), (120, 40))
+
+
+def answer(path, options=None, **graph):
+    """What a tiny model answers."""
+    tiny_detector(path, **graph)
+    return OnnxDetector(path, **({"classes": CATEGORIES} | (options or {}))).predict(frame())
+
+
+def double(points):
+    """A step before the model, by name."""
+    return {"points": np.concatenate([points, points])}
+
+
+def upside_down(outputs):
+    """A step after the model, by name."""
+    return {
+        "boxes": outputs["boxes"][::-1],
+        "scores": outputs["scores"][::-1],
+        "labels": outputs["labels"],
+    }
+
+
+def nonsense(_):
+    """Answers no mapping."""
+    return 3
+
+
+@pytest.fixture
+def path(tmp_path):
+    """Where the model will be."""
+    return tmp_path / "model.onnx"
+
+
+def test_boxes_scores_and_labels_become_detections(path):
+    """By falling score, named by the classes."""
+    found = answer(path)
+    assert found.categories.tolist() == ["Car", "Pedestrian", "Cyclist"]
+    np.testing.assert_allclose(found.boxes[0], [10, 2, -1, 3.9, 1.6, 1.5, 0.3], atol=1e-5)
+    np.testing.assert_allclose(found.scores, [0.9, 0.525, 0.15], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("convention", "row"),
+    [
+        ({"origin": "bottom"}, [0, 0, -0.75, 3.9, 1.6, 1.5, 0.3]),
+        ({"order": "wlh"}, [0, 0, 0, 1.6, 3.9, 1.5, 0.3]),
+        ({"order": "hwl", "origin": "bottom"}, [0, 0, -0.75, 1.5, 1.6, 3.9, 0.3]),
+        ({"yaw_sign": -1}, [0, 0, 0, 3.9, 1.6, 1.5, -0.3]),
+        ({"yaw_axis": "y"}, [0, 0, 0, 3.9, 1.6, 1.5, 0.3 - np.pi / 2]),
+        ({"yaw_sign": -1, "yaw_offset_rad": -np.pi}, [0, 0, 0, 3.9, 1.6, 1.5, -0.3 - np.pi]),
+        ({"yaw_offset_rad": 2 * np.pi}, [0, 0, 0, 3.9, 1.6, 1.5, 0.3]),
+    ],
+)  # fmt: skip
+def test_declared_conventions_are_undone(path, convention, row):
+    """The same car, however the model writes it."""
+    found = answer(path, {"convention": convention}, rows=np.array([row]))
+    np.testing.assert_allclose(found.boxes, [[10, 2, -1, 3.9, 1.6, 1.5, 0.3]], atol=1e-5)
+
+
+def test_outputs_go_by_declared_names_and_inputs_may_have_a_batch(path):
+    """`[1, n, 3]` is fed x, y, z alone."""
+    names = ("bbox", "confidence", "class")
+    outputs = {"boxes": "bbox", "scores": "confidence", "labels": "class"}
+    found = answer(path, {"outputs": outputs}, names=names, shape=(1, "n", 3))
+    assert len(found) == 3
+
+
+def test_scores_per_class_and_logits(path):
+    """The best class of each box; the logistic function where scores are logits."""
+    logits = np.array([[0.0, 2.0, -1.0], [-3.0, -4.0, 1.0]])
+    rows = np.array([[0, 0, 0, 1, 1, 1, 0.0], [5, 0, 0, 1, 1, 1, 0.0]])
+    found = answer(path, {"sigmoid": True}, rows=rows, scores=logits)
+    assert found.categories.tolist() == ["Pedestrian", "Cyclist"]
+    np.testing.assert_allclose(found.scores, 1 / (1 + np.exp([-2.0, -1.0])), atol=1e-6)
+
+
+def test_labels_may_start_at_one(path):
+    """As many frameworks number them."""
+    found = answer(path, {"first_label": 1}, labels=np.array([3, 1, 2]))
+    assert found.categories.tolist() == ["Cyclist", "Car", "Pedestrian"]
+
+
+def test_nms_where_the_export_left_it_out(path):
+    """The better of two boxes of a category stays; other categories are left alone."""
+    rows = np.tile([0, 0, 0, 3.9, 1.6, 1.5, 0.0], (3, 1))
+    labels = np.array([0, 0, 1])
+    assert len(answer(path, rows=rows, labels=labels)) == 3
+    assert len(answer(path, {"nms_iou": 0.5}, rows=rows, labels=labels)) == 2
+
+
+def test_functions_of_the_user_come_before_and_after(path):
+    """Named as package.module:function."""
+    options = {"preprocess": f"{__name__}:double", "postprocess": f"{__name__}:upside_down"}
+    found = answer(path, options)
+    assert found.categories.tolist() == ["Cyclist", "Pedestrian", "Car"]
+
+
+@pytest.mark.parametrize(
+    ("options", "graph", "error", "message"),
+    [
+        ({}, {"shape": ("n", 5)}, ModelError, "expected one tensor"),
+        ({}, {"shape": (100, 4)}, ModelError, r"takes points .*free n: .*preprocess"),
+        ({"points": "sweep"}, {}, ModelError, "no input is named sweep"),
+        ({}, {"names": ("b", "s", "l")}, ModelError, "answers b, l, s; no output is named boxes"),
+        ({"outputs": {"box": "b"}}, {}, ConfigError, "box: use boxes, scores, labels"),
+        ({}, {"scores": np.array([3.0, 2, -1])}, ModelError, "from -1 to 3 are not in"),
+        ({}, {"labels": np.array([0, 1, 7])}, ModelError, "labels 0 to 7, but classes Car,"),
+        ({}, {"labels": np.array([0, 1])}, ModelError, r"labels \[2\]; expected"),
+        ({"convention": {"order": "xyz"}}, {}, ConfigError, "order 'xyz': use lwh"),
+        ({"convention": {"handed": "left"}}, {}, ConfigError, "unexpected keyword"),
+        ({"preprocess": "nowhere:f"}, {}, ConfigError, "'nowhere:f' cannot be imported"),
+        ({"preprocess": f"{__name__}:nonsense"}, {}, ModelError, "answers no dict but int"),
+        ({"preprocess": f"{__name__}:POINTS"}, {}, ConfigError, "is no function"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(path, options, graph, error, message):
+    """With the model, what it has, and what to set."""
+    with pytest.raises(error, match=message) as caught:
+        answer(path, options, **graph)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_sweep_without_points_is_not_shown_to_the_model(path):
+    """Many exports fail on it."""
+    tiny_detector(path)
+    assert len(OnnxDetector(path, classes=CATEGORIES).predict(frame(POINTS[:0]))) == 0
