@@ -26,6 +26,7 @@ from pipelines.commands import (
     solve,
     status,
     train_round,
+    view,
 )
 
 app = typer.Typer(
@@ -52,6 +53,7 @@ for command in (
     graph,
     query,
     explain,
+    view,
     evaluate,
     audit,
     bench,
