@@ -11,6 +11,7 @@ from pipelines.commands import (
     audit,
     bench,
     demo,
+    diff,
     evaluate,
     explain,
     export,
@@ -26,6 +27,7 @@ from pipelines.commands import (
     solve,
     status,
     train_round,
+    view,
 )
 
 app = typer.Typer(
@@ -52,6 +54,8 @@ for command in (
     graph,
     query,
     explain,
+    view,
+    diff,
     evaluate,
     audit,
     bench,

@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
-from curate.errors import DataError
+from curate.errors import ConfigError, DataError
+from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.viewing.bird_eye import draw_bird_eye
 from curate.viewing.canvas import save_png
+from curate.viewing.frame_view import draw_frame
 from curate.viewing.overlay import draw_overlay
 from curate.viewing.tags import ShownLabels
+from pipelines.frame_boxes import newest_round, read_frame
 from pipelines.labels import FrameLabels, read_labels
 from pipelines.workspace import Workspace
 
@@ -17,6 +20,43 @@ def draw_telling_frame(workspace: Workspace, round_number: int) -> list[Path]:
     frames = list(read_labels(workspace, round_number, policy))
     shown = max(frames, key=_variety)
     return draw_labels(workspace, round_number, shown)
+
+
+def draw_view(
+    workspace: Workspace,
+    name: str,
+    round_number: int | None = None,
+    policy: str | None = None,
+    output: Path | None = None,
+) -> Path:
+    """Image and bird's eye view of any frame in one picture; says where it is.
+
+    Args:
+        workspace: see `Workspace`.
+        name: of the frame.
+        round_number: None for the last that has predictions.
+        policy: whose weights; None for the configured one.
+        output: None for a file in the folder `pictures`.
+
+    Raises:
+        ConfigError: no frame has that name, or a picture cannot be written to `output`.
+        WorkspaceError: no round has predictions yet.
+    """
+    number = newest_round(workspace) if round_number is None else round_number
+    policy = policy or workspace.config.run.method
+    found = read_frame(workspace, name, number, policy)
+    frame = workspace.dataset.read(name, image=True)
+    counts = count_points_in_boxes(frame.points, found.labels.boxes)
+    labels = ShownLabels(
+        found.labels.boxes, found.labels.categories, found.labels.scores, found.weights, counts
+    )
+    title = f"frame {name} ({found.split}), round {number}, weights by {policy}"
+    picture = draw_frame(frame, labels, found.truth_boxes, found.repredictions, title=title)
+    path = output or workspace.root / "pictures" / f"round-{number:02d}-{name}-{policy}.png"
+    if path.is_dir() or not path.parent.is_dir():
+        raise ConfigError(f"--output {path}: name a file in a folder that exists")
+    save_png(path, picture)
+    return path
 
 
 def draw_labels(workspace: Workspace, round_number: int, shown: FrameLabels) -> list[Path]:

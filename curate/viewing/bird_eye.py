@@ -6,7 +6,14 @@ import numpy as np
 
 from curate.geometry.boxes import bev_corners
 from curate.viewing.canvas import Canvas, Colour
-from curate.viewing.legend import STRIP_HEIGHT, TITLE_HEIGHT, draw_legend, draw_title
+from curate.viewing.legend import (
+    REPREDICTION_DASHES,
+    STRIP_HEIGHT,
+    TITLE_HEIGHT,
+    TRUTH_DOTS,
+    draw_legend,
+    draw_title,
+)
 from curate.viewing.palette import (
     BACKGROUND,
     FAINT_TEXT,
@@ -14,8 +21,9 @@ from curate.viewing.palette import (
     GROUND_TRUTH,
     TEXT,
     height_shades,
+    weight_colours,
 )
-from curate.viewing.tags import ShownLabels, draw_tags
+from curate.viewing.tags import ShownLabels, ShownRepredictions, draw_tags
 
 _RING_METRES = 10.0
 _SCALE_BAR_METRES = 10.0
@@ -60,6 +68,7 @@ def draw_bird_eye(
     labels: ShownLabels,
     truth_boxes: np.ndarray | None = None,
     *,
+    repredictions: ShownRepredictions | None = None,
     region: Region = _DEFAULT_REGION,
     title: str = "",
 ) -> np.ndarray:
@@ -68,7 +77,8 @@ def draw_bird_eye(
     Args:
         points: (n, >=3) LiDAR points in metres.
         labels: coloured by weight, the highest on top, with captions where there is room.
-        truth_boxes: (m, 7) ground truth in the LiDAR frame, white; None where it is unknown.
+        truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None where it is unknown.
+        repredictions: dashed, in the colour of the label that each was matched with.
         region: what to show, and how large.
         title: written at the top.
 
@@ -80,14 +90,22 @@ def draw_bird_eye(
     _draw_rings(canvas, region)
     _draw_points(canvas, region, points)
     footprints = region.to_pixels(bev_corners(labels.boxes))
-    for index in np.argsort(labels.weights, kind="stable"):
-        _draw_label(canvas, footprints[index], labels.colour(int(index)), labels.weights[index])
+    emphasis = labels.emphasis
+    for index in np.argsort(emphasis, kind="stable"):
+        _draw_label(canvas, footprints[index], labels.colour(int(index)), emphasis[index])
+    if repredictions is not None:
+        _draw_repredictions(canvas, region, repredictions)
     if truth_boxes is not None:
         _draw_truth(canvas, region, truth_boxes)
     anchors = np.concatenate([footprints.min(axis=1), footprints.max(axis=1)], axis=1)
     draw_tags(canvas, labels, anchors, np.array([0, TITLE_HEIGHT, width, TITLE_HEIGHT + height]))
     draw_title(canvas, title, "bird's eye view, x forward, metres")
-    draw_legend(canvas, truth=truth_boxes is not None)
+    draw_legend(
+        canvas,
+        truth=truth_boxes is not None,
+        repredictions=repredictions is not None,
+        unweighted=bool(np.isnan(labels.weights).any()),
+    )
     _draw_scale_bar(canvas, region)
     return canvas.finish()
 
@@ -103,10 +121,23 @@ def _draw_label(canvas: Canvas, footprint: np.ndarray, colour: Colour, weight: f
 
 
 def _draw_truth(canvas: Canvas, region: Region, boxes: np.ndarray) -> None:
-    """Footprints without regions that have no box, thin and over the labels."""
+    """Footprints without regions that have no box, dotted and over the labels."""
     known = boxes[~np.isnan(boxes).any(axis=1)]
-    if len(known):
-        canvas.lines(region.to_pixels(bev_corners(known)), GROUND_TRUTH, 1.0, closed=True)
+    canvas.dashes(_sides(known, region), GROUND_TRUTH, 1.5, TRUTH_DOTS)
+
+
+def _draw_repredictions(canvas: Canvas, region: Region, shown: ShownRepredictions) -> None:
+    """Footprints in dashes, the highest weight on top."""
+    sides = _sides(shown.boxes, region).reshape(-1, 4, 2, 2)
+    colours = weight_colours(shown.weights).tolist()
+    for index in np.argsort(shown.weights, kind="stable"):
+        canvas.dashes(sides[index], tuple(colours[index]), 1.2, REPREDICTION_DASHES)
+
+
+def _sides(boxes: np.ndarray, region: Region) -> np.ndarray:
+    """(4 n, 2, 2) start and end in pixels of the sides of n footprints."""
+    corners = region.to_pixels(bev_corners(boxes))
+    return np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
 
 
 def _draw_points(canvas: Canvas, region: Region, points: np.ndarray) -> None:

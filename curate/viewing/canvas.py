@@ -58,6 +58,20 @@ class Canvas:
             self._pixels, list(_fixed(strokes)), closed, colour, thickness, cv2.LINE_AA, _SHIFT
         )
 
+    def dashes(
+        self, strokes: np.ndarray, colour: Colour, width: float, pattern: tuple[float, float]
+    ) -> None:
+        """Straight strokes (n, 2, 2) as dashes; `pattern` is the length of a dash and of a gap."""
+        dash, gap = pattern
+        for start, end in strokes:
+            length = float(np.linalg.norm(end - start))
+            first, last = _inside(start, end, (self.width, self.height))
+            at = np.arange(first // (dash + gap) * (dash + gap), last, dash + gap)
+            if length == 0 or len(at) == 0:
+                continue
+            ends = np.minimum(np.stack([at, at + dash], axis=1), length) / length
+            self.lines(start + ends[..., None] * (end - start), colour, width)
+
     def fill(self, outline: np.ndarray, colour: Colour, opacity: float) -> None:
         """A convex polygon (points, 2), blended over what is there."""
         shape = self._pixels.shape
@@ -114,6 +128,28 @@ def save_png(path: Path, rgb: np.ndarray) -> None:
     """Writes an (h, w, 3) uint8 RGB picture as PNG, whole or not at all."""
     _, content = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
     replace_file(path, content.tobytes())
+
+
+def jpeg(rgb: np.ndarray, quality: int = 82) -> bytes:
+    """An (h, w, 3) uint8 RGB picture as the content of a JPEG file."""
+    settings = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    _, content = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), settings)
+    return content.tobytes()
+
+
+def _inside(start: np.ndarray, end: np.ndarray, size: tuple[int, int]) -> tuple[float, float]:
+    """Distances along a stroke between which it may be on the picture; (0, 0) where it never is."""
+    along = end - start
+    low, high = 0.0, 1.0
+    for axis in (0, 1):
+        if along[axis] == 0:
+            if not 0 <= start[axis] <= size[axis]:
+                return 0.0, 0.0
+            continue
+        shares = sorted((edge - start[axis]) / along[axis] for edge in (0, size[axis]))
+        low, high = max(low, shares[0]), min(high, shares[1])
+    length = float(np.linalg.norm(along))
+    return (low * length, high * length) if low < high else (0.0, 0.0)
 
 
 def _font_scale(size: float) -> float:

@@ -9,11 +9,16 @@ from curate.viewing.palette import (
     IGNORED,
     PANEL,
     TEXT,
+    UNWEIGHTED,
     weight_colours,
 )
 
 STRIP_HEIGHT = 40
 TITLE_HEIGHT = 36
+
+# Lengths of a dash and a gap in pixels: line styles tell apart whose box it is.
+REPREDICTION_DASHES = (6.0, 4.0)
+TRUTH_DOTS = (1.5, 3.0)
 
 _BAR_PIXELS = 150
 _GAP = 28.0
@@ -26,15 +31,22 @@ def draw_title(canvas: Canvas, title: str, note: str) -> None:
     canvas.text(canvas.width - 14 - text_width(note, 12), 23, note, FAINT_TEXT, 12)
 
 
-def draw_legend(canvas: Canvas, *, truth: bool) -> None:
-    """The strip at the bottom: weight scale, ignored labels and, if `truth`, ground truth."""
+def draw_legend(
+    canvas: Canvas, *, truth: bool, repredictions: bool = False, unweighted: bool = False
+) -> None:
+    """The strip at the bottom: the weight scale, and the line styles and colours that occur."""
     top = canvas.height - STRIP_HEIGHT
     canvas.box(0, top, canvas.width, canvas.height, PANEL)
     baseline = top + 25.0
     left = _weight_bar(canvas, 14.0, top + 13.0, baseline)
     left = _swatch(canvas, left, baseline, "weight 0: ignored", IGNORED)
+    if unweighted:
+        left = _swatch(canvas, left, baseline, "not weighted", UNWEIGHTED)
+    if repredictions:
+        left = _swatch(canvas, left, baseline, "prediction", TEXT)
+        left = _swatch(canvas, left, baseline, "reprediction", TEXT, REPREDICTION_DASHES)
     if truth:
-        _swatch(canvas, left, baseline, "ground truth", GROUND_TRUTH)
+        _swatch(canvas, left, baseline, "ground truth", GROUND_TRUTH, TRUTH_DOTS)
 
 
 def _weight_bar(canvas: Canvas, left: float, top: float, baseline: float) -> float:
@@ -51,8 +63,21 @@ def _weight_bar(canvas: Canvas, left: float, top: float, baseline: float) -> flo
     return left + text_width("1") + _GAP
 
 
-def _swatch(canvas: Canvas, left: float, baseline: float, name: str, colour: Colour) -> float:
+def _swatch(
+    canvas: Canvas,
+    left: float,
+    baseline: float,
+    name: str,
+    colour: Colour,
+    pattern: tuple[float, float] | None = None,
+) -> float:
     corners = np.array([[0, -10], [20, -10], [20, 1], [0, 1]])
-    canvas.lines(corners + np.array([left, baseline]), colour, 1.5, closed=True)
+    outline = corners + np.array([left, baseline])
+    if pattern is None:
+        canvas.lines(outline, colour, 1.5, closed=True)
+    else:
+        canvas.dashes(
+            np.stack([outline, np.roll(outline, -1, axis=0)], axis=1), colour, 1.5, pattern
+        )
     canvas.text(left + 28, baseline, name, TEXT)
     return left + 28 + text_width(name) + _GAP

@@ -6,9 +6,16 @@ from curate.frames import Calibration
 from curate.geometry.boxes import box_corners
 from curate.geometry.projection import image_rectangles
 from curate.viewing.canvas import Canvas, Colour
-from curate.viewing.legend import STRIP_HEIGHT, TITLE_HEIGHT, draw_legend, draw_title
-from curate.viewing.palette import BACKGROUND, GROUND_TRUTH
-from curate.viewing.tags import ShownLabels, draw_tags
+from curate.viewing.legend import (
+    REPREDICTION_DASHES,
+    STRIP_HEIGHT,
+    TITLE_HEIGHT,
+    TRUTH_DOTS,
+    draw_legend,
+    draw_title,
+)
+from curate.viewing.palette import BACKGROUND, GROUND_TRUTH, weight_colours
+from curate.viewing.tags import ShownLabels, ShownRepredictions, draw_tags
 
 _LEAST_WIDTH = 1200
 _NEAR_METRES = 0.1
@@ -26,7 +33,9 @@ def draw_overlay(
     labels: ShownLabels,
     truth_boxes: np.ndarray | None = None,
     *,
+    repredictions: ShownRepredictions | None = None,
     title: str = "",
+    legend: bool = True,
 ) -> np.ndarray:
     """The picture.
 
@@ -34,8 +43,10 @@ def draw_overlay(
         image: (h, w, 3) uint8 RGB; enlarged by a whole factor where it is small.
         calibration: of the frame.
         labels: coloured by weight, far ones first, with captions where there is room.
-        truth_boxes: (m, 7) ground truth in the LiDAR frame, white; None where it is unknown.
+        truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None where it is unknown.
+        repredictions: dashed, in the colour of the label that each was matched with.
         title: written above the image.
+        legend: false leaves out the strip below it, where another picture brings it.
 
     Returns:
         (height, width, 3) uint8 RGB.
@@ -43,16 +54,21 @@ def draw_overlay(
     height, width = image.shape[:2]
     factor = max(1, -(-_LEAST_WIDTH // width))
     shown = (width * factor, height * factor)
-    canvas = Canvas(shown[0], shown[1] + TITLE_HEIGHT + STRIP_HEIGHT, BACKGROUND)
+    canvas = Canvas(shown[0], shown[1] + TITLE_HEIGHT + legend * STRIP_HEIGHT, BACKGROUND)
     canvas.image(0, TITLE_HEIGHT, *shown, image)
     offset = np.array([0.0, TITLE_HEIGHT])
     if truth_boxes is not None:
         known = truth_boxes[~np.isnan(truth_boxes).any(axis=1)]
         for strokes in box_strokes(known, calibration, (width, height)):
-            _draw_strokes(canvas, strokes * factor + offset, GROUND_TRUTH, 1.0, shade=0.0)
+            canvas.dashes(strokes * factor + offset, GROUND_TRUTH, 1.6, TRUTH_DOTS)
+    if repredictions is not None:
+        strokes_of = box_strokes(repredictions.boxes, calibration, (width, height))
+        colours = weight_colours(repredictions.weights).tolist()
+        for strokes, colour in zip(strokes_of, colours, strict=True):
+            canvas.dashes(strokes * factor + offset, tuple(colour), 1.3, REPREDICTION_DASHES)
     strokes_of = box_strokes(labels.boxes, calibration, (width, height))
     for index in np.argsort(-np.linalg.norm(labels.boxes[:, :2], axis=1), kind="stable"):
-        weight = float(labels.weights[index])
+        weight = float(labels.emphasis[index])
         stroke = 1.0 if weight <= 0 else 1.5 + weight
         strokes = strokes_of[index] * factor + offset
         _draw_strokes(
@@ -63,7 +79,13 @@ def draw_overlay(
     bounds = np.array([0, TITLE_HEIGHT, shown[0], TITLE_HEIGHT + shown[1]])
     draw_tags(canvas, labels, anchors, bounds)
     draw_title(canvas, title, "camera image")
-    draw_legend(canvas, truth=truth_boxes is not None)
+    if legend:
+        draw_legend(
+            canvas,
+            truth=truth_boxes is not None,
+            repredictions=repredictions is not None,
+            unweighted=bool(np.isnan(labels.weights).any()),
+        )
     return canvas.finish()
 
 

@@ -14,6 +14,7 @@ TEXT = (226, 231, 238)
 FAINT_TEXT = (139, 150, 165)
 GROUND_TRUTH = (255, 255, 255)
 IGNORED = (128, 134, 146)
+UNWEIGHTED = (236, 128, 84)
 
 _ANCHORS = np.array(
     [(116, 82, 190), (76, 124, 205), (32, 168, 186), (66, 201, 140), (158, 222, 88), (253, 231, 37)]
@@ -21,11 +22,16 @@ _ANCHORS = np.array(
 
 
 def weight_colours(weights: np.ndarray) -> np.ndarray:
-    """(n, 3) uint8 RGB of (n,) weights in [0, 1]; weight 0 means ignore and is grey."""
-    place = np.clip(weights, 0, 1) * (len(_ANCHORS) - 1)
+    """(n, 3) uint8 RGB of (n,) weights in [0, 1].
+
+    Weight 0 means ignore and is grey; NaN means that nobody weighted the box and is orange.
+    """
+    unknown = np.isnan(weights)
+    place = np.clip(np.where(unknown, 0, weights), 0, 1) * (len(_ANCHORS) - 1)
     channels = [np.interp(place, np.arange(len(_ANCHORS)), channel) for channel in _ANCHORS.T]
     colours: np.ndarray = np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
     colours[np.asarray(weights) <= 0] = IGNORED
+    colours[unknown] = UNWEIGHTED
     return colours
 
 

@@ -22,7 +22,7 @@ class ShownLabels:
         boxes: (n, 7) in the LiDAR frame.
         categories: (n,) str.
         scores: (n,) in [0, 1].
-        weights: (n,) in [0, 1]; 0 means ignore.
+        weights: (n,) in [0, 1]; 0 means ignore, NaN that nobody weighted the label.
         points: (n,) LiDAR points inside each box, or None where they were not counted.
     """
 
@@ -40,6 +40,11 @@ class ShownLabels:
         red, green, blue = weight_colours(self.weights[index : index + 1])[0].tolist()
         return red, green, blue
 
+    @property
+    def emphasis(self) -> np.ndarray:
+        """(n,) in [0, 1], how much a label stands out: its weight, or half where it has none."""
+        return np.where(np.isnan(self.weights), 0.5, self.weights)
+
     def caption(self, index: int) -> tuple[str, str]:
         """The two lines of a label's caption; the first is empty where the label is ignored."""
         points = "" if self.points is None else f"  {self.points[index]} pts"
@@ -47,10 +52,24 @@ class ShownLabels:
         return weight, f"{self.categories[index]} {self.scores[index]:.2f}{points}"
 
 
+@dataclass(frozen=True)
+class ShownRepredictions:
+    """The boxes of the augmented copies of a frame, mapped back.
+
+    Attributes:
+        boxes: (n, 7) in the LiDAR frame.
+        weights: (n,) of the label that each was matched with; 0 where it was matched with none.
+    """
+
+    boxes: np.ndarray
+    weights: np.ndarray
+
+
 def draw_tags(canvas: Canvas, labels: ShownLabels, anchors: np.ndarray, bounds: np.ndarray) -> None:
     """Writes each label's caption beside its box where there is room, high weights first.
 
-    A caption that would cover another one, or more than a little of any box, is left out.
+    A caption that would cover another one, or more than a little of any box, is left out; where
+    the number of points alone finds room, that is written.
 
     Args:
         canvas: drawn on.
@@ -59,22 +78,43 @@ def draw_tags(canvas: Canvas, labels: ShownLabels, anchors: np.ndarray, bounds: 
         bounds: (4,) left, top, right, bottom of the room for captions.
     """
     taken: list[np.ndarray] = []
-    for index in np.argsort(-labels.weights, kind="stable"):
-        anchor = anchors[index]
-        if np.isnan(anchor).any():
+    shown = np.argsort(-labels.emphasis, kind="stable")
+    left_out = []
+    for index in shown[~np.isnan(anchors[shown]).any(axis=1)]:
+        place = _place_tag(labels.caption(int(index)), int(index), anchors, taken, bounds)
+        if place is None:
+            left_out.append(int(index))
             continue
-        heavy, light = labels.caption(int(index))
-        size = (
-            max(text_width(heavy, _LARGE), text_width(light, _SMALL)),
-            _LINE_PIXELS[1] + (_LINE_PIXELS[0] if heavy else 0),
-        )
-        places = _candidates(anchor, np.array(size) + 2 * _MARGIN)
-        others = np.delete(anchors, index, axis=0)
-        covered = [_covered(place, taken, others, bounds) for place in places]
-        best = int(np.argmin(covered))
-        if covered[best] < _COVERED_LIMIT:
-            taken.append(places[best])
-            _draw_tag(canvas, places[best], (heavy, light), labels.colour(int(index)))
+        taken.append(place)
+        _draw_tag(canvas, place, labels.caption(int(index)), labels.colour(int(index)))
+    if labels.points is None:
+        return
+    for index in left_out:
+        short = ("", str(labels.points[index]))
+        place = _place_tag(short, index, anchors, taken, bounds)
+        if place is not None:
+            taken.append(place)
+            _draw_tag(canvas, place, short, labels.colour(index))
+
+
+def _place_tag(
+    lines: tuple[str, str],
+    index: int,
+    anchors: np.ndarray,
+    taken: list[np.ndarray],
+    bounds: np.ndarray,
+) -> np.ndarray | None:
+    """(4,) left, top, right, bottom of a caption beside its box; None where there is no room."""
+    heavy, light = lines
+    size = (
+        max(text_width(heavy, _LARGE), text_width(light, _SMALL)),
+        _LINE_PIXELS[1] + (_LINE_PIXELS[0] if heavy else 0),
+    )
+    places = _candidates(anchors[index], np.array(size) + 2 * _MARGIN)
+    others = np.delete(anchors, index, axis=0)
+    covered = [_covered(place, taken, others, bounds) for place in places]
+    best = int(np.argmin(covered))
+    return places[best] if covered[best] < _COVERED_LIMIT else None
 
 
 def _draw_tag(canvas: Canvas, place: np.ndarray, lines: tuple[str, str], colour: Colour) -> None:

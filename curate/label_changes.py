@@ -1,0 +1,143 @@
+"""What became of labels from one round to the next: matched one to one by BEV IoU.
+
+Source: SQL joins rounds by key, but label k of one round is not label k of the next; like MS3D's
+and ST3D's memory, labels are the same where their boxes overlap.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from curate.errors import ConfigError
+from curate.geometry.overlap import overlapping_pairs
+
+
+@dataclass(frozen=True)
+class RoundLabels:
+    """The n labels of a round with the weights of one policy.
+
+    Attributes:
+        frames: (n,) integer, the same frame has the same number in both rounds.
+        categories: (n,) integer, likewise.
+        boxes: (n, 7) in the LiDAR frame.
+        weights: (n,) in [0, 1].
+    """
+
+    frames: np.ndarray
+    categories: np.ndarray
+    boxes: np.ndarray
+    weights: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+
+@dataclass(frozen=True)
+class LabelChanges:
+    """Labels before and after.
+
+    Attributes:
+        before: n labels.
+        after: m labels.
+        pairs: (p, 2) rows before and after that mean the same object.
+        iou: (p,) BEV IoU of each pair.
+    """
+
+    before: RoundLabels
+    after: RoundLabels
+    pairs: np.ndarray
+    iou: np.ndarray
+
+    @cached_property
+    def lost(self) -> np.ndarray:
+        """Rows before without a match, ascending."""
+        return np.setdiff1d(np.arange(len(self.before)), self.pairs[:, 0])
+
+    @cached_property
+    def gained(self) -> np.ndarray:
+        """Rows after without a match, ascending."""
+        return np.setdiff1d(np.arange(len(self.after)), self.pairs[:, 1])
+
+    @cached_property
+    def weight_change(self) -> np.ndarray:
+        """(p,) weight after less weight before of each pair."""
+        change: np.ndarray = (
+            self.after.weights[self.pairs[:, 1]] - self.before.weights[self.pairs[:, 0]]
+        )
+        return change
+
+    def largest(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """The labels whose weight changed most; a lost or gained one changes from or to 0.
+
+        Returns:
+            (c, 2) rows before and after, -1 for none, and (c,) changes, the largest first; labels
+            whose weight did not change are not among them.
+        """
+        nobody = np.full(len(self.lost), -1), np.full(len(self.gained), -1)
+        rows = np.concatenate([
+            self.pairs,
+            np.stack([self.lost, nobody[0]], axis=1),
+            np.stack([nobody[1], self.gained], axis=1),
+        ])  # fmt: skip
+        change = np.concatenate([
+            self.weight_change, -self.before.weights[self.lost], self.after.weights[self.gained]
+        ])  # fmt: skip
+        first = np.argsort(-np.abs(change), kind="stable")[:count]
+        first = first[change[first] != 0]
+        return rows[first], change[first]
+
+
+def compare_labels(
+    before: RoundLabels, after: RoundLabels, minimum_iou: float = 0.1
+) -> LabelChanges:
+    """Matches labels of the same frame and category, the largest BEV IoU first.
+
+    Args:
+        before: labels of the earlier round.
+        after: labels of the later round.
+        minimum_iou: pairs with a BEV IoU at or below this are different objects.
+
+    Raises:
+        ConfigError: minimum_iou is not in [0, 1).
+    """
+    if not 0 <= minimum_iou < 1:
+        raise ConfigError(f"diff: the least overlap must be in [0, 1), not {minimum_iou}")
+    groups = np.concatenate([_groups(before), _groups(after)])
+    names, group = np.unique(groups, return_inverse=True)
+    of_before, of_after = group[: len(before)], group[len(before) :]
+    order_before, starts_before = _by_group(of_before, len(names))
+    order_after, starts_after = _by_group(of_after, len(names))
+    row, column, iou, _ = overlapping_pairs(
+        before.boxes[order_before], starts_before, after.boxes[order_after], starts_after
+    )
+    near = iou > minimum_iou
+    row, column, iou = order_before[row[near]], order_after[column[near]], iou[near]
+    first = np.lexsort([column, row, -iou])
+    taken = _take(row[first], column[first], len(before), len(after))
+    kept = first[taken]
+    kept = kept[np.argsort(row[kept])]
+    return LabelChanges(before, after, np.stack([row[kept], column[kept]], axis=1), iou[kept])
+
+
+def _groups(labels: RoundLabels) -> np.ndarray:
+    """(n,) a number per frame and category."""
+    number: np.ndarray = labels.frames.astype(np.int64) * 2**20 + labels.categories
+    return number
+
+
+def _by_group(group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows ordered by their group, and where each group starts."""
+    starts = np.concatenate([[0], np.cumsum(np.bincount(group, minlength=groups))])
+    return np.argsort(group, kind="stable"), starts
+
+
+def _take(rows: np.ndarray, columns: np.ndarray, n: int, m: int) -> np.ndarray:
+    """Indices of pairs in their order, without those of which one label is taken already."""
+    free_row, free_column = [True] * n, [True] * m
+    taken = []
+    for index, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
+        if free_row[row] and free_column[column]:
+            free_row[row] = free_column[column] = False
+            taken.append(index)
+    return np.array(taken, dtype=np.int64)

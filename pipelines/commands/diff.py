@@ -1,0 +1,54 @@
+"""curate diff: what changed between two rounds."""
+
+from typing import Annotated
+
+import typer
+
+from pipelines.commands.options import (
+    JsonOption,
+    PolicyOption,
+    WorkspaceOption,
+    open_workspace,
+    print_json,
+    print_table,
+)
+
+
+def diff(
+    before: Annotated[int, typer.Argument(min=1, help="The earlier round.")],
+    after: Annotated[int, typer.Argument(min=1, help="The later round.")],
+    policy: PolicyOption = None,
+    limit: Annotated[int, typer.Option(min=0, help="How many changed labels to list.")] = 10,
+    workspace: WorkspaceOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare the labels of two rounds: gained, lost, moved, and how their weights changed.
+
+    Labels are matched one to one by BEV IoU within a frame and category. Moved: the boxes overlap
+    by less than 0.7; heavier and lighter: the weight changed by 0.05 or more.
+
+    Example: curate diff 1 2 --policy pspsl
+    """
+    from dataclasses import astuple
+
+    from pipelines.differences import COLUMNS, compare_rounds
+
+    opened = open_workspace(workspace)
+    found = compare_rounds(opened, (before, after), policy or opened.config.run.method, limit)
+    if as_json:
+        print_json(found)
+        return
+    title = f"round {before} to {after}, weights by {found.policy}"
+    print_table(
+        [name.replace("_", " ") for name in COLUMNS],
+        [tuple(row.values()) for row in found.categories],
+        title=title,
+    )
+    if found.labels:
+        names = ("change", "frame", "category", "k", "k after", "IoU", "weight", "weight after")
+        print_table(names, map(astuple, found.labels), title="the most changed labels")
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command."""
+    app.command()(diff)

@@ -1,0 +1,101 @@
+"""What is stored of one frame in a round: labels, repredictions and, outside X_u, ground truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy import func, select
+
+from curate.detections import Detections
+from curate.errors import ConfigError, WorkspaceError
+from curate.viewing.tags import ShownRepredictions
+from db import bulk
+from db.models import BOX_COLUMNS
+from pipelines.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class FrameBoxes:
+    """The boxes of a frame.
+
+    Attributes:
+        split: of the frame.
+        labels: the predictions.
+        weights: (n,) of one policy; 0 where it dropped the label, NaN where it weighted nothing.
+        repredictions: of all views, with the weight of the label that each was matched with.
+        truth_boxes: (m, 7) in the LiDAR frame, NaN for DontCare; None for frames of X_u.
+    """
+
+    split: str
+    labels: Detections
+    weights: np.ndarray
+    repredictions: ShownRepredictions
+    truth_boxes: np.ndarray | None
+
+
+def newest_round(workspace: Workspace) -> int:
+    """The last round that has predictions.
+
+    Raises:
+        WorkspaceError: there is none.
+    """
+    table = bulk.table("prediction")
+    with workspace.database.reading() as connection:
+        number = connection.execute(select(func.max(table.c.round))).scalar_one()
+    if number is None:
+        raise WorkspaceError("no round has predictions yet; run `curate run` or `curate predict`")
+    return int(number)
+
+
+def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) -> FrameBoxes:
+    """The stored boxes of a frame.
+
+    Raises:
+        ConfigError: no frame has that name.
+    """
+    split, key = _find(workspace, name)
+    labels = workspace.predictions(round_number, [key])[key]
+    weights = _weights(workspace, round_number, key, policy, len(labels))
+    truth = None if split == "unlabeled" else workspace.ground_truth(split)[name].boxes
+    return FrameBoxes(
+        split, labels, weights, _repredictions(workspace, round_number, key, weights), truth
+    )
+
+
+def _find(workspace: Workspace, name: str) -> tuple[str, int]:
+    table = bulk.table("frame")
+    query = select(table.c.split, table.c.id).where(table.c.frame == name)
+    with workspace.database.reading() as connection:
+        found = bulk.select(connection, query)
+    if not found:
+        raise ConfigError(f"no frame is named '{name}' here; the table frame lists all of them")
+    return found[0][0], found[0][1]
+
+
+def _weights(
+    workspace: Workspace, round_number: int, key: int, policy: str, count: int
+) -> np.ndarray:
+    """(count,) by k."""
+    table = bulk.table("weight")
+    here = (table.c.round == round_number, table.c.policy == policy, table.c.frame_id == key)
+    with workspace.database.reading() as connection:
+        found = bulk.select(connection, select(table.c.k, table.c.v).where(*here))
+    weights = np.full(count, 0.0 if found else np.nan)
+    for k, v in found:
+        weights[k] = v
+    return weights
+
+
+def _repredictions(
+    workspace: Workspace, round_number: int, key: int, weights: np.ndarray
+) -> ShownRepredictions:
+    table = bulk.table("reprediction")
+    query = (
+        select(table.c.matched_k, *(table.c[name] for name in BOX_COLUMNS))
+        .where(table.c.round == round_number, table.c.frame_id == key)
+        .order_by(table.c.view, table.c.k)
+    )
+    with workspace.database.reading() as connection:
+        rows = bulk.select(connection, query)
+    boxes = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 7)
+    own = [0.0 if row[0] is None else float(weights[row[0]]) for row in rows]
+    return ShownRepredictions(boxes, np.array(own, dtype=np.float64))

@@ -1,0 +1,7 @@
+-- The age parameter lambda and the losses it was held against, per round and policy (Eq. 4).
+SELECT round, policy, count(*) AS labels, count(loss) AS matched,
+       min(loss) AS least_loss, avg(loss) AS mean_loss, max(loss) AS greatest_loss,
+       min(lambda_u) AS least_lambda, max(lambda_u) AS greatest_lambda
+FROM weighted_labels
+GROUP BY round, policy
+ORDER BY round, policy

@@ -1,0 +1,5 @@
+-- Labels that the detector is sure of and the weight is not: high score, low weight.
+SELECT round, policy, frame, k, category, score, loss, points, rho_diff, rho_anno, weight
+FROM weighted_labels
+WHERE score >= 0.5 AND weight < 0.2
+ORDER BY score - weight DESC, round, policy, frame, k

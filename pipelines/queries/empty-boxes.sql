@@ -1,0 +1,5 @@
+-- Labels with hardly a LiDAR point inside, although the detector gives them a score above 0.3.
+SELECT DISTINCT round, frame, k, category, score, points, points_threshold, x, y
+FROM weighted_labels
+WHERE points < 5 AND score > 0.3
+ORDER BY score DESC, round, frame, k

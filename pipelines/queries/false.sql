@@ -1,0 +1,5 @@
+-- False detections of val frames, the surest first, after `curate evaluate --store` (working database).
+SELECT source, frame, k, category, score, iou, x, y, length, width
+FROM evaluation
+WHERE side = 'detection' AND outcome = 'fp'
+ORDER BY score DESC, source, frame, k

@@ -1,0 +1,15 @@
+-- Labels with a weight above 0, per category and distance from the LiDAR.
+WITH placed AS (
+    SELECT round, policy, category, weight,
+           CASE WHEN x * x + y * y < 400 THEN '00-20 m'
+                WHEN x * x + y * y < 1600 THEN '20-40 m'
+                WHEN x * x + y * y < 3600 THEN '40-60 m'
+                ELSE '60 m and more' END AS distance
+    FROM weighted_labels
+)
+SELECT round, policy, category, distance, count(*) AS labels,
+       sum(CASE WHEN weight > 0 THEN 1 ELSE 0 END) AS kept, sum(weight) AS weight,
+       avg(weight) AS mean_weight
+FROM placed
+GROUP BY round, policy, category, distance
+ORDER BY round, policy, category, distance

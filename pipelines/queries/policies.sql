@@ -1,0 +1,7 @@
+-- The policies of a round side by side: how much each keeps of the same labels.
+SELECT round, policy, category, count(*) AS labels,
+       sum(CASE WHEN weight > 0 THEN 1 ELSE 0 END) AS kept,
+       sum(CASE WHEN weight > 0.5 THEN 1 ELSE 0 END) AS trusted, sum(weight) AS weight
+FROM weighted_labels
+GROUP BY round, policy, category
+ORDER BY round, category, policy

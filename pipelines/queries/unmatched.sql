@@ -1,0 +1,7 @@
+-- Labels that no reprediction matched, per category: no evidence, hence weight 0 in SPSL and PSPSL.
+SELECT round, policy, category, count(*) AS labels, count(*) - count(loss) AS unmatched,
+       avg(CASE WHEN loss IS NULL THEN score END) AS mean_score_unmatched,
+       avg(CASE WHEN loss IS NOT NULL THEN score END) AS mean_score_matched
+FROM weighted_labels
+GROUP BY round, policy, category
+ORDER BY round, policy, category

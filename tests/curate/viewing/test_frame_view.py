@@ -1,0 +1,80 @@
+"""Tests of the picture of a whole frame, and of its line styles."""
+
+import numpy as np
+import pytest
+from toys import toy_calibration
+
+from curate.errors import DataError
+from curate.frames import Frame
+from curate.viewing.canvas import Canvas, jpeg
+from curate.viewing.frame_view import draw_frame
+from curate.viewing.palette import UNWEIGHTED, weight_colours
+from curate.viewing.tags import ShownLabels, ShownRepredictions
+
+BOX = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3]])
+
+
+def frame(image=True):
+    """A grey frame without points."""
+    picture = np.full((40, 120, 3), 90, np.uint8) if image else None
+    return Frame("000000", np.zeros((0, 4), np.float32), toy_calibration(), (120, 40), picture)
+
+
+def shown(weight):
+    """One car."""
+    return ShownLabels(BOX, np.array(["Car"]), np.array([0.9]), np.array([weight]), np.array([7]))
+
+
+def has(picture, colour):
+    """Whether some pixel is nearly of a colour."""
+    return (np.abs(picture.astype(int) - np.array(colour)).max(axis=2) < 12).any()
+
+
+def test_image_and_bird_eye_are_one_picture():
+    """As wide as the overlay; truth and repredictions add to what is drawn."""
+    plain = draw_frame(frame(), shown(0.9))
+    assert plain.shape[1] == 1200
+    moved = BOX + np.array([3.0, 3, 0, 0, 0, 0, 0])
+    truth = draw_frame(frame(), shown(0.9), moved)
+    both = draw_frame(
+        frame(), shown(0.9), moved, ShownRepredictions(moved - 6 * (np.arange(7) == 1), np.zeros(1))
+    )
+    assert plain.shape == truth.shape == both.shape
+    for one, other in ((plain, truth), (truth, both)):
+        changed = (one != other).any(axis=2)
+        half = len(plain) // 2
+        assert changed[:half].any()
+        assert changed[half:-60].any()
+
+
+def test_a_label_without_weight_has_its_own_colour():
+    """NaN is neither ignored nor trusted."""
+    assert has(draw_frame(frame(), shown(np.nan)), UNWEIGHTED)
+    assert not has(draw_frame(frame(), shown(0.9)), UNWEIGHTED)
+    assert weight_colours(np.array([np.nan]))[0].tolist() == list(UNWEIGHTED)
+
+
+def test_without_an_image_there_is_no_picture():
+    """The error names the frame."""
+    with pytest.raises(DataError, match="000000"):
+        draw_frame(frame(image=False), shown(0.5))
+
+
+def test_dashes_leave_gaps_and_end_with_the_picture():
+    """Half of the pixels of a line; a stroke that starts far outside still crosses the picture."""
+    canvas = Canvas(200, 20, (0, 0, 0))
+    canvas.dashes(np.array([[[-100_000.0, 10], [100_000, 10]]]), (255, 255, 255), 1.0, (5.0, 5.0))
+    row = canvas.finish()[10, :, 0] > 100
+    assert 0.35 < row.mean() < 0.65
+    assert 15 <= np.count_nonzero(np.diff(row.astype(int)) == 1) <= 21
+    canvas = Canvas(20, 20, (0, 0, 0))
+    outside = np.array([[[30.0, 5], [40, 9]], [[5, 5], [5, 5]], [[-5, -5], [-5, 30]]])
+    canvas.dashes(outside, (255, 255, 255), 1.0, (5.0, 5.0))
+    assert not canvas.finish().any()
+
+
+def test_a_jpeg_is_smaller_than_its_pixels():
+    """And starts as one does."""
+    content = jpeg(np.full((64, 64, 3), 120, np.uint8))
+    assert content[:2] == b"\xff\xd8"
+    assert len(content) < 2000
