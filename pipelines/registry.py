@@ -127,6 +127,11 @@ EXPORTERS = Registry(
     {
         "sqlite": "curate.exporters.sqlite:SqliteExporter",
         "kitti": "curate.exporters.kitti:KittiExporter",
+        "csv": "curate.exporters.comma_separated:CsvExporter",
+        "coco": "curate.exporters.coco:CocoExporter",
+        "openpcdet": "curate.exporters.openpcdet:OpenPCDetExporter",
+        "st3d": "curate.exporters.st3d:ST3DExporter",
+        "mmdet3d": "curate.exporters.mmdet3d:MMDet3DExporter",
     },
 )
 EXECUTORS = Registry(

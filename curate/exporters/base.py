@@ -57,6 +57,7 @@ class LabelSet:
         ground_truth: rows of `GROUND_TRUTH_COLUMNS`, of labeled frames.
         labels: rows of `WEIGHTED_LABEL_COLUMNS`, of unlabeled frames, by frame and k.
         read: calibration and image size of a frame, for formats in the camera's frame.
+        read_points: the same with the frame's points, for formats that carry objects' points.
 
     Raises:
         LeakageError: ground truth of a frame that is not labeled, or a frame of another split.
@@ -68,6 +69,7 @@ class LabelSet:
     ground_truth: Sequence[Row]
     labels: Sequence[Row]
     read: Callable[[str], Frame]
+    read_points: Callable[[str], Frame]
 
     def __post_init__(self) -> None:
         """Checks the splits."""

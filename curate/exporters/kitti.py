@@ -11,10 +11,9 @@ metres, yaw in radians). Only there do ignored labels keep their category and th
 DIRECTORY/export.json marks the folder as an export; nothing but a former export is overwritten.
 """
 
-import json
-import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
@@ -25,11 +24,11 @@ from curate.datasets.kitti_labels import DONT_CARE, from_detections, write_objec
 from curate.detections import Detections
 from curate.errors import ConfigError, DataError
 from curate.exporters.base import BOX_COLUMNS, WEIGHTED_LABEL_COLUMNS, LabelSet, Row
+from curate.exporters.folder import write_folder
 from curate.frames import Calibration
 
 LastField = Literal["weight", "score", "none"]
 
-_MARKER = "export.json"
 _FORMAT = "curate weighted labels, KITTI"
 
 
@@ -86,16 +85,8 @@ def export_kitti(
     """
     if last_field not in get_args(LastField):
         raise ConfigError(f"last field {last_field!r}: use one of {', '.join(get_args(LastField))}")
-    _refuse_foreign(directory)
-    directory.parent.mkdir(parents=True, exist_ok=True)
-    partial = directory.with_name(f".{directory.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of an export that was killed
-    try:
-        count = _write_frames(partial, frames, last_field)
-        _take_place(partial, directory)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return count
+    fill = partial(_write_frames, frames=frames, last_field=last_field)
+    return int(write_folder(directory, _FORMAT, fill)["labels"])
 
 
 def _weighted_frames(labels: LabelSet) -> Iterator[WeightedFrame]:
@@ -116,7 +107,9 @@ def _weighted_frames(labels: LabelSet) -> Iterator[WeightedFrame]:
         )
 
 
-def _write_frames(folder: Path, frames: Iterable[WeightedFrame], last_field: LastField) -> int:
+def _write_frames(
+    folder: Path, frames: Iterable[WeightedFrame], last_field: LastField
+) -> dict[str, str | int]:
     for part in ("label_2", "weight"):
         (folder / part).mkdir(parents=True)
     labels, seen = 0, set()
@@ -126,9 +119,7 @@ def _write_frames(folder: Path, frames: Iterable[WeightedFrame], last_field: Las
         seen.add(frame.frame_id)
         _write_frame(folder, frame, last_field)
         labels += len(frame.labels)
-    marker = {"format": _FORMAT, "last_field": last_field, "frames": len(seen), "labels": labels}
-    (folder / _MARKER).write_text(json.dumps(marker, indent=2) + "\n", encoding="utf-8")
-    return labels
+    return {"last_field": last_field, "frames": len(seen), "labels": labels}
 
 
 def _write_frame(folder: Path, frame: WeightedFrame, last_field: LastField) -> None:
@@ -151,25 +142,3 @@ def _write_frame(folder: Path, frame: WeightedFrame, last_field: LastField) -> N
         )
     ]
     (folder / "weight" / name).write_text("".join(lines), encoding="utf-8")
-
-
-def _refuse_foreign(directory: Path) -> None:
-    """ConfigError where something would be lost that is no former export."""
-    if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
-        return
-    try:
-        known = json.loads((directory / _MARKER).read_text(encoding="utf-8"))["format"] == _FORMAT
-    except (OSError, ValueError, TypeError, KeyError):
-        known = False
-    if not known:
-        raise ConfigError(f"{directory}: is there and is no former export; name another folder")
-
-
-def _take_place(partial: Path, directory: Path) -> None:
-    """Moves a finished folder to its place, and what was there out of the way first."""
-    former = partial.with_suffix(".former")
-    shutil.rmtree(former, ignore_errors=True)
-    if directory.exists():
-        directory.rename(former)
-    partial.rename(directory)
-    shutil.rmtree(former, ignore_errors=True)

@@ -11,7 +11,10 @@ from pipelines.commands.stages import run_round_command
 
 def export(
     file_format: Annotated[
-        str, typer.Option("--format", help="sqlite, kitti or module:Class.")
+        str,
+        typer.Option(
+            "--format", help="sqlite, csv, coco, kitti, openpcdet, st3d, mmdet3d or module:Class."
+        ),
     ] = "sqlite",
     output: Annotated[
         Optional[Path],  # noqa: UP045
@@ -22,7 +25,7 @@ def export(
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the weighted labels: one SQLite file, or KITTI label files.
+    """Write the weighted labels in the format of a trainer; docs/training.md tells them apart.
 
     Example: curate export --format sqlite
     """

@@ -85,7 +85,7 @@ def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:
         frames = _frames(connection, {label[1] for label in labels})
         truth = _ground_truth(connection)
     read = partial(workspace.dataset.read, points=False)
-    return LabelSet(description, frames, truth, labels, read)
+    return LabelSet(description, frames, truth, labels, read, workspace.dataset.read)
 
 
 def _labels(connection: Connection, round_number: int, policy: str) -> Sequence[bulk.Row]:

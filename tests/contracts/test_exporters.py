@@ -1,5 +1,8 @@
 """What every registered exporter promises."""
 
+import csv
+import json
+import pickle
 import sqlite3
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -13,7 +16,12 @@ from toys import SIZES
 
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, DataError, LeakageError
-from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelFileDescription, LabelSet
+from curate.exporters.base import (
+    BOX_COLUMNS,
+    WEIGHTED_LABEL_COLUMNS,
+    LabelFileDescription,
+    LabelSet,
+)
 from pipelines.registry import EXPORTERS
 
 # Labels by frame: category, x, y, z, length, width, height, yaw, weight, in the order of k.
@@ -43,8 +51,80 @@ def read_kitti(path: Path) -> Written:
     return found
 
 
+def read_csv(path: Path) -> Written:
+    """The rows of the file, whose frames are those that have labels."""
+    found: dict[str, list[tuple]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            numbers = tuple(float(row[name]) for name in (*BOX_COLUMNS, "weight"))
+            found.setdefault(row["frame"], []).append((row["category"], *numbers))
+    return found
+
+
+def read_coco(path: Path) -> Written:
+    """The annotations of the unlabeled images."""
+    document = json.loads(path.read_text())
+    names = {category["id"]: category["name"] for category in document["categories"]}
+    images = {image["id"]: image for image in document["images"] if image["split"] == "unlabeled"}
+    found: dict[str, list[tuple]] = {image["frame"]: [] for image in images.values()}
+    for each in document["annotations"]:
+        if each["image_id"] in images:
+            row = (names[each["category_id"]], *each["box_3d"], each["weight"])
+            found[images[each["image_id"]]["frame"]].append(row)
+    return found
+
+
+def read_openpcdet(path: Path) -> Written:
+    """The annos of the unlabeled frames."""
+    infos = pickle.loads((path / "kitti_infos_train.pkl").read_bytes())
+    found = {}
+    for info in infos:
+        annos, name = info["annos"], info["image"]["image_idx"]
+        rows = np.column_stack([annos["gt_boxes_lidar"], annos["weight"]]).tolist()
+        found[name] = [(c, *row) for c, row in zip(annos["category"], rows, strict=True)]
+    return {name: rows for name, rows in found.items() if name != "000000"}
+
+
+def read_st3d(path: Path) -> Written:
+    """Boxes of single precision; the sign of the category says what is ignored."""
+    found = {}
+    for name, frame in pickle.loads((path / "ps_label_e0.pkl").read_bytes()).items():
+        boxes, weights = frame["gt_boxes"], frame["weight"]
+        assert ((boxes[:, 7] < 0) == (weights == 0)).all()
+        categories = [CATEGORIES[int(abs(number)) - 1] for number in boxes[:, 7]]
+        rows = np.column_stack([boxes[:, :7].astype(float), weights]).tolist()
+        found[name] = [(c, *row) for c, row in zip(categories, rows, strict=True)]
+    return found
+
+
+def read_mmdet3d(path: Path) -> Written:
+    """The instances of the unlabeled frames, brought back from the camera's frame."""
+    infos = pickle.loads((path / "kitti_infos_train.pkl").read_bytes())["data_list"]
+    found = {}
+    for info in infos:
+        back = np.linalg.inv(np.array(info["images"]["CAM2"]["lidar2cam"]))
+        rows = []
+        for each in info["instances"]:
+            x, y, z, length, height, width, rotation_y = each["bbox_3d"]
+            centre = (back @ [x, y - height / 2, z, 1])[:3].tolist()
+            yaw = (-rotation_y - np.pi / 2) % (2 * np.pi)
+            yaw = float(yaw - 2 * np.pi if yaw > np.pi else yaw)
+            box = (*centre, length, width, height, yaw)
+            rows.append((each["category"], *box, each["weight"]))
+        found[info["frame"]] = rows
+    return {name: rows for name, rows in found.items() if name != "000000"}
+
+
 # Reads an export back.
-SAMPLES: Mapping[str, Callable[[Path], Written]] = {"sqlite": read_sqlite, "kitti": read_kitti}
+SAMPLES: Mapping[str, Callable[[Path], Written]] = {
+    "sqlite": read_sqlite,
+    "kitti": read_kitti,
+    "csv": read_csv,
+    "coco": read_coco,
+    "openpcdet": read_openpcdet,
+    "st3d": read_st3d,
+    "mmdet3d": read_mmdet3d,
+}
 
 
 @pytest.fixture(params=sorted(EXPORTERS.classes))
@@ -80,6 +160,7 @@ def labels(frames) -> LabelSet:
         ground_truth=[(names[0], 0, "Car", 10.0, 0.0, -0.8, 4.0, 1.8, 1.6, 0.0, 0.0, 0)],
         labels=rows,
         read={frame.frame_id: frame for frame in frames}.__getitem__,
+        read_points={frame.frame_id: frame for frame in frames}.__getitem__,
     )  # fmt: skip
 
 
@@ -116,7 +197,7 @@ def test_every_label_arrives_with_its_weight(exporter, read_back, labels, tmp_pa
         expected = [row for row in labels.labels if row[1] == name]
         assert [row[0] for row in rows] == [row[3] for row in expected]
         numbers = [(*row[4:11], row[-1]) for row in expected]
-        np.testing.assert_allclose([row[1:] for row in rows], numbers, atol=1e-6)
+        np.testing.assert_allclose([row[1:] for row in rows], numbers, atol=2e-6)
 
 
 def test_the_same_labels_make_the_same_files(exporter, labels, tmp_path) -> None:

@@ -73,9 +73,9 @@ def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_pa
     assert (code, out) == (0, f"18 labels in {copy}\n")
     with closing(sqlite3.connect(copy)) as connection:
         assert connection.execute("SELECT count(*) FROM weighted_labels").fetchone() == (18,)
-    code, _, err = curate("export", "--format", "coco", *folder)
+    code, _, err = curate("export", "--format", "yolo", *folder)
     assert code == ConfigError.exit_code
-    assert "unknown exporter 'coco': use one of kitti, sqlite" in err
+    assert "unknown exporter 'yolo': use one of coco, csv, kitti," in err
 
 
 def test_what_is_no_export_is_not_overwritten(

@@ -141,7 +141,7 @@ def test_missing_columns_and_files_are_named(tmp_path):
 def test_workers_can_have_a_copy(tmp_path):
     """It answers the same after a trip to another process."""
     detector = RecordedDetector(write(tmp_path / "a.csv", PLAIN, MOVED))
-    copy = pickle.loads(pickle.dumps(detector))  # noqa: S301 - our own bytes
+    copy = pickle.loads(pickle.dumps(detector))
     np.testing.assert_array_equal(
         copy.predict(frame("000001")).boxes, detector.predict(frame("000001")).boxes
     )

@@ -1,0 +1,92 @@
+"""Exports that are a folder: whole or not there, and nothing replaced but a former export.
+
+DIRECTORY/export.json marks the folder as an export and says in which format.
+"""
+
+import json
+import pickle
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curate.errors import ConfigError
+
+_MARKER = "export.json"
+# Read by every Python 3 that a training framework still runs on.
+_PICKLE_PROTOCOL = 4
+
+
+def write_folder(
+    directory: Path, format_name: str, fill: Callable[[Path], Mapping[str, Any]]
+) -> Mapping[str, Any]:
+    """Writes an export folder, whole or not at all; a former export in its place is replaced.
+
+    Args:
+        directory: absent, empty, or a former export of the same format.
+        format_name: what the marker says.
+        fill: writes the content into an existing folder; what it returns goes into the marker.
+
+    Returns:
+        What `fill` returned.
+
+    Raises:
+        ConfigError: the directory holds something else.
+    """
+    _refuse_foreign(directory, format_name)
+    partial = directory.with_name(f".{directory.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of an export that was killed
+    try:
+        partial.mkdir(parents=True)
+        facts = fill(partial)
+        marker = json.dumps({"format": format_name, **facts}, indent=2)
+        (partial / _MARKER).write_text(marker + "\n", encoding="utf-8")
+        _take_place(partial, directory)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return facts
+
+
+def write_pickle(path: Path, value: Any) -> None:
+    """Writes plain containers of numpy arrays so that any numpy reads them.
+
+    numpy 2 names a module in its own pickles that releases before 1.26 do not have, and these are
+    what the frameworks that read such files run on.
+    """
+    with path.open("wb") as stream:
+        _ArrayPickler(stream, protocol=_PICKLE_PROTOCOL).dump(value)
+
+
+class _ArrayPickler(pickle.Pickler):
+    """Arrays as calls of `numpy.ndarray` with shape, type and content."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if type(value) is not np.ndarray:
+            return NotImplemented
+        # Over a bytearray, which unlike bytes leaves the array writable.
+        return np.ndarray, (value.shape, value.dtype.str, bytearray(value.tobytes()))
+
+
+def _refuse_foreign(directory: Path, format_name: str) -> None:
+    """ConfigError where something would be lost that is no former export."""
+    if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
+        return
+    try:
+        marker = json.loads((directory / _MARKER).read_text(encoding="utf-8"))
+        known = marker["format"] == format_name
+    except (OSError, ValueError, TypeError, KeyError):
+        known = False
+    if not known:
+        raise ConfigError(f"{directory}: is there and is no former export; name another folder")
+
+
+def _take_place(partial: Path, directory: Path) -> None:
+    """Moves a finished folder to its place, and what was there out of the way first."""
+    former = partial.with_suffix(".former")
+    shutil.rmtree(former, ignore_errors=True)
+    if directory.exists():
+        directory.rename(former)
+    partial.rename(directory)
+    shutil.rmtree(former, ignore_errors=True)

@@ -1,0 +1,132 @@
+"""Labels as OpenPCDet's KITTI infos and object database, each object with its weight.
+
+Source: OpenPCDet's KITTI data set (github.com/open-mmlab/OpenPCDet). DIRECTORY holds
+
+    kitti_infos_train.pkl    a list with a dict per frame of X_l and X_u: point_cloud, image, calib,
+                             annos
+    kitti_dbinfos_train.pkl  the objects of X_l by category, for its cut-and-paste augmentation
+    gt_database/*.bin        their points, relative to the box centre
+
+Beside OpenPCDet's own arrays `annos` has `weight` (v; 1 for ground truth) and `category`. The
+`name` of a label of weight 0 is DontCare, which OpenPCDet leaves out, so that a trainer that reads
+no weights never takes it for an object; one that does finds what it was in `category`.
+
+Annos are in the rectified camera frame (`location` is the bottom centre, `dimensions` length,
+height, width), `gt_boxes_lidar` is (n, 7) at the box centre in the LiDAR frame. R0_rect is the
+identity and Tr_velo_to_cam the whole way from the LiDAR to the rectified camera.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from curate.datasets.kitti_labels import DONT_CARE, KittiObjects, from_detections
+from curate.exporters.base import LabelSet
+from curate.exporters.folder import write_folder, write_pickle
+from curate.exporters.objects import UNKNOWN, FrameObjects, difficulties, frame_objects
+from curate.frames import Frame
+from curate.geometry.points_in_boxes import points_in_box_mask
+
+_FORMAT = "curate weighted labels, OpenPCDet"
+_DATABASE = "gt_database"
+Info = dict[str, Any]
+
+
+class OpenPCDetExporter:
+    """An `Exporter` that writes OpenPCDet's infos and dbinfos."""
+
+    name: ClassVar[str] = "openpcdet"
+    suffix: ClassVar[str] = ""
+
+    def write(self, path: Path, labels: LabelSet) -> int:
+        """See `curate.exporters.base.Exporter`.
+
+        Raises:
+            DataError: the calibration, the image or the points of a frame cannot be read.
+        """
+        return int(write_folder(path, _FORMAT, partial(_fill, labels=labels))["labels"])
+
+
+def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
+    infos: list[Info] = []
+    database: dict[str, list[Info]] = {}
+    (folder / _DATABASE).mkdir()
+    for objects in frame_objects(labels):
+        read = labels.read_points if objects.labeled else labels.read
+        frame = read(objects.frame_id)
+        info = _info(objects, frame)
+        if objects.labeled:
+            _cut_out(folder, frame, info["annos"], database)
+        infos.append(info)
+    write_pickle(folder / "kitti_infos_train.pkl", infos)
+    write_pickle(folder / "kitti_dbinfos_train.pkl", database)
+    return {"frames": len(infos), "labels": len(labels.labels)}
+
+
+def _info(objects: FrameObjects, frame: Frame) -> Info:
+    width, height = frame.image_size
+    square = np.array([[0.0, 0, 0, 1]])
+    shown = from_detections(objects.detections, frame.calibration, frame.image_size)
+    return {
+        "point_cloud": {"num_features": 4, "lidar_idx": objects.frame_id},
+        "image": {
+            "image_idx": objects.frame_id,
+            "image_shape": np.array([height, width], dtype=np.int32),
+        },
+        "calib": {
+            "P2": np.concatenate([frame.calibration.projection, square]),
+            "R0_rect": np.eye(4),
+            "Tr_velo_to_cam": np.asarray(frame.calibration.lidar_to_camera),
+        },
+        "annos": _annos(objects, shown),
+    }
+
+
+def _annos(objects: FrameObjects, shown: KittiObjects) -> Info:
+    """The arrays of a frame's objects, all of the same length."""
+    found, count = objects.detections, len(objects.detections)
+    names = np.where(objects.weights == 0, DONT_CARE, found.categories)
+    return {
+        "name": names,
+        "category": found.categories,
+        "weight": objects.weights,
+        "truncated": objects.truncated,
+        "occluded": objects.occluded,
+        "alpha": shown.alpha,
+        "bbox": shown.boxes_2d,
+        "dimensions": shown.dimensions[:, [2, 0, 1]],
+        "location": shown.locations,
+        "rotation_y": shown.rotations_y,
+        "score": np.full(count, float(UNKNOWN)) if objects.labeled else found.scores,
+        "difficulty": difficulties(shown.boxes_2d, objects.truncated, objects.occluded),
+        "index": np.arange(count, dtype=np.int32),
+        "gt_boxes_lidar": found.boxes,
+        "num_points_in_gt": objects.points.astype(np.int32),
+    }
+
+
+def _cut_out(folder: Path, frame: Frame, annos: Info, database: dict[str, list[Info]]) -> None:
+    """Writes the points of a labeled frame's objects, and counts them in its annos."""
+    for k, box in enumerate(annos["gt_boxes_lidar"]):
+        points = frame.points[points_in_box_mask(frame.points, box)].astype(np.float32)
+        points[:, :3] -= box[:3].astype(np.float32)
+        annos["num_points_in_gt"][k] = len(points)
+        category = str(annos["category"][k])
+        path = f"{_DATABASE}/{frame.frame_id}_{category}_{k}.bin"
+        points.tofile(folder / path)
+        entry = {
+            "name": category,
+            "path": path,
+            "image_idx": frame.frame_id,
+            "gt_idx": k,
+            "box3d_lidar": box,
+            "num_points_in_gt": len(points),
+            "difficulty": int(annos["difficulty"][k]),
+            "bbox": annos["bbox"][k],
+            "score": float(annos["score"][k]),
+            "weight": float(annos["weight"][k]),
+        }
+        database.setdefault(category, []).append(entry)

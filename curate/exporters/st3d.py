@@ -1,0 +1,82 @@
+"""Weighted labels as the pseudo-label file of ST3D and MS3D.
+
+Source: Yang et al., "ST3D", CVPR 2021, and Tsai et al., "MS3D", RA-L 2023, with their code
+(github.com/CVMI-Lab/ST3D, github.com/darrenjkt/MS3D). DIRECTORY/ps_label_e0.pkl, the file that
+SELF_TRAIN.INIT_PS names, is a dict by frame id of X_u:
+
+    gt_boxes        (n, 9) float32: x, y, z of the box centre, length, width, height, yaw in the
+                    LiDAR frame; category, from 1 in the order of the configured categories, and
+                    negative for a label of weight 0, which is an ignore region; score
+    cls_scores      (n,) float32, the score
+    iou_scores      None
+    memory_counter  (n,) zeros: no round has missed the label yet
+    weight          (n,) v, to be read by the loss
+
+A data set configuration with SHIFT_COOR works in shifted coordinates: the boxes here are not
+shifted.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from curate.errors import DataError
+from curate.exporters.base import LabelSet
+from curate.exporters.folder import write_folder, write_pickle
+from curate.exporters.objects import FrameObjects, frame_objects
+
+_FORMAT = "curate weighted labels, ST3D"
+
+
+class ST3DExporter:
+    """An `Exporter` that writes ST3D's and MS3D's pseudo-labels."""
+
+    name: ClassVar[str] = "st3d"
+    suffix: ClassVar[str] = ""
+
+    def write(self, path: Path, labels: LabelSet) -> int:
+        """See `curate.exporters.base.Exporter`.
+
+        Raises:
+            DataError: a label's category is not among the configured ones.
+        """
+        return int(write_folder(path, _FORMAT, partial(_fill, labels=labels))["labels"])
+
+
+def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
+    categories = labels.description.categories
+    frames = {
+        objects.frame_id: _pseudo_labels(objects, categories)
+        for objects in frame_objects(labels)
+        if not objects.labeled
+    }
+    write_pickle(folder / "ps_label_e0.pkl", frames)
+    return {
+        "frames": len(frames),
+        "labels": len(labels.labels),
+        "categories": list(categories),
+    }
+
+
+def _pseudo_labels(objects: FrameObjects, categories: tuple[str, ...]) -> dict[str, Any]:
+    found = objects.detections
+    numbers = {name: number for number, name in enumerate(categories, start=1)}
+    strangers = sorted(set(found.categories.tolist()) - set(numbers))
+    if strangers:
+        raise DataError(
+            f"frame {objects.frame_id}: category {strangers[0]!r} has no number; "
+            f"dataset.categories names {', '.join(categories)}"
+        )
+    order = np.array([numbers[str(name)] for name in found.categories], dtype=np.float64)
+    order = np.where(objects.weights == 0, -order, order)
+    boxes = np.column_stack([found.boxes, order, found.scores])
+    return {
+        "gt_boxes": boxes.astype(np.float32),
+        "cls_scores": found.scores.astype(np.float32),
+        "iou_scores": None,
+        "memory_counter": np.zeros(len(found)),
+        "weight": objects.weights,
+    }

@@ -1,0 +1,35 @@
+"""Weighted labels as ST3D's pseudo-labels."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exported import BOXES, SCORES, WEIGHTS, toy_labels
+
+from curate.errors import DataError
+from curate.exporters.st3d import ST3DExporter
+
+
+def test_pseudo_labels_come_back_with_their_weights(tmp_path):
+    """Of unlabeled frames only; the category counts from 1 and is negative where v = 0."""
+    assert ST3DExporter().write(tmp_path / "out", toy_labels()) == 3
+    frames = pickle.loads((tmp_path / "out" / "ps_label_e0.pkl").read_bytes())
+    assert list(frames) == ["000001"]
+    boxes = frames["000001"]["gt_boxes"]
+    assert (boxes.shape, boxes.dtype) == ((3, 9), np.float32)
+    assert boxes[:, :7] == pytest.approx(np.array(BOXES), abs=1e-5)
+    assert boxes[:, 7].tolist() == [1, -2, 1]
+    assert boxes[:, 8] == pytest.approx(np.array(SCORES))
+    assert frames["000001"]["weight"].tolist() == list(WEIGHTS)
+    assert frames["000001"]["memory_counter"].tolist() == [0, 0, 0]
+    assert frames["000001"]["cls_scores"] == pytest.approx(np.array(SCORES))
+
+
+def test_a_category_without_a_number_is_refused(tmp_path):
+    """The error names the frame and what is configured."""
+    labels = toy_labels()
+    fewer = replace(labels, description=replace(labels.description, categories=("Car",)))
+    with pytest.raises(DataError, match="frame 000001: category 'Pedestrian' has no number"):
+        ST3DExporter().write(tmp_path / "out", fewer)
+    assert list(tmp_path.iterdir()) == []
