@@ -81,6 +81,8 @@ DATASETS = Registry(
     "dataset",
     {
         "kitti": "curate.datasets.kitti:KittiDataset",
+        "kitti-raw": "curate.datasets.kitti_raw:KittiRawDataset",
+        "folder": "curate.datasets.folder:FolderDataset",
     },
 )
 DETECTORS = Registry(

@@ -55,7 +55,7 @@ class KittiDataset:
 
     @cached_property
     def _frame_ids(self) -> tuple[str, ...]:
-        return tuple(sorted(path.stem for path in _visible(self._home / "velodyne", "*.bin")))
+        return tuple(sorted(path.stem for path in visible_files(self._home / "velodyne", "*.bin")))
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """The lists of ROOT/ImageSets, by file name; they may name frames that are not there.
@@ -66,10 +66,12 @@ class KittiDataset:
         Raises:
             DataError: a list names something that is no frame id.
         """
-        lists = {path.stem: path for path in sorted(_visible(self.root / "ImageSets", "*.txt"))}
+        lists = {
+            path.stem: path for path in sorted(visible_files(self.root / "ImageSets", "*.txt"))
+        }
         if self._home != self.root and "test" in lists:
             _log.info("%s: left out, it names frames of testing/", lists.pop("test"))
-        return {name: _read_frame_list(path) for name, path in lists.items()}
+        return {name: read_frame_list(path) for name, path in lists.items()}
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie; `label` is None where there is no label file.
@@ -77,7 +79,7 @@ class KittiDataset:
         Raises:
             DataError: the name would lead out of the data set.
         """
-        _check_frame_id(frame_id)
+        check_frame_id(frame_id)
         images = [self._home / "image_2" / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
         label = self._home / "label_2" / f"{frame_id}.txt"
         return FrameFiles(
@@ -120,7 +122,7 @@ def read_points(path: Path) -> np.ndarray:
     Raises:
         DataError: the file is missing or truncated, or holds NaN or infinite numbers.
     """
-    content = _read_bytes(path, "velodyne")
+    content = read_bytes(path, "velodyne")
     if len(content) % POINT_BYTES:
         raise DataError(
             f"{path}: {len(content)} bytes are no multiple of {POINT_BYTES} "
@@ -145,11 +147,11 @@ def read_calibration(path: Path) -> Calibration:
             entries, or is not finite.
     """
     matrices: dict[str, np.ndarray] = {}
-    text = _read_bytes(path, "calibration").decode("utf-8", errors="replace")
+    text = read_bytes(path, "calibration").decode("utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), start=1):
         key, _, entries = line.partition(":")
         if key in CALIBRATION_SHAPES:
-            matrices[key] = _parse_matrix(entries, CALIBRATION_SHAPES[key], f"{path}:{number}")
+            matrices[key] = parse_matrix(entries, CALIBRATION_SHAPES[key], f"{path}:{number}")
     missing = [key for key in CALIBRATION_SHAPES if key not in matrices]
     if missing:
         raise DataError(f"{path}: no line {' and no line '.join(f'{key}:' for key in missing)}")
@@ -179,7 +181,8 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     replace_file(path, "".join(lines).encode())
 
 
-def _parse_matrix(entries: str, shape: tuple[int, int], place: str) -> np.ndarray:
+def parse_matrix(entries: str, shape: tuple[int, int], place: str) -> np.ndarray:
+    """A matrix from the numbers of a calibration line; DataError at `place` where it is none."""
     try:
         numbers = np.array([float(entry) for entry in entries.split()])
     except ValueError as error:
@@ -191,31 +194,33 @@ def _parse_matrix(entries: str, shape: tuple[int, int], place: str) -> np.ndarra
     return numbers.reshape(shape)
 
 
-def _visible(folder: Path, pattern: str) -> Iterator[Path]:
+def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
     """The files of a folder without hidden ones: macOS strews ._ files over foreign disks."""
     return (path for path in folder.glob(pattern) if not path.name.startswith("."))
 
 
-def _read_frame_list(path: Path) -> tuple[str, ...]:
+def read_frame_list(path: Path) -> tuple[str, ...]:
+    """The frame ids of a text file, one per line; DataError for what is no frame id."""
     names: list[str] = []
-    text = _read_bytes(path, "frame list").decode("utf-8", errors="replace")
+    text = read_bytes(path, "frame list").decode("utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip():
             try:
-                _check_frame_id(line.strip())
+                check_frame_id(line.strip())
             except DataError as error:
                 raise DataError(f"{path}:{number}: {error}") from None
             names.append(line.strip())
     return tuple(names)
 
 
-def _check_frame_id(frame_id: str) -> None:
+def check_frame_id(frame_id: str) -> None:
     """DataError where the id could lead out of the data set's folders."""
     if not frame_id or frame_id.startswith(".") or {"/", "\\", "\0"} & set(frame_id):
         raise DataError(f"{frame_id!r} is no frame id: it must be a plain file name such as 000008")
 
 
-def _read_bytes(path: Path, kind: str) -> bytes:
+def read_bytes(path: Path, kind: str) -> bytes:
+    """The content of a file; DataError with its kind where it is missing."""
     try:
         return path.read_bytes()
     except FileNotFoundError:

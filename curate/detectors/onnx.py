@@ -1,9 +1,9 @@
 """Any 3D detector that was exported to ONNX, by a small declared mapping of inputs and outputs.
 
 The model takes the points of a sweep, [n, 3 or 4] or [1, n, 3 or 4] float32 (x, y, z,
-intensity), and answers boxes [n, >=7] or [1, n, >=7] with either scores and labels [n], or scores per class
-[n, classes]. Voxels before and anchors after it, where the export left them out, are the business
-of two functions that the user names as `package.module:function`.
+intensity), and answers boxes [n, >=7] or [1, n, >=7] with either scores and labels [n], or scores
+per class [n, classes]. Voxels before and anchors after it, where the export left them out, are the
+business of two functions that the user names as `package.module:function`.
 """
 
 import importlib
@@ -115,7 +115,7 @@ class OnnxDetector:
         names = [one.name for one in self._session.get_outputs()]
         try:
             return dict(zip(names, self._session.run(None, dict(inputs)), strict=True))
-        except (*runtime_errors(), ValueError) as error:
+        except runtime_errors() as error:
             raise ModelError(f"{self.model}: {first_line(error)}") from error
 
     def _detections(self, named: Mapping[str, np.ndarray]) -> Detections:
@@ -126,8 +126,8 @@ class OnnxDetector:
             scores = scores[:, 0]
         if labels is None and scores.ndim == 2:
             labels, scores = scores.argmax(axis=1) + self.first_label, scores.max(axis=1)
-        shapes = {"boxes": boxes.shape, "scores": scores.shape, "labels": np.shape(labels)}
-        labels = np.asarray(labels).reshape(-1)
+        labels = np.zeros(0, np.int64) if labels is None else np.asarray(labels).reshape(-1)
+        shapes = {"boxes": boxes.shape, "scores": scores.shape, "labels": labels.shape}
         if (
             boxes.ndim != 2
             or boxes.shape[1] < 7

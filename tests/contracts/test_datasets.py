@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from contracts.samples import assert_one_line, assert_same, sample_of
+from dataset_layouts import write_toy_folder, write_toy_raw
 from toys import write_toy_kitti
 
 from curate.errors import DataError
@@ -15,6 +16,8 @@ from pipelines.registry import DATASETS
 # Writes four frames below a folder, all with label files.
 SAMPLES: Mapping[str, Callable[[Path], None]] = {
     "kitti": lambda root: write_toy_kitti(root, frames=4, val=1),
+    "kitti-raw": write_toy_raw,
+    "folder": write_toy_folder,
 }
 
 
@@ -116,6 +119,8 @@ def test_a_missing_file_is_named(dataset, part: str) -> None:
     """DataError in one line; the other frames can still be read."""
     name, other = dataset.frame_ids()[:2]
     path = getattr(dataset.files(name), part)
+    if path == getattr(dataset.files(other), part):
+        pytest.skip("all frames share it")
     path.unlink()
     with pytest.raises(DataError) as caught:
         dataset.annotations(name) if part == "label" else dataset.read(name, image=True)

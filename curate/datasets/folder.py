@@ -1,0 +1,182 @@
+"""Any folder of point files and images with one calibration, described in ROOT/dataset.toml.
+
+points = "lidar"              # folder of FRAME.bin, .pcd, .ply or .npy
+images = "camera"             # folder of FRAME.png or .jpg
+labels = "label_2"            # optional: KITTI label files of the labeled frames
+splits = "lists"              # optional: folder of train.txt, val.txt
+columns = 4                   # of .bin and .npy files
+intensity_scale = 255.0       # what full intensity is in the files
+
+[calibration]                 # or calibration = "calib.txt", a file in KITTI's form
+projection = [[...], [...], [...]]             # 3 x 4, camera (z forward) to pixels
+lidar_to_camera = [[...], [...], [...]]        # 3 x 4 or 4 x 4, LiDAR (x forward) to camera
+"""
+
+import tomllib
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curate.datasets.clouds import CLOUD_SUFFIXES, read_cloud
+from curate.datasets.images import read_image, read_image_size
+from curate.datasets.kitti import (
+    IMAGE_SUFFIXES,
+    check_frame_id,
+    read_bytes,
+    read_calibration,
+    read_frame_list,
+    visible_files,
+)
+from curate.datasets.kitti_labels import read_objects, to_annotations
+from curate.detections import Annotations
+from curate.errors import DataError
+from curate.frames import Calibration, Frame, FrameFiles
+
+DESCRIPTION = "dataset.toml"
+_TEXTS = ("points", "images", "labels", "splits")
+_KEYS = (*_TEXTS, "columns", "intensity_scale", "calibration")
+
+
+class FolderDataset:
+    """A `Dataset` in a plain folder; its frames are the ones that have a point file.
+
+    Args:
+        root: the folder that holds dataset.toml.
+
+    Raises:
+        DataError: the description is missing or malformed, or names no images (a data set without
+            a camera has no calibration to project boxes with, and is not read).
+    """
+
+    name = "folder"
+
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root)
+        self._path = self.root / DESCRIPTION
+        self._told = _read_description(self._path)
+
+    def frame_ids(self) -> tuple[str, ...]:
+        """All frames with a point file, in sorted order."""
+        return tuple(self._points)
+
+    @cached_property
+    def _points(self) -> Mapping[str, Path]:
+        """The point file of each frame."""
+        found = visible_files(self.root / self._told["points"], "*")
+        paths = sorted(path for path in found if path.suffix.lower() in CLOUD_SUFFIXES)
+        return {path.stem: path for path in paths}
+
+    def splits(self) -> Mapping[str, tuple[str, ...]]:
+        """The lists of the folder `splits`, by file name."""
+        if "splits" not in self._told:
+            return {}
+        lists = sorted(visible_files(self.root / self._told["splits"], "*.txt"))
+        return {path.stem: read_frame_list(path) for path in lists}
+
+    def files(self, frame_id: str) -> FrameFiles:
+        """Where the frame's files lie; the calibration is that of all frames.
+
+        Raises:
+            DataError: there is no such frame.
+        """
+        check_frame_id(frame_id)
+        if frame_id not in self._points:
+            raise DataError(f"{self.root / self._told['points']}: no point file of {frame_id}")
+        folder = self.root / self._told["images"]
+        images = [folder / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
+        calibration = self._told["calibration"]
+        label = self._label(frame_id)
+        return FrameFiles(
+            points=self._points[frame_id],
+            image=next((image for image in images if image.exists()), images[0]),
+            calibration=self.root / calibration if isinstance(calibration, str) else self._path,
+            label=label if label is not None and label.exists() else None,
+        )
+
+    def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
+        """The frame's calibration, its points unless unwanted, and its image where asked for.
+
+        Raises:
+            DataError: a file is missing, damaged or malformed.
+        """
+        files = self.files(frame_id)
+        sweep = np.zeros((0, 4), dtype=np.float32)
+        if points:
+            scale = float(self._told.get("intensity_scale", 1.0))
+            sweep = read_cloud(files.points, int(self._told.get("columns", 4)), scale)
+        pixels = read_image(files.image) if image else None
+        return Frame(frame_id, sweep, self._calibration, read_image_size(files.image), pixels)
+
+    def annotations(self, frame_id: str) -> Annotations:
+        """The frame's ground truth in the LiDAR frame.
+
+        Raises:
+            DataError: there is no label file, or it is malformed.
+        """
+        label = self.files(frame_id).label
+        if label is None:
+            named = self._label(frame_id) or f"{self._path}: names no labels, nor of {frame_id}"
+            raise DataError(f"{named}: no such label file")
+        return to_annotations(read_objects(label, known=None), self._calibration)
+
+    @cached_property
+    def _calibration(self) -> Calibration:
+        told = self._told["calibration"]
+        if isinstance(told, str):
+            return read_calibration(self.root / told)
+        projection = _matrix(self._path, told, "projection", ((3, 4),))
+        extrinsic = np.eye(4)
+        rows = _matrix(self._path, told, "lidar_to_camera", ((3, 4), (4, 4)))
+        extrinsic[: len(rows)] = rows
+        if abs(np.linalg.det(extrinsic)) < 1e-6:
+            raise DataError(f"{self._path}: calibration.lidar_to_camera cannot be inverted")
+        return Calibration(projection, extrinsic)
+
+    def _label(self, frame_id: str) -> Path | None:
+        if "labels" not in self._told:
+            return None
+        return self.root / self._told["labels"] / f"{frame_id}.txt"
+
+
+def _read_description(path: Path) -> Mapping[str, Any]:
+    """What dataset.toml says; DataError where it cannot be."""
+    try:
+        told = tomllib.loads(read_bytes(path, "description").decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not TOML: {error}") from None
+    unknown = sorted(set(told) - set(_KEYS))
+    if unknown:
+        raise DataError(f"{path}: unknown key {unknown[0]}; known are {', '.join(_KEYS)}")
+    for key in ("points", "calibration"):
+        if key not in told:
+            raise DataError(f"{path}: no key {key}")
+    if "images" not in told:
+        raise DataError(
+            f"{path}: no key images; data sets without a camera are not read: which points a "
+            "detector saw, and every 2D box, come from the image and its calibration"
+        )
+    wrong = [key for key in _TEXTS if not isinstance(told.get(key, ""), str)]
+    wrong += [key for key in ("columns", "intensity_scale") if not _positive(told.get(key, 1))]
+    if wrong or not isinstance(told["calibration"], str | dict) or told.get("columns", 4) < 3:
+        raise DataError(f"{path}: {(wrong or ['calibration or columns'])[0]} cannot be that")
+    return told
+
+
+def _positive(value: object) -> bool:
+    return isinstance(value, int | float) and value > 0
+
+
+def _matrix(
+    path: Path, told: Mapping[str, Any], key: str, shapes: tuple[tuple[int, int], ...]
+) -> np.ndarray:
+    try:
+        matrix = np.array(told.get(key, ()), dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape not in shapes or not np.isfinite(matrix).all():
+        known = " or ".join(f"{rows} x {columns}" for rows, columns in shapes)
+        raise DataError(f"{path}: calibration.{key} must be {known} finite numbers")
+    return matrix

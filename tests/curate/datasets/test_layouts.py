@@ -1,0 +1,131 @@
+"""Tests of KITTI raw and of the plain folder: the same frames as in KITTI's object layout."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_layouts import DRIVE, write_cloud, write_toy_folder, write_toy_raw
+from toys import write_toy_kitti
+
+from curate.datasets.clouds import read_cloud
+from curate.datasets.folder import FolderDataset
+from curate.datasets.kitti import KittiDataset, read_calibration
+from curate.datasets.kitti_raw import KittiRawDataset, read_raw_calibration
+from curate.errors import DataError
+
+LAYOUTS = {
+    "raw": (write_toy_raw, KittiRawDataset, f"{DRIVE}_0000"),
+    "folder": (write_toy_folder, FolderDataset, ""),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_frames_are_those_of_kittis_layout(tmp_path, layout):
+    """Points, calibration, image size and ground truth, in every point format."""
+    write, kind, prefix = LAYOUTS[layout]
+    write(tmp_path / "other")
+    write_toy_kitti(tmp_path / "kitti", frames=4)
+    kitti, other = KittiDataset(tmp_path / "kitti"), kind(tmp_path / "other")
+    assert other.frame_ids() == tuple(f"{prefix}{name}" for name in kitti.frame_ids())
+    for name in kitti.frame_ids():
+        expected, found = kitti.read(name, image=True), other.read(f"{prefix}{name}", image=True)
+        np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
+        np.testing.assert_array_equal(found.image, expected.image)
+        one, two = expected.calibration, found.calibration
+        np.testing.assert_allclose(two.lidar_to_image, one.lidar_to_image, atol=1e-12)
+        truth = other.annotations(f"{prefix}{name}")
+        np.testing.assert_allclose(truth.boxes, kitti.annotations(name).boxes, atol=1e-9)
+
+
+def test_a_raw_frame_without_image_is_left_out(tmp_path):
+    """Some drives lack one."""
+    write_toy_raw(tmp_path)
+    image = f"2011_09_26/{DRIVE}/image_02/data/0000000001.png"
+    (tmp_path / image).unlink()
+    assert len(KittiRawDataset(tmp_path).frame_ids()) == 3
+
+
+def test_raw_calibration_is_named_where_it_is_wrong(tmp_path):
+    """Missing file, missing line, wrong count."""
+    write_toy_raw(tmp_path)
+    day = tmp_path / "2011_09_26"
+    (day / "calib_cam_to_cam.txt").write_text("R_rect_00: 1 2 3\n")
+    with pytest.raises(DataError, match=r"cam_to_cam\.txt:1: 3 numbers, expected 3 x 3"):
+        read_raw_calibration(day)
+    (day / "calib_velo_to_cam.txt").write_text("R: 1 0 0 0 1 0 0 0 1\n")
+    with pytest.raises(DataError, match=r"velo_to_cam\.txt: no line T:"):
+        read_raw_calibration(day)
+    (day / "calib_velo_to_cam.txt").unlink()
+    with pytest.raises(DataError, match=r"velo_to_cam\.txt: no such calibration file"):
+        read_raw_calibration(day)
+
+
+@pytest.mark.parametrize(
+    ("line", "other", "message"),
+    [
+        ('images = "camera"\n', "", "no key images; data sets without a camera are not read"),
+        ('points = "lidar"\n', "", "no key points"),
+        ("intensity_scale = 255\n", "intensity_scale = 0\n", "intensity_scale cannot be"),
+        ("intensity_scale = 255\n", "columns = 2\n", "columns cannot be"),
+        ("intensity_scale = 255\n", "rings = 64\n", "unknown key rings; known are points"),
+        ("projection = [[60.0,", "projection = [[", r"calibration\.projection must be 3 x 4"),
+        ("[calibration]\n", "[calibration\n", "not TOML"),
+    ],
+)
+def test_a_wrong_description_is_one_line(tmp_path, line, other, message):
+    """It names the file and the key."""
+    write_toy_folder(tmp_path)
+    path = tmp_path / "dataset.toml"
+    assert line in path.read_text()
+    path.write_text(path.read_text().replace(line, other))
+    with pytest.raises(DataError, match=message) as caught:
+        FolderDataset(tmp_path).read("000000")
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_calibration_may_be_a_kitti_file(tmp_path):
+    """Named instead of written down."""
+    write_toy_folder(tmp_path)
+    calib = tmp_path / "made" / "training" / "calib" / "000000.txt"
+    calib.rename(tmp_path / "calib.txt")
+    (tmp_path / "dataset.toml").write_text(
+        'points = "lidar"\nimages = "camera"\ncalibration = "calib.txt"\n'
+    )
+    dataset = FolderDataset(tmp_path)
+    found = dataset.read("000000", points=False).calibration
+    expected = read_calibration(tmp_path / "calib.txt")
+    np.testing.assert_array_equal(found.lidar_to_image, expected.lidar_to_image)
+    assert dataset.files("000000").label is None
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".npy", ".pcd", ".ply"])
+def test_damaged_point_files_are_named(tmp_path, suffix):
+    """Garbage, in one line."""
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"no points at all!")
+    with pytest.raises(DataError, match=f"a{suffix}: ") as caught:
+        read_cloud(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path):
+    """Organised clouds mark missing returns by NaN."""
+    points = np.array([[1, 2, 3, 100], [np.nan, 0, 0, 0], [4, 5, 6, 300]])
+    write_cloud(tmp_path / "a.npy", points)
+    found = read_cloud(tmp_path / "a.npy", intensity_scale=200)
+    assert found.tolist() == [[1, 2, 3, 0.5], [4, 5, 6, 1]]
+
+
+@pytest.mark.kitti
+def test_real_frames_in_a_plain_folder(kitti_root: Path, tmp_path: Path):
+    """Those of a raw drive, described in three lines, are as KITTI's reader reads them."""
+    raw = kitti_root / "raw"
+    name = KittiDataset(raw).frame_ids()[0]
+    (tmp_path / "dataset.toml").write_text(
+        f'points = "{raw / "velodyne"}"\nimages = "{raw / "image_2"}"\n'
+        f'calibration = "{raw / "calib" / name}.txt"\n'
+    )
+    expected, found = KittiDataset(raw).read(name), FolderDataset(tmp_path).read(name)
+    np.testing.assert_array_equal(found.points, expected.points)
+    assert found.image_size == expected.image_size
