@@ -34,7 +34,7 @@ def test_every_kind_of_change_is_counted_and_listed(curate: Curate, two_rounds: 
     """A car that goes, one that moves a metre, a pedestrian that loses its weight."""
     first, second, third = list(two_rounds.frames("unlabeled").values())[:3]
     k = "(SELECT k FROM prediction WHERE round = 2 AND frame_id = {} AND category = '{}')"
-    car, other, walker = (
+    car, one, walker = (
         k.format(first, "Car"),
         k.format(second, "Car"),
         k.format(third, "Pedestrian"),
