@@ -138,7 +138,7 @@ class FolderDataset:
     def _label(self, frame_id: str) -> Path | None:
         if "labels" not in self._told:
             return None
-        return self.root / self._told["labels"] / f"{frame_id}.txt"
+        return self.root / str(self._told["labels"]) / f"{frame_id}.txt"
 
 
 def _read_description(path: Path) -> Mapping[str, Any]:

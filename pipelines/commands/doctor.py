@@ -1,0 +1,39 @@
+"""curate doctor: is the chain from the sensors to the labels sound?"""
+
+from typing import Annotated, Optional
+
+import typer
+
+from pipelines.commands.options import JsonOption, WorkspaceOption, open_workspace, print_json
+
+
+def doctor(
+    frame: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Argument(help="Frame id; default: the first unlabeled frame."),
+    ] = None,
+    workspace: WorkspaceOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check one frame through the whole chain: data, calibration, boxes and their convention.
+
+    The exit code is 1 where something is wrong. Nothing is stored. Take a frame with near objects.
+
+    Example: curate doctor 000008
+    """
+    from pipelines.examination import examine
+
+    name, findings = examine(open_workspace(workspace), frame)
+    if as_json:
+        print_json({"frame": name, "findings": findings})
+    else:
+        typer.echo(f"frame {name}")
+        for one in findings:
+            typer.echo(f"{one.state:<8} {one.check:<12} {one.message}")
+    if any(one.state == "wrong" for one in findings):
+        raise typer.Exit(1)
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command."""
+    app.command()(doctor)
