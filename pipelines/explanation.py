@@ -186,7 +186,7 @@ def _rho_diff(_config: Config, label: dict[str, Any]) -> float | None:
     if label["points"] is None:
         return None
     threshold: float = label["points_threshold"]
-    return min(label["points"], threshold) / threshold
+    return float(min(label["points"], threshold) / threshold)
 
 
 def _rho_anno(config: Config, label: dict[str, Any]) -> float | None:
