@@ -1,8 +1,10 @@
 """Every number behind one weight, and the weight recomputed from them."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from sqlalchemy import func, select, text
 
 from curate.errors import WorkspaceError
@@ -10,6 +12,7 @@ from curate.weighting.self_paced import easiness
 from db import bulk
 from db.views import WEIGHTED_LABELS
 from pipelines.config import Config
+from pipelines.registry import PRIORS
 from pipelines.workspace import Workspace
 
 
@@ -28,11 +31,46 @@ class View:
 
 
 @dataclass(frozen=True)
+class AgeParameter:
+    """What Eq. 4 takes: lambda = (e/E) hardest + (1 - e/E) mean, never above the maximum.
+
+    Attributes:
+        round: e.
+        rounds: E.
+        scope: whose losses: of the round, the label's category, or its frame.
+        matched: how many losses these are.
+        hardest: their maximum, or the configured quantile.
+        mean: of the losses.
+        lambda_u: recomputed from these.
+    """
+
+    round: int
+    rounds: int
+    scope: str
+    matched: int
+    hardest: float
+    mean: float
+    lambda_u: float
+
+
+@dataclass(frozen=True)
+class Recomputed:
+    """The numbers of a label, each worked out again from those before it; None where unused."""
+
+    loss: float | None
+    rho_diff: float | None
+    rho_anno: float | None
+    rho_det: float
+
+
+@dataclass(frozen=True)
 class Explanation:
     """A row of `weighted_labels`, the views behind its loss, and the weight recomputed."""
 
     label: dict[str, Any]
     views: tuple[View, ...]
+    age: AgeParameter | None
+    evidence: Recomputed
     recomputed: float | None
     lines: tuple[str, ...]
 
@@ -51,9 +89,11 @@ def explain_label(
     """
     label = _label(workspace, frame, k, round_number, policy)
     views = _views(workspace, label["round"], frame, k)
-    recomputed = _weight(label)
-    lines = _lines(workspace.config, label, views, recomputed)
-    return Explanation(label, views, recomputed, tuple(lines))
+    age = _age(workspace, label) if label["lambda_u"] is not None else None
+    evidence = _evidence(workspace.config, label, views)
+    recomputed = _weight(label, evidence, age)
+    lines = _lines(workspace.config, label, views, age, evidence, recomputed)
+    return Explanation(label, views, age, evidence, recomputed, tuple(lines))
 
 
 def _label(
@@ -92,25 +132,101 @@ def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple
         return tuple(View(row[0], bool(row[1]), *row[2:]) for row in rows)
 
 
-def _weight(label: dict[str, Any]) -> float | None:
+def _age(workspace: Workspace, label: dict[str, Any]) -> AgeParameter | None:
+    """Eq. 4 over the losses that share the label's lambda; None without any."""
+    scope, quantile = _schedule(workspace.config, label["policy"])
+    labels, number = WEIGHTED_LABELS.c, bulk.table("round")
+    same = {"round", "policy", *({scope} - {"round"})}
+    query = select(labels.loss).where(
+        *(labels[name] == label[name] for name in same), labels.loss.is_not(None)
+    )
+    rounds = select(number.c.rounds).where(number.c.number == label["round"])
+    with workspace.database.reading() as connection:
+        losses = np.array([row[0] for row in bulk.select(connection, query)])
+        last = int(connection.execute(rounds).scalar_one())
+    if not len(losses):
+        return None
+    hardest = float(losses.max() if quantile is None else np.quantile(losses, quantile))
+    share, mean = label["round"] / last, float(losses.mean())
+    lambda_u = min(share * hardest + (1 - share) * mean, float(losses.max()))
+    return AgeParameter(label["round"], last, scope, len(losses), hardest, mean, lambda_u)
+
+
+def _schedule(config: Config, policy: str) -> tuple[str, float | None]:
+    """Which labels share one lambda, and the quantile in place of the maximum, of a policy."""
+    section = config.solve
+    options = section.options.get(policy, {})
+    return options.get("scope", section.scope), options.get("quantile", section.quantile)
+
+
+def _evidence(config: Config, label: dict[str, Any], views: tuple[View, ...]) -> Recomputed:
+    """L from the views; the priors from their counts, those of the user as they are stored."""
+    weights = config.repredict.score_weight, config.repredict.box_weight
+    losses = [
+        weights[0] * view.score_loss + weights[1] * view.box_loss
+        for view in views
+        if view.score_loss is not None and view.box_loss is not None
+    ]
+    again = {"points": ("rho_diff", _rho_diff), "semantic": ("rho_anno", _rho_anno)}
+    rho: dict[str, float | None] = {}
+    for prior in config.run.priors:
+        if prior in again:
+            column, formula = again[prior]
+            rho[column] = formula(config, label)
+        else:
+            column = PRIORS.load(prior).rho_column
+            rho[column] = label[column]
+    product = math.prod(value for value in rho.values() if value is not None)
+    loss = sum(losses) / len(losses) if losses else None
+    return Recomputed(loss, rho.get("rho_diff"), rho.get("rho_anno"), product)
+
+
+def _rho_diff(_config: Config, label: dict[str, Any]) -> float | None:
+    """Eq. 8."""
+    if label["points"] is None:
+        return None
+    threshold: float = label["points_threshold"]
+    return float(min(label["points"], threshold) / threshold)
+
+
+def _rho_anno(config: Config, label: dict[str, Any]) -> float | None:
+    """Eq. 9."""
+    score, box_pixels = label["score"], label["box_pixels"]
+    if box_pixels is None:
+        return None
+    if box_pixels == 0:
+        return float(score) if config.semantic.outside == "neutral" else 0.0
+    share = label["mask_pixels"] / box_pixels
+    means = {
+        "geometric": math.sqrt(score * share),
+        "product": score * share,
+        "arithmetic": (score + share) / 2,
+    }
+    return float(means[config.semantic.mean])
+
+
+def _weight(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> float | None:
     """The weight by Eqs. 7 and 11; None for policies that do not use them.
 
     A label that matched has a lambda unless the policy was told to do without: it weighs rho_det.
     """
     if label["policy"] not in {"spsl", "pspsl"}:
         return None
-    if label["loss"] is None:
+    if evidence.loss is None:
         return 0.0
-    if label["lambda_u"] is None:
-        return float(label["rho_det"])
-    import numpy as np
-
-    v = float(easiness(np.array([label["loss"]]), np.array([label["lambda_u"]]))[0])
-    return v * (label["rho_det"] if label["policy"] == "pspsl" else 1.0)
+    if age is None:
+        return evidence.rho_det
+    v = float(easiness(np.array([evidence.loss]), np.array([age.lambda_u]))[0])
+    return v * (evidence.rho_det if label["policy"] == "pspsl" else 1.0)
 
 
 def _lines(
-    config: Config, label: dict[str, Any], views: tuple[View, ...], recomputed: float | None
+    config: Config,
+    label: dict[str, Any],
+    views: tuple[View, ...],
+    age: AgeParameter | None,
+    evidence: Recomputed,
+    recomputed: float | None,
 ) -> list[str]:
     number = {
         name: "none" if value is None else f"{value:.4f}" if isinstance(value, float) else value
@@ -141,8 +257,13 @@ def _lines(
             f"  semantic, Eq. 9  rho_anno = {formula} with s = {number['score']}, "
             f"S = {number['mask_pixels']}, A = {number['box_pixels']} pixels = {number['rho_anno']}"
         )
-    lines.append("  priors         rho_det = {rho_det}".format(**number))
-    lines.append("  age, Eq. 4     lambda = {lambda_u}".format(**number))
+    factors = [
+        f"{name} {value:.4f}"
+        for name, value in (("rho_diff", evidence.rho_diff), ("rho_anno", evidence.rho_anno))
+        if value is not None
+    ]
+    lines.append(f"  priors         rho_det = {' * '.join(factors) or '1'} = {number['rho_det']}")
+    lines.append(_age_line(config, label["policy"], age, str(number["lambda_u"])))
     formulas = {"spsl": "1 - L / lambda, Eq. 7", "pspsl": "rho_det (1 - L / lambda), Eq. 11"}
     if label["lambda_u"] is None and label["loss"] is not None:
         formulas["pspsl"] = "rho_det, without the self-paced term"
@@ -150,8 +271,33 @@ def _lines(
     lines.append(f"  policy         {label['policy']}: v = {formula}")
     lines.append(f"  weight         {number['weight']}")
     if recomputed is not None:
-        lines.append(f"  recomputed     {recomputed:.4f}")
+        lines.append(f"  recomputed     {_working(label, evidence, age)}{recomputed:.4f}")
+        if not math.isclose(recomputed, label["weight"], abs_tol=1e-6):
+            lines.append("  they differ: settings have changed since; `curate solve` weighs again")
     return lines
+
+
+def _age_line(config: Config, policy: str, age: AgeParameter | None, stored: str) -> str:
+    """Eq. 4 with its numbers."""
+    if age is None:
+        return f"  age, Eq. 4     lambda = {stored}"
+    _, quantile = _schedule(config, policy)
+    hardest = "max(L)" if quantile is None else f"{quantile:g} quantile of L"
+    return (
+        f"  age, Eq. 4     lambda = (e/E) {hardest} + (1 - e/E) mean(L) = {age.round}/{age.rounds} "
+        f"* {age.hardest:.4f} + {1 - age.round / age.rounds:.4f} * {age.mean:.4f} = {stored}, over "
+        f"{age.matched} matched labels of the {age.scope}"
+    )
+
+
+def _working(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> str:
+    """The equation of the weight with its numbers; empty where nothing is to be worked out."""
+    if age is None or evidence.loss is None:
+        return ""
+    if evidence.loss >= age.lambda_u > 0:
+        return f"L {evidence.loss:.4f} is not below lambda {age.lambda_u:.4f}: "
+    ease = f"1 - {evidence.loss:.4f} / {age.lambda_u:.4f}"
+    return f"{evidence.rho_det:.4f} * ({ease}) = " if label["policy"] == "pspsl" else f"{ease} = "
 
 
 def _view_line(view: View) -> str:

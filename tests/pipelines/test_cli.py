@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -114,10 +115,18 @@ def test_explain_recomputes_the_weight(curate: Curate, made: Path) -> None:
     best = json.loads(out)[0]
     code, out, _ = curate("explain", best["frame"], best["k"], "--json")
     assert code == 0
-    assert json.loads(out)["recomputed"] == pytest.approx(best["weight"])
+    found = json.loads(out)
+    assert found["recomputed"] == pytest.approx(best["weight"])
+    assert found["age"]["lambda_u"] == pytest.approx(found["label"]["lambda_u"])
+    for name in ("loss", "rho_diff", "rho_anno", "rho_det"):
+        assert found["evidence"][name] == pytest.approx(found["label"][name])
     code, out, _ = curate("explain", best["frame"], best["k"])
-    assert "Eq. 8" in out
-    assert "Eq. 11" in out
+    assert all(f"Eq. {number}" in out for number in (4, 8, 9, 11))
+    assert "they differ" not in out
+    with closing(sqlite3.connect(made / "curate.db")) as connection:
+        connection.execute("UPDATE weight SET v = v / 2")
+        connection.commit()
+    assert "they differ" in curate("explain", best["frame"], best["k"])[1]
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def test_without_an_image_there_is_no_picture():
 
 
 def test_dashes_leave_gaps_and_end_with_the_picture():
-    """About half of the pixels of a line; a stroke that starts far outside still crosses the picture."""
+    """About half of the pixels; a stroke from far outside still crosses the picture."""
     canvas = Canvas(200, 20, (0, 0, 0))
     canvas.dashes(np.array([[[-100_000.0, 10], [100_000, 10]]]), (255, 255, 255), 1.0, (5.0, 5.0))
     row = canvas.finish()[10, :, 0] > 100

@@ -1,0 +1,106 @@
+"""A label from near: its part of the image beside its surroundings from above."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from curate.frames import Frame
+from curate.geometry.boxes import bev_corners
+from curate.geometry.projection import image_rectangles
+from curate.viewing.bird_eye import Region
+from curate.viewing.canvas import Canvas
+from curate.viewing.legend import REPREDICTION_DASHES
+from curate.viewing.overlay import box_strokes
+from curate.viewing.palette import BACKGROUND, PANEL, TEXT, height_shades, weight_colours
+
+_SIDE, _WIDE = 260, 390
+_REACH_METRES = 8.0
+_MARGIN_SHARE = 0.6
+_LEAST_PIXELS = 60.0
+
+
+@dataclass(frozen=True)
+class LabelShown:
+    """A label as a close-up shows it.
+
+    Attributes:
+        box: (7,) in the LiDAR frame.
+        weight: in [0, 1]; gives the colour.
+        former: (7,) its box in the round before, dashed; None where there was none.
+    """
+
+    box: np.ndarray
+    weight: float
+    former: np.ndarray | None = None
+
+
+def draw_close_up(frame: Frame, label: LabelShown) -> np.ndarray:
+    """(260, 650, 3) uint8 RGB; the left part is empty where the image does not show the label."""
+    canvas = Canvas(_WIDE + _SIDE, _SIDE, BACKGROUND)
+    red, green, blue = weight_colours(np.array([label.weight]))[0].tolist()
+    colour = (red, green, blue)
+    boxes = label.box[None] if label.former is None else np.stack([label.box, label.former])
+    _draw_above(canvas, frame, boxes, colour)
+    _draw_image(canvas, frame, boxes, colour)
+    return canvas.finish()
+
+
+def _draw_above(
+    canvas: Canvas, frame: Frame, boxes: np.ndarray, colour: tuple[int, int, int]
+) -> None:
+    """The right part: points within a few metres, x forward points up."""
+    reach = _REACH_METRES
+    x, y = boxes[0, :2]
+    region = Region(x - reach, x + reach, y - reach, y + reach, _SIDE / (2 * reach))
+    near = (np.abs(frame.points[:, :2] - boxes[0, :2]) < reach).all(axis=1)
+    points = frame.points[near]
+    points = points[np.argsort(points[:, 2], kind="stable")]
+    # Region leaves room for a title, which a close-up has not.
+    shift = np.array([_WIDE, -region.to_pixels(np.array([region.x_max, y]))[1]])
+    places = region.to_pixels(points[:, :2].astype(np.float64)) + shift
+    canvas.dots(places, height_shades(points[:, 2]))
+    outlines = region.to_pixels(bev_corners(boxes)) + shift
+    sides = np.stack([outlines, np.roll(outlines, -1, axis=1)], axis=2)
+    canvas.lines(outlines[:1], colour, 2.0, closed=True)
+    front = (outlines[0, 0] + outlines[0, 3]) / 2
+    canvas.lines(np.stack([outlines[0].mean(axis=0), front]), colour, 1.5)
+    for side in sides[1:]:
+        canvas.dashes(side, TEXT, 1.2, REPREDICTION_DASHES)
+
+
+def _draw_image(
+    canvas: Canvas, frame: Frame, boxes: np.ndarray, colour: tuple[int, int, int]
+) -> None:
+    """The left part: the image around the label, cut to the shape of the picture."""
+    canvas.box(0, 0, _WIDE, _SIDE, PANEL)
+    rectangle = image_rectangles(boxes[:1], frame.calibration, frame.image_size)[0]
+    if frame.image is None or np.isnan(rectangle).any():
+        canvas.text(20, _SIDE / 2, "outside the image", TEXT)
+        return
+    window = _window(rectangle, frame.image_size)
+    left, top, right, bottom = window
+    factor = min(_WIDE / (right - left), _SIDE / (bottom - top))
+    size = (round((right - left) * factor), round((bottom - top) * factor))
+    corner = np.array([(_WIDE - size[0]) // 2, (_SIDE - size[1]) // 2])
+    canvas.image(int(corner[0]), int(corner[1]), *size, frame.image[top:bottom, left:right])
+    strokes = box_strokes(boxes, frame.calibration, frame.image_size)
+    low, high = corner, corner + np.array(size)
+    for index, own in enumerate(strokes):
+        places = (own - np.array([left, top])) * factor + corner
+        inside = places[((places >= low) & (places <= high)).all(axis=(1, 2))]
+        if index:
+            canvas.dashes(inside, TEXT, 1.2, REPREDICTION_DASHES)
+        elif len(inside):
+            canvas.lines(inside, BACKGROUND, 3.2)
+            canvas.lines(inside, colour, 1.8)
+
+
+def _window(rectangle: np.ndarray, image_size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of what is shown around a rectangle of the image, in pixels."""
+    middle = (rectangle[:2] + rectangle[2:]) / 2
+    half = (rectangle[2:] - rectangle[:2]) * (0.5 + _MARGIN_SHARE)
+    height = max(half[1], half[0] * _SIDE / _WIDE, _LEAST_PIXELS)
+    half = np.array([height * _WIDE / _SIDE, height])
+    low = np.floor(np.clip(middle - half, 0, image_size)).astype(int)
+    high = np.ceil(np.clip(middle + half, 0, image_size)).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])

@@ -1,0 +1,116 @@
+"""A page that stands alone: one HTML file with its style, its charts and its pictures inside."""
+
+import base64
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from curate.viewing.canvas import jpeg
+
+_STYLE = """
+:root { color-scheme: light dark; --ground: #fff; --text: #1b2129; --faint: #5b6675;
+  --line: #d5dae2; --panel: #f4f6f9; --bar: #2a7fb8; --mark: #c2410c; }
+@media (prefers-color-scheme: dark) { :root { --ground: #0d1015; --text: #e2e7ee; --faint: #94a0b0;
+  --line: #2c333e; --panel: #161a21; --bar: #4fb0d8; --mark: #f59e5b; } }
+body { margin: 0 auto; max-width: 1080px; padding: 24px; background: var(--ground);
+  color: var(--text); font: 15px/1.5 system-ui, sans-serif; }
+h1 { font-size: 24px; margin: 0; } h2 { font-size: 18px; margin: 32px 0 8px; }
+p { margin: 4px 0 12px; color: var(--faint); }
+.row { display: grid; grid-template-columns: repeat(auto-fit, minmax(320px, 1fr)); gap: 16px; }
+figure { margin: 0; padding: 12px; background: var(--panel); border-radius: 6px; min-width: 0; }
+figcaption { font-size: 13px; margin-top: 6px; color: var(--faint); overflow-wrap: anywhere; }
+figure img, svg { display: block; width: 100%; height: auto; border-radius: 4px; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums; }
+th, td { padding: 3px 12px 3px 0; border-bottom: 1px solid var(--line); text-align: right; }
+th { color: var(--faint); font-weight: 500; }
+th:first-child, td:first-child { text-align: left; }
+.bar { fill: var(--bar); } .grid { stroke: var(--line); }
+.mark { stroke: var(--mark); stroke-width: 2; }
+.marked { fill: var(--mark); font-size: 12px; }
+.tick, .axis { fill: var(--faint); font-size: 11px; }
+.diagonal { stroke: var(--faint); stroke-dasharray: 4 4; }
+.curve { fill: none; stroke: var(--bar); stroke-width: 2; } .dot { fill: var(--bar); }
+"""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A chart or a picture with its caption.
+
+    Attributes:
+        content: finished SVG, or an <img>, see `picture`; it is not escaped.
+        caption: plain text.
+    """
+
+    content: str
+    caption: str
+
+    @classmethod
+    def picture(cls, rgb: np.ndarray, caption: str) -> "Figure":
+        """An (h, w, 3) uint8 RGB picture inside the page."""
+        data = base64.b64encode(jpeg(rgb)).decode("ascii")
+        image = f'<img alt="{escape(caption)}" src="data:image/jpeg;base64,{data}">'
+        return cls(image, caption)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page; every text is plain and gets escaped.
+
+    Attributes:
+        title: its heading.
+        note: below the heading, "" for none.
+        columns: heads of its table, none for no table.
+        rows: of the table; floats are shown with four digits, None as nothing.
+        figures: side by side.
+    """
+
+    title: str
+    note: str = ""
+    columns: Sequence[str] = ()
+    rows: Sequence[Sequence[Any]] = ()
+    figures: Sequence[Figure] = ()
+
+
+def render_page(title: str, note: str, sections: Iterable[Section]) -> str:
+    """The HTML text; it loads nothing from anywhere."""
+    body = "\n".join(_section(each) for each in sections)
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{_STYLE}</style></head>\n"
+        f"<body><h1>{escape(title)}</h1><p>{escape(note)}</p>\n{body}\n</body></html>\n"
+    )
+
+
+def _section(section: Section) -> str:
+    parts = [f"<section><h2>{escape(section.title)}</h2>"]
+    if section.note:
+        parts.append(f"<p>{escape(section.note)}</p>")
+    if section.columns:
+        heads = "".join(f"<th>{escape(name)}</th>" for name in section.columns)
+        lines = "\n".join(
+            "<tr>" + "".join(f"<td>{escape(_cell(value))}</td>" for value in row) + "</tr>"
+            for row in section.rows
+        )
+        parts.append(
+            f'<div class="scroll"><table><thead><tr>{heads}</tr></thead>'
+            f"<tbody>{lines}</tbody></table></div>"
+        )
+    if section.figures:
+        shown = "\n".join(
+            f"<figure>{each.content}<figcaption>{escape(each.caption)}</figcaption></figure>"
+            for each in section.figures
+        )
+        parts.append(f'<div class="row">{shown}</div>')
+    return "\n".join([*parts, "</section>"])
+
+
+def _cell(value: Any) -> str:
+    if value is None or value != value:  # noqa: PLR0124 - NaN is not equal to itself
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,98 @@
+"""Tests of pages and their charts: well-formed, self-contained, every text escaped."""
+
+import re
+from html.parser import HTMLParser
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from toys import toy_calibration
+
+from curate.frames import Frame
+from curate.viewing.close_up import LabelShown, draw_close_up
+from curate.viewing.page import Figure, Section, render_page
+from curate.viewing.svg import Mark, histogram, share_curve
+
+EVIL = "<script>alert('x')</script> & \"q\""
+
+
+class Reader(HTMLParser):
+    """Checks that tags close in order, and collects tags and links."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.tags, self.links = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        """Remembers what is open."""
+        self.tags.append(tag)
+        self.links += [value for key, value in attrs if key in {"src", "href"}]
+        if tag not in {"meta", "img"}:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        """Nothing is left open."""
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        """The last that was opened closes first."""
+        assert self.open.pop() == tag
+
+
+def test_a_page_is_well_formed_and_loads_nothing():
+    """Hostile texts stay texts; the only source is the picture inside."""
+    picture = Figure.picture(np.zeros((8, 8, 3), np.uint8), EVIL)
+    chart = Figure(histogram(np.array([1, 2]), np.array([0, 0.5, 1]), EVIL), EVIL)
+    rows = [(EVIL, 1.23456, None, float("nan"))]
+    section = Section(EVIL, EVIL, (EVIL, "b", "c", "d"), rows, [picture, chart])
+    reader = Reader()
+    text = render_page(EVIL, EVIL, [section])
+    reader.feed(text)
+    assert reader.open == []
+    assert "script" not in reader.tags
+    assert {"table", "img", "svg", "rect"} <= set(reader.tags)
+    assert [link[:23] for link in reader.links] == ["data:image/jpeg;base64,"]
+    assert not re.search(r"https?://|url\(|@import", text)
+    assert "<td>1.235</td><td></td><td></td>" in text
+    assert "prefers-color-scheme: dark" in text
+
+
+def bars(svg):
+    """Heights of the bars."""
+    return [float(bar.get("height")) for bar in ET.fromstring(svg).iter("rect")]  # noqa: S314
+
+
+def test_bars_are_as_high_as_their_counts():
+    """Empty ones have no height; a mark outside the edges is left out."""
+    edges = np.linspace(0, 2, 5)
+    svg = histogram(np.array([4, 0, 2, 1]), edges, "L", [Mark(1.0, "λ 1"), Mark(3.0, "λ 3")])
+    heights = np.array(bars(svg))
+    assert heights / heights[0] == pytest.approx([1, 0, 0.5, 0.25], abs=1e-3)
+    assert "λ 1" in svg
+    assert "λ 3" not in svg
+
+
+def test_a_histogram_of_nothing_is_flat():
+    """And still a chart."""
+    assert bars(histogram(np.zeros(3, int), np.linspace(0, 1, 4), "v")) == [0, 0, 0]
+
+
+def test_a_curve_rises_with_its_shares():
+    """Up is a smaller y."""
+    svg = share_curve(np.array([0.1, 0.9]), np.array([0.2, 0.8]), np.array([10, 20]), "weight")
+    low, high = (float(dot.get("cy")) for dot in ET.fromstring(svg).iter("circle"))  # noqa: S314
+    assert high < low
+
+
+@pytest.mark.parametrize("place", [(12.0, 1.0), (12.0, 11.9), (-5.0, 0.0)])
+def test_a_close_up_shows_a_label_wherever_it_is(place):
+    """Also at the image's edge and outside of it; the former box is drawn too."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-20, -20, -2, 0], [40, 20, 1, 1], (3000, 4)).astype(np.float32)
+    image = rng.integers(0, 255, (40, 120, 3), dtype=np.uint8)
+    frame = Frame("000000", points, toy_calibration(), (120, 40), image)
+    box = np.array([*place, -0.5, 4, 2, 1.5, 0.3])
+    alone = draw_close_up(frame, LabelShown(box, 0.8))
+    both = draw_close_up(frame, LabelShown(box, 0.8, box + np.array([1, 1, 0, 0, 0, 0, 0])))
+    assert alone.shape == (260, 650, 3)
+    assert (alone != both)[:, 390:].any()
