@@ -8,7 +8,8 @@ CurateError (1)
 ├── WorkspaceError (6)   a workspace or a stage's input is not there
 ├── DatabaseError (7)    the database refuses, is damaged, or is of another version
 ├── FramesFailed (8)     the command ended, but some frames failed; they are recorded
-└── CellsFailed (9)      the grid ended, but some of its cells failed; the others are kept
+├── CellsFailed (9)      the grid ended, but some of its cells failed; the others are kept
+└── TrainerFailed (10)   the user's trainer ended with an error, or without a checkpoint
 
 Each message is one line: what is wrong, in which file and where, what to do.
 """
@@ -66,3 +67,9 @@ class CellsFailed(CurateError):  # noqa: N818 - it reports cells, it is not itse
     """The grid ended, but some of its cells failed; the others are kept."""
 
     exit_code = 9
+
+
+class TrainerFailed(CurateError):  # noqa: N818 - it reports another program's failure
+    """The user's trainer ended with an error, or without a checkpoint."""
+
+    exit_code = 10

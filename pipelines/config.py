@@ -136,6 +136,8 @@ class TrainSection(Section):
     teacher: Literal["method", "student", "ema"] = "method"  # what teaches the next round
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999  # per 1/10,000 of the training
     pasted: Annotated[int, Field(ge=0)] = 4  # of the object bank, per category; 0 = no bank
+    command: str | None = None  # of your own trainer, see docs/training.md
+    labels_format: str = "sqlite"  # in which it gets the labels; an exporter's name
     options: Options = {}
 
 

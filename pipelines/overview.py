@@ -9,7 +9,7 @@ from curate.errors import WorkspaceError
 from db import bulk
 from pipelines import plan
 from pipelines.round import active
-from pipelines.rounds import find_teacher, is_trainable, peek_round
+from pipelines.rounds import find_teacher, is_student_trained, is_trainable, peek_round
 from pipelines.stage import FrameStage, RoundContext, RoundStage
 from pipelines.workspace import Workspace
 
@@ -24,9 +24,10 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
             row[0]
             for row in bulk.select(connection, select(table.c.number).order_by(table.c.number))
         ]
-    # A detector that the user brings is not trained here: nothing would ever come of these rows.
-    trainable = is_trainable(workspace)
-    rows: list[tuple[Any, ...]] = [_pretrain_row(workspace)] if trainable else []
+    # A detector that the user brings needs no pretraining, and has students only by a command:
+    # nothing would ever come of these rows.
+    trained = is_student_trained(workspace)
+    rows: list[tuple[Any, ...]] = [_pretrain_row(workspace)] if is_trainable(workspace) else []
     for number in numbers:
         context = peek_round(workspace, number)
         if context is None:
@@ -35,7 +36,7 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
         for stage in active(workspace.config.run.priors):
             if isinstance(stage, FrameStage):
                 rows += _frame_rows(workspace, context, stage)
-            elif trainable or stage.name != "train-round":
+            elif trained or stage.name != "train-round":
                 rows += _round_rows(workspace, context, stage)
     return COLUMNS, rows
 

@@ -18,6 +18,11 @@ def is_trainable(workspace: Workspace) -> bool:
     return workspace.config.detector.name in TRAINABLE
 
 
+def is_student_trained(workspace: Workspace) -> bool:
+    """Whether rounds end with a student: curate's own, or that of the user's command."""
+    return is_trainable(workspace) or workspace.config.train.command is not None
+
+
 def open_round(
     workspace: Workspace, number: int | None = None, rounds: int | None = None
 ) -> RoundContext:
@@ -73,11 +78,15 @@ def peek_round(workspace: Workspace, number: int) -> RoundContext | None:
 def find_teacher(workspace: Workspace, number: int) -> tuple[int, Teacher]:
     """The key and the file of the detector that answers in a round.
 
+    A detector that the user brings answers in the first round, and in later ones as well where it
+    is not trained; where it is, the student of the round before does.
+
     Raises:
         WorkspaceError: it does not exist yet.
         ConfigError: the user's file does not exist.
     """
-    if not is_trainable(workspace):
+    brought = not is_trainable(workspace)
+    if brought and number == 1:
         return _brought(workspace)
     table = bulk.table("checkpoint")
     policy = workspace.config.run.method if number > 1 else ""
@@ -87,6 +96,8 @@ def find_teacher(workspace: Workspace, number: int) -> tuple[int, Teacher]:
     with workspace.database.reading() as connection:
         found = bulk.select(connection, query)
     before = "curate pretrain" if number == 1 else f"curate train-round --round {number - 1}"
+    if not found and brought and not is_student_trained(workspace):
+        return _brought(workspace)
     if not found:
         raise WorkspaceError(f"round {number} has no teacher yet; run `{before}`")
     key, path, digest = found[0]

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pipelines.assembly import open_policy
 from pipelines.progress import Progress
 from pipelines.round import active
-from pipelines.rounds import is_trainable, open_round
+from pipelines.rounds import is_student_trained, is_trainable, open_round
 from pipelines.runner import Report, open_executor, run_frames, run_round
 from pipelines.stage import FrameStage
 from pipelines.stages.pretrain import pretrain
@@ -17,7 +17,8 @@ def run_all(
 ) -> Iterator[Report]:
     """Brings every stage of every round up to date, and says what each did as it ends.
 
-    A detector that the user brings is not trained, so it has one round, without train-round.
+    A detector that the user brings is trained only by the user's own command (`train.command`);
+    without it, it has one round, without train-round.
 
     Args:
         workspace: see `Workspace`.
@@ -25,17 +26,17 @@ def run_all(
         progress: see `Progress`.
         train: whether students are trained; without them only the first round can be run.
     """
-    trainable = is_trainable(workspace)
+    trained = train and is_student_trained(workspace)
     policy = workspace.config.run.method
     open_policy(workspace.config, policy)  # a wrong one is better known before hours of work
-    if trainable:
+    if is_trainable(workspace):
         yield pretrain(workspace, progress)
-    total = (rounds or workspace.config.run.rounds) if trainable and train else 1
+    total = (rounds or workspace.config.run.rounds) if trained else 1
     with open_executor(workspace) as executor:
         for number in range(1, total + 1):
             context = open_round(workspace, number, rounds)
             for stage in active(workspace.config.run.priors):
                 if isinstance(stage, FrameStage):
                     yield run_frames(workspace, context, stage, executor, progress)
-                elif (trainable and train) or stage.name != "train-round":
+                elif trained or stage.name != "train-round":
                     yield run_round(workspace, context, stage, policy, progress)

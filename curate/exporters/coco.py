@@ -46,7 +46,8 @@ def _document(labels: LabelSet) -> dict[str, Any]:
     truth = {str(row[2]) for row in labels.ground_truth} | {str(row[3]) for row in labels.labels}
     names = [*about.categories, *sorted(truth - set(about.categories))]
     ids = {name: number for number, name in enumerate(names, start=1)}
-    images, annotations = [], []
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
     for number, objects in enumerate(frame_objects(labels), start=1):
         frame = labels.read(objects.frame_id)
         images.append(_image(number, objects, frame))

@@ -1,7 +1,8 @@
 """What the commands of single stages have in common."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pipelines.commands.options import end, open_workspace, print_report
 
@@ -51,17 +52,17 @@ def run_round_command(
     round_number: int | None,
     policy: str | None,
     *,
-    threads: int | None = None,
+    train: Mapping[str, Any] | None = None,
     as_json: bool,
 ) -> None:
-    """Runs a round stage for a policy."""
+    """Runs a round stage for a policy; `train` changes the settings of that section."""
     from pipelines.progress import Bar
     from pipelines.round import stage
     from pipelines.rounds import open_round
     from pipelines.runner import run_round
     from pipelines.stage import RoundStage
 
-    workspace = open_workspace(folder, threads=threads)
+    workspace = open_workspace(folder).with_settings("train", **(train or {}))
     found = stage(name)
     if not isinstance(found, RoundStage):
         raise TypeError(name)

@@ -40,6 +40,8 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
             "zero_weight",
             "teacher",
             "ema_decay",
+            "command",
+            "labels_format",
         },
     )
     key = [

@@ -24,10 +24,20 @@ if TYPE_CHECKING:
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
     """What a student depends on beside teacher and labels."""
     section = workspace.config.train
+    if section.command is not None:
+        return {"command": section.command, "labels_format": section.labels_format}
     teacher = teacher_mode(workspace.config, policy)
     return {
         **section.model_dump(
-            mode="json", exclude={"pretrain_steps", "learning_rate", "threads", "ema_decay"}
+            mode="json",
+            exclude={
+                "pretrain_steps",
+                "learning_rate",
+                "threads",
+                "ema_decay",
+                "command",
+                "labels_format",
+            },
         ),
         "teacher": teacher,
         "ema_decay": section.ema_decay if teacher == "ema" else None,
@@ -38,24 +48,40 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
-    """The checkpoint of the next teacher: the student, or the average of its weights."""
-    name = f"round-{context.number:02d}-{policy}.safetensors"
+    """The checkpoint of the next teacher: the student, or the average of its weights.
+
+    It ends like the file that the user brings, so that the detector knows it by its name.
+    """
+    brought = workspace.config.detector.path
+    suffix = ".safetensors" if is_trainable(workspace) else (brought.suffix if brought else "")
+    name = f"round-{context.number:02d}-{policy}{suffix}"
     return workspace.root / "checkpoints" / name
 
 
 def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
-    """Trains the student.
+    """Trains the student, or has it trained by the user's command.
 
     Raises:
-        ConfigError: curate cannot train the configured detector.
+        ConfigError: curate cannot train the configured detector, or the command is wrong.
+        TrainerFailed: the command failed, or left no checkpoint.
     """
+    path = file(workspace, job.context, job.policy)
+
+    def write(connection: Connection) -> None:
+        register_checkpoint(connection, workspace, job.context.number, job.policy, path)
+
+    if workspace.config.train.command is not None:
+        # It asks the graph of stages, which this module is a part of.
+        from pipelines.external_trainer import train_externally
+
+        train_externally(workspace, job, path)
+        return Product(f"{workspace.relative(path)}, by your trainer", write)
     if not is_trainable(workspace):
         raise ConfigError(
             f"detector '{workspace.config.detector.name}' is not trained by curate; "
-            f"train it from {export.file(workspace, job.context, job.policy)}"
+            f"train it from {export.file(workspace, job.context, job.policy)}, or with --command"
         )
     section = workspace.config.train
-    path = file(workspace, job.context, job.policy)
     report = train_with_progress(
         labels=export.file(workspace, job.context, job.policy),
         output=path,
@@ -70,10 +96,6 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
         read=workspace.dataset.read,
         progress=progress,
     )
-
-    def write(connection: Connection) -> None:
-        register_checkpoint(connection, workspace, job.context.number, job.policy, path)
-
     return Product(f"{report.steps} steps, {workspace.relative(path)}", write)
 
 
