@@ -75,7 +75,7 @@ def test_every_module_says_what_it_is_for() -> None:
 
 
 def test_nothing_unpickles_files() -> None:
-    """The process executor unpickles its parent's bytes, foreign pickles have a reader that runs nothing."""
+    """The process executor reads its parent's bytes; a foreign pickle's reader runs nothing."""
     calls = {
         (str(path.relative_to(ROOT)), ast.unparse(node.func))
         for path in HOUSE
