@@ -12,7 +12,7 @@ from pipelines_cli import Curate
 from curate.detectors.pillars.checkpoint import load_checkpoint
 from curate.errors import ConfigError, WorkspaceError
 from pipelines import plan
-from pipelines.config import Config, make_config
+from pipelines.config import Config, make_config, write_config
 from pipelines.executors.serial import SerialExecutor
 from pipelines.methods import METHODS, method_named, teacher_mode, with_method
 from pipelines.progress import Silent
@@ -206,7 +206,9 @@ def test_every_ablation_of_the_weights_is_a_flag(
     before = rows(run(workspace), question)
     document = workspace.config.model_dump(mode="json")
     document[section] |= flag
-    after = rows(run(replace(workspace, config=Config.model_validate(document))), question)
+    changed = Config.model_validate(document)
+    write_config(workspace.root / "curate.toml", changed)
+    after = rows(run(replace(workspace, config=changed)), question)
     assert before != after
     frame, k, weight = max(after, key=lambda row: row[2])
     _, out, _ = curate("explain", frame, k, "--json", "-w", workspace.root)
@@ -221,7 +223,8 @@ def trained(
     config = make_config(document | {"run": {"rounds": 2, "method": name}}, "test")
     own = initialise(tmp_path / f"{name}-{len(train)}", config, "0.25", "")
     settings = {"preset": tiny, "pretrain_steps": 5, "round_steps": 3} | train
-    return run(own.with_settings("train", **settings))
+    section = own.config.train.model_copy(update=settings)  # the tiny preset is no user's
+    return run(replace(own, config=own.config.model_copy(update={"train": section})))
 
 
 def test_an_averaged_teacher_teaches_the_next_round(
