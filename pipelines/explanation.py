@@ -89,10 +89,11 @@ def explain_label(
     """
     label = _label(workspace, frame, k, round_number, policy)
     views = _views(workspace, label["round"], frame, k)
-    age = _age(workspace, label) if label["lambda_u"] is not None else None
-    evidence = _evidence(workspace.config, label, views)
+    config = _stored_config(workspace, label["round"])
+    age = _age(workspace, config, label) if label["lambda_u"] is not None else None
+    evidence = _evidence(config, label, views)
     recomputed = _weight(label, evidence, age)
-    lines = _lines(workspace.config, label, views, age, evidence, recomputed)
+    lines = _lines(config, label, views, age, evidence, recomputed)
     return Explanation(label, views, age, evidence, recomputed, tuple(lines))
 
 
@@ -117,6 +118,14 @@ def _label(
     return dict(row._mapping)  # noqa: SLF001 - its public name
 
 
+def _stored_config(workspace: Workspace, round_number: int) -> Config:
+    """The settings that the round was last worked on with; curate.toml may say others by now."""
+    table = bulk.table("round")
+    query = select(table.c.config).where(table.c.number == round_number)
+    with workspace.database.reading() as connection:
+        return Config.model_validate_json(connection.execute(query).scalar_one())
+
+
 def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple[View, ...]:
     query = text(
         """
@@ -132,9 +141,9 @@ def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple
         return tuple(View(row[0], bool(row[1]), *row[2:]) for row in rows)
 
 
-def _age(workspace: Workspace, label: dict[str, Any]) -> AgeParameter | None:
+def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgeParameter | None:
     """Eq. 4 over the losses that share the label's lambda; None without any."""
-    scope, quantile = _schedule(workspace.config, label["policy"])
+    scope, quantile = _schedule(config, label["policy"])
     labels, number = WEIGHTED_LABELS.c, bulk.table("round")
     same = {"round", "policy", *({scope} - {"round"})}
     query = select(labels.loss).where(
