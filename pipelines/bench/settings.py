@@ -23,7 +23,7 @@ OWN = {
     "dataset.kind": "--data",
     "dataset.root": "--data",
     "run.method": "--methods",
-    "train.pretrain_steps": "--steps",
+    "train.pretrain_steps": "--teacher-steps",
     "train.round_steps": "--steps",
     "train.threads": "--workers",
     "run.rounds": "--rounds",
@@ -42,7 +42,8 @@ class BenchSettings(Section):
         frames: training frames to simulate; None for a folder.
         val: validation frames to simulate; None for a folder.
         data_seed: of the simulation; None for a folder.
-        steps: optimiser steps of the teacher's training, and again of every round.
+        steps: optimiser steps of every round.
+        teacher_steps: of the teacher's training; None for as many.
         rounds: E.
         overrides: "section.key=value", for every method.
     """
@@ -52,6 +53,7 @@ class BenchSettings(Section):
     val: AtLeastOne | None = None
     data_seed: int | None = None
     steps: AtLeastOne = 1200
+    teacher_steps: AtLeastOne | None = None
     rounds: AtLeastOne = 2
     overrides: tuple[str, ...] = ()
 
@@ -104,7 +106,10 @@ class Bench:
         document: dict[str, Any] = {
             "dataset": {"root": self.data},
             "segmenter": {"name": "simulated" if self.simulated else "none"},
-            "train": dict.fromkeys(("pretrain_steps", "round_steps"), self.settings.steps),
+            "train": {
+                "pretrain_steps": self.settings.teacher_steps or self.settings.steps,
+                "round_steps": self.settings.steps,
+            },
             "run": {"rounds": self.settings.rounds, "seed": seed},
         }
         _merge(document, overrides)

@@ -52,9 +52,11 @@ def bench(
     ] = None,
     steps: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(
-            min=1, help="Optimiser steps of the teacher and of each round. Default: 1200."
-        ),
+        typer.Option(min=1, help="Optimiser steps of each round. Default: 1200."),
+    ] = None,
+    teacher_steps: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=1, help="Optimiser steps of the teacher. Default: those of a round."),
     ] = None,
     rounds: Annotated[
         Optional[int],  # noqa: UP045
@@ -101,6 +103,7 @@ def bench(
         "val": val,
         "data_seed": data_seed,
         "steps": steps,
+        "teacher_steps": teacher_steps,
         "rounds": rounds,
         "overrides": tuple(map(_absolute, override)) if override else None,
     }
