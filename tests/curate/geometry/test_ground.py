@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from curate.training.ground import GroundMap
+from curate.geometry.ground import GroundMap
 
 
 def plane(slope=0.0):
