@@ -83,7 +83,9 @@ def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
         preset: the grid.
     """
     x, y, z, intensity = (points[:, axis] for axis in range(4))
-    inside = _within(x, preset.x_range) & _within(y, preset.y_range) & _within(z, preset.height_range)
+    inside = (
+        _within(x, preset.x_range) & _within(y, preset.y_range) & _within(z, preset.height_range)
+    )
     x, y, z, intensity = x[inside], y[inside], z[inside], intensity[inside]
     column = ((x - preset.x_range[0]) / preset.pillar_m).astype(np.int64)
     row = ((y - preset.y_range[0]) / preset.pillar_m).astype(np.int64)
