@@ -23,8 +23,8 @@ from curate.detections import as_categories
 from curate.errors import DataError
 from curate.exporters.sqlite import FORMAT_VERSION, refuse_leakage
 from curate.frames import Frame
+from curate.geometry.ground import GroundMap
 from curate.geometry.projection import in_view
-from curate.training.ground import GroundMap
 
 # Ground truth that looks like a category without being one: neither object nor background of it.
 NEIGHBOURS: Final = {"Van": "Car", "Person_sitting": "Pedestrian"}
