@@ -131,7 +131,7 @@ class TrainSection(Section):
     learning_rate: Positive = 5e-3  # peak, from scratch
     round_learning_rate: Positive = 3e-3  # peak, from the teacher
     threads: AtLeastOne = 1
-    zero_weight: Literal["ignore", "background"] = "ignore"
+    zero_weight: Literal["method", "ignore", "background"] = "method"  # see docs/methods.md
     start: Literal["teacher", "scratch"] = "teacher"
     teacher: Literal["method", "student", "ema"] = "method"  # what teaches the next round
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999  # per 1/10,000 of the training

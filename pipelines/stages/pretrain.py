@@ -5,6 +5,7 @@ from sqlalchemy import Connection
 from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError, WorkspaceError
 from pipelines import plan
+from pipelines.methods import METHODS
 from pipelines.progress import Progress
 from pipelines.rounds import is_trainable, register_checkpoint
 from pipelines.runner import Report, run_once
@@ -61,7 +62,11 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
             labels=labels,
             output=path,
             settings=training_settings(
-                workspace, config.train.pretrain_steps, config.train.learning_rate, 0, "student"
+                workspace,
+                config.train.pretrain_steps,
+                config.train.learning_rate,
+                0,
+                METHODS["baseline"],
             ),
             start=None,
             read=workspace.dataset.read,
