@@ -154,7 +154,7 @@ def test_numbers_out_of_range_are_refused(tmp_path, arguments, message):
     assert not (tmp_path / "data").exists()
 
 
-def wait_until(happened, seconds=60):
+def wait_until(happened, seconds=600):
     """Polls until something happened; fails the test if it does not."""
     end = time.monotonic() + seconds
     while not happened():
