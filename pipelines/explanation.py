@@ -1,5 +1,6 @@
 """Every number behind one weight, and the weight recomputed from them."""
 
+import json
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,7 @@ from curate.errors import WorkspaceError
 from curate.weighting.self_paced import easiness
 from db import bulk
 from db.views import WEIGHTED_LABELS
-from pipelines.config import Config
+from pipelines.config import Config, make_config
 from pipelines.registry import PRIORS
 from pipelines.workspace import Workspace
 
@@ -123,7 +124,8 @@ def _stored_config(workspace: Workspace, round_number: int) -> Config:
     table = bulk.table("round")
     query = select(table.c.config).where(table.c.number == round_number)
     with workspace.database.reading() as connection:
-        return Config.model_validate_json(connection.execute(query).scalar_one())
+        stored = connection.execute(query).scalar_one()
+    return make_config(json.loads(stored), f"settings stored of round {round_number}")
 
 
 def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple[View, ...]:
