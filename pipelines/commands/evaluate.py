@@ -108,7 +108,8 @@ def _evaluate_val(
 ) -> "tuple[KittiEvaluation, str]":
     """The evaluation on the val frames, and what to say of it."""
     from curate.errors import WorkspaceError
-    from pipelines.evaluation import detect_val, evaluate_detections, stored_val
+    from curate.evaluation import kitti_ap
+    from pipelines.evaluation import detect_val, stored_val, val_objects
     from pipelines.progress import Bar
     from pipelines.rounds import newest_checkpoint
     from pipelines.stored_evaluation import store_evaluation
@@ -122,10 +123,11 @@ def _evaluate_val(
             raise WorkspaceError(f"--checkpoint {path}: no such file")
         source = workspace.relative(path)
         answers = detect_val(workspace, path, Bar())
-    found = evaluate_detections(workspace, answers)
+    objects = val_objects(workspace, answers)
+    found = kitti_ap.evaluate(*objects)
     notes = f"{source} on {len(answers)} val frames"
     if store:
-        counts = store_evaluation(workspace, source, answers, found)
+        counts = store_evaluation(workspace, source, answers, objects, found)
         tail = ", ".join(f"{counts.get(name, 0)} {word}" for name, word in OUTCOMES.items())
         notes += f"; stored as source '{source}': {tail} objects"
     return found, notes
