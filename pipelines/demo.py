@@ -23,7 +23,7 @@ from pipelines.commands.options import print_report, print_table
 from pipelines.config import Config, make_config
 from pipelines.evaluation import detect_val, val_objects
 from pipelines.label_quality import label_quality
-from pipelines.progress import Bar
+from pipelines.progress import Bar, reaching
 from pipelines.round import stage
 from pipelines.rounds import open_round
 from pipelines.runner import run_round
@@ -132,20 +132,13 @@ def _simulate(demo: Demo, say: Say) -> None:
     total = demo.frames + demo.val
     say(f"1. Simulate {total} LiDAR-camera frames in KITTI's format.\n")
     with Bar().track("simulate", total) as advance:
-        done = 0
-
-        def progress(now: int, _total: int) -> None:
-            nonlocal done
-            advance(now - done, "")
-            done = now
-
         simulate(
             demo.data,
             total,
             demo.seed,
             val_frames=demo.val,
             workers=demo.processes,
-            progress=progress,
+            progress=reaching(advance),
         )
     say(f"   {total} frames in {_shown(demo.data)} ({time.perf_counter() - start:.1f} s)")
 
