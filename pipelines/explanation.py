@@ -9,9 +9,13 @@ import numpy as np
 from sqlalchemy import func, select, text
 
 from curate.errors import WorkspaceError
-from curate.weighting.self_paced import easiness
+from curate.priors.points import point_trust
+from curate.priors.semantic import semantic_trust
+from curate.weighting.base import Age, Evidence
+from curate.weighting.self_paced import age_parameter, easiness
 from db import bulk
 from db.views import WEIGHTED_LABELS
+from pipelines.assembly import semantic_settings
 from pipelines.config import Config, make_config
 from pipelines.registry import PRIORS
 from pipelines.workspace import Workspace
@@ -158,9 +162,16 @@ def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgePara
     if not len(losses):
         return None
     hardest = float(losses.max() if quantile is None else np.quantile(losses, quantile))
-    share, mean = label["round"] / last, float(losses.mean())
-    lambda_u = min(share * hardest + (1 - share) * mean, float(losses.max()))
+    lambda_u = _lambda(losses, Age(label["round"], last), quantile)
+    mean = float(losses.mean())
     return AgeParameter(label["round"], last, scope, len(losses), hardest, mean, lambda_u)
+
+
+def _lambda(losses: np.ndarray, age: Age, quantile: float | None) -> float:
+    """Eq. 4 of losses that share their lambda."""
+    zeros = np.zeros(len(losses))
+    evidence = Evidence(zeros.astype(np.int64), zeros.astype(np.str_), score=zeros, loss=losses)
+    return float(age_parameter(evidence, age, quantile=quantile)[0])
 
 
 def _schedule(config: Config, policy: str) -> tuple[str, float | None]:
@@ -196,24 +207,15 @@ def _rho_diff(_config: Config, label: dict[str, Any]) -> float | None:
     """Eq. 8."""
     if label["points"] is None:
         return None
-    threshold: float = label["points_threshold"]
-    return float(min(label["points"], threshold) / threshold)
+    return float(point_trust(*(np.array(label[name]) for name in ("points", "points_threshold"))))
 
 
 def _rho_anno(config: Config, label: dict[str, Any]) -> float | None:
     """Eq. 9."""
-    score, box_pixels = label["score"], label["box_pixels"]
-    if box_pixels is None:
+    if label["box_pixels"] is None:
         return None
-    if box_pixels == 0:
-        return float(score) if config.semantic.outside == "neutral" else 0.0
-    share = label["mask_pixels"] / box_pixels
-    means = {
-        "geometric": math.sqrt(score * share),
-        "product": score * share,
-        "arithmetic": (score + share) / 2,
-    }
-    return float(means[config.semantic.mean])
+    numbers = (np.array(label[name]) for name in ("score", "mask_pixels", "box_pixels"))
+    return float(semantic_trust(*numbers, semantic_settings(config)))
 
 
 def _weight(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> float | None:
