@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from curate.datasets.clouds import CLOUD_SUFFIXES, read_cloud
-from curate.datasets.images import read_image, read_image_size
+from curate.datasets.images import read_sized_image
 from curate.datasets.kitti import (
     IMAGE_SUFFIXES,
     check_frame_id,
     read_bytes,
     read_calibration,
-    read_frame_list,
+    read_frame_lists,
     visible_files,
 )
 from curate.datasets.kitti_labels import read_objects, to_annotations
@@ -71,10 +71,8 @@ class FolderDataset:
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """The lists of the folder `splits`, by file name."""
-        if "splits" not in self._told:
-            return {}
-        lists = sorted(visible_files(self.root / self._told["splits"], "*.txt"))
-        return {path.stem: read_frame_list(path) for path in lists}
+        folder = self._told.get("splits")
+        return {} if folder is None else read_frame_lists(self.root / folder)
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie; the calibration is that of all frames.
@@ -107,8 +105,8 @@ class FolderDataset:
         if points:
             scale = float(self._told.get("intensity_scale", 1.0))
             sweep = read_cloud(files.points, int(self._told.get("columns", 4)), scale)
-        pixels = read_image(files.image) if image else None
-        return Frame(frame_id, sweep, self._calibration, read_image_size(files.image), pixels)
+        size, pixels = read_sized_image(files.image, pixels=image)
+        return Frame(frame_id, sweep, self._calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
         """The frame's ground truth in the LiDAR frame.
