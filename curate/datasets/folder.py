@@ -171,7 +171,9 @@ def _read_description(path: Path) -> Mapping[str, Any]:
             "where only the images are missing, write image_size = [width, height]"
         )
     if "images" in told and "image_size" in told:
-        raise DataError(f"{path}: image_size is for data sets without images; leave one of them out")
+        raise DataError(
+            f"{path}: image_size is for data sets without images; leave one of them out"
+        )
     wrong = [key for key in _TEXTS if not isinstance(told.get(key, ""), str)]
     wrong += [] if _is_size(told.get("image_size", [1, 1])) else ["image_size"]
     wrong += [key for key in ("columns", "intensity_scale") if not _positive(told.get(key, 1))]
