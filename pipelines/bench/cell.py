@@ -12,7 +12,7 @@ from pathlib import Path
 import curate
 from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
 from pipelines.assembly import device
-from pipelines.bench.grid import Job
+from pipelines.bench.grid import Job, looks_at_unlabeled
 from pipelines.bench.metered import Metered
 from pipelines.bench.results import JobResult, LabelFigures, write_result
 from pipelines.bench.settings import Bench
@@ -49,7 +49,7 @@ def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
     if job.method is None:
         reports = _share(workspace, progress)
     else:
-        reports = list(run_all(workspace, None, progress))
+        reports = list(run_all(workspace, None, progress, evidence=looks_at_unlabeled(job)))
     found = _evaluate(workspace, newest_checkpoint(workspace), progress)
     result = JobResult(
         ratio=job.ratio,
