@@ -17,6 +17,7 @@ def change_settings(path: Path, section: str, changes: Mapping[str, str]) -> Non
         ConfigError: the file cannot be changed in this way, which leaves it as it was.
     """
     lines = [f"{key} = {toml(value)}" for key, value in changes.items()]
+    fault = "cannot be changed line by line"
     try:
         text = path.read_text(encoding="utf-8")
         before = tomllib.loads(text)
@@ -25,11 +26,10 @@ def change_settings(path: Path, section: str, changes: Mapping[str, str]) -> Non
         if tomllib.loads(changed) == wanted:
             replace_file(path, changed.encode())
             return
-        fault = "settings are written in a way of their own"
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        fault = f"not TOML: {error}"
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        pass  # what was written is no TOML: a table in braces, or a text over several lines
     except OSError as error:
-        fault = str(error.strerror)
+        fault = f"cannot be changed: {error.strerror}"
     raise ConfigError(f"{path}: {fault}; write into its [{section}] yourself: {'; '.join(lines)}")
 
 

@@ -214,8 +214,10 @@ def _rho_anno(config: Config, label: dict[str, Any]) -> float | None:
     """Eq. 9."""
     if label["box_pixels"] is None:
         return None
-    numbers = (np.array(label[name]) for name in ("score", "mask_pixels", "box_pixels"))
-    return float(semantic_trust(*numbers, semantic_settings(config)))
+    score, mask_pixels, box_pixels = (
+        np.array(label[name]) for name in ("score", "mask_pixels", "box_pixels")
+    )
+    return float(semantic_trust(score, mask_pixels, box_pixels, semantic_settings(config)))
 
 
 def _weight(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> float | None:

@@ -24,7 +24,7 @@ class Progress(Protocol):
 class Reach(Protocol):
     """Takes how much is done in all, and of how much."""
 
-    def __call__(self, done: int, total: int, note: str = "") -> None:
+    def __call__(self, done: int, total: int, note: str = "", /) -> None:
         """Shows it, with a word on how it goes."""
         ...
 

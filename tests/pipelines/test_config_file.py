@@ -39,20 +39,21 @@ def test_only_what_is_said_changes(tmp_path: Path, before: str, after: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("text", "fault"),
+    "text",
     [
-        ('train = { command = "x" }\n', "not TOML"),
-        ('[train]\n"command" = "x"\n', "not TOML"),
-        ('[train]\ncommand = """\nx\ny"""\n', "not TOML"),
-        ("[train]\noptions = [\n[1],\n]\ncommand = 'x'\n", "not TOML"),
-        ("[train\n", "not TOML"),
+        'train = { command = "x" }\n',
+        '[train]\n"command" = "x"\n',
+        '[train]\ncommand = """\nx\ny"""\n',
+        "[train]\noptions = [\n[1],\n]\ncommand = 'x'\n",
+        '[train]\na = """\ncommand = 1\n"""\ncommand = "x"\n',
+        "[train\n",
     ],
 )
-def test_a_file_that_cannot_be_changed_stays(tmp_path: Path, text: str, fault: str) -> None:
+def test_a_file_that_cannot_be_changed_stays(tmp_path: Path, text: str) -> None:
     """The error says what to write."""
     path = tmp_path / "curate.toml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=fault) as caught:
+    with pytest.raises(ConfigError, match="cannot be changed line by line") as caught:
         change_settings(path, "train", {"command": "new"})
     assert str(caught.value).endswith('write into its [train] yourself: command = "new"')
     assert "\n" not in str(caught.value)
