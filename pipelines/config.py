@@ -1,5 +1,6 @@
 """The configuration of a workspace, `curate.toml`: sections, defaults, and what they may hold."""
 
+import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -204,19 +205,19 @@ def write_config(path: Path, config: Config) -> None:
     document = config.model_dump(mode="json", exclude_none=True)
     lines = []
     for section, settings in document.items():
-        lines += [f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in settings.items())]
+        lines += [f"[{section}]", *(f"{key} = {toml(value)}" for key, value in settings.items())]
         lines.append("")
     replace_file(path, "\n".join(lines).encode())
 
 
-def _toml(value: Any) -> str:
+def toml(value: Any) -> str:
+    """A value in TOML's notation."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
+        return json.dumps(value, ensure_ascii=False)  # TOML's strings are escaped as JSON's are
     if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
+        return f"[{', '.join(map(toml, value))}]"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{_toml(k)} = {_toml(v)}' for k, v in value.items())}}}"
+        return f"{{{', '.join(f'{toml(k)} = {toml(v)}' for k, v in value.items())}}}"
     return repr(value)

@@ -1,5 +1,6 @@
 """Every number behind one weight, and the weight recomputed from them."""
 
+import json
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -8,10 +9,14 @@ import numpy as np
 from sqlalchemy import func, select, text
 
 from curate.errors import WorkspaceError
-from curate.weighting.self_paced import easiness
+from curate.priors.points import point_trust
+from curate.priors.semantic import semantic_trust
+from curate.weighting.base import Age, Evidence
+from curate.weighting.self_paced import age_parameter, easiness
 from db import bulk
 from db.views import WEIGHTED_LABELS
-from pipelines.config import Config
+from pipelines.assembly import semantic_settings
+from pipelines.config import Config, make_config
 from pipelines.registry import PRIORS
 from pipelines.workspace import Workspace
 
@@ -123,7 +128,8 @@ def _stored_config(workspace: Workspace, round_number: int) -> Config:
     table = bulk.table("round")
     query = select(table.c.config).where(table.c.number == round_number)
     with workspace.database.reading() as connection:
-        return Config.model_validate_json(connection.execute(query).scalar_one())
+        stored = connection.execute(query).scalar_one()
+    return make_config(json.loads(stored), f"settings stored of round {round_number}")
 
 
 def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple[View, ...]:
@@ -156,9 +162,16 @@ def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgePara
     if not len(losses):
         return None
     hardest = float(losses.max() if quantile is None else np.quantile(losses, quantile))
-    share, mean = label["round"] / last, float(losses.mean())
-    lambda_u = min(share * hardest + (1 - share) * mean, float(losses.max()))
+    lambda_u = _lambda(losses, Age(label["round"], last), quantile)
+    mean = float(losses.mean())
     return AgeParameter(label["round"], last, scope, len(losses), hardest, mean, lambda_u)
+
+
+def _lambda(losses: np.ndarray, age: Age, quantile: float | None) -> float:
+    """Eq. 4 of losses that share their lambda."""
+    zeros = np.zeros(len(losses))
+    evidence = Evidence(zeros.astype(np.int64), zeros.astype(np.str_), score=zeros, loss=losses)
+    return float(age_parameter(evidence, age, quantile=quantile)[0])
 
 
 def _schedule(config: Config, policy: str) -> tuple[str, float | None]:
@@ -194,24 +207,17 @@ def _rho_diff(_config: Config, label: dict[str, Any]) -> float | None:
     """Eq. 8."""
     if label["points"] is None:
         return None
-    threshold: float = label["points_threshold"]
-    return float(min(label["points"], threshold) / threshold)
+    return float(point_trust(*(np.array(label[name]) for name in ("points", "points_threshold"))))
 
 
 def _rho_anno(config: Config, label: dict[str, Any]) -> float | None:
     """Eq. 9."""
-    score, box_pixels = label["score"], label["box_pixels"]
-    if box_pixels is None:
+    if label["box_pixels"] is None:
         return None
-    if box_pixels == 0:
-        return float(score) if config.semantic.outside == "neutral" else 0.0
-    share = label["mask_pixels"] / box_pixels
-    means = {
-        "geometric": math.sqrt(score * share),
-        "product": score * share,
-        "arithmetic": (score + share) / 2,
-    }
-    return float(means[config.semantic.mean])
+    score, mask_pixels, box_pixels = (
+        np.array(label[name]) for name in ("score", "mask_pixels", "box_pixels")
+    )
+    return float(semantic_trust(score, mask_pixels, box_pixels, semantic_settings(config)))
 
 
 def _weight(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> float | None:

@@ -21,6 +21,14 @@ class Progress(Protocol):
         ...
 
 
+class Reach(Protocol):
+    """Takes how much is done in all, and of how much."""
+
+    def __call__(self, done: int, total: int, note: str = "", /) -> None:
+        """Shows it, with a word on how it goes."""
+        ...
+
+
 class Silent:
     """Shows nothing."""
 
@@ -28,6 +36,18 @@ class Silent:
     def track(self, what: str, total: int) -> Iterator[Advance]:  # noqa: ARG002
         """Yields a function that does nothing."""
         yield lambda _step, _note: None
+
+
+def reaching(advance: Advance) -> Reach:
+    """Moves `advance` for work that tells how much is done in all, not how much more."""
+    before = 0
+
+    def reach(done: int, _total: int, note: str = "") -> None:
+        nonlocal before
+        advance(done - before, note)
+        before = done
+
+    return reach
 
 
 class Bar:

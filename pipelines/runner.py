@@ -109,7 +109,7 @@ def run_round(
     workspace: Workspace, context: RoundContext, stage: RoundStage, policy: str, progress: Progress
 ) -> Report:
     """Brings a round stage up to date for a policy."""
-    frames = plan.complete_frames(workspace, context)
+    frames = plan.frames_to_weigh(workspace, context, policy)
     return run_once(
         workspace,
         plan.Once(context.number, stage.name, policy),

@@ -5,13 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from toys import write_toy_kitti
 
 ROOT = Path(__file__).parent.parent
 
 # How long an example takes says nothing on a busy machine.
-settings.register_profile("curate")
+settings.register_profile("curate", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("curate")
 
 

@@ -91,6 +91,17 @@ class LabelSet:
                 "export labels of unlabeled frames only"
             )
 
+    @property
+    def categories(self) -> frozenset[str]:
+        """The categories that ground truth or labels have; not all need be ones to be learned."""
+        of_truth, of_labels = (
+            columns.index("category") for columns in (GROUND_TRUTH_COLUMNS, WEIGHTED_LABEL_COLUMNS)
+        )
+        return frozenset(
+            {str(row[of_truth]) for row in self.ground_truth}
+            | {str(row[of_labels]) for row in self.labels}
+        )
+
 
 class Exporter(Protocol):
     """Writes a label set in one format.

@@ -11,7 +11,7 @@ from curate.errors import ConfigError
 from curate.frames import Frame
 from pipelines.assembly import device
 from pipelines.methods import Method, method_of
-from pipelines.progress import Progress
+from pipelines.progress import Progress, reaching
 from pipelines.rounds import is_trainable, register_checkpoint
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
@@ -149,11 +149,9 @@ def train_with_progress(
     from curate.training.trainer import train
 
     with progress.track(output.stem, settings.steps) as advance:
-        done = 0
+        reach = reaching(advance)
 
-        def show(step: int, _steps: int, loss: float) -> None:
-            nonlocal done
-            advance(step - done, f"loss {loss:.2f}")
-            done = step
+        def show(step: int, steps: int, loss: float) -> None:
+            reach(step, steps, f"loss {loss:.2f}")
 
         return train(labels, output, settings, start=start, read=read, progress=show)
