@@ -200,7 +200,7 @@ def make_config(document: Mapping[str, Any], source: str) -> Config:
 
 
 def change_setting(document: dict[str, Any], setting: str) -> None:
-    """Sets SECTION.KEY=VALUE in a document; the value as in TOML, or a bare word.
+    """Sets section.key=value in a document; the value as in TOML, anything else is a string.
 
     Raises:
         ConfigError: it is not of that form.
@@ -208,13 +208,15 @@ def change_setting(document: dict[str, Any], setting: str) -> None:
     place, equals, text = setting.partition("=")
     *sections, key = place.strip().split(".")
     if not (equals and sections and key and all(sections)):
-        raise ConfigError(f"--set {setting}: write SECTION.KEY=VALUE, e.g. solve.self_paced=false")
+        raise ConfigError(f"--set {setting}: write section.key=value, e.g. solve.self_paced=false")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text.strip()
     for section in sections:
-        document = document.setdefault(section, {})
+        if not isinstance(document.get(section), dict):
+            document[section] = {}
+        document = document[section]
     document[key] = value
 
 

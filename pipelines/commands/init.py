@@ -39,7 +39,9 @@ def init(
     ] = None,
     settings: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Any setting of curate.toml."),
+        typer.Option(
+            "--set", help="Any setting of curate.toml, section.key=value; repeat it for several."
+        ),
     ] = None,
 ) -> None:
     """Make a workspace: curate.toml, curate.db, which frames are labeled, their ground truth.

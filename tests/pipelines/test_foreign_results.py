@@ -75,10 +75,11 @@ def test_the_priors_alone_weigh_where_the_setting_says_so(
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("self_paced=false", "write SECTION.KEY=VALUE"),
-        ("solve.self_paced", "write SECTION.KEY=VALUE"),
+        ("self_paced=false", "write section.key=value"),
+        ("solve.self_paced", "write section.key=value"),
         ("solve.self_paced=perhaps", "solve.self_paced"),
         ("solve.selfpaced=true", "solve.selfpaced"),
+        ("run.seed.first=3", "run.seed"),
     ],
 )
 def test_a_wrong_setting_is_refused(
