@@ -72,7 +72,7 @@ class SegmenterSection(Section):
 
     name: str = "none"
     path: Path | None = None
-    classes: str = "voc"
+    classes: str | None = None  # whose numbers: voc, coco, cityscapes, ... (docs/segmenters.md)
     options: Options = {}
 
 
@@ -198,6 +198,27 @@ def make_config(document: Mapping[str, Any], source: str) -> Config:
             f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors()
         )
         raise ConfigError(f"{source}: {faults}") from error
+
+
+def change_setting(document: dict[str, Any], setting: str) -> None:
+    """Sets section.key=value in a document; the value as in TOML, anything else is a string.
+
+    Raises:
+        ConfigError: it is not of that form.
+    """
+    place, equals, text = setting.partition("=")
+    *sections, key = place.strip().split(".")
+    if not (equals and sections and key and all(sections)):
+        raise ConfigError(f"--set {setting}: write section.key=value, e.g. solve.self_paced=false")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()
+    for section in sections:
+        if not isinstance(document.get(section), dict):
+            document[section] = {}
+        document = document[section]
+    document[key] = value
 
 
 def write_config(path: Path, config: Config) -> None:

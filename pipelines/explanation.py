@@ -97,7 +97,7 @@ def explain_label(
     config = _stored_config(workspace, label["round"])
     age = _age(workspace, config, label) if label["lambda_u"] is not None else None
     evidence = _evidence(config, label, views)
-    recomputed = _weight(label, evidence, age)
+    recomputed = _weight(label, evidence, age, alone=not views and not _self_paced(config, policy))
     lines = _lines(config, label, views, age, evidence, recomputed)
     return Explanation(label, views, age, evidence, recomputed, tuple(lines))
 
@@ -220,15 +220,25 @@ def _rho_anno(config: Config, label: dict[str, Any]) -> float | None:
     return float(semantic_trust(score, mask_pixels, box_pixels, semantic_settings(config)))
 
 
-def _weight(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> float | None:
+def _self_paced(config: Config, policy: str) -> bool:
+    """Whether the policy weighs by the consistency loss."""
+    section = config.solve
+    own = section.options.get(policy, {}).get("self_paced", section.self_paced)
+    return policy != "pspsl" or bool(own)
+
+
+def _weight(
+    label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None, *, alone: bool
+) -> float | None:
     """The weight by Eqs. 7 and 11; None for policies that do not use them.
 
-    A label that matched has a lambda unless the policy was told to do without: it weighs rho_det.
+    A label that matched has a lambda unless the policy was told to do without: it weighs rho_det,
+    as do all where the priors are `alone`, without a second pass.
     """
     if label["policy"] not in {"spsl", "pspsl"}:
         return None
     if evidence.loss is None:
-        return 0.0
+        return evidence.rho_det if alone else 0.0
     if age is None:
         return evidence.rho_det
     v = float(easiness(np.array([evidence.loss]), np.array([age.lambda_u]))[0])
@@ -258,6 +268,8 @@ def _lines(
     lines.append(
         f"  consistency    L = {section.score_weight:g} (-ln s') + {section.box_weight:g} box loss"
         f", mean over matched views = {number['loss']}"
+        if views
+        else "  consistency    no second pass over augmented copies, so no L"
     )
     if label["points"] is not None:
         lines.append(
@@ -280,7 +292,7 @@ def _lines(
     lines.append(f"  priors         rho_det = {' * '.join(factors) or '1'} = {number['rho_det']}")
     lines.append(_age_line(config, label["policy"], age, str(number["lambda_u"])))
     formulas = {"spsl": "1 - L / lambda, Eq. 7", "pspsl": "rho_det (1 - L / lambda), Eq. 11"}
-    if label["lambda_u"] is None and label["loss"] is not None:
+    if label["lambda_u"] is None and not _self_paced(config, label["policy"]):
         formulas["pspsl"] = "rho_det, without the self-paced term"
     formula = formulas.get(label["policy"], "see curate solve --help")
     lines.append(f"  policy         {label['policy']}: v = {formula}")

@@ -63,7 +63,8 @@ class Registry:
         """
         factory = self.load(name)
         signature = inspect.signature(factory)
-        keywords = {key: make() for key, make in offered.items() if key in signature.parameters}
+        wanted = signature.parameters.keys() - options.keys()
+        keywords = {key: make() for key, make in offered.items() if key in wanted}
         try:
             signature.bind(*given, **(keywords := keywords | dict(options)))
         except TypeError as error:
@@ -98,6 +99,7 @@ SEGMENTERS = Registry(
     {
         "onnx": "curate.segmenters.onnx:OnnxSegmenter",
         "saved": "curate.segmenters.saved:SavedSegmenter",
+        "instances": "curate.segmenters.instances:InstanceSegmenter",
         "degraded": "curate.segmenters.degraded:DegradedSegmenter",
     },
 )

@@ -13,7 +13,7 @@ from curate.viewing.page import Figure, Section, render_page
 from curate.viewing.svg import Mark, histogram, share_curve
 from db import bulk
 from pipelines.differences import COLUMNS, Difference, difference_of
-from pipelines.frame_boxes import newest_round
+from pipelines.frame_boxes import chosen_round
 from pipelines.label_columns import LabelColumns, read_columns
 from pipelines.workspace import Workspace
 
@@ -33,7 +33,7 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
     Raises:
         WorkspaceError: the policy has weighted nothing in that round.
     """
-    number = newest_round(workspace) if round_number is None else round_number
+    number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
     labels = read_columns(workspace, number, policy)
     sections = [

@@ -10,6 +10,7 @@ from sqlalchemy import func, select
 from curate.datasets.base import Dataset
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
+from curate.segmenters.classes import CLASS_MAPS, class_map
 from db import bulk
 from pipelines import registry
 from pipelines.config import Config
@@ -75,6 +76,24 @@ def _refuse_absent(config: Config) -> None:
             raise ConfigError(f"{section} '{name}' needs a path: give --{section}-path")
         if path is not None and not path.exists():
             raise ConfigError(f"--{section}-path {path}: no such file")
+    _refuse_undeclared_classes(config)
+
+
+def _refuse_undeclared_classes(config: Config) -> None:
+    """ConfigError where nobody says what the numbers of a segmenter's classes mean."""
+    name, section = config.segmenter.name, config.segmenter
+    if section.classes is not None:
+        class_map(section.classes)
+    elif (
+        name in registry.SEGMENTERS.classes
+        and registry.SEGMENTERS.takes(name, "classes")
+        and "classes" not in section.options
+    ):
+        raise ConfigError(
+            f"segmenter '{name}': say what its class numbers mean: --segmenter-classes "
+            f"{', '.join(CLASS_MAPS)}; or a table of your own: --set "
+            '"segmenter.options.classes={Car=[7]}"'
+        )
 
 
 def choose_split(dataset: Dataset, labeled: str, val: str, seed: int) -> Split:

@@ -1,7 +1,6 @@
 """What all cells of a bench have in common, and the configuration that follows from it."""
 
 import json
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from pydantic import ValidationError
 
 from curate.atomic import replace_file
 from curate.errors import ConfigError, DataError, WorkspaceError
-from pipelines.config import AtLeastOne, Config, Section, make_config
+from pipelines.config import AtLeastOne, Config, Section, change_setting, make_config
 from pipelines.methods import METHODS, with_method
 from pipelines.registry import TRAINABLE
 
@@ -206,25 +205,11 @@ def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
     """The overrides as a document."""
     document: dict[str, Any] = {}
     for override in overrides:
-        key, equals, text = override.partition("=")
-        path = key.strip().split(".")
-        if not equals or len(path) < 2:
-            raise ConfigError(f"--set {override}: write section.key=value")
-        if key.strip() in OWN:
-            raise ConfigError(f"--set {override}: decided by {OWN[key.strip()]}")
-        value: Any = _value(text.strip())
-        for name in reversed(path):
-            value = {name: value}
-        _merge(document, value)
+        key = override.partition("=")[0].strip()
+        if key in OWN:
+            raise ConfigError(f"--set {override}: decided by {OWN[key]}")
+        change_setting(document, override)
     return document
-
-
-def _value(text: str) -> Any:
-    """A value in TOML's notation; anything else is a string."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
 
 
 def _merge(document: dict[str, Any], other: Mapping[str, Any]) -> None:

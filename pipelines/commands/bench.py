@@ -88,7 +88,8 @@ def bench(
     share may not change. Ablations: --set train.zero_weight=background, --set solve.scope=frame.
 
     Prints tables (AP R40, recall, labels) and leaves results.md, results.json, curve.png in DIR.
-    On KITTI: --data KITTI --set segmenter.name=onnx --set segmenter.path=deeplab.onnx.
+    On KITTI: --data KITTI --set segmenter.name=onnx --set segmenter.path=deeplab.onnx --set
+    segmenter.classes=voc.
 
     Example: curate bench bench --methods baseline,pspsl --ratios 0.08 --seeds 0 --steps 300
     """
