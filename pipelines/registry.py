@@ -134,6 +134,7 @@ EXPORTERS = Registry(
         "openpcdet": "curate.exporters.openpcdet:OpenPCDetExporter",
         "st3d": "curate.exporters.st3d:ST3DExporter",
         "mmdet3d": "curate.exporters.mmdet3d:MMDet3DExporter",
+        "parquet": "curate.exporters.parquet:ParquetExporter",
     },
 )
 EXECUTORS = Registry(

@@ -115,6 +115,17 @@ def read_mmdet3d(path: Path) -> Written:
     return {name: rows for name, rows in found.items() if name != "000000"}
 
 
+def read_parquet(path: Path) -> Written:
+    """The rows of the file, whose frames are those that have labels."""
+    from pyarrow import parquet
+
+    found: dict[str, list[tuple]] = {}
+    for row in parquet.read_table(path).to_pylist():
+        numbers = tuple(row[name] for name in (*BOX_COLUMNS, "weight"))
+        found.setdefault(row["frame"], []).append((row["category"], *numbers))
+    return found
+
+
 # Reads an export back.
 SAMPLES: Mapping[str, Callable[[Path], Written]] = {
     "sqlite": read_sqlite,
@@ -124,12 +135,17 @@ SAMPLES: Mapping[str, Callable[[Path], Written]] = {
     "openpcdet": read_openpcdet,
     "st3d": read_st3d,
     "mmdet3d": read_mmdet3d,
+    "parquet": read_parquet,
 }
+# Packages of extras, without which an exporter is not tested.
+NEEDS = {"parquet": "pyarrow"}
 
 
 @pytest.fixture(params=sorted(EXPORTERS.classes))
 def exporter(request: pytest.FixtureRequest):
     """Every registered exporter with its default settings."""
+    if request.param in NEEDS:
+        pytest.importorskip(NEEDS[request.param], reason=f"{NEEDS[request.param]} is an extra")
     return EXPORTERS.build(request.param, offered={}, options={})
 
 

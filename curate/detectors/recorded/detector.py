@@ -13,6 +13,7 @@ from curate.datasets.kitti_labels import KittiObjects, to_detections
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded.answers import Answer, Reading, as_detections
 from curate.detectors.recorded.formats import refuse_unknown_kind, tell_kind
+from curate.detectors.recorded.parquet import ParquetRecord
 from curate.detectors.recorded.passes import PassesRecord
 from curate.detectors.recorded.table import TableRecord
 from curate.errors import ConfigError, DataError
@@ -20,10 +21,20 @@ from curate.frames import Calibration, Frame
 from curate.geometry.similarity import Similarity
 
 _log = logging.getLogger(__name__)
+# Formats with the augmented copies in the same file.
+_TABLES: Mapping[str, Callable[[Path], "Record"]] = {
+    "csv": TableRecord.read,
+    "parquet": ParquetRecord.read,
+}
 
 
 class Record(Protocol):
     """The answers for frames, and for augmented copies of them."""
+
+    @property
+    def has_views(self) -> bool:
+        """Whether augmented copies were recorded."""
+        ...
 
     def frame_ids(self) -> tuple[str, ...]:
         """The recorded frames, in sorted order."""
@@ -42,12 +53,13 @@ class RecordedDetector:
     """A `Detector` and `RecordedViews` that answers from files.
 
     Args:
-        path: a CSV file, a folder of KITTI result files, OpenPCDet's result.pkl, or mmdetection3d's
-            results (pickle of arrays, JSON, or folder of JSON).
+        path: a CSV or Parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, or
+            mmdetection3d's results (pickle of arrays, JSON, or folder of JSON).
         minimum_score: boxes below it are left out.
-        kind: of the format: csv, kitti, openpcdet, mmdetection3d, or auto to tell it by suffix and
-            contents.
-        passes: of other formats than CSV, the passes over augmented copies; see `PassesRecord`.
+        kind: of the format: csv, parquet, kitti, openpcdet, mmdetection3d, or auto to tell it by
+            suffix and contents.
+        passes: of other formats than these tables, the passes over augmented copies; see
+            `PassesRecord`.
         classes: the names behind numbered labels, in the order of the model.
         frame_list: a file of frame ids (relative to the folder of `path`) for results that name no
             frames.
@@ -104,7 +116,7 @@ class RecordedDetector:
             DataError: nothing was recorded for the frame, or what was is malformed.
         """
         views = self._record.views(frame_id)
-        if isinstance(self._record, PassesRecord) and not views:
+        if not views and not self._record.has_views:
             _warn_once(
                 f"{self.path}: no second pass over augmented copies, so no label has a consistency "
                 "loss, and methods that need one weigh every label 0: name passes in "
@@ -153,11 +165,11 @@ class RecordedDetector:
 
 def _open(path: Path, kind: str, reading: Reading, passes: Sequence[Mapping[str, Any]]) -> Record:
     told = tell_kind(path) if kind == "auto" else kind
-    if told != "csv":
+    if told not in _TABLES:
         return PassesRecord.read(path, told, reading, passes)
     if passes:
-        raise ConfigError(f"{path}: a CSV holds its augmented copies itself, as views 1, 2, ...")
-    return TableRecord.read(path)
+        raise ConfigError(f"{path}: a table holds its augmented copies itself, as views 1, 2, ...")
+    return _TABLES[told](path)
 
 
 @cache

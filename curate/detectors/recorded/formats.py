@@ -16,10 +16,11 @@ _LISTS: Mapping[str, Callable[[Path, Sequence[Any], Reading], Answers]] = {
     "openpcdet": read_openpcdet,
     "mmdetection3d": read_mmdetection3d,
 }
-KINDS = ("csv", "kitti", *_LISTS)
+KINDS = ("csv", "parquet", "kitti", *_LISTS)
+_LIST_SUFFIXES = (".pkl", ".pickle", ".json")
 _EXPECTED = (
-    "a .csv file, a folder of KITTI result files, OpenPCDet's result.pkl, or mmdetection3d's "
-    "results as .pkl, .json or a folder of .json"
+    "a .csv or .parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, or "
+    "mmdetection3d's results as .pkl, .json or a folder of .json"
 )
 
 
@@ -33,14 +34,14 @@ def tell_kind(path: Path) -> str:
         raise DataError(f"{path}: no such file of recorded detections")
     if path.is_dir():
         return "mmdetection3d" if any(path.glob("*.json")) else "kitti"
-    kinds = {".csv": "csv", ".pkl": "list", ".pickle": "list", ".json": "list"}
+    kinds = {".csv": "csv", ".parquet": "parquet"} | dict.fromkeys(_LIST_SUFFIXES, "list")
     if path.suffix.lower() not in kinds:
         raise DataError(f"{path}: no known record of detections; expected {_EXPECTED}")
     return kinds[path.suffix.lower()]
 
 
 def read_answers(path: Path, kind: str, reading: Reading) -> Answers:
-    """The answers of one pass in any format but CSV.
+    """The answers of one pass in any format but tables.
 
     Args:
         path: file or folder.

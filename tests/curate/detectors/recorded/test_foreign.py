@@ -234,7 +234,7 @@ def test_numbered_labels_need_their_names(tmp_path):
         ("a.json", [{"a": 1}], r"no known format \(a\)"),
         ("a.json", [3], r"no known format \(int\)"),
         ("a.json", [{"boxes_lidar": []}], "no frame_id, name, score"),
-        ("a.parquet", [], "no known record of detections; expected a .csv file"),
+        ("a.feather", [], "no known record of detections; expected a .csv or .parquet file"),
     ],
 )
 def test_other_contents_are_refused_by_name(tmp_path, name, held, message):
@@ -256,7 +256,9 @@ def test_the_format_can_be_named(tmp_path):
     """An unknown name is refused, and so is a folder without results."""
     path = write_openpcdet(tmp_path / "a.pkl")
     assert len(RecordedDetector(path, kind="openpcdet").frame_ids()) == 2
-    with pytest.raises(ConfigError, match="'yolo': use one of auto, csv, kitti, openpcdet"):
+    with pytest.raises(
+        ConfigError, match="'yolo': use one of auto, csv, parquet, kitti, openpcdet"
+    ):
         RecordedDetector(path, kind="yolo")
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="holds no KITTI result files"):
