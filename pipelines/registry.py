@@ -83,6 +83,7 @@ DATASETS = Registry(
         "kitti": "curate.datasets.kitti:KittiDataset",
         "kitti-raw": "curate.datasets.kitti_raw:KittiRawDataset",
         "folder": "curate.datasets.folder:FolderDataset",
+        "nuscenes": "curate.datasets.nuscenes:NuScenesDataset",
     },
 )
 DETECTORS = Registry(
@@ -135,6 +136,7 @@ EXPORTERS = Registry(
         "st3d": "curate.exporters.st3d:ST3DExporter",
         "mmdet3d": "curate.exporters.mmdet3d:MMDet3DExporter",
         "parquet": "curate.exporters.parquet:ParquetExporter",
+        "nuscenes": "curate.exporters.nuscenes:NuScenesExporter",
     },
 )
 EXECUTORS = Registry(

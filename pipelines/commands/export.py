@@ -14,7 +14,8 @@ def export(
         str,
         typer.Option(
             "--format",
-            help="sqlite, parquet, csv, coco, kitti, openpcdet, st3d, mmdet3d or module:Class.",
+            help="sqlite, parquet, csv, coco, kitti, openpcdet, st3d, mmdet3d, nuscenes or "
+            "module:Class.",
         ),
     ] = "sqlite",
     output: Annotated[

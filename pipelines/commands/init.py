@@ -10,7 +10,7 @@ def init(
     directory: Annotated[Path, typer.Argument(help="Folder for the workspace.")],
     root: Annotated[Path, typer.Option(help="Folder of the data set.")],
     dataset: Annotated[
-        str, typer.Option(help="kitti, kitti-raw, folder or module:Class.")
+        str, typer.Option(help="kitti, kitti-raw, folder, nuscenes or module:Class.")
     ] = "kitti",
     labeled: Annotated[
         str, typer.Option(help="Share of the training frames that is labeled, or a file of ids.")

@@ -11,7 +11,7 @@ import numpy as np
 
 from curate.datasets.kitti_labels import KittiObjects, to_detections
 from curate.detections import Detections, as_categories
-from curate.detectors.recorded.answers import Answer, Reading, as_detections
+from curate.detectors.recorded.answers import Answer, Placed, Reading, as_detections
 from curate.detectors.recorded.formats import refuse_unknown_kind, tell_kind
 from curate.detectors.recorded.parquet import ParquetRecord
 from curate.detectors.recorded.passes import PassesRecord
@@ -54,10 +54,11 @@ class RecordedDetector:
 
     Args:
         path: a CSV or Parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, or
-            mmdetection3d's results (pickle of arrays, JSON, or folder of JSON).
+            mmdetection3d's results (pickle of arrays, JSON, or folder of JSON), or nuScenes'
+            results (JSON).
         minimum_score: boxes below it are left out.
-        kind: of the format: csv, parquet, kitti, openpcdet, mmdetection3d, or auto to tell it by
-            suffix and contents.
+        kind: of the format: csv, parquet, kitti, openpcdet, mmdetection3d, nuscenes, or auto to
+            tell it by suffix and contents.
         passes: of other formats than these tables, the passes over augmented copies; see
             `PassesRecord`.
         classes: the names behind numbered labels, in the order of the model.
@@ -66,7 +67,8 @@ class RecordedDetector:
         rename: the record's names of categories and ours, e.g. {"car": "Car"}; names that are not
             in it stay.
         frame_ids: of the data set; recorded frames that are not among them are reported.
-        calibration: of a frame of the data set, by its name, for views in KITTI's form.
+        calibration: of a frame of the data set, by its name, for views in KITTI's or nuScenes'
+            form.
 
     Raises:
         DataError: a file is missing or malformed, or none of its frames is in the data set.
@@ -134,16 +136,24 @@ class RecordedDetector:
         calibration: Callable[[str], Calibration] | None,
     ) -> Detections:
         """The answer in the LiDAR frame, with our names, from the lowest score on."""
-        if isinstance(answer, KittiObjects):
+        if not isinstance(answer, Detections):
             if calibration is None:
-                raise ConfigError(f"{self.path}: KITTI results need the calibration of the frames")
-            found = to_detections(answer, calibration(frame_id))
-            place = f"{self.path}: frame {frame_id}"
-            answer = as_detections(place, found.boxes, found.scores, found.categories)
+                raise ConfigError(f"{self.path}: these results need the calibration of the frames")
+            answer = self._placed(frame_id, answer, calibration(frame_id))
         if self.rename:
             names = [self.rename.get(name, name) for name in answer.categories.tolist()]
             answer = replace(answer, categories=as_categories(names))
         return answer.select(np.flatnonzero(answer.scores >= self.minimum_score))
+
+    def _placed(
+        self, frame_id: str, answer: KittiObjects | Placed, calibration: Calibration
+    ) -> Detections:
+        """The answer in the LiDAR's frame of reference."""
+        if not isinstance(answer, KittiObjects):
+            return answer.in_lidar(calibration)
+        found = to_detections(answer, calibration)
+        place = f"{self.path}: frame {frame_id}"
+        return as_detections(place, found.boxes, found.scores, found.categories)
 
     def _report_strays(self, frame_ids: Sequence[str]) -> None:
         """Says which recorded frames the data set does not have; DataError where it has none."""
