@@ -12,6 +12,10 @@ def init(
     dataset: Annotated[
         str, typer.Option(help="kitti, kitti-raw, folder, nuscenes or module:Class.")
     ] = "kitti",
+    dataset_option: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(help="NAME=VALUE of the data set, such as camera=CAM_BACK; repeatable."),
+    ] = None,
     labeled: Annotated[
         str, typer.Option(help="Share of the training frames that is labeled, or a file of ids.")
     ] = "0.04",
@@ -50,7 +54,11 @@ def init(
     if not root.is_dir():
         raise ConfigError(f"--root {root}: no such folder")
     document: dict[str, Any] = {
-        "dataset": {"kind": dataset, "root": root.resolve()},
+        "dataset": {
+            "kind": dataset,
+            "root": root.resolve(),
+            "options": dict(map(_option, dataset_option or ())),
+        },
         "detector": {"name": detector, "path": detector_path and detector_path.resolve()},
         "segmenter": {
             "name": segmenter,
@@ -68,6 +76,16 @@ def init(
         f"{workspace.root}: {counts['labeled']} labeled, {counts['unlabeled']} unlabeled and "
         f"{counts['val']} val frames; settings in curate.toml"
     )
+
+
+def _option(text: str) -> tuple[str, str | int]:
+    """Name and value; ConfigError where there is no =."""
+    from curate.errors import ConfigError
+
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise ConfigError(f"--dataset-option {text}: give NAME=VALUE, e.g. camera=CAM_BACK")
+    return name, int(value) if value.isdecimal() else value
 
 
 def register(app: typer.Typer) -> None:
