@@ -27,6 +27,12 @@ _TABLES: Mapping[str, Callable[[Path], "Record"]] = {
     "parquet": ParquetRecord.read,
 }
 
+# What brings boxes in these axes into ours.
+_TURNS = {
+    "forward-left": Similarity(),
+    "right-forward": Similarity(rotation_rad=-np.pi / 2),
+}
+
 
 class Record(Protocol):
     """The answers for frames, and for augmented copies of them."""
@@ -66,6 +72,8 @@ class RecordedDetector:
             frames.
         rename: the record's names of categories and ours, e.g. {"car": "Car"}; names that are not
             in it stay.
+        axes: of boxes in a LiDAR's frame: "forward-left" (x forward, y left), or "right-forward" as
+            nuScenes' sensor has them.
         frame_ids: of the data set; recorded frames that are not among them are reported.
         calibration: of a frame of the data set, by its name, for views in KITTI's or nuScenes'
             form.
@@ -85,13 +93,17 @@ class RecordedDetector:
         classes: Sequence[str] = (),
         frame_list: str | None = None,
         rename: Mapping[str, str] | None = None,
+        axes: str = "forward-left",
         frame_ids: Sequence[str] = (),
         calibration: Callable[[str], Calibration] | None = None,
     ) -> None:
         refuse_unknown_kind(kind)
+        if axes not in _TURNS:
+            raise ConfigError(f"detector.options.axes '{axes}': use one of {', '.join(_TURNS)}")
         self.path = Path(path)
         self.minimum_score = minimum_score
         self.rename = dict(rename or {})
+        self._turn = _TURNS[axes]
         self._calibration = calibration
         listed = self.path.parent / frame_list if frame_list else None
         self._record = _open(self.path, kind, Reading(tuple(classes), listed), passes)
@@ -140,6 +152,8 @@ class RecordedDetector:
             if calibration is None:
                 raise ConfigError(f"{self.path}: these results need the calibration of the frames")
             answer = self._placed(frame_id, answer, calibration(frame_id))
+        elif self._turn != Similarity():
+            answer = replace(answer, boxes=self._turn.apply_to_boxes(answer.boxes))
         if self.rename:
             names = [self.rename.get(name, name) for name in answer.categories.tolist()]
             answer = replace(answer, categories=as_categories(names))

@@ -21,6 +21,7 @@ from strategies import similarities
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded import RecordedDetector
 from curate.detectors.recorded.formats import KINDS
+from curate.errors import ConfigError
 from curate.frames import Calibration, Frame
 from curate.geometry.similarity import Similarity
 
@@ -220,3 +221,20 @@ def test_the_boxes_of_a_copy_come_back(
         [(told, seen)] = record.views(FRAME)
         back = Detections(told.invert_boxes(seen.boxes), seen.scores, seen.categories)
         assert_equal(back, found)
+
+
+@pytest.mark.parametrize("kind", ["csv", "openpcdet", "mmdetection3d"])
+def test_boxes_in_the_axes_of_nuscenes_sensor_come_back(kind: str, tmp_path: Path) -> None:
+    """There x is to the right and y forward; what is in the camera's frame or a map's stays."""
+    boxes = np.array([[12.0, 3.0, -0.8, 4.0, 1.8, 1.5, 0.3], [9.0, -4.0, 0.1, 1.0, 0.8, 1.7, 3.1]])
+    found = Detections(boxes, np.array([0.9, 0.5]), as_categories(["Car", "Pedestrian"]))
+    quarter = Rotation.from_euler("z", 90, degrees=True)
+    there = np.column_stack([quarter.apply(boxes[:, :3]), boxes[:, 3:6], boxes[:, 6] + np.pi / 2])
+    rig = Rig((LOOKING_AHEAD, np.zeros(3)), (Rotation.identity(), np.zeros(3)))
+    written = Detections(there, found.scores, found.categories)
+    path, options = WRITERS[kind](tmp_path / "results", written, rig)
+    frame = Frame(FRAME, np.zeros((0, 4), np.float32), rig.calibration, (1200, 360))
+    record = RecordedDetector(path, axes="right-forward", **options)
+    assert_equal(record.predict(frame), found)
+    with pytest.raises(ConfigError, match="axes 'up': use one of forward-left, right-forward"):
+        RecordedDetector(path, axes="up", **options)
