@@ -78,14 +78,19 @@ def init(
     )
 
 
-def _option(text: str) -> tuple[str, str | int]:
-    """Name and value; ConfigError where there is no =."""
+def _option(text: str) -> tuple[str, Any]:
+    """Name and value, which is TOML where it can be and else a text; ConfigError without a =."""
+    import tomllib
+
     from curate.errors import ConfigError
 
     name, equals, value = text.partition("=")
     if not name or not equals:
         raise ConfigError(f"--dataset-option {text}: give NAME=VALUE, e.g. camera=CAM_BACK")
-    return name, int(value) if value.isdecimal() else value
+    try:
+        return name, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, value
 
 
 def register(app: typer.Typer) -> None:

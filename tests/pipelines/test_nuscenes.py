@@ -131,7 +131,13 @@ def test_wrong_results_are_one_line(root: Path, tmp_path: Path, curate: Curate) 
     assert "--dataset-option camera: give NAME=VALUE" in err
     (tmp_path / "a.json").write_text(json.dumps({"meta": {}, "results": {"x": []}}))
     named = ("--detector", "recorded", "--detector-path", tmp_path / "a.json")
-    assert curate(*arguments, *named, "--labeled", "0.5")[0] == 0
+    own = ("--labeled", "0.5", "--dataset-option", 'rename={car = "PKW"}')
+    assert curate(*arguments, *named, *own)[0] == 0
+    _, out, _ = curate(
+        "query", "SELECT DISTINCT category FROM ground_truth ORDER BY 1", "-w", tmp_path / "work"
+    )
+    assert "PKW" in out
+    assert "bicycle" in out
     _, out, err = curate("doctor", "-w", tmp_path / "work")
     assert "results for frames that do not exist (x)" in out + err
 
