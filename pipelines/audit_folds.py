@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.base import Sequences
 from curate.errors import ConfigError
 from pipelines.config import Config, read_config, write_config
 from pipelines.setup import initialise
@@ -27,10 +28,9 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
             f"--folds {folds}: the {len(labeled)} labeled frames make 2 to {len(labeled)} folds"
         )
     seed = workspace.config.run.seed
-    shuffled = np.random.default_rng([seed, folds]).permutation(labeled).tolist()
+    dealt = _dealt(workspace, labeled, folds, np.random.default_rng([seed, folds]))
     home = workspace.root / "reports" / "audit" / f"{folds}-folds-seed-{seed}"
-    for fold in range(folds):
-        held_out = sorted(shuffled[fold::folds])
+    for fold, held_out in enumerate(dealt):
         root = home / f"fold-{fold + 1}"
         root.mkdir(parents=True, exist_ok=True)
         rest = sorted(set(labeled) - set(held_out))
@@ -43,6 +43,26 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
             # Settings of the workspace have changed since; what depends on them becomes stale.
             write_config(root / CONFIG_NAME, config)
         yield initialise(root, config, *map(str, lists))
+
+
+def _dealt(
+    workspace: Workspace, labeled: Sequence[str], folds: int, generator: np.random.Generator
+) -> list[list[str]]:
+    """The labeled frames in folds of about the same size; a sequence is never in two of them."""
+    if not isinstance(workspace.dataset, Sequences):
+        shuffled = generator.permutation(labeled).tolist()
+        return [sorted(shuffled[fold::folds]) for fold in range(folds)]
+    sequences = workspace.dataset.sequences().values()
+    own = [frames for frames in (sorted(set(labeled) & set(one)) for one in sequences) if frames]
+    if len(own) < folds:
+        raise ConfigError(
+            f"--folds {folds}: the labeled frames are of {len(own)} sequences, which are not cut; "
+            "ask for fewer folds, or label frames of more sequences"
+        )
+    dealt: list[list[str]] = [[] for _ in range(folds)]
+    for place in generator.permutation(len(own)):
+        min(dealt, key=len).extend(own[place])
+    return [sorted(fold) for fold in dealt]
 
 
 def _fold_config(workspace: Workspace) -> Config:

@@ -84,6 +84,7 @@ DATASETS = Registry(
         "kitti": "curate.datasets.kitti:KittiDataset",
         "kitti-raw": "curate.datasets.kitti_raw:KittiRawDataset",
         "folder": "curate.datasets.folder:FolderDataset",
+        "nuscenes": "curate.datasets.nuscenes:NuScenesDataset",
     },
 )
 DETECTORS = Registry(
@@ -136,6 +137,8 @@ EXPORTERS = Registry(
         "openpcdet": "curate.exporters.openpcdet:OpenPCDetExporter",
         "st3d": "curate.exporters.st3d:ST3DExporter",
         "mmdet3d": "curate.exporters.mmdet3d:MMDet3DExporter",
+        "parquet": "curate.exporters.parquet:ParquetExporter",
+        "nuscenes": "curate.exporters.nuscenes:NuScenesExporter",
     },
 )
 EXECUTORS = Registry(

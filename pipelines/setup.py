@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy import func, select
 
-from curate.datasets.base import Dataset
+from curate.datasets.base import Dataset, Sequences
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.segmenters.classes import CLASS_MAPS, class_map
 from db import bulk
 from pipelines import registry
 from pipelines.config import Config
-from pipelines.workspace import Workspace, open_dataset
+from pipelines.workspace import SPLITS, Workspace, open_dataset
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,22 @@ def choose_split(dataset: Dataset, labeled: str, val: str, seed: int) -> Split:
     pool = [frame for frame in frames if frame not in set(held_out)]
     chosen = _choose(dataset, pool, labeled, generator, "labeled")
     rest = sorted(set(pool) - set(chosen))
-    return Split(tuple(sorted(chosen)), tuple(rest), tuple(sorted(held_out)))
+    split = Split(tuple(sorted(chosen)), tuple(rest), tuple(sorted(held_out)))
+    if isinstance(dataset, Sequences):
+        _refuse_cut(dataset, split)
+    return split
+
+
+def _refuse_cut(dataset: Sequences, split: Split) -> None:
+    """LeakageError where neighbouring frames are on two sides: they show the same objects."""
+    homes = {frame: name for name in SPLITS for frame in getattr(split, name)}
+    for sequence, frames in dataset.sequences().items():
+        sides = sorted({homes[frame] for frame in frames if frame in homes})
+        if len(sides) > 1:
+            raise LeakageError(
+                f"frames of {sequence} would be both {' and '.join(sides)}: neighbouring frames "
+                "show the same objects; list whole sequences (a list may hold their names)"
+            )
 
 
 def _choose(
@@ -137,7 +152,25 @@ def _choose(
             f"--{split} {wish} asks for {count} frames, but only {len(with_label)} of {len(pool)} "
             "have a label file; give a smaller share (0 for none)"
         )
+    if isinstance(dataset, Sequences):
+        return _whole_sequences(dataset, with_label, count, generator)
     return list(generator.permutation(with_label)[:count].tolist())
+
+
+def _whole_sequences(
+    dataset: Sequences, frames: Sequence[str], count: int, generator: np.random.Generator
+) -> list[str]:
+    """Drawn sequences with about `count` of the frames; at least one."""
+    wanted = set(frames)
+    sequences = [wanted.intersection(own) for own in dataset.sequences().values()]
+    sequences = [own for own in sequences if own]
+    chosen: list[str] = []
+    for place in generator.permutation(len(sequences)):
+        more = sorted(sequences[place])
+        # One that would overshoot further than what is missing now is passed over.
+        if not chosen or len(chosen) + len(more) - count <= count - len(chosen):
+            chosen += more
+    return chosen
 
 
 def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
@@ -146,6 +179,9 @@ def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> li
         names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"--{split} {path}: no list of frame ids: {error}") from error
+    if isinstance(dataset, Sequences):
+        sequences = dataset.sequences()
+        names = [frame for name in names for frame in sequences.get(name, (name,))]
     unknown = sorted(set(names) - set(pool))
     if unknown:
         raise ConfigError(f"--{split} {path}: frame {unknown[0]} is not among the training frames")

@@ -1,7 +1,7 @@
 """What every data set offers."""
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from curate.detections import Annotations
 from curate.frames import Frame, FrameFiles
@@ -34,4 +34,13 @@ class Dataset(Protocol):
 
     def annotations(self, frame_id: str) -> Annotations:
         """The frame's ground truth."""
+        ...
+
+
+@runtime_checkable
+class Sequences(Protocol):
+    """A data set whose frames follow each other: neighbours must not be on two sides of a split."""
+
+    def sequences(self) -> Mapping[str, tuple[str, ...]]:
+        """The frames of each drive or scene, by its name; every frame is in one."""
         ...

@@ -1,6 +1,6 @@
 """What every exporter offers: the labels of a round as files for trainers."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -21,6 +21,18 @@ FRAME_COLUMNS = ("frame", "split", "points", "image", "calibration")
 _NAMED_FRAMES = 5
 
 Row = tuple[Any, ...]
+
+
+class Rows(Protocol):
+    """Rows that can be counted and walked through again; they need not be in memory."""
+
+    def __len__(self) -> int:
+        """How many there are."""
+        ...
+
+    def __iter__(self) -> Iterator[Row]:
+        """From the first on."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -67,7 +79,7 @@ class LabelSet:
     description: LabelFileDescription
     frames: Sequence[Row]
     ground_truth: Sequence[Row]
-    labels: Sequence[Row]
+    labels: Rows
     read: Callable[[str], Frame]
     read_points: Callable[[str], Frame]
 

@@ -10,8 +10,12 @@ def init(
     directory: Annotated[Path, typer.Argument(help="Folder for the workspace.")],
     root: Annotated[Path, typer.Option(help="Folder of the data set.")],
     dataset: Annotated[
-        str, typer.Option(help="kitti, kitti-raw, folder or module:Class.")
+        str, typer.Option(help="kitti, kitti-raw, folder, nuscenes or module:Class.")
     ] = "kitti",
+    dataset_option: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(help="NAME=VALUE of the data set, such as camera=CAM_BACK; repeatable."),
+    ] = None,
     labeled: Annotated[
         str, typer.Option(help="Share of the training frames that is labeled, or a file of ids.")
     ] = "0.04",
@@ -58,7 +62,11 @@ def init(
         raise ConfigError(f"--root {root}: no such folder")
     run = {"seed": seed, "priors": ("points",) if segmenter == "none" else ("points", "semantic")}
     document: dict[str, Any] = {
-        "dataset": {"kind": dataset, "root": root.resolve()},
+        "dataset": {
+            "kind": dataset,
+            "root": root.resolve(),
+            "options": dict(map(_option, dataset_option or ())),
+        },
         "detector": {"name": detector, "path": detector_path and detector_path.resolve()},
         "segmenter": {
             "name": segmenter,
@@ -75,6 +83,21 @@ def init(
         f"{workspace.root}: {counts['labeled']} labeled, {counts['unlabeled']} unlabeled and "
         f"{counts['val']} val frames; settings in curate.toml"
     )
+
+
+def _option(text: str) -> tuple[str, Any]:
+    """Name and value, which is TOML where it can be and else a text; ConfigError without a =."""
+    import tomllib
+
+    from curate.errors import ConfigError
+
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise ConfigError(f"--dataset-option {text}: give NAME=VALUE, e.g. camera=CAM_BACK")
+    try:
+        return name, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, value
 
 
 def register(app: typer.Typer) -> None:
