@@ -78,7 +78,23 @@ def run_frames(
     *,
     split: str = "unlabeled",
 ) -> Report:
-    """Brings a stage up to date for every frame of a split that can be worked on."""
+    """Brings a stage up to date for every frame of a split that can be worked on.
+
+    Raises:
+        DatabaseError: another process works on the round; the message says who.
+    """
+    with workspace.database.claiming_round(context.number, None, stage.name):
+        return _run_frames(workspace, context, stage, executor, progress, split)
+
+
+def _run_frames(
+    workspace: Workspace,
+    context: RoundContext,
+    stage: FrameStage,
+    executor: Executor,
+    progress: Progress,
+    split: str,
+) -> Report:
     start = time.perf_counter()
     waiting = plan.waiting_frames(workspace, context, stage, split)
     before = plan.counts(workspace, context, stage, split)
@@ -108,15 +124,20 @@ def run_frames(
 def run_round(
     workspace: Workspace, context: RoundContext, stage: RoundStage, policy: str, progress: Progress
 ) -> Report:
-    """Brings a round stage up to date for a policy."""
-    frames = plan.complete_frames(workspace, context)
-    return run_once(
-        workspace,
-        plan.Once(context.number, stage.name, policy),
-        plan.round_fingerprint(workspace, context, stage, policy, frames),
-        stage.file(workspace, context, policy) if stage.file else None,
-        lambda: stage.run(workspace, RoundJob(context, policy, frames), progress),
-    )
+    """Brings a round stage up to date for a policy.
+
+    Raises:
+        DatabaseError: another process works on the round, or on the same policy in it.
+    """
+    with workspace.database.claiming_round(context.number, policy, stage.name):
+        frames = plan.complete_frames(workspace, context)
+        return run_once(
+            workspace,
+            plan.Once(context.number, stage.name, policy),
+            plan.round_fingerprint(workspace, context, stage, policy, frames),
+            stage.file(workspace, context, policy) if stage.file else None,
+            lambda: stage.run(workspace, RoundJob(context, policy, frames), progress),
+        )
 
 
 def run_once(
