@@ -291,15 +291,19 @@ class _Writer:
         )
 
     def _forget_weights(self, connection: Connection, keys: Sequence[int]) -> None:
-        """Removes the tasks of the policies that have weighted labels of these frames."""
-        task, weight = bulk.table("task"), bulk.table("weight")
+        """Removes tasks and counts of the policies that have weighed labels of these frames."""
+        task, weight, count = map(bulk.table, ("task", "weight", "label_count"))
         weighted = (weight.c.round == self.context.number, weight.c.frame_id.in_(keys))
+        policies = select(weight.c.policy).where(*weighted)
         connection.execute(
             task.delete().where(
                 task.c.round == self.context.number,
                 task.c.stage == "solve",
-                task.c.variant.in_(select(weight.c.policy).where(*weighted)),
+                task.c.variant.in_(policies),
             )
+        )
+        connection.execute(
+            count.delete().where(count.c.round == self.context.number, count.c.policy.in_(policies))
         )
 
     def _row(self, key: int, state: str, error: str | None, seconds: float) -> bulk.Row:
