@@ -26,6 +26,7 @@ class SavedSegmenter:
     """
 
     needs_image = False
+    needs_points = False
 
     def __init__(self, directory: Path, classes: Mapping[str, Sequence[int]]) -> None:
         self.directory = Path(directory)
