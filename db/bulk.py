@@ -101,6 +101,16 @@ def replacing(connection: Connection, name: str, count: int) -> Iterator[None]:
         connection.execute(CreateIndex(index))
 
 
+def refresh_statistics(connection: Connection) -> None:
+    """Lets SQLite look at samples of its tables, some milliseconds; a server does so by itself.
+
+    Without them it reads all weights where somebody asks for one frame.
+    """
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql("PRAGMA analysis_limit = 400")
+        connection.exec_driver_sql("ANALYZE")
+
+
 def delete_frames(
     connection: Connection, name: str, round_number: int, frame_ids: Sequence[int]
 ) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from sqlalchemy.schema import CreateIndex, DropIndex
 
 from db import bulk
 from pipelines.config import make_config
@@ -23,12 +24,20 @@ def filled_workspace(root: Path, frames: int, database: str | None = None) -> Wo
     with workspace.database.writing() as connection:
         bulk.insert(connection, "frame", _frames(frames))
         bulk.insert(connection, "round", [(1, 3, None, "{}", "0", 0)])
+    # An index by value that exists while millions of rows come makes each of them a seek.
+    indices = sorted(bulk.table("prediction").indexes, key=lambda index: str(index.name))
+    with workspace.database.writing() as connection:
+        for index in indices:
+            connection.execute(DropIndex(index))
     generator = np.random.default_rng(0)
     for first in range(1, frames + 1, BATCH_FRAMES):
         keys = _keys(first, min(first + BATCH_FRAMES, frames + 1))
         with workspace.database.writing() as connection:
             for table, rows in _evidence(generator, keys):
                 bulk.insert(connection, table, rows)
+    with workspace.database.writing() as connection:
+        for index in indices:
+            connection.execute(CreateIndex(index))
     return workspace
 
 

@@ -60,6 +60,7 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
             for rows in _rows(context.number, keys, policy, weights, evidence):
                 bulk.insert(connection, "weight", rows)
         bulk.insert(connection, "label_count", counts)
+        bulk.refresh_statistics(connection)
 
     trusted, total = int((weights.v > 0).sum()), float(weights.v.sum())
     summary = f"{len(keys)} labels, {trusted} with weight > 0, their weights sum to {total:.1f}"
