@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -56,29 +55,22 @@ def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
     return [tuple(row) for row in cursor]
 
 
-def stream(connection: Connection, statement: Select[Any]) -> Iterator[list[Row]]:
-    """The rows of a query in blocks, as the driver hands them over.
-
-    They are plain tuples of plain types, as many as a block holds at a time.
-    """
-    result = connection.execution_options(stream_results=True).execute(statement)
-    cursor = result.cursor
-    while rows := cursor.fetchmany(BLOCK_ROWS):
-        yield rows
-    result.close()
+def stream(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[Any]]:
+    """The values of a query's only column in blocks, as many as a block holds at a time."""
+    result = connection.execution_options(yield_per=BLOCK_ROWS).execute(statement)
+    yield from result.scalars().partitions()
 
 
 def numbers(connection: Connection, statement: Select[Any]) -> np.ndarray:
     """(n,) float64 the only column of a query; NaN for null."""
     blocks = stream(connection, statement)
-    found = [np.array(list(chain.from_iterable(rows)), dtype=np.float64) for rows in blocks]
+    found = [np.array(values, dtype=np.float64) for values in blocks]
     return np.concatenate([np.zeros(0), *found])
 
 
 def integers(connection: Connection, statement: Select[Any]) -> np.ndarray:
     """(n,) int64 the only column of a query, without nulls."""
-    blocks = stream(connection, statement)
-    found = [np.fromiter(chain.from_iterable(rows), np.int64, len(rows)) for rows in blocks]
+    found = [np.array(values, dtype=np.int64) for values in stream(connection, statement)]
     return np.concatenate([np.zeros(0, dtype=np.int64), *found])
 
 

@@ -6,7 +6,6 @@ them costs a seek per label and table, and rows of many columns cost an object p
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -121,8 +120,7 @@ class _Scan:
         numbering: dict[str, int] = {}
         blocks = [np.zeros(0, dtype=np.int64)]
         query = self._ordered("prediction", bulk.table("prediction").c.category)
-        for rows in bulk.stream(self._connection, query):
-            names = list(chain.from_iterable(rows))
+        for names in bulk.stream(self._connection, query):
             for name in set(names):
                 numbering.setdefault(name, len(numbering))
             blocks.append(np.fromiter(map(numbering.__getitem__, names), np.int64, len(names)))
