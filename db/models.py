@@ -80,6 +80,7 @@ class Frame(Base):
     __table_args__ = (
         UniqueConstraint("dataset", "frame"),
         UniqueConstraint("id", "split"),
+        Index("ix_frame_frame", "frame"),
         CheckConstraint("split IN ('labeled', 'unlabeled', 'val')", name="split"),
         CheckConstraint(
             "split <> 'unlabeled' OR label_path IS NULL", name="unlabeled_has_no_label"
@@ -283,6 +284,24 @@ class Weight(Base):
     lambda_u: Mapped[float | None] = mapped_column(Float(53), comment="Eq. 4; null where unused")
     rho_det: Mapped[float | None] = mapped_column(Float(53), comment="product of the priors")
     v: Mapped[Share]
+
+
+class LabelCount(Base):
+    """How many labels a policy has weighed in a round; written by solve together with `weight`.
+
+    Counting millions of them anew would take seconds.
+    """
+
+    __tablename__ = "label_count"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
+    policy: Mapped[str] = mapped_column(Text, primary_key=True)
+    category: Mapped[str] = mapped_column(Text, primary_key=True)
+    labels: Mapped[int] = mapped_column(Integer, comment="that the policy did not drop")
+    kept: Mapped[int] = mapped_column(Integer, comment="with a weight above 0")
+    trusted: Mapped[int] = mapped_column(Integer, comment="with a weight above 0.5")
+    weight: Mapped[float] = mapped_column(Float(53), comment="sum of the weights")
 
 
 class _Audited:

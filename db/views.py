@@ -43,7 +43,12 @@ _VIEWS = {
 
 
 def create_views(connection: Connection) -> None:
-    """(Re)creates every view."""
+    """Creates every view."""
     for name, query in _VIEWS.items():
-        connection.execute(text(f"DROP VIEW IF EXISTS {name}"))
         connection.execute(text(f"CREATE VIEW {name} AS {query}"))
+
+
+def drop_views(connection: Connection) -> None:
+    """Drops every view, so that the tables beneath can change."""
+    for name in _VIEWS:
+        connection.execute(text(f"DROP VIEW IF EXISTS {name}"))

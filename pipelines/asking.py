@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import URL, create_engine
+from sqlalchemy import URL, Connection, CursorResult, NullPool, create_engine
 from sqlalchemy.exc import DBAPIError
 
 from curate.errors import ConfigError, DatabaseError
@@ -15,6 +15,7 @@ from curate.errors import ConfigError, DatabaseError
 ALLOWED = frozenset(
     {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
 )
+SERVER_ROWS = 1000  # that a server sends at once
 FORBIDDEN_FUNCTIONS = frozenset({"load_extension", "readfile", "writefile", "edit"})
 
 
@@ -56,12 +57,34 @@ def _authorize(action: int, _first: str | None, second: str | None, *_: str | No
 
 
 def _ask_server(url: URL, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
-    connection = create_engine(url).connect().execution_options(postgresql_readonly=True)
+    """The answer of a PostgreSQL server, a part at a time.
+
+    The question becomes DECLARE ... CURSOR FOR, in the protocol that takes one statement only, in a
+    read-only transaction: whatever is not a question is no valid SQL there.
+    """
+    engine = create_engine(url, poolclass=NullPool)
     try:
-        result = connection.exec_driver_sql(sql)
+        connection = engine.connect()
     except DBAPIError as error:
-        raise ConfigError(_explain(str(error.orig))) from error
-    return list(result.keys()), (tuple(row) for row in result)
+        raise DatabaseError(f"{url.render_as_string()}: {_one_line(error.orig)}") from error
+    reading = connection.execution_options(
+        postgresql_readonly=True, stream_results=True, max_row_buffer=SERVER_ROWS
+    )
+    try:
+        result = reading.exec_driver_sql(sql)
+    except DBAPIError as error:
+        raise ConfigError(_explain(_one_line(error.orig))) from error
+    return list(result.keys()), _rows(reading, result)
+
+
+def _rows(connection: Connection, result: CursorResult[Any]) -> Iterator[tuple[Any, ...]]:
+    with connection:
+        for row in result:
+            yield tuple(row)
+
+
+def _one_line(error: BaseException | None) -> str:
+    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
 def _explain(message: str) -> str:

@@ -30,6 +30,7 @@ class SavedSegmenter:
     """
 
     needs_image = False
+    needs_points = False
 
     def __init__(
         self,

@@ -35,6 +35,11 @@ class SPSL:
         """Raises ConfigError for a setting without meaning."""
         _check(self.name, self.scope, self.quantile)
 
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The columns that it looks at."""
+        return ("loss", "category") if self.scope == "category" else ("loss",)
+
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
         """The weight of every label; 0 where no reprediction matched."""
         lambda_u = age_parameter(evidence, age, self.scope, self.quantile)
@@ -62,6 +67,11 @@ class PSPSL:
     def __post_init__(self) -> None:
         """Raises ConfigError for a setting without meaning."""
         _check(self.name, self.scope, self.quantile)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The columns that it looks at."""
+        return ("loss", "category") if self.scope == "category" else ("loss",)
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
         """The weight of every label; 0 where no reprediction matched."""

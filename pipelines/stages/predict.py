@@ -49,7 +49,7 @@ def visible(frame: Frame, config: Config) -> Frame:
     """The frame as the detector sees it: only points in the camera's view, if so configured."""
     if not config.detector.camera_view:
         return frame
-    seen = in_view(frame.points[:, :3], frame.calibration, frame.image_size)
+    seen = in_view(frame.points, frame.calibration, frame.image_size)
     return frame.with_points(frame.points[seen])
 
 

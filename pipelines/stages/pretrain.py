@@ -78,4 +78,5 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
     def write(connection: Connection) -> None:
         register_checkpoint(connection, workspace, 0, "", path)
 
-    return run_once(workspace, plan.Once(0, "pretrain", ""), plan.digest(key), path, make)
+    with workspace.database.claiming_round(0, None, "pretrain"):
+        return run_once(workspace, plan.Once(0, "pretrain", ""), plan.digest(key), path, make)

@@ -13,6 +13,7 @@ from curate.detectors.pillars.checkpoint import load_checkpoint
 from curate.errors import ConfigError, WorkspaceError
 from pipelines import plan
 from pipelines.config import Config, make_config, write_config
+from pipelines.evidence import read_memory
 from pipelines.executors.serial import SerialExecutor
 from pipelines.methods import METHODS, method_named, method_of, with_method
 from pipelines.progress import Silent
@@ -23,7 +24,6 @@ from pipelines.runner import run_frames, run_round
 from pipelines.schedule import run_all
 from pipelines.setup import initialise
 from pipelines.stage import FrameStage
-from pipelines.stages.solve import read_memory
 from pipelines.workspace import Workspace, sha256
 
 NAMES = [
