@@ -14,6 +14,7 @@ from db.models import BOX_COLUMNS
 from pipelines.assembly import open_policy
 from pipelines.progress import Progress
 from pipelines.registry import PRIORS
+from pipelines.review.human_labels import refresh_matches
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages.score import table_of
 from pipelines.workspace import Workspace
@@ -51,6 +52,7 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
         mine = (weight.c.round == context.number, weight.c.policy == policy)
         connection.execute(weight.delete().where(*mine))
         bulk.insert(connection, "weight", rows)
+        refresh_matches(connection, context.number)
 
     trusted, total = int((weights.v > 0).sum()), float(weights.v.sum())
     summary = f"{len(keys)} labels, {trusted} with weight > 0, their weights sum to {total:.1f}"
