@@ -166,7 +166,7 @@ def _pairs(shown: ShownFrame, edited: Sequence[EditedBox]) -> tuple[dict[int, in
     gain = bev_iou(before, after) + 1e-3 * same_name
     gain[list(unchanged)] = 0.0
     gain[:, list(unchanged.values())] = 0.0
-    return unchanged, _greedy(gain, SAME_OBJECT_IOU + 1e-3)
+    return unchanged, _greedy(gain, SAME_OBJECT_IOU + 2e-3)
 
 
 def _greedy(gain: np.ndarray, least: float) -> dict[int, int]:

@@ -17,9 +17,9 @@ SAME_OBJECT_IOU = 0.1
 """A prediction, of any category, whose BEV IoU with a human label's box is above this means the
 same object and gives way to it: the bound of the consistency match and of `curate diff`."""
 REFUSED_IOU = 0.3
-"""A prediction whose BEV IoU with a refused box is above this is refused as well, whatever its
-category: one that overlaps less is a claim that nobody has judged. The same holds for the place
-that a moved box was moved away from."""
+"""A prediction of the same category whose BEV IoU with a refused box is above this is refused as
+well. One that overlaps less, or says something else of the place, is a claim that nobody has judged:
+detectors answer the same box with two categories, of which a person refuses the wrong one."""
 SAME_DECISION_IOU = 0.5
 """A later decision about a box that overlaps an earlier one by more than this takes its place."""
 
@@ -60,11 +60,12 @@ class Spoken:
     leads: np.ndarray
 
 
-def speak_for(boxes: np.ndarray, labels: HumanLabels) -> Spoken:
+def speak_for(boxes: np.ndarray, categories: np.ndarray, labels: HumanLabels) -> Spoken:
     """Which predictions of a frame the human labels speak for; objects come before refusals.
 
     Args:
         boxes: (m, 7) of the predictions, in the LiDAR frame.
+        categories: (m,) str of the predictions.
         labels: of the same frame.
     """
     label = np.full(len(boxes), -1, dtype=np.int64)
@@ -74,8 +75,9 @@ def speak_for(boxes: np.ndarray, labels: HumanLabels) -> Spoken:
     with_box, with_seen = bev_iou(boxes, labels.boxes), bev_iou(boxes, _known(labels.seen))
     overlap = np.maximum(with_box, with_seen)
     refused = labels.decisions == REJECTED
-    same = ~refused & ((with_box > SAME_OBJECT_IOU) | (with_seen > REFUSED_IOU))
-    alike = refused & (overlap > REFUSED_IOU)
+    alike_named = categories[:, None] == labels.categories[None]
+    same = ~refused & (with_box > SAME_OBJECT_IOU)
+    alike = refused & alike_named & (with_box > REFUSED_IOU)
     for near in (same, alike):
         gain = np.where(near, overlap, 0.0)
         free = (label < 0) & (gain.max(axis=1) > 0)
@@ -94,8 +96,18 @@ def superseded(former: HumanLabels, later: HumanLabels) -> np.ndarray:
     overlap = np.maximum(
         bev_iou(former.boxes, later.boxes), bev_iou(former.boxes, _known(later.seen))
     )
-    result: np.ndarray = overlap.max(axis=1) > SAME_DECISION_IOU
+    # A refusal says nothing of an object of another category at its place.
+    counts = (later.decisions != REJECTED) | (former.categories[:, None] == later.categories[None])
+    result: np.ndarray = (counts & (overlap > SAME_DECISION_IOU)).any(axis=1)
     return result
+
+
+def entangled(labels: HumanLabels) -> list[tuple[int, int]]:
+    """Pairs of rows of objects that lie in each other, which no two objects do."""
+    objects = np.flatnonzero(labels.decisions != REJECTED)
+    overlap = np.triu(bev_iou(labels.boxes[objects], labels.boxes[objects]), 1)
+    rows, columns = np.nonzero(overlap > SAME_DECISION_IOU)
+    return list(zip(objects[rows].tolist(), objects[columns].tolist(), strict=True))
 
 
 def _known(boxes: np.ndarray) -> np.ndarray:

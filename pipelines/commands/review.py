@@ -52,8 +52,9 @@ def export_review(
     """Hand the least certain labels to an editor, with pictures of their whole frames.
 
     Uncertain: weight nearest to 0.5; lowest: lowest weight, of equal ones the highest score;
-    changed: largest change since the round before. The other labels with a weight above 0 are
-    shown as context, and may be corrected as well; docs/review.md goes through an example.
+    changed: largest change since the round before. The other labels of these frames
+    from a weight of 0.1 on are shown as context, and may be corrected as well; docs/review.md goes
+    through an example.
 
     Example: curate review export to-review --count 50 --category Pedestrian,Cyclist
     """
@@ -147,7 +148,10 @@ def list_reviews(workspace: WorkspaceOption = None, as_json: JsonOption = False)
     if as_json:
         print_json([dict(zip(_COLUMNS, row, strict=True)) for row in rows])
     else:
-        print_table(_COLUMNS, rows)
+        # To the minute, in UTC.
+        print_table(
+            _COLUMNS, [(*row[:7], *((at or "")[:16] for at in row[7:9]), *row[9:]) for row in rows]
+        )
 
 
 @group.command("clear")

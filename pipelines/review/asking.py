@@ -18,6 +18,8 @@ from pipelines.workspace import SPLITS, Workspace
 ORDERS = ("uncertain", "lowest", "changed")
 EVEN_ODDS = 0.5
 """The least certain label is the one whose weight is nearest to this."""
+CONTEXT_WEIGHT = 0.1
+"""Labels of the same frames are shown as context from this weight on."""
 
 Asked = Collection[tuple[str, int]]
 """Frames and numbers of labels."""
@@ -167,7 +169,7 @@ def _human_labels(workspace: Workspace, number: int, policy: str) -> Asked:
 def _shown(
     connection: Connection, number: int, policy: str, name: str, asked: Asked
 ) -> list[ShownBox]:
-    """The boxes of a frame: those asked about, all others that count, and human labels."""
+    """The boxes of a frame: those asked about, others of some weight, and human labels."""
     labels = WEIGHTED_LABELS.c
     names = ("k", "category", *BOX_COLUMNS, "score", "weight", "provenance")
     query = (
@@ -178,7 +180,7 @@ def _shown(
     shown = []
     for k, category, *box, score, weight, provenance in bulk.select(connection, query):
         wanted = (name, k) in asked
-        if wanted or weight > 0:
+        if wanted or weight >= CONTEXT_WEIGHT:
             human = provenance == "human"
             place = tuple(np.array(box, dtype=np.float64).tolist())
             shown.append(

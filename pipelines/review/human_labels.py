@@ -83,8 +83,8 @@ def refresh_matches(
     rows: list[bulk.Row] = []
     for batch in _batched(list(labels)):
         predictions = _predictions(connection, round_number, batch)
-        for frame_id, (ks, boxes) in predictions.items():
-            rows += _match_rows(round_number, frame_id, ks, boxes, labels[frame_id])
+        for frame_id, predicted in predictions.items():
+            rows += _match_rows(round_number, frame_id, predicted, labels[frame_id])
     bulk.insert(connection, "human_match", rows)
     return len(rows)
 
@@ -137,31 +137,30 @@ def _stored(rows: Sequence[bulk.Row]) -> StoredLabels:
 
 def _predictions(
     connection: Connection, round_number: int, frame_ids: Sequence[int]
-) -> Mapping[int, tuple[list[int], np.ndarray]]:
-    """Numbers and (m, 7) boxes of the predictions of some frames of a round."""
+) -> Mapping[int, list[bulk.Row]]:
+    """Number, category and box of the predictions of some frames of a round."""
     table = bulk.table("prediction")
+    names = ("frame_id", "k", "category", *BOX_COLUMNS)
     query = (
-        select(table.c.frame_id, table.c.k, *(table.c[name] for name in BOX_COLUMNS))
+        select(*(table.c[name] for name in names))
         .where(table.c.round == round_number, table.c.frame_id.in_(frame_ids))
         .order_by(table.c.frame_id, table.c.k)
     )
     found: dict[int, list[bulk.Row]] = {}
     for frame_id, *row in bulk.select(connection, query):
         found.setdefault(frame_id, []).append(tuple(row))
-    return {
-        frame_id: ([row[0] for row in rows], np.array([row[1:] for row in rows], dtype=np.float64))
-        for frame_id, rows in found.items()
-    }
+    return found
 
 
 def _match_rows(
-    round_number: int, frame_id: int, ks: Sequence[int], boxes: np.ndarray, stored: StoredLabels
+    round_number: int, frame_id: int, predicted: Sequence[bulk.Row], stored: StoredLabels
 ) -> Iterable[bulk.Row]:
-    spoken = speak_for(boxes, stored.labels)
+    boxes = np.array([row[2:] for row in predicted], dtype=np.float64)
+    spoken = speak_for(boxes, as_categories([row[1] for row in predicted]), stored.labels)
     for place in np.flatnonzero(spoken.label >= 0).tolist():
         n = int(stored.n[spoken.label[place]])
-        leads = int(spoken.leads[place])
-        yield (round_number, frame_id, ks[place], n, float(spoken.iou[place]), leads)
+        what = (predicted[place][0], n, float(spoken.iou[place]), int(spoken.leads[place]))
+        yield (round_number, frame_id, *what)
 
 
 def _batched(items: Sequence[int], size: int = 400) -> Iterable[Sequence[int]]:

@@ -13,7 +13,15 @@ from sqlalchemy import Connection, select
 from curate.detections import as_categories
 from curate.errors import ConfigError, DataError, LeakageError
 from curate.review.answer import Answer, Decision, EditedBox, check_boxes, read_answer
-from curate.review.human_labels import ACCEPTED, ADDED, MOVED, REJECTED, HumanLabels, superseded
+from curate.review.human_labels import (
+    ACCEPTED,
+    ADDED,
+    MOVED,
+    REJECTED,
+    HumanLabels,
+    entangled,
+    superseded,
+)
 from curate.review.sheet import MANIFEST, Sheet, ShownFrame, read_sheet
 from curate.review.table import Words, read_table
 from db import bulk
@@ -23,6 +31,8 @@ from pipelines.review.human_labels import SEEN_COLUMNS, read_human_labels, refre
 from pipelines.workspace import SPLITS, Workspace
 
 ALL_FRAMES = "all"
+# How many faults an error names.
+_NAMED = 5
 _SHARED = ("frame_id", "item", "decision", "category", "from_round", *BOX_COLUMNS, *SEEN_COLUMNS)
 
 
@@ -154,7 +164,28 @@ def _answers(
         check_boxes(boxes, sheet.categories)
         rest = said.accept_rest or not {shown.frame, ALL_FRAMES}.isdisjoint(accept)
         answers.append(read_answer(shown, boxes, said.boxes, accept_rest=rest))
+    _refuse_entangled(answers)
     return answers
+
+
+def _refuse_entangled(answers: Sequence[Answer]) -> None:
+    """DataError where two objects of an answer lie in each other."""
+    found = []
+    for answer in answers:
+        rows = [_row(0, decision, 1) for decision in answer.decisions]
+        for pair in entangled(_by_frame(rows)[0]) if rows else ():
+            one, other = (_called(answer.decisions[place]) for place in pair)
+            found.append(f"{one} and {other} of frame {answer.frame}")
+    if found:
+        more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        raise DataError(
+            f"two objects cannot lie in each other: reject one of {'; '.join(found[:_NAMED])}{more}"
+        )
+
+
+def _called(decision: Decision) -> str:
+    number = "new box" if decision.number is None else f"box {decision.number}"
+    return f"{number} ({decision.category})"
 
 
 def _as_shown(shown: ShownFrame) -> list[EditedBox]:

@@ -3,8 +3,8 @@
 Source: CVAT's documentation, "Data formats for a 3D task" (pointcloud/NAME.pcd with
 related_images/NAME_pcd/) and its list of 3D formats; Datumaro's JSON (annotations/SUBSET.json):
 categories.label.labels, and items whose annotations of type cuboid_3d hold label_id, position,
-rotation (Euler angles, radians) and scale (the sides along the box's own x, y and z). CVAT finds the
-frame of an item by its id, the name of the point file without its ending.
+rotation (Euler angles, radians) and scale (the sides along the box's own x, y and z). CVAT finds
+the frame of an item by its id, the name of the point file without its ending.
 
 task.zip makes the task, labels.json is its labels for the tab Raw, annotations.zip is uploaded into
 it. What CVAT exports as "Datumaro 3D 1.0" is the answer; it takes the place of annotations.zip, or
@@ -51,7 +51,12 @@ class CvatEditor:
         with zipfile.ZipFile(folder / ANNOTATIONS, "w", zipfile.ZIP_DEFLATED) as annotations:
             annotations.writestr(_MEMBER, json.dumps(_document(sheet)))
 
-    def read(self, answer: Path, sheet: Sheet, read: Reader) -> Mapping[str, Sequence[EditedBox]]:
+    def read(
+        self,
+        answer: Path,
+        sheet: Sheet,
+        read: Reader,  # noqa: ARG002 - its boxes are in the LiDAR frame
+    ) -> Mapping[str, Sequence[EditedBox]]:
         """See `curate.review.editors.base.Editor`."""
         path = answer / ANNOTATIONS if answer.is_dir() else answer
         found: dict[str, list[EditedBox]] = {}
