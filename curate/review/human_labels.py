@@ -18,8 +18,8 @@ SAME_OBJECT_IOU = 0.1
 same object and gives way to it: the bound of the consistency match and of `curate diff`."""
 REFUSED_IOU = 0.3
 """A prediction of the same category whose BEV IoU with a refused box is above this is refused as
-well. One that overlaps less, or says something else of the place, is a claim that nobody has judged:
-detectors answer the same box with two categories, of which a person refuses the wrong one."""
+well. One that overlaps less, or says something else of the place, is a claim that nobody has
+judged: detectors answer the same box with two categories, and a person refuses the wrong one."""
 SAME_DECISION_IOU = 0.5
 """A later decision about a box that overlaps an earlier one by more than this takes its place."""
 

@@ -2,10 +2,10 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +92,8 @@ def take(curate: Curate, workspace: Workspace, folder: Path, *options: object) -
 def reviewed(curate: Curate, weighted: Workspace, tmp_path: Path) -> tuple[Workspace, Path, str]:
     """A review of which one frame was corrected and imported: workspace, folder, frame."""
     folder = tmp_path / "review"
-    frame = handed_out(curate, weighted, folder, "--frames", "000003,000004", "--count", 6)
+    frames = ",".join(list(weighted.frames("unlabeled"))[:2])
+    frame = handed_out(curate, weighted, folder, "--frames", frames, "--count", 6)
     corrected(folder, frame)
     take(curate, weighted, folder)
     return weighted, folder, frame
@@ -275,18 +276,18 @@ def test_a_later_review_overrules_an_earlier_one(
     assert rows(workspace, decisions) == [("rejected",), ("rejected",), ("moved",), ("added",)]
 
 
-@pytest.mark.parametrize("editor", sorted(EDITORS.classes))
-def test_every_format_goes_round(
-    curate: Curate, weighted: Workspace, tmp_path: Path, editor: str
-) -> None:
+def test_every_format_goes_round(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
     """Sent back as it is, nothing is decided; accepted, all of it, as it was shown."""
-    folder = tmp_path / "review"
-    frame = handed_out(curate, weighted, folder, "--format", editor, "--frames", "000003")
-    assert take(curate, weighted, folder)["untouched"] == 3
-    assert take(curate, weighted, folder, "--accept", frame)["accepted"] == 3
+    name = next(iter(weighted.frames("unlabeled")))
     names = ", ".join(f"h.{name}" for name in ("x", "y", "z", "length", "width", "height", "yaw"))
     same = "JOIN prediction AS p ON p.frame_id = h.frame_id AND p.x = h.x AND p.yaw = h.yaw"
-    assert len(rows(weighted, f"SELECT {names} FROM human_label AS h {same}")) == 3
+    for editor in EDITORS.classes:
+        folder = tmp_path / editor
+        handed_out(curate, weighted, folder, "--format", editor, "--frames", name)
+        assert take(curate, weighted, folder)["untouched"] == 3, editor
+        assert take(curate, weighted, folder, "--accept", name)["accepted"] == 3, editor
+        assert len(rows(weighted, f"SELECT {names} FROM human_label AS h {same}")) == 3, editor
+        assert curate("review", "clear", "--all", "-w", weighted.root)[0] == 0
 
 
 def test_people_are_seen_where_labels_are_shown(
@@ -303,7 +304,8 @@ def test_people_are_seen_where_labels_are_shown(
     assert "recomputed" in rejected
     assert "differ" not in rejected
     assert "added by ada" in added
-    untouched = curate("explain", "000004", 0, "-w", workspace.root)[1]
+    other = list(workspace.frames("unlabeled"))[1]
+    untouched = curate("explain", other, 0, "-w", workspace.root)[1]
     assert "differ" not in untouched
     found = read_frame(workspace, frame, 1, "pspsl")
     assert (len(found.labels), found.weights.tolist()) == (1, [0.0])
@@ -316,28 +318,28 @@ def test_people_are_seen_where_labels_are_shown(
     assert sum(row["objects"] for row in asked) == 3
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "fault"),
-    [
-        (("--frames", "{labeled}"), 5, "is not unlabeled"),
-        (("--frames", "{val}"), 5, "is not unlabeled"),
-        (("--frames", "999999"), 2, "no frame is named '999999'"),
-        (("--category", "Tram"), 2, "--category Tram"),
-        (("--by", "luck"), 2, "--by luck"),
-        (("--format", "paint"), 2, "unknown editor 'paint'"),
-        (("--round", 7), 6, "--round 7"),
-        (("--policy", "uniform"), 6, "uniform has weighted no labels"),
-    ],
+WISHES = (
+    (("--frames", "{labeled}"), 5, "is not unlabeled"),
+    (("--frames", "{val}"), 5, "is not unlabeled"),
+    (("--frames", "999999"), 2, "no frame is named '999999'"),
+    (("--category", "Tram"), 2, "--category Tram"),
+    (("--by", "luck"), 2, "--by luck"),
+    (("--format", "paint"), 2, "unknown editor 'paint'"),
+    (("--round", 7), 6, "--round 7"),
+    (("--policy", "uniform"), 6, "uniform has weighted no labels"),
 )
+
+
 def test_a_wish_that_cannot_be_granted_is_one_line(
-    curate: Curate, weighted: Workspace, tmp_path: Path, options: tuple, code: int, fault: str
+    curate: Curate, weighted: Workspace, tmp_path: Path
 ) -> None:
     """And leaves no folder."""
     names = {split: next(iter(weighted.frames(split))) for split in ("labeled", "val")}
-    words = [str(option).format(**names) for option in options]
-    ended, _, err = curate("review", "export", tmp_path / "r", "-w", weighted.root, *words)
-    assert (ended, fault in err, err.count("\n")) == (code, True, 1), err
-    assert not (tmp_path / "r").exists()
+    for options, code, fault in WISHES:
+        words = [str(option).format(**names) for option in options]
+        ended, _, err = curate("review", "export", tmp_path / "r", "-w", weighted.root, *words)
+        assert (ended, fault in err, err.count("\n")) == (code, True, 1), err
+        assert not (tmp_path / "r").exists()
 
 
 def spoil_text(folder: Path, frame: str) -> None:
@@ -353,55 +355,35 @@ def spoil_both(folder: Path, frame: str) -> None:
     path.write_text(path.read_text() + path.read_text().splitlines()[0] + "\n")
 
 
-@pytest.mark.parametrize(
-    ("spoil", "options", "fault"),
-    [
-        (lambda folder, frame: (folder / "review.json").unlink(), (), "review.json: no such file"),
-        (spoil_text, (), "fields, but a label line"),
-        (spoil_both, (), "cannot lie in each other: reject one of box 1 (Car) and new box (Car)"),
-        (lambda folder, frame: decide(folder, frame, 1, "perhaps"), (), "decision 'perhaps'"),
-        (lambda folder, frame: None, ("--answer", "nowhere"), "nowhere: no such folder"),
-        (lambda folder, frame: None, ("--accept", "000099"), "'000099' is not in this review"),
-    ],
-    ids=["manifest", "line", "twice", "word", "answer", "accept"],
+FAULTS = (
+    (lambda folder, frame: (folder / "review.json").unlink(), (), "review.json: no such file"),
+    (spoil_text, (), "fields, but a label line"),
+    (spoil_both, (), "cannot lie in each other: reject one of box 1 (Car) and new box (Car)"),
+    (lambda folder, frame: decide(folder, frame, 1, "perhaps"), (), "decision 'perhaps'"),
+    (lambda folder, frame: None, ("--answer", "nowhere"), "nowhere: no such folder"),
+    (lambda folder, frame: None, ("--accept", "000099"), "'000099' is not in this review"),
 )
+
+
 def test_a_bad_answer_is_one_line_and_stores_nothing(
-    curate: Curate,
-    weighted: Workspace,
-    tmp_path: Path,
-    spoil: Callable[[Path, str], object],
-    options: tuple,
-    fault: str,
+    curate: Curate, weighted: Workspace, tmp_path: Path
 ) -> None:
-    """Not even the good half."""
-    folder = tmp_path / "review"
-    frame = handed_out(curate, weighted, folder)
-    decide(folder, frame, 2, "accept")
-    spoil(folder, frame)
-    code, _, err = curate("review", "import", folder, "-w", weighted.root, *options)
-    assert (code in {2, 3}, fault in err, err.count("\n")) == (True, True, 1), err
+    """Not even the good half; and a folder that is there is left alone."""
+    whole = tmp_path / "review"
+    frame = handed_out(curate, weighted, whole, "--count", 2)
+    decide(whole, frame, 2, "accept")
+    for number, (spoil, options, fault) in enumerate(FAULTS):
+        folder = tmp_path / str(number)
+        shutil.copytree(whole, folder)
+        spoil(folder, frame)
+        code, _, err = curate("review", "import", folder, "-w", weighted.root, *options)
+        assert (code in {2, 3}, fault in err, err.count("\n")) == (True, True, 1), err
     assert rows(weighted, "SELECT count(*) FROM human_label") == [(0,)]
-
-
-def test_a_review_of_another_workspace_is_refused(
-    curate: Curate, weighted: Workspace, tmp_path: Path
-) -> None:
-    """Its frames may have the same names."""
-    folder = tmp_path / "review"
-    handed_out(curate, weighted, folder)
-    change(weighted, "DELETE FROM review")
-    code, _, err = curate("review", "import", folder, "-w", weighted.root)
-    assert (code, "was not exported from the workspace" in err) == (3, True)
-
-
-def test_a_folder_that_is_there_is_left_alone(
-    curate: Curate, weighted: Workspace, tmp_path: Path
-) -> None:
-    """It may hold hours of somebody's work."""
-    folder = tmp_path / "review"
-    handed_out(curate, weighted, folder)
-    code, _, err = curate("review", "export", folder, "-w", weighted.root)
+    code, _, err = curate("review", "export", whole, "-w", weighted.root)
     assert (code, "may hold answers" in err) == (2, True)
+    change(weighted, "DELETE FROM review")
+    code, _, err = curate("review", "import", whole, "-w", weighted.root)
+    assert (code, "was not exported from the workspace" in err) == (3, True)
 
 
 def test_frames_that_are_not_unlabeled_cannot_have_human_labels(weighted: Workspace) -> None:
