@@ -62,6 +62,11 @@ def handed_out(curate: Curate, workspace: Workspace, folder: Path, *options: obj
     return json.loads(out)["frames"][0]
 
 
+def only_first(workspace: Workspace) -> tuple[str, str]:
+    """The option that asks about all labels of one frame and no others."""
+    return "--frames", next(iter(workspace.frames("unlabeled")))
+
+
 def decide(folder: Path, frame: str, box: int, word: str) -> None:
     """Writes a word into the table."""
     path = folder / "review.csv"
@@ -92,8 +97,7 @@ def take(curate: Curate, workspace: Workspace, folder: Path, *options: object) -
 def reviewed(curate: Curate, weighted: Workspace, tmp_path: Path) -> tuple[Workspace, Path, str]:
     """A review of which one frame was corrected and imported: workspace, folder, frame."""
     folder = tmp_path / "review"
-    frames = ",".join(list(weighted.frames("unlabeled"))[:2])
-    frame = handed_out(curate, weighted, folder, "--frames", frames, "--count", 6)
+    frame = handed_out(curate, weighted, folder, *only_first(weighted))
     corrected(folder, frame)
     take(curate, weighted, folder)
     return weighted, folder, frame
@@ -168,7 +172,7 @@ def test_policies_do_not_see_decisions(curate: Curate, weighted: Workspace, tmp_
     """The weights that they store are the same before and after."""
     before = rows(weighted, "SELECT * FROM weight ORDER BY frame_id, k")
     folder = tmp_path / "review"
-    corrected(folder, handed_out(curate, weighted, folder))
+    corrected(folder, handed_out(curate, weighted, folder, *only_first(weighted)))
     take(curate, weighted, folder)
     change(weighted, "DELETE FROM task WHERE stage = 'solve'")
     assert curate("solve", "-w", weighted.root)[0] == 0
@@ -205,7 +209,7 @@ def test_an_import_makes_files_stale(curate: Curate, weighted: Workspace, tmp_pa
     export = stage("export")
     assert isinstance(export, RoundStage)
     folder = tmp_path / "review"
-    frame = handed_out(curate, weighted, folder)
+    frame = handed_out(curate, weighted, folder, *only_first(weighted))
 
     def state() -> str:
         return plan.round_state(weighted, open_round(weighted, 1), export, "pspsl")
@@ -228,7 +232,7 @@ def test_a_decision_counts_from_the_reviewed_round_on(
     """Earlier rounds stay as they were trained, unless told otherwise."""
     advance(curate, weighted, 2)
     folder = tmp_path / "review"
-    corrected(folder, handed_out(curate, weighted, folder))
+    corrected(folder, handed_out(curate, weighted, folder, *only_first(weighted)))
     rounds = "SELECT DISTINCT round FROM weighted_labels WHERE provenance = 'human' ORDER BY 1"
     assert take(curate, weighted, folder)["from_round"] == 2
     assert rows(weighted, rounds) == [(2,)]
@@ -370,7 +374,7 @@ def test_a_bad_answer_is_one_line_and_stores_nothing(
 ) -> None:
     """Not even the good half; and a folder that is there is left alone."""
     whole = tmp_path / "review"
-    frame = handed_out(curate, weighted, whole, "--count", 2)
+    frame = handed_out(curate, weighted, whole, *only_first(weighted))
     decide(whole, frame, 2, "accept")
     for number, (spoil, options, fault) in enumerate(FAULTS):
         folder = tmp_path / str(number)
@@ -402,7 +406,7 @@ def test_a_killed_import_leaves_nothing_behind(
 ) -> None:
     """Killed between the labels and what they speak for; the same import then does all of it."""
     folder = tmp_path / "review"
-    corrected(folder, handed_out(curate, weighted, folder))
+    corrected(folder, handed_out(curate, weighted, folder, *only_first(weighted)))
     code = (
         "import os, signal, sys\n"
         "from pipelines.review import taking_back\n"
