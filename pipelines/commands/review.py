@@ -206,5 +206,6 @@ def _told(taken: "Taken") -> str:
     if taken.dry_run:
         return f"{line}; dry run, nothing is stored"
     if not taken.changed:
-        return f"{line}; stored already"
+        decided = taken.accepted + taken.rejected + taken.moved + taken.added
+        return f"{line}; {'stored already' if decided else 'nothing is decided yet'}"
     return f"{line}; they count from round {taken.from_round} on, `curate run` trains with them"
