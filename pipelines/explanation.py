@@ -2,11 +2,11 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import func, select, text
+from sqlalchemy import Select, and_, func, select, text
 
 from curate.errors import WorkspaceError
 from curate.priors.points import point_trust
@@ -18,6 +18,7 @@ from db.views import WEIGHTED_LABELS
 from pipelines.assembly import semantic_settings
 from pipelines.config import Config, make_config
 from pipelines.registry import PRIORS
+from pipelines.review.told import tell_decision
 from pipelines.workspace import Workspace
 
 
@@ -93,6 +94,25 @@ def explain_label(
         WorkspaceError: the policy has not weighted such a label in that round.
     """
     label = _label(workspace, frame, k, round_number, policy)
+    if label["provenance"] == "human":
+        return _human(workspace, label)
+    return _computed(workspace, label)
+
+
+def _human(workspace: Workspace, label: dict[str, Any]) -> Explanation:
+    """What people decided; with the numbers behind the policy's own weight where they rejected."""
+    told = tell_decision(workspace, label)
+    if label["weight"] == 0 and told.policy_weight is not None:
+        alone = _computed(workspace, {**label, "weight": told.policy_weight})
+        return replace(alone, label=label, lines=(*alone.lines, told.lines[0]))
+    lines = (*_head(_numbers(label)), *told.lines)
+    nothing = Recomputed(None, None, None, math.nan)
+    return Explanation(label, (), None, nothing, None, lines)
+
+
+def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
+    """The numbers behind a policy's weight."""
+    frame, k = label["frame"], label["k"]
     views = _views(workspace, label["round"], frame, k)
     config = _stored_config(workspace, label["round"])
     age = _age(workspace, config, label) if label["lambda_u"] is not None else None
@@ -150,11 +170,8 @@ def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple
 def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgeParameter | None:
     """Eq. 4 over the losses that share the label's lambda; None without any."""
     scope, quantile = _schedule(config, label["policy"])
-    labels, number = WEIGHTED_LABELS.c, bulk.table("round")
-    same = {"round", "policy", *({scope} - {"round"})}
-    query = select(labels.loss).where(
-        *(labels[name] == label[name] for name in same), labels.loss.is_not(None)
-    )
+    number = bulk.table("round")
+    query = _losses(label, scope)
     rounds = select(number.c.rounds).where(number.c.number == label["round"])
     with workspace.database.reading() as connection:
         losses = np.array([row[0] for row in bulk.select(connection, query)])
@@ -172,6 +189,22 @@ def _lambda(losses: np.ndarray, age: Age, quantile: float | None) -> float:
     zeros = np.zeros(len(losses))
     evidence = Evidence(zeros.astype(np.int64), zeros.astype(np.str_), score=zeros, loss=losses)
     return float(age_parameter(evidence, age, quantile=quantile)[0])
+
+
+def _losses(label: dict[str, Any], scope: str) -> Select[tuple[float]]:
+    """The losses that share a label's lambda; the policy saw those that people decided on too."""
+    weight, loss = bulk.table("weight"), bulk.table("consistency")
+    frame, prediction = bulk.table("frame"), bulk.table("prediction")
+    keys = ("round", "frame_id", "k")
+    tables = weight.join(loss, and_(*(loss.c[key] == weight.c[key] for key in keys)))
+    tables = tables.join(prediction, and_(*(prediction.c[key] == weight.c[key] for key in keys)))
+    tables = tables.join(frame, frame.c.id == weight.c.frame_id)
+    places = {"category": prediction.c.category, "frame": frame.c.frame}
+    same = () if scope == "round" else (places[scope] == label[scope],)
+    return select(loss.c.loss).select_from(tables).where(
+        weight.c.round == label["round"], weight.c.policy == label["policy"],
+        frame.c.split == "unlabeled", loss.c.loss.is_not(None), *same,
+    )  # fmt: skip
 
 
 def _schedule(config: Config, policy: str) -> tuple[str, float | None]:
@@ -253,17 +286,9 @@ def _lines(
     evidence: Recomputed,
     recomputed: float | None,
 ) -> list[str]:
-    number = {
-        name: "none" if value is None else f"{value:.4f}" if isinstance(value, float) else value
-        for name, value in label.items()
-    }
+    number = _numbers(label)
     section = config.repredict
-    lines = [
-        "round {round}, frame {frame}, label {k}: {category}, score {score}".format(**number),
-        "  box            x {x}  y {y}  z {z}  l {length}  w {width}  h {height}  yaw {yaw}".format(
-            **number
-        ),
-    ]
+    lines = _head(number)
     lines += [f"  {_view_line(view)}" for view in views]
     lines.append(
         f"  consistency    L = {section.score_weight:g} (-ln s') + {section.box_weight:g} box loss"
@@ -302,6 +327,24 @@ def _lines(
         if not math.isclose(recomputed, label["weight"], abs_tol=1e-6):
             lines.append("  they differ: settings have changed since; `curate solve` weighs again")
     return lines
+
+
+def _numbers(label: dict[str, Any]) -> dict[str, Any]:
+    """The columns of a label as they are printed."""
+    return {
+        name: "none" if value is None else f"{value:.4f}" if isinstance(value, float) else value
+        for name, value in label.items()
+    }
+
+
+def _head(number: dict[str, Any]) -> list[str]:
+    """Which label it is, and where."""
+    return [
+        "round {round}, frame {frame}, label {k}: {category}, score {score}".format(**number),
+        "  box            x {x}  y {y}  z {z}  l {length}  w {width}  h {height}  yaw {yaw}".format(
+            **number
+        ),
+    ]
 
 
 def _age_line(config: Config, policy: str, age: AgeParameter | None, stored: str) -> str:

@@ -7,9 +7,11 @@ from sqlalchemy import func, select
 
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError, WorkspaceError
+from curate.review.human_labels import REJECTED
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
+from pipelines.review.human_labels import human_boxes
 from pipelines.workspace import Workspace
 
 
@@ -23,6 +25,8 @@ class FrameBoxes:
         weights: (n,) of one policy; 0 where it dropped the label, NaN where it weighted nothing.
         repredictions: of all views, with the weight of the label that each was matched with.
         truth: NaN boxes for DontCare; None for frames of X_u.
+        human_boxes: (h, 7) what people decided on; predictions that give way to them are left out
+            of the labels, rejected ones weigh 0.
     """
 
     split: str
@@ -30,6 +34,7 @@ class FrameBoxes:
     weights: np.ndarray
     repredictions: ShownRepredictions
     truth: Annotations | None
+    human_boxes: np.ndarray
 
     @property
     def truth_boxes(self) -> np.ndarray | None:
@@ -93,8 +98,15 @@ def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) 
     labels = workspace.predictions(round_number, [key])[key]
     weights = _weights(workspace, round_number, key, policy, len(labels))
     truth = None if split == "unlabeled" else workspace.ground_truth(split)[name]
+    rejected, replaced = _decided(workspace, round_number, key, len(labels))
+    weights[rejected] = 0.0
     return FrameBoxes(
-        split, labels, weights, _repredictions(workspace, round_number, key, weights), truth
+        split,
+        labels.select(~replaced),
+        weights[~replaced],
+        _repredictions(workspace, round_number, key, weights),
+        truth,
+        human_boxes(workspace, round_number, key),
     )
 
 
@@ -120,6 +132,22 @@ def _weights(
     for k, v in found:
         weights[k] = v
     return weights
+
+
+def _decided(
+    workspace: Workspace, round_number: int, key: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(count,) bool by k: rejected by people, and giving way to a human label's own box."""
+    match, label = bulk.table("human_match"), bulk.table("human_label")
+    same = (label.c.frame_id == match.c.frame_id, label.c.n == match.c.n)
+    query = select(match.c.k, label.c.decision).where(
+        *same, match.c.round == round_number, match.c.frame_id == key
+    )
+    rejected, replaced = np.zeros((2, count), dtype=bool)
+    with workspace.database.reading() as connection:
+        for k, decision in bulk.select(connection, query):
+            (rejected if decision == REJECTED else replaced)[k] = True
+    return rejected, replaced
 
 
 def _repredictions(

@@ -51,7 +51,14 @@ def draw_view(
         found.labels.boxes, found.labels.categories, found.labels.scores, found.weights, counts
     )
     title = f"frame {name} ({found.split}), round {number}, weights by {policy}"
-    picture = draw_frame(frame, labels, found.truth_boxes, found.repredictions, title=title)
+    picture = draw_frame(
+        frame,
+        labels,
+        found.truth_boxes,
+        found.repredictions,
+        human_boxes=found.human_boxes,
+        title=title,
+    )
     path = output or workspace.root / "pictures" / f"round-{number:02d}-{name}-{policy}.png"
     if path.is_dir() or not path.parent.is_dir():
         raise ConfigError(f"--output {path}: name a file in a folder that exists")

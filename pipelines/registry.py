@@ -148,5 +148,13 @@ EXECUTORS = Registry(
         "process": "pipelines.executors.process:ProcessExecutor",
     },
 )
+EDITORS = Registry(
+    "editor",
+    {
+        "kitti": "curate.review.editors.kitti:KittiEditor",
+        "labelcloud": "curate.review.editors.labelcloud:LabelCloudEditor",
+        "cvat": "curate.review.editors.cvat:CvatEditor",
+    },
+)
 # Detectors that `pretrain` and `train-round` can train; the others are brought by the user.
 TRAINABLE = frozenset({"pillars"})

@@ -15,6 +15,7 @@ from db import bulk
 from pipelines.differences import COLUMNS, Difference, difference_of
 from pipelines.frame_boxes import chosen_round
 from pipelines.label_columns import LabelColumns, read_columns
+from pipelines.review.human_labels import counts
 from pipelines.workspace import Workspace
 
 _BINS = 40
@@ -49,6 +50,10 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
         f"{len(labels):,} labels in {len(labels.frame_names):,} unlabeled frames, {kept:,} with a "
         f"weight above 0; their weights sum to {labels.weights.sum():,.1f}."
     )
+    decided = counts(workspace, number)
+    if decided:
+        told = ", ".join(f"{count:,} {name}" for name, count in decided.items())
+        note += f" People decided on some, whatever the policy says: {told}."
     path = workspace.root / "reports" / f"round-{number:02d}-{policy}.html"
     replace_file(path, render_page(title, note, sections).encode("utf-8"))
     return path

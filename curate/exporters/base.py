@@ -12,8 +12,10 @@ BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 WEIGHTED_LABEL_COLUMNS = (
     "round", "frame", "k", "category", *BOX_COLUMNS,
     "score", "loss", "points", "points_threshold", "rho_diff", "mask_pixels", "box_pixels",
-    "rho_anno", "rho_det", "lambda_u", "policy", "weight",
+    "rho_anno", "rho_det", "lambda_u", "provenance", "policy", "weight",
 )  # fmt: skip
+PROVENANCES = ("detector", "human")
+"""Whose a label is: a prediction that a policy weighs, or what a person decided in a review."""
 GROUND_TRUTH_COLUMNS = ("frame", "k", "category", *BOX_COLUMNS, "truncated", "occluded")
 FRAME_COLUMNS = ("frame", "split", "points", "image", "calibration")
 

@@ -18,6 +18,7 @@ from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
 from pipelines.progress import Progress
+from pipelines.review.human_labels import fingerprint
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.workspace import Workspace
 
@@ -25,9 +26,10 @@ CURRENT = "labels.sqlite"
 _CHUNK = 10_000
 
 
-def settings(_workspace: Workspace, _context: RoundContext, _policy: str) -> Settings:
-    """What the exported file depends on beside weights and ground truth."""
-    return {"format": 1}
+def settings(workspace: Workspace, context: RoundContext, _policy: str) -> Settings:
+    """What the exported file depends on beside weights and ground truth: what people decided."""
+    human = fingerprint(workspace, context.number)
+    return {"format": 1} if human is None else {"format": 1, "human": human}
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:

@@ -12,6 +12,7 @@ from db import bulk
 from pipelines.assembly import open_policy
 from pipelines.evidence import LabelKeys, read_evidence, read_memory, solved_fingerprint
 from pipelines.progress import Progress
+from pipelines.review.human_labels import refresh_matches
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.workspace import Workspace
 
@@ -60,6 +61,7 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
             for rows in _rows(context.number, keys, policy, weights, evidence):
                 bulk.insert(connection, "weight", rows)
         bulk.insert(connection, "label_count", counts)
+        refresh_matches(connection, context.number)
         bulk.refresh_statistics(connection)
 
     trusted, total = int((weights.v > 0).sum()), float(weights.v.sum())

@@ -200,7 +200,7 @@ def labels(frames) -> LabelSet:
             box = (*rng.uniform([6, -4, -1], [30, 4, 0]).tolist(), *SIZES[category], float(k - 2))
             # Without counterpart, without priors, weight zero and one: all that there is.
             loss, points = (None, None) if k == 0 else (0.5, 12)
-            evidence = (loss, points, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "pspsl", k / 4)
+            evidence = (loss, points, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "detector", "pspsl", k / 4)
             rows.append((1, name, k, category, *box, 0.7, *evidence))
     return LabelSet(
         description=LabelFileDescription("kitti", Path("/data"), CATEGORIES, 1, "pspsl", "1"),
