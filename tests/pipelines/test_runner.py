@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import toys
+from stored_rows import dump
 
 from curate.errors import WorkspaceError
 from curate.priors.points import PointPrior
@@ -19,23 +20,6 @@ from pipelines.setup import initialise
 from pipelines.workspace import Workspace
 
 FRAME_STAGES = ("predict", "repredict", "points", "semantic")
-
-
-def dump(workspace: Workspace) -> list[tuple]:
-    """All rows that a run makes, without keys and times that may differ."""
-    tables = {
-        "prediction": "*", "reprediction_view": "*", "reprediction": "*", "consistency": "*",
-        "point_prior": "*", "semantic_prior": "*", "weight": "*",
-        "task": "round, stage, variant, frame_id, fingerprint, state, error",
-    }  # fmt: skip
-    with workspace.database.reading() as connection:
-        return [
-            (table, *row)
-            for table, columns in tables.items()
-            for row in sorted(
-                map(tuple, connection.exec_driver_sql(f"SELECT {columns} FROM {table}")), key=str
-            )
-        ]
 
 
 def count(workspace: Workspace, table: str) -> int:
@@ -254,16 +238,6 @@ def test_policies_stand_side_by_side(workspace: Workspace) -> None:
     after = [row for row in dump(workspace) if row[0] == "weight"]
     assert set(before) < set(after)
     assert len(after) == 36
-
-
-def test_the_rows_do_not_depend_on_the_executor(
-    workspace: Workspace, tmp_path: Path, toy_kitti: Path
-) -> None:
-    """Two worker processes write what one serial run writes, to the last bit."""
-    run(workspace)
-    other = initialise(tmp_path / "other", workspace.config, "0.25", "")
-    run(with_setting(other, "run", executor="process", workers=2))
-    assert dump(other) == dump(workspace)
 
 
 def test_every_stage_reads_what_exists_before_it(workspace: Workspace) -> None:
