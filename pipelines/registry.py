@@ -141,6 +141,7 @@ EXECUTORS = Registry(
     {
         "serial": "pipelines.executors.serial:SerialExecutor",
         "process": "pipelines.executors.process:ProcessExecutor",
+        "ray": "pipelines.executors.ray:RayExecutor",
     },
 )
 # Detectors that `pretrain` and `train-round` can train; the others are brought by the user.

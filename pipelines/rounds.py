@@ -10,7 +10,7 @@ from curate.errors import WorkspaceError
 from db import bulk
 from pipelines.registry import TRAINABLE
 from pipelines.stage import RoundContext, Teacher
-from pipelines.workspace import SPLITS, Workspace, sha256
+from pipelines.workspace import Workspace, sha256
 
 
 def is_trainable(workspace: Workspace) -> bool:
@@ -37,7 +37,7 @@ def open_round(
         WorkspaceError: the detector that would answer in the round does not exist yet, or the
             workspace has no frames.
     """
-    if not workspace.frames(*SPLITS):
+    if not workspace.holds_frames():
         raise WorkspaceError(
             f"{workspace.root}: holds no frames, its init was interrupted; "
             "run `curate init` again with the same arguments"

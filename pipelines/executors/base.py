@@ -16,8 +16,8 @@ logger = logging.getLogger(__name__)
 
 # A frame whose worker died is tried so often in all; the next death may well be its own doing.
 TRIES = 2
-# So many workers in a row may die while they load their models.
-OPENINGS = 3
+# So many more workers than there are may die in a row while they load their models.
+SPARE_OPENINGS = 2
 
 # Rows by table, each without its first two columns, round and frame_id.
 FrameRows = Mapping[str, list[tuple[Any, ...]]]
@@ -84,7 +84,8 @@ class Executor(Protocol):
 class JobQueue:
     """Jobs to hand out: first those that a dead worker has left, then the next of all."""
 
-    def __init__(self, jobs: Iterable[FrameJob]) -> None:
+    def __init__(self, jobs: Iterable[FrameJob], workers: int) -> None:
+        self._openings = workers + SPARE_OPENINGS
         self._next = iter(jobs)
         self._again: deque[FrameJob] = deque()
         self._deaths: Counter[int] = Counter()
@@ -115,10 +116,10 @@ class JobQueue:
         """
         if not opened:
             self._dead_openings += 1
-            if self._dead_openings == OPENINGS:
+            if self._dead_openings == self._openings:
                 raise CurateError(
-                    f"{OPENINGS} workers in a row died while they loaded their models, the last "
-                    f"{reason}; run again with fewer workers, finished frames are kept"
+                    f"{self._openings} workers in a row died while they loaded their models, the "
+                    f"last {reason}; run again with fewer workers, finished frames are kept"
                 )
             self.give_back(in_hand)
             return

@@ -47,7 +47,7 @@ class ProcessExecutor:
         Raises:
             CurateError: the models cannot be loaded, or workers die while they load them.
         """
-        queue = JobQueue(jobs)
+        queue = JobQueue(jobs, self.workers)
         packed = pickle.dumps(function)
         try:
             while True:
