@@ -1,7 +1,9 @@
 """Opening a database: pragmas, migrations, and errors in our own words."""
 
+import logging
+import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,10 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError
+from db.lock_holders import holders
 from db.views import create_views
+
+_log = logging.getLogger(__name__)
 
 # A writer that finds another one waits this long before it gives up.
 BUSY_TIMEOUT_MS = 30_000
@@ -65,10 +70,35 @@ class Database:
             raise DatabaseError(
                 f"{self.url.database}: written by a newer curate (schema {current}); update curate"
             )
+        if current is not None and self.engine.dialect.name == "sqlite":
+            _back_up(Path(str(self.url.database)), current)
         with self.writing() as connection:
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
             create_views(connection)
+
+
+def _back_up(path: Path, revision: str) -> None:
+    """Copies a database as it is before it is migrated.
+
+    Raises:
+        DatabaseError: there is no room for it, or its folder cannot be written.
+    """
+    backup = path.with_name(f"{path.name}.schema-{revision}.backup")
+    partial = backup.with_suffix(".partial")
+    try:
+        with closing(sqlite3.connect(path)) as old, closing(sqlite3.connect(partial)) as copy:
+            old.backup(copy)
+        partial.replace(backup)
+    except (sqlite3.Error, OSError) as error:
+        partial.unlink(missing_ok=True)
+        raise DatabaseError(
+            f"{path}: cannot be copied before its schema is migrated: {error}; make room for "
+            f"{backup.name} and run the command again"
+        ) from error
+    _log.warning(
+        "%s: schema %s is migrated; the old database is kept as %s", path, revision, backup
+    )
 
 
 def parse_url(text: str) -> URL:
@@ -127,16 +157,22 @@ def _own_words(name: str | None) -> Iterator[None]:
     except DBAPIError as error:
         if "ground truth of an unlabeled frame" in str(error.orig):
             raise LeakageError(f"{name}: {error.orig} must not be stored") from error
-        raise DatabaseError(f"{name}: {error.orig}{_remedy(str(error.orig))}") from error
+        raise DatabaseError(f"{name}: {error.orig}{_remedy(str(error.orig), name)}") from error
 
 
-def _remedy(message: str) -> str:
+def _remedy(message: str, name: str | None) -> str:
+    if "locked" in message and name is not None and (found := holders(Path(name))):
+        return (
+            f"; waited {BUSY_TIMEOUT_MS / 1000:g} s for {', '.join(found)}, which is writing: "
+            "wait for it or end it, then run the command again"
+        )
     remedies = {
         "malformed": "; restore a backup, or rebuild it with `sqlite3 OLD .recover | sqlite3 NEW`",
         "not a database": "; this file is damaged or of another kind, move it away or restore it",
         "locked": "; another process is writing, wait for it or end it",
         "readonly": "; give yourself write permission on the file and its folder",
         "unable to open": "; check that the folder exists and can be written",
+        "disk I/O error": "; check the disk and its mount, finished frames are kept",
         "full": "; free space on the disk and run the command again, finished frames are kept",
     }
     return next((remedy for sign, remedy in remedies.items() if sign in message), "")
