@@ -2,6 +2,8 @@
 
 import os
 import signal
+import time
+import uuid
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,3 +77,28 @@ class Shuffled:
 
     def close(self) -> None:
         """Nothing to end."""
+
+
+@dataclass
+class Slow:
+    """Takes its time, and says on which node of a cluster it worked.
+
+    Attributes:
+        folder: where it notes every frame that it begins.
+        seconds: per frame.
+    """
+
+    folder: Path
+    seconds: float
+
+    def open(self) -> None:
+        """Needs nothing."""
+
+    def __call__(self, job: FrameJob) -> FrameRows:
+        """The node, as a row."""
+        import ray
+
+        node = ray.get_runtime_context().get_node_id()
+        (self.folder / f"{job.frame}-{uuid.uuid4()}").touch()
+        time.sleep(self.seconds)
+        return {"nodes": [(node,)]}

@@ -217,17 +217,17 @@ def _import_ray() -> Any:
 
 def _join(ray: Any, address: str | None, workers: int) -> None:
     """Joins a cluster, or starts one with a CPU per worker at least."""
-    quiet = {"logging_level": "ERROR", "log_to_driver": False, "include_dashboard": False}
     joins = address or os.environ.get("RAY_ADDRESS")
-    if joins:
-        own: dict[str, Any] = {"address": joins}
-    else:
-        own = {"num_cpus": max(workers, os.cpu_count() or 1)}
+    where: dict[str, Any] = (
+        {"address": joins}
+        if joins
+        else {"num_cpus": max(workers, os.cpu_count() or 1), "include_dashboard": False}
+    )
     try:
-        ray.init(**own, **({} if joins else quiet))
+        ray.init(**where, logging_level="ERROR", log_to_driver=False)
     except Exception as error:  # Ray raises many kinds, none of which says more than its words
-        where = f"joined at {joins}" if joins else "started on this machine"
-        raise CurateError(f"no Ray cluster could be {where}: {_one_line(error)}") from error
+        done = f"joined at {joins}" if joins else "started on this machine"
+        raise CurateError(f"no Ray cluster could be {done}: {_one_line(error)}") from error
 
 
 def _one_line(error: Exception) -> str:

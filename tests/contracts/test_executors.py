@@ -20,24 +20,31 @@ from pipelines.setup import initialise
 from pipelines.workspace import Workspace
 
 
+@pytest.fixture(scope="module")
+def missing_ray() -> Iterator[str]:
+    """Why there is no Ray cluster here; "" where there is one, which all tests share."""
+    try:
+        first = EXECUTORS.build("ray", offered={"workers": lambda: 3}, options={})
+    except CurateError as error:
+        yield str(error)
+    else:
+        yield ""
+        first.close()
+
+
+def skip_absent(name: str, request: pytest.FixtureRequest) -> None:
+    """Skips what belongs to an executor that cannot run here, with the reason."""
+    if name == "ray" and (reason := request.getfixturevalue("missing_ray")):
+        pytest.skip(reason)
+
+
 @pytest.fixture(scope="module", params=sorted(EXECUTORS.classes))
 def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
     """Every registered executor, with two workers where it has workers."""
-    made = opened(request.param, 2)
+    skip_absent(request.param, request)
+    made = EXECUTORS.build(request.param, offered={"workers": lambda: 2}, options={})
     yield made
     made.close()
-
-
-def opened(name: str, workers: int) -> Executor:
-    """An executor; the test is skipped where what it needs is not installed."""
-    skip_absent(name)
-    return EXECUTORS.build(name, offered={"workers": lambda: workers}, options={})
-
-
-def skip_absent(name: str) -> None:
-    """Skips what belongs to an executor whose extra is not installed."""
-    if name == "ray":
-        pytest.importorskip("ray", reason="ray is not installed: pip install '.[ray]'")
 
 
 @pytest.fixture
@@ -152,10 +159,14 @@ def finished(home: Path, name: str, executor: str, workers: int) -> Workspace:
     ],
 )
 def test_the_rows_depend_on_nothing_but_the_seed(
-    serial_rows: tuple[Path, list[tuple]], tmp_path: Path, name: str, workers: int
+    serial_rows: tuple[Path, list[tuple]],
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+    name: str,
+    workers: int,
 ) -> None:
     """Whatever the executor, the number of workers, the order of frames: the same to the bit."""
-    skip_absent(name)
+    skip_absent(name, request)
     home, rows = serial_rows
     assert sum(row[0] == "weight" for row in rows) > 50
     assert dump(finished(home, f"{tmp_path.name}", name, workers)) == rows
