@@ -43,8 +43,9 @@ def _write_locks() -> Iterator[tuple[int, int, int, float]]:
 
 
 def _command(pid: int) -> str:
+    """The command line of a process, in one line."""
     try:
-        words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+        text = Path(f"/proc/{pid}/cmdline").read_text()
     except OSError:
         return "of another user"
-    return " ".join(words).strip()[:120]
+    return " ".join(text.replace("\0", " ").split())[:120]
