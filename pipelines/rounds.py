@@ -37,7 +37,7 @@ def open_round(
         WorkspaceError: the detector that would answer in the round does not exist yet, or the
             workspace has no frames.
     """
-    if not workspace.holds_frames():
+    if not _has_frames(workspace):
         raise WorkspaceError(
             f"{workspace.root}: holds no frames, its init was interrupted; "
             "run `curate init` again with the same arguments"
@@ -151,6 +151,11 @@ def _brought(workspace: Workspace) -> tuple[int, Teacher]:
             register_checkpoint(connection, workspace, 0, "", path)
             found = bulk.select(connection, query)
     return found[0][0], Teacher(path, digest)
+
+
+def _has_frames(workspace: Workspace) -> bool:
+    with workspace.database.reading() as connection:
+        return bool(bulk.select(connection, select(bulk.table("frame").c.id).limit(1)))
 
 
 def _students(workspace: Workspace) -> set[int]:

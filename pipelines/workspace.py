@@ -91,11 +91,6 @@ class Workspace:
         with self.database.reading() as connection:
             return dict(bulk.select(connection, query.order_by(frame.c.frame)))
 
-    def holds_frames(self) -> bool:
-        """Whether `curate init` has come to its end."""
-        with self.database.reading() as connection:
-            return bool(bulk.select(connection, select(bulk.table("frame").c.id).limit(1)))
-
     def ground_truth(self, *splits: str) -> dict[str, Annotations]:
         """The stored ground truth per frame; there is none of unlabeled frames."""
         truth, frame = bulk.table("ground_truth"), bulk.table("frame")

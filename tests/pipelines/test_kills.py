@@ -84,7 +84,7 @@ def results(workspace: Workspace) -> list[tuple]:
     """All rows of the database and of the exported file, and the student."""
     with closing(sqlite3.connect(workspace.root / "exports" / "labels.sqlite")) as labels:
         exported = [("exported", line) for line in labels.iterdump()]
-    students = sorted((workspace.root / "checkpoints").iterdir())
+    students = sorted((workspace.root / "checkpoints").glob("*.*"))
     return [*dump(workspace), *exported, *((path.name, path.read_bytes()) for path in students)]
 
 
