@@ -98,16 +98,18 @@ def waiting_frames(
     prints = fingerprints(workspace, context, workspace.config.run.method)
     frame = bulk.table("frame")
     query, holds = _waiting(workspace, context, of, split, prints)
-    query = query.where(holds if measured else not_(holds)).order_by(frame.c.id).limit(PAGE)
-    last = -1
-    while True:
+    query = query.where(holds if measured else not_(holds)).order_by(frame.c.id)
+    ends = select(func.min(frame.c.id), func.max(frame.c.id)).where(frame.c.split == split)
+    with workspace.database.reading() as connection:
+        [(lowest, highest)] = bulk.select(connection, ends)
+    if lowest is None:
+        return
+    for first in range(lowest, highest + 1, PAGE):
+        page = query.where(frame.c.id.between(first, first + PAGE - 1))
         with workspace.database.reading() as connection:
-            page = bulk.select(connection, query.where(frame.c.id > last))
-        for key, name, empty in page:
+            found = bulk.select(connection, page)
+        for key, name, empty in found:
             yield key, name, bool(empty)
-        if len(page) < PAGE:
-            return
-        last = page[-1][0]
 
 
 def count_waiting(workspace: Workspace, context: RoundContext, of: FrameStage, split: str) -> int:
