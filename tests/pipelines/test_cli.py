@@ -13,6 +13,7 @@ import pytest
 from pipelines_cli import Curate
 
 from curate.errors import ConfigError, DataError, FramesFailed, WorkspaceError
+from pipelines.commands.options import open_workspace
 
 LABELS = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
 
@@ -416,3 +417,17 @@ def test_a_category_without_ground_truth_warns_and_uses_the_fallback(
     sql = "SELECT DISTINCT points_threshold FROM weighted_labels WHERE category = 'Cyclist'"
     _, out, _ = curate("query", sql, "--json", "-w", folder)
     assert json.loads(out) == [{"points_threshold": 5.0}]
+
+
+@pytest.mark.parametrize(
+    ("configured", "workers", "used"),
+    [("serial", 4, "process"), ("process", 1, "serial"), ("ray", 4, "ray"), ("ray", 1, "ray")],
+)
+def test_workers_choose_an_executor_only_where_none_of_a_cluster_is_configured(
+    made: Path, configured: str, workers: int, used: str
+) -> None:
+    """On one machine more than one worker are processes; a cluster stays a cluster."""
+    path = made / "curate.toml"
+    path.write_text(path.read_text().replace('executor = "serial"', f'executor = "{configured}"'))
+    run = open_workspace(made, workers=workers).config.run
+    assert (run.executor, run.workers) == (used, workers)
