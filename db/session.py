@@ -1,7 +1,9 @@
 """Opening a database: pragmas, migrations, and errors in our own words."""
 
+import logging
+import sqlite3
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,10 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError
 from db.claims import claimed, round_resources
+from db.lock_holders import holders
 from db.views import create_views, drop_views
+
+_log = logging.getLogger(__name__)
 
 # A writer that finds another one waits this long before it gives up.
 BUSY_TIMEOUT_MS = 30_000
@@ -89,6 +94,8 @@ class Database:
             raise DatabaseError(
                 f"{self.name}: written by a newer curate (schema {current}); update curate"
             )
+        if current is not None and self.engine.dialect.name == "sqlite":
+            _back_up(Path(str(self.url.database)), current)
         with self.writing() as connection:
             if self.engine.dialect.name == "postgresql":
                 connection.execute(text(f"SELECT pg_advisory_xact_lock({_MIGRATION_LOCK})"))
@@ -112,9 +119,41 @@ class Database:
         message = "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
         if "ground truth of an unlabeled frame" in message:
             return LeakageError(f"{self.name}: {message} must not be stored")
-        remedies = _REMEDIES[self.engine.dialect.name]
-        remedy = next((each for sign, each in remedies.items() if sign in message), "")
-        return DatabaseError(f"{self.name}: {message}{remedy}")
+        return DatabaseError(f"{self.name}: {message}{self._remedy(message)}")
+
+    def _remedy(self, message: str) -> str:
+        backend = self.engine.dialect.name
+        if backend == "sqlite" and "locked" in message:
+            writing = holders(Path(str(self.url.database)))
+            if writing:
+                return (
+                    f"; waited {BUSY_TIMEOUT_MS / 1000:g} s for {', '.join(writing)}, which is "
+                    "writing: wait for it or end it, then run the command again"
+                )
+        return next((each for sign, each in _REMEDIES[backend].items() if sign in message), "")
+
+
+def _back_up(path: Path, revision: str) -> None:
+    """Copies a database as it is before it is migrated.
+
+    Raises:
+        DatabaseError: there is no room for it, or its folder cannot be written.
+    """
+    backup = path.with_name(f"{path.name}.schema-{revision}.backup")
+    partial = backup.with_suffix(".partial")
+    try:
+        with closing(sqlite3.connect(path)) as old, closing(sqlite3.connect(partial)) as copy:
+            old.backup(copy)
+        partial.replace(backup)
+    except (sqlite3.Error, OSError) as error:
+        partial.unlink(missing_ok=True)
+        raise DatabaseError(
+            f"{path}: cannot be copied before its schema is migrated: {error}; make room for "
+            f"{backup.name} and run the command again"
+        ) from error
+    _log.warning(
+        "%s: schema %s is migrated; the old database is kept as %s", path, revision, backup
+    )
 
 
 def parse_url(address: str) -> URL:
@@ -179,6 +218,7 @@ _REMEDIES = {
         "locked": "; another process is writing, wait for it or end it",
         "readonly": "; give yourself write permission on the file and its folder",
         "unable to open": "; check that the folder exists and can be written",
+        "disk I/O error": "; check the disk and its mount, finished frames are kept",
         "full": "; free space on the disk and run the command again, finished frames are kept",
     },
     "postgresql": {

@@ -89,8 +89,14 @@ def main() -> None:
     except CurateError as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(error.exit_code)
+    except BrokenPipeError:
+        sys.exit(0)
+    except OSError as error:
+        # The machine's fault, not the input's: a full disk, a folder that cannot be written.
+        place = f"{error.filename}: " if error.filename else ""
+        reason = error.strerror or error
+        sys.stderr.write(f"error: {place}{reason}; mend it and run the command again, it goes on\n")
+        sys.exit(CurateError.exit_code)
     except KeyboardInterrupt:
         sys.stderr.write("interrupted; run the command again, it continues\n")
         sys.exit(130)
-    except BrokenPipeError:
-        sys.exit(0)

@@ -150,7 +150,8 @@ class RunSection(Section):
     seed: Seed = 0
     priors: Annotated[tuple[str, ...], AfterValidator(_each_once)] = ("points", "semantic")
     prior_options: dict[str, Options] = {}  # of your own priors, by name
-    executor: str = "serial"
+    executor: str = "serial"  # or process, ray; see docs/scale.md
+    executor_options: dict[str, Options] = {}  # by executor, e.g. executor_options.ray.num_gpus = 1
     workers: AtLeastOne = 1
     database: str | None = None  # an SQLAlchemy URL; default: curate.db in the workspace
 

@@ -10,11 +10,11 @@ whose task carries the current first part needs not be measured again.
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, select
+from sqlalchemy import ColumnElement, Connection, Select, and_, false, func, not_, or_, select
 
 from curate.errors import WorkspaceError
 from db import bulk
@@ -24,6 +24,7 @@ from pipelines.stage import FrameStage, RoundContext, RoundStage
 from pipelines.workspace import Workspace
 
 FINISHED = ("done", "empty")
+PAGE = 1024  # frames that are read at once
 
 
 @dataclass(frozen=True)
@@ -86,53 +87,93 @@ def fingerprints(workspace: Workspace, context: RoundContext, policy: str) -> di
 
 
 def waiting_frames(
-    workspace: Workspace, context: RoundContext, of: FrameStage, split: str
-) -> list[tuple[int, str, bool]]:
+    workspace: Workspace, context: RoundContext, of: FrameStage, split: str, *, measured: bool
+) -> Iterator[tuple[int, str, bool]]:
     """Frames to work on: key, name, and whether an earlier stage found them empty.
 
     They are those of the split that all earlier stages have finished and this one has not, or not
-    with its current fingerprint.
+    with its current fingerprint. They are read page by page: what becomes of them meanwhile changes
+    nothing in those that follow. With `measured` they are those whose stored measurements still
+    hold, else the others.
     """
     prints = fingerprints(workspace, context, workspace.config.run.method)
     frame = bulk.table("frame")
-    query = select(frame.c.id, frame.c.frame).where(frame.c.split == split).order_by(frame.c.frame)
+    query, holds = _waiting(workspace, context, of, split, prints)
+    query = query.where(holds if measured else not_(holds)).order_by(frame.c.id)
+    ends = select(func.min(frame.c.id), func.max(frame.c.id)).where(frame.c.split == split)
     with workspace.database.reading() as connection:
-        frames = bulk.select(connection, query)
-        own = _states(connection, context.number, of.name, prints[of.name])
-        before = [
-            _states(connection, context.number, other.name, prints[other.name])
-            for other in frames_before(of, workspace.config.run.priors)
-        ]
-    return [
-        (key, name, any(states[key] == "empty" for states in before))
-        for key, name in frames
-        if own.get(key) not in FINISHED and all(states.get(key) in FINISHED for states in before)
-    ]
+        [(lowest, highest)] = bulk.select(connection, ends)
+    if lowest is None:
+        return
+    for first in range(lowest, highest + 1, PAGE):
+        page = query.where(frame.c.id.between(first, first + PAGE - 1))
+        with workspace.database.reading() as connection:
+            found = bulk.select(connection, page)
+        for key, name, empty in found:
+            yield key, name, bool(empty)
 
 
-def measured_frames(workspace: Workspace, context: RoundContext, of: FrameStage) -> set[int]:
-    """The frames whose stored measurements still hold, though what follows from them may not."""
-    current = fingerprints(workspace, context, workspace.config.run.method)[of.name]
-    task = bulk.table("task")
-    query = select(task.c.frame_id).where(
-        task.c.round == context.number,
-        task.c.stage == of.name,
-        task.c.state == "done",
-        task.c.fingerprint.startswith(current.partition(".")[0] + "."),
+def count_waiting(workspace: Workspace, context: RoundContext, of: FrameStage, split: str) -> int:
+    """How many frames are to be worked on."""
+    prints = fingerprints(workspace, context, workspace.config.run.method)
+    query, _ = _waiting(workspace, context, of, split, prints)
+    with workspace.database.reading() as connection:
+        found = bulk.select(connection, select(func.count()).select_from(query.subquery()))
+    return int(found[0][0])
+
+
+def _waiting(
+    workspace: Workspace,
+    context: RoundContext,
+    of: FrameStage,
+    split: str,
+    prints: Mapping[str, str],
+) -> tuple[Select[Any], ColumnElement[bool]]:
+    """The query for the frames to work on, and the condition that their measurements still hold."""
+    frame = bulk.table("frame")
+    own = bulk.table("task").alias("own")
+    source = frame.outerjoin(own, _task_of(own, context, of.name))
+    empty: list[ColumnElement[bool]] = [false()]
+    for other in frames_before(of, workspace.config.run.priors):
+        task = bulk.table("task").alias(f"task_{other.name}")
+        finished = (task.c.fingerprint == prints[other.name], task.c.state.in_(FINISHED))
+        source = source.join(task, and_(_task_of(task, context, other.name), *finished))
+        empty.append(task.c.state == "empty")
+    current = prints[of.name]
+    holds = and_(
+        own.c.id.is_not(None),
+        func.coalesce(own.c.state, "") == "done",
+        func.coalesce(own.c.fingerprint, "").startswith(current.partition(".")[0] + "."),
     )
-    with workspace.database.reading() as connection:
-        return {row[0] for row in bulk.select(connection, query)}
+    undone = or_(own.c.id.is_(None), own.c.fingerprint != current, own.c.state.not_in(FINISHED))
+    query = select(frame.c.id, frame.c.frame, or_(*empty)).select_from(source)
+    return query.where(frame.c.split == split, undone), holds
 
 
 def counts(workspace: Workspace, context: RoundContext, of: FrameStage, split: str) -> Counts:
     """How far a stage is with a split."""
     prints = fingerprints(workspace, context, workspace.config.run.method)
-    frames = set(workspace.frames(split).values())
+    frame, own = bulk.table("frame"), bulk.table("task").alias("own")
+    mine = and_(_task_of(own, context, of.name), own.c.fingerprint == prints[of.name])
+    query = (
+        select(own.c.state, func.count())
+        .select_from(frame.outerjoin(own, mine))
+        .where(frame.c.split == split)
+        .group_by(own.c.state)
+    )
     with workspace.database.reading() as connection:
-        own = _states(connection, context.number, of.name, prints[of.name])
-    states = [own.get(key) for key in frames]
-    done, empty, failed = (states.count(state) for state in ("done", "empty", "failed"))
-    return Counts(done, empty, failed, len(states) - done - empty - failed)
+        found: dict[str | None, int] = dict(bulk.select(connection, query))
+    done, empty, failed, waiting = (found.get(key, 0) for key in ("done", "empty", "failed", None))
+    return Counts(done, empty, failed, waiting)
+
+
+def _task_of(task: Any, context: RoundContext, stage_name: str) -> ColumnElement[bool]:
+    """The join of a frame with its task of a stage."""
+    return and_(
+        task.c.round == context.number,
+        task.c.stage == stage_name,
+        task.c.frame_id == bulk.table("frame").c.id,
+    )
 
 
 def complete_frames(

@@ -146,6 +146,7 @@ EXECUTORS = Registry(
     {
         "serial": "pipelines.executors.serial:SerialExecutor",
         "process": "pipelines.executors.process:ProcessExecutor",
+        "ray": "pipelines.executors.ray:RayExecutor",
     },
 )
 EDITORS = Registry(

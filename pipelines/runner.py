@@ -5,9 +5,10 @@ whole or untouched.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -61,7 +62,9 @@ def open_executor(workspace: Workspace) -> Iterator[Executor]:
     """The configured executor, whose workers serve several stages."""
     section = workspace.config.run
     executor: Executor = registry.EXECUTORS.build(
-        section.executor, offered={"workers": lambda: section.workers}, options={}
+        section.executor,
+        offered={"workers": lambda: section.workers},
+        options=section.executor_options.get(section.executor, {}),
     )
     try:
         yield executor
@@ -96,15 +99,17 @@ def _run_frames(
     split: str,
 ) -> Report:
     start = time.perf_counter()
-    waiting = plan.waiting_frames(workspace, context, stage, split)
+    total = plan.count_waiting(workspace, context, stage, split)
     before = plan.counts(workspace, context, stage, split)
     writer = _Writer(workspace, context, stage)
-    with progress.track(stage.name, len(waiting)) as advance:
-        writer.skip([key for key, _, empty in waiting if empty])
-        advance(writer.empty, "")
-        jobs = [(key, name) for key, name, empty in waiting if not empty]
-        if jobs:
-            for outcome in _outcomes(workspace, context, stage, jobs, executor):
+    with progress.track(stage.name, total) as advance:
+
+        def skip(keys: Sequence[int]) -> None:
+            writer.skip(keys)
+            advance(len(keys), "")
+
+        if total:
+            for outcome in _outcomes(workspace, context, stage, split, executor, skip):
                 writer.add(outcome)
                 advance(1, f"{writer.failed} failed" if writer.failed else "")
             writer.flush()
@@ -168,42 +173,52 @@ def _outcomes(
     workspace: Workspace,
     context: RoundContext,
     stage: FrameStage,
-    frames: Sequence[tuple[int, str]],
+    split: str,
     executor: Executor,
+    skip: Callable[[Sequence[int]], None],
 ) -> Iterator[Outcome]:
     """The executor works on the frames; those whose measurements still hold need none."""
-    recall = stage.recall
-    known = plan.measured_frames(workspace, context, stage) if recall else set()
-    recalled = [frame for frame in frames if frame[0] in known]
-    if recall and recalled:
-        jobs = _jobs(workspace, context, stage, recalled, recall)
-        yield from SerialExecutor().map(recall.function(workspace, context), jobs)
-    fresh = [frame for frame in frames if frame[0] not in known]
-    if fresh:
-        jobs = _jobs(workspace, context, stage, fresh)
-        yield from executor.map(stage.function(workspace, context), jobs)
+    frames = plan.waiting_frames(workspace, context, stage, split, measured=False)
+    jobs = _jobs(workspace, context, stage, frames, skip)
+    # The models are loaded only where a frame needs them.
+    for first in jobs:
+        yield from executor.map(stage.function(workspace, context), chain([first], jobs))
+    if stage.recall:
+        frames = plan.waiting_frames(workspace, context, stage, split, measured=True)
+        jobs = _jobs(workspace, context, stage, frames, skip, stage.recall)
+        for first in jobs:
+            rate = stage.recall.function(workspace, context)
+            yield from SerialExecutor().map(rate, chain([first], jobs))
 
 
 def _jobs(
     workspace: Workspace,
     context: RoundContext,
     stage: FrameStage,
-    frames: Sequence[tuple[int, str]],
+    frames: Iterable[tuple[int, str, bool]],
+    skip: Callable[[Sequence[int]], None],
     recall: Recall | None = None,
 ) -> Iterator[FrameJob]:
-    """The jobs of frames, with their predictions and measurements where they are needed."""
+    """The jobs of frames, with their predictions and measurements where they are needed.
+
+    Frames that an earlier stage found empty are no jobs; `skip` is told of them.
+    """
+    reads = "prediction" in stage.reads
     for batch in _batched(frames, READ_AHEAD):
-        keys = [key for key, _ in batch]
-        reads = "prediction" in stage.reads
+        if empty := [key for key, _, is_empty in batch if is_empty]:
+            skip(empty)
+        keys = [key for key, _, is_empty in batch if not is_empty]
         found = workspace.predictions(context.number, keys) if reads else {}
         measured = recall.read(workspace, context, keys) if recall else {}
-        for key, name in batch:
-            yield FrameJob(key, name, found.get(key), measured.get(key))
+        for key, name, is_empty in batch:
+            if not is_empty:
+                yield FrameJob(key, name, found.get(key), measured.get(key))
 
 
-def _batched(items: Sequence[Item], size: int) -> Iterator[Sequence[Item]]:
-    for start in range(0, len(items), size):
-        yield items[start : start + size]
+def _batched(items: Iterable[Item], size: int) -> Iterator[Sequence[Item]]:
+    waiting = iter(items)
+    while batch := list(islice(waiting, size)):
+        yield batch
 
 
 class _Writer:
@@ -229,12 +244,10 @@ class _Writer:
 
     def skip(self, keys: Sequence[int]) -> None:
         """Records frames without predictions as empty."""
-        for batch in _batched(keys, READ_AHEAD):
-            with self.workspace.database.writing() as connection:
-                self._clear(connection, batch)
-                rows = [self._row(key, "empty", None, 0.0) for key in batch]
-                bulk.insert(connection, "task", rows)
-            self.empty += len(batch)
+        with self.workspace.database.writing() as connection:
+            self._clear(connection, keys)
+            bulk.insert(connection, "task", [self._row(key, "empty", None, 0.0) for key in keys])
+        self.empty += len(keys)
 
     def flush(self) -> None:
         """Stores what has been collected, whole or not at all."""

@@ -75,7 +75,7 @@ def test_every_module_says_what_it_is_for() -> None:
 
 
 def test_nothing_unpickles_files() -> None:
-    """The process executor reads its parent's bytes; a foreign pickle's reader runs nothing."""
+    """Workers read their parent's bytes; a foreign pickle's reader runs nothing."""
     calls = {
         (str(path.relative_to(ROOT)), ast.unparse(node.func))
         for path in HOUSE
@@ -84,7 +84,9 @@ def test_nothing_unpickles_files() -> None:
         and ast.unparse(node.func) in {"pickle.load", "pickle.loads", "eval", "exec", "torch.load"}
         and not any(keyword.arg == "weights_only" for keyword in node.keywords)
     }
-    assert calls == {("pipelines/executors/process.py", "pickle.loads")}
+    assert calls == {
+        (f"pipelines/executors/{name}.py", "pickle.loads") for name in ("process", "ray")
+    }
     readers = {str(path.relative_to(ROOT)) for path in HOUSE if "Unpickler" in path.read_text()}
     assert readers == {"curate/detectors/recorded/plain_pickle.py"}
 

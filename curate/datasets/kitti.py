@@ -6,7 +6,9 @@ flat ROOT/{velodyne,image_2,calib,label_2}; label_2 and ROOT/ImageSets/*.txt are
 """
 
 import logging
+import os
 from collections.abc import Iterator, Mapping
+from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 
@@ -193,7 +195,12 @@ def parse_matrix(entries: str, shape: tuple[int, int], place: str) -> np.ndarray
 
 def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
     """The files of a folder without hidden ones: macOS strews ._ files over foreign disks."""
-    return (path for path in folder.glob(pattern) if not path.name.startswith("."))
+    if not folder.is_dir():
+        return
+    with os.scandir(folder) as entries:  # `glob` would hold an object per file
+        for entry in entries:
+            if not entry.name.startswith(".") and fnmatchcase(entry.name, pattern):
+                yield folder / entry.name
 
 
 def read_frame_lists(folder: Path) -> Mapping[str, tuple[str, ...]]:

@@ -129,7 +129,8 @@ def write_labels(
 
     Raises:
         LeakageError: ground truth of a frame that is not labeled, or a frame of another split.
-        DataError: a row does not fit its table, or a label belongs to no unlabeled frame.
+        DataError: a row does not fit its table, a label belongs to no unlabeled frame, or the disk
+            is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -140,6 +141,10 @@ def write_labels(
         with partial.open("rb") as written:
             os.fsync(written.fileno())
         partial.replace(path)
+    except sqlite3.OperationalError as error:
+        raise DataError(
+            f"{path}: cannot be written: {error}; see to the space and the rights of its folder"
+        ) from None
     finally:
         partial.unlink(missing_ok=True)
 
@@ -186,8 +191,6 @@ def _fill(
     except (sqlite3.ProgrammingError, sqlite3.InterfaceError) as error:
         reason = f"{error}; it was {last[0]}"
         raise DataError(f"{path}: a row does not fit its table: {reason}") from None
-    except sqlite3.OperationalError as error:
-        raise DataError(f"{path}: cannot be written: {error}") from None
 
 
 def _meta(description: LabelFileDescription) -> dict[str, str]:

@@ -27,11 +27,17 @@ PolicyOption = Annotated[
 ]
 ExecutorOption = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option("--executor", help="serial or process; default: run.executor of curate.toml."),
+    typer.Option(
+        "--executor", help="serial, process or ray; default: run.executor of curate.toml."
+    ),
 ]
 WorkersOption = Annotated[
     Optional[int],  # noqa: UP045
-    typer.Option("--workers", min=1, help="Workers; more than one means --executor process."),
+    typer.Option(
+        "--workers",
+        min=1,
+        help="Workers, each with its own model; more than one need process or ray.",
+    ),
 ]
 UNLIMITED = 10_000
 ThreadsOption = Annotated[
@@ -53,7 +59,9 @@ def open_workspace(
     workspace = Workspace.open(folder)
     changes: dict[str, Any] = {}
     if workers is not None:
-        changes = {"workers": workers, "executor": "process" if workers > 1 else "serial"}
+        changes["workers"] = workers
+        if workspace.config.run.executor in {"serial", "process"}:
+            changes["executor"] = "process" if workers > 1 else "serial"
     if executor is not None:
         changes["executor"] = executor
     workspace = workspace.with_settings("run", **changes)

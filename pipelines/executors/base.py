@@ -2,16 +2,22 @@
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from curate.detections import Detections
-from curate.errors import CurateError
+from curate.errors import CurateError, ModelError
 
 logger = logging.getLogger(__name__)
+
+# A frame whose worker died is tried so often in all; the next death may well be its own doing.
+TRIES = 2
+# So many more workers than there are may die in a row while they load their models.
+SPARE_OPENINGS = 2
 
 # Rows by table, each without its first two columns, round and frame_id.
 FrameRows = Mapping[str, list[tuple[Any, ...]]]
@@ -57,15 +63,93 @@ class Outcome:
 
 
 class Executor(Protocol):
-    """Maps a function over frames; yields outcomes in any order, holding a bounded number."""
+    """Maps a function over frames; yields outcomes in any order, holding a bounded number.
+
+    A worker that dies costs the frame in its hands one more try and no other frame anything.
+    """
 
     def map(self, function: FrameFunction, jobs: Iterable[FrameJob]) -> Iterator[Outcome]:
-        """One outcome per job."""
+        """One outcome per job.
+
+        Raises:
+            CurateError: the models cannot be loaded.
+        """
         ...
 
     def close(self) -> None:
         """Ends its workers."""
         ...
+
+
+class JobQueue:
+    """Jobs to hand out: first those that a dead worker has left, then the next of all."""
+
+    def __init__(self, jobs: Iterable[FrameJob], workers: int) -> None:
+        self._openings = workers + SPARE_OPENINGS
+        self._next = iter(jobs)
+        self._again: deque[FrameJob] = deque()
+        self._deaths: Counter[int] = Counter()
+        self._dead_openings = 0
+
+    def take(self) -> FrameJob | None:
+        """The next job; None where there is none."""
+        return self._again.popleft() if self._again else next(self._next, None)
+
+    def give_back(self, jobs: Iterable[FrameJob]) -> None:
+        """Takes jobs back that nobody has begun."""
+        self._again.extend(jobs)
+
+    def opened(self) -> None:
+        """A worker has loaded its models."""
+        self._dead_openings = 0
+
+    def bury(self, in_hand: Sequence[FrameJob], reason: str, *, opened: bool) -> Iterator[Outcome]:
+        """Takes back what a dead worker had in hand; a frame that was tried too often has failed.
+
+        Args:
+            in_hand: its jobs in their order; it had begun the first, if any.
+            reason: how it died.
+            opened: whether it had loaded its models.
+
+        Raises:
+            CurateError: workers die before they have loaded their models.
+        """
+        if not opened:
+            self._dead_openings += 1
+            if self._dead_openings == self._openings:
+                raise CurateError(
+                    f"{self._openings} workers in a row died while they loaded their models, the "
+                    f"last {reason}; run again with fewer workers, finished frames are kept"
+                )
+            self.give_back(in_hand)
+            return
+        begun, rest = in_hand[:1], in_hand[1:]
+        self.give_back(rest)
+        for job in begun:
+            self._deaths[job.frame_id] += 1
+            if self._deaths[job.frame_id] < TRIES:
+                self._again.appendleft(job)
+            else:
+                yield Outcome(
+                    job, {}, f"frame {job.frame}: its worker died {TRIES} times, {reason}", 0.0
+                )
+
+
+def open_function(function: FrameFunction) -> None:
+    """Loads what a function needs, and turns whatever goes wrong into one line.
+
+    Raises:
+        CurateError: it cannot be loaded.
+    """
+    try:
+        function.open()
+    except CurateError:
+        raise
+    except Exception as fault:  # a user's model may raise anything
+        logger.debug("cannot load", exc_info=True)
+        raise ModelError(
+            f"the models cannot be loaded: {type(fault).__name__}: {_one_line(fault)}"
+        ) from fault
 
 
 def attempt(function: FrameFunction, job: FrameJob) -> Outcome:

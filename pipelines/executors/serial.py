@@ -2,15 +2,19 @@
 
 from collections.abc import Iterable, Iterator
 
-from pipelines.executors.base import FrameFunction, FrameJob, Outcome, attempt
+from pipelines.executors.base import FrameFunction, FrameJob, Outcome, attempt, open_function
 
 
 class SerialExecutor:
     """Works on frames in their order."""
 
     def map(self, function: FrameFunction, jobs: Iterable[FrameJob]) -> Iterator[Outcome]:
-        """One outcome per job, in order."""
-        function.open()
+        """One outcome per job, in order.
+
+        Raises:
+            CurateError: the models cannot be loaded.
+        """
+        open_function(function)
         for job in jobs:
             yield attempt(function, job)
 

@@ -1,47 +1,68 @@
 """What every registered executor promises."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from contracts.samples import assert_one_line
+from frame_functions import Deadly, Square
+from stored_rows import dump
+from toys import toy_document, write_toy_kitti
 
-from curate.errors import ModelError
-from pipelines.executors.base import FrameJob, FrameRows
+from curate.errors import CurateError, ModelError
+from pipelines.config import make_config
+from pipelines.executors.base import Executor, FrameJob
+from pipelines.executors.serial import SerialExecutor
+from pipelines.progress import Silent
 from pipelines.registry import EXECUTORS
+from pipelines.schedule import run_all
+from pipelines.setup import initialise
+from pipelines.workspace import Workspace
 
 
-@dataclass
-class Square:
-    """Squares the key of a frame; refuses some, cannot even start if told so."""
+@pytest.fixture(scope="module")
+def missing_ray() -> Iterator[str]:
+    """Why there is no Ray cluster here; "" where there is one, which all tests share."""
+    try:
+        first = EXECUTORS.build("ray", offered={"workers": lambda: 3}, options={})
+    except CurateError as error:
+        yield str(error)
+    else:
+        yield ""
+        first.close()
 
-    broken: bool = False
 
-    def open(self) -> None:
-        """Fails where the model is broken."""
-        if self.broken:
-            raise ModelError("model.onnx: broken")
-
-    def __call__(self, job: FrameJob) -> FrameRows:
-        """One row."""
-        if job.frame_id % 7 == 3:
-            raise ValueError(f"three\nlines {job.frame_id}\nlong")
-        return {"squares": [(job.frame_id**2,)]}
+def skip_absent(name: str, request: pytest.FixtureRequest) -> None:
+    """Skips what belongs to an executor that cannot run here, with the reason."""
+    if name == "ray" and (reason := request.getfixturevalue("missing_ray")):
+        pytest.skip(reason)
 
 
 @pytest.fixture(scope="module", params=sorted(EXECUTORS.classes))
-def executor(request: pytest.FixtureRequest):
+def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
     """Every registered executor, with two workers where it has workers."""
+    skip_absent(request.param, request)
     made = EXECUTORS.build(request.param, offered={"workers": lambda: 2}, options={})
     yield made
     made.close()
 
 
+@pytest.fixture
+def crew(executor: Executor) -> Executor:
+    """An executor whose workers can die without it."""
+    if isinstance(executor, SerialExecutor):
+        pytest.skip("serial works in this very process")
+    return executor
+
+
 JOBS = [FrameJob(key, f"{key:06d}") for key in range(50)]
 
 
-def test_every_job_has_one_outcome(executor) -> None:
+def test_every_job_has_one_outcome(executor: Executor) -> None:
     """Rows or an error of one line, never both, none lost, none twice."""
-    outcomes = {outcome.job.frame_id: outcome for outcome in executor.map(Square(), iter(JOBS))}
-    assert sorted(outcomes) == list(range(50))
+    found = list(executor.map(Square(), iter(JOBS)))
+    outcomes = {outcome.job.frame_id: outcome for outcome in found}
+    assert sorted(outcome.job.frame_id for outcome in found) == list(range(50))
     for key, outcome in outcomes.items():
         if key % 7 == 3:
             assert outcome.rows == {}
@@ -50,17 +71,17 @@ def test_every_job_has_one_outcome(executor) -> None:
             assert (outcome.rows, outcome.error) == ({"squares": [(key**2,)]}, None)
 
 
-def test_a_broken_model_ends_the_run_in_its_own_words(executor) -> None:
+def test_a_broken_model_ends_the_run_in_its_own_words(executor: Executor) -> None:
     """It is no fault of any frame."""
     with pytest.raises(ModelError, match=r"model.onnx: broken"):
         list(executor.map(Square(broken=True), iter(JOBS)))
 
 
-def test_jobs_are_taken_as_they_are_needed(executor) -> None:
+def test_jobs_are_taken_as_they_are_needed(executor: Executor) -> None:
     """An endless list of frames does not fill the memory."""
     taken = 0
 
-    def endless():
+    def endless() -> Iterator[FrameJob]:
         nonlocal taken
         while True:
             taken += 1
@@ -72,6 +93,80 @@ def test_jobs_are_taken_as_they_are_needed(executor) -> None:
     assert taken < 40
 
 
-def test_no_jobs_no_outcomes(executor) -> None:
+def test_an_abandoned_run_leaves_nothing_to_the_next(executor: Executor) -> None:
+    """Neither its outcomes nor its models."""
+    abandoned = executor.map(Deadly(), iter(JOBS))
+    next(abandoned)
+    abandoned.close()
+    found = list(executor.map(Square(), iter(JOBS[:4])))
+    assert sorted(outcome.job.frame_id for outcome in found) == [0, 1, 2, 3]
+    assert [outcome.error is None for outcome in found].count(False) == 1
+
+
+def test_no_jobs_no_outcomes(executor: Executor) -> None:
     """And no complaint."""
     assert list(executor.map(Square(), iter([]))) == []
+
+
+def test_a_killed_worker_costs_its_frame_a_retry(crew: Executor, tmp_path: Path) -> None:
+    """SIGKILL, as the kernel sends it where memory is short: every frame is done all the same."""
+    found = list(crew.map(Deadly(folder=tmp_path, once=(0, 7, 8, 31)), iter(JOBS)))
+    assert sorted(outcome.job.frame_id for outcome in found) == list(range(50))
+    assert {outcome.error for outcome in found} == {None}
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_a_frame_that_kills_every_worker_fails_alone(crew: Executor, tmp_path: Path) -> None:
+    """It is tried twice, then counted as failed with its reason."""
+    found = list(crew.map(Deadly(folder=tmp_path, always=(5, 6)), iter(JOBS)))
+    assert sorted(outcome.job.frame_id for outcome in found) == list(range(50))
+    failed = {outcome.job.frame_id: outcome for outcome in found if outcome.error is not None}
+    assert sorted(failed) == [5, 6]
+    assert failed[5].rows == {}
+    assert failed[5].error.startswith("frame 000005: its worker died 2 times, ")
+    assert_one_line(Exception(failed[5].error))
+
+
+def test_workers_that_die_while_loading_end_the_run(crew: Executor) -> None:
+    """A model for which there is no memory is not tried for every frame."""
+    with pytest.raises(CurateError, match=r"died while they loaded their models.*fewer workers"):
+        list(crew.map(Deadly(opening=True), iter(JOBS)))
+
+
+@pytest.fixture(scope="module")
+def serial_rows(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple]]:
+    """A toy data set, and the rows of all stages as one process makes them in order."""
+    home = tmp_path_factory.mktemp("executors")
+    write_toy_kitti(home / "kitti", frames=24, val=2)
+    (home / "detector.txt").write_text("000007")  # the detector raises on this frame
+    return home, dump(finished(home, "reference", "serial", 1))
+
+
+def finished(home: Path, name: str, executor: str, workers: int) -> Workspace:
+    """A workspace in which all stages have run."""
+    document = toy_document(home / "kitti", home / "detector.txt")
+    document["run"] = {"executor": executor, "workers": workers}
+    workspace = initialise(home / name, make_config(document, "test"), "0.1", "")
+    list(run_all(workspace, None, Silent()))
+    return workspace
+
+
+@pytest.mark.parametrize(
+    ("name", "workers"),
+    [
+        *((name, workers) for name in sorted(EXECUTORS.classes) for workers in (1, 3)),
+        ("frame_functions:Shuffled", 1),
+    ],
+)
+def test_the_rows_depend_on_nothing_but_the_seed(
+    serial_rows: tuple[Path, list[tuple]],
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+    name: str,
+    workers: int,
+) -> None:
+    """Whatever the executor, the number of workers, the order of frames: the same to the bit."""
+    skip_absent(name, request)
+    home, rows = serial_rows
+    assert sum(row[0] == "weight" for row in rows) > 50
+    assert dump(finished(home, f"{tmp_path.name}", name, workers)) == rows

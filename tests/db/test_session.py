@@ -69,6 +69,30 @@ def test_a_database_of_an_older_curate_is_migrated(database: Database) -> None:
             assert connection.exec_driver_sql(f"SELECT count(*) FROM {name}").scalar_one() == 0
 
 
+def test_an_older_database_is_kept_before_it_is_migrated(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As it was, under a name that says which schema it has; a new database needs no copy."""
+    url = f"sqlite:///{tmp_path / 'curate.db'}"
+    database = Database(url)
+    assert [path.name for path in tmp_path.glob("*backup*")] == []
+    _frame(database, "val")
+    config = Config()
+    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
+    with database.writing() as connection:
+        config.attributes["connection"] = connection
+        command.downgrade(config, "0001")
+    database.close()
+    Database(url).close()
+    backup = tmp_path / "curate.db.schema-0001.backup"
+    assert str(backup) in caplog.text
+    with sqlite3.connect(backup) as old:
+        assert old.execute("SELECT count(*) FROM frame").fetchone() == (1,)
+        assert old.execute("SELECT version_num FROM alembic_version").fetchone() == ("0001",)
+        tables = {row[0] for row in old.execute("SELECT name FROM sqlite_master")}
+    assert "audit" not in tables
+
+
 def test_weighted_labels_has_exactly_the_columns_of_the_format(database: Database) -> None:
     """The view and the exported file agree on names and order."""
     with database.reading() as connection:

@@ -3,11 +3,9 @@
 import csv
 import io
 import json
-import os
 import sqlite3
 import subprocess
 import sys
-import time
 from contextlib import closing
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import pytest
 from pipelines_cli import Curate
 
 from curate.errors import ConfigError, DataError, FramesFailed, WorkspaceError
+from pipelines.commands.options import open_workspace
 
 LABELS = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
 
@@ -420,63 +419,15 @@ def test_a_category_without_ground_truth_warns_and_uses_the_fallback(
     assert json.loads(out) == [{"points_threshold": 5.0}]
 
 
-@pytest.mark.parametrize("command", ["predict", "repredict", "score", "run"])
-def test_a_killed_command_continues_and_loses_nothing(
-    curate: Curate, made: Path, tmp_path: Path, command: str
+@pytest.mark.parametrize(
+    ("configured", "workers", "used"),
+    [("serial", 4, "process"), ("process", 1, "serial"), ("ray", 4, "ray"), ("ray", 1, "ray")],
+)
+def test_workers_choose_an_executor_only_where_none_of_a_cluster_is_configured(
+    made: Path, configured: str, workers: int, used: str
 ) -> None:
-    """SIGKILL in the middle, then the same command: the rows of an uninterrupted run."""
-    curate("init", tmp_path / "whole", *_settings(tmp_path))
-    for earlier in ("predict", "repredict", "score"):
-        if earlier == command:
-            break
-        if command != "run":
-            curate(earlier)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "pipelines", command, "-w", str(made)],
-        env=_environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    _wait_for_rows(made / "curate.db", process)
-    process.kill()
-    process.wait()
-    with sqlite3.connect(made / "curate.db") as database:
-        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-        torn = database.execute(
-            "SELECT count(*) FROM prediction AS p WHERE NOT EXISTS (SELECT 1 FROM task AS t "
-            "WHERE t.stage = 'predict' AND t.frame_id = p.frame_id)"
-        ).fetchone()
-    assert torn == (0,)
-    assert curate("run")[0] == 0
-    assert curate("run", "-w", tmp_path / "whole")[0] == 0
-    dump = "SELECT * FROM weighted_labels ORDER BY frame, k"
-    killed, whole = (
-        curate("query", dump, "--csv"),
-        curate("query", dump, "--csv", "-w", tmp_path / "whole"),
-    )
-    assert killed == whole
-    assert killed[1].count("\n") == 19
-
-
-def _settings(tmp_path: Path) -> tuple[object, ...]:
-    weights = tmp_path / "detector.txt"
-    return (
-        "--root", tmp_path / "kitti", "--labeled", "0.25",
-        "--detector", "toys:ToyDetector", "--detector-path", weights,
-        "--segmenter", "toys:ToySegmenter", "--segmenter-path", weights,
-    )  # fmt: skip
-
-
-def _environment() -> dict[str, str]:
-    root = Path(__file__).parent.parent
-    return os.environ | {"PYTHONPATH": f"{root}:{root.parent}", "TOY_DELAY_S": "0.4"}
-
-
-def _wait_for_rows(path: Path, process: subprocess.Popen) -> None:
-    """Returns once the process has stored something but, if possible, not everything."""
-    with sqlite3.connect(path, timeout=30) as database:
-        before = database.execute("SELECT count(*) FROM task").fetchone()
-        while process.poll() is None:
-            if database.execute("SELECT count(*) FROM task").fetchone() != before:
-                return
-            time.sleep(0.01)
+    """On one machine more than one worker are processes; a cluster stays a cluster."""
+    path = made / "curate.toml"
+    path.write_text(path.read_text().replace('executor = "serial"', f'executor = "{configured}"'))
+    run = open_workspace(made, workers=workers).config.run
+    assert (run.executor, run.workers) == (used, workers)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import toys
+from stored_rows import dump
 
 from curate.errors import WorkspaceError
 from curate.priors.points import PointPrior
@@ -21,23 +22,6 @@ from pipelines.workspace import Workspace
 ENGINES = ("sqlite", "postgresql")
 NewWorkspace = Callable[[Path], Workspace]
 FRAME_STAGES = ("predict", "repredict", "points", "semantic")
-
-
-def dump(workspace: Workspace) -> list[tuple]:
-    """All rows that a run makes, without keys and times that may differ."""
-    tables = {
-        "prediction": "*", "reprediction_view": "*", "reprediction": "*", "consistency": "*",
-        "point_prior": "*", "semantic_prior": "*", "weight": "*",
-        "task": "round, stage, variant, frame_id, fingerprint, state, error",
-    }  # fmt: skip
-    with workspace.database.reading() as connection:
-        return [
-            (table, *row)
-            for table, columns in tables.items()
-            for row in sorted(
-                map(tuple, connection.exec_driver_sql(f"SELECT {columns} FROM {table}")), key=str
-            )
-        ]
 
 
 def count(workspace: Workspace, table: str) -> int:
@@ -256,16 +240,6 @@ def test_policies_stand_side_by_side(workspace: Workspace) -> None:
     after = [row for row in dump(workspace) if row[0] == "weight"]
     assert set(before) < set(after)
     assert len(after) == 36
-
-
-def test_the_rows_do_not_depend_on_the_executor(
-    workspace: Workspace, another: NewWorkspace, tmp_path: Path
-) -> None:
-    """Two worker processes write what one serial run writes, to the last bit."""
-    run(workspace)
-    other = another(tmp_path / "other")
-    run(with_setting(other, "run", executor="process", workers=2))
-    assert dump(other) == dump(workspace)
 
 
 def test_every_stage_reads_what_exists_before_it(workspace: Workspace) -> None:

@@ -1,7 +1,7 @@
 """The detector that answers from a record."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -42,7 +42,7 @@ class Record(Protocol):
         """Whether augmented copies were recorded."""
         ...
 
-    def frame_ids(self) -> tuple[str, ...]:
+    def frame_ids(self) -> Iterable[str]:
         """The recorded frames, in sorted order."""
         ...
 
@@ -112,7 +112,7 @@ class RecordedDetector:
 
     def frame_ids(self) -> tuple[str, ...]:
         """The recorded frames, in sorted order."""
-        return self._record.frame_ids()
+        return tuple(self._record.frame_ids())
 
     def predict(self, frame: Frame) -> Detections:
         """What was recorded for the frame as it is; `frame.points` are not looked at.
@@ -171,18 +171,18 @@ class RecordedDetector:
 
     def _report_strays(self, frame_ids: Sequence[str]) -> None:
         """Says which recorded frames the data set does not have; DataError where it has none."""
-        recorded = self.frame_ids()
         known = set(frame_ids)
-        strays = [name for name in recorded if name not in known]
+        recorded = sum(1 for _ in self._record.frame_ids())
+        strays = [name for name in self._record.frame_ids() if name not in known]
         few = ", ".join(strays[:3]) + (", ..." if len(strays) > 3 else "")
-        if strays and len(strays) == len(recorded):
+        if strays and len(strays) == recorded:
             raise DataError(
                 f"{self.path}: results for frames that do not exist ({few}); the data set's are "
                 f"named like {frame_ids[0]}"
             )
         if strays:
             _warn_once(
-                f"{self.path}: {len(strays)} of {len(recorded)} results are for frames that the "
+                f"{self.path}: {len(strays)} of {recorded} results are for frames that the "
                 f"data set does not have ({few}); they are left out"
             )
 

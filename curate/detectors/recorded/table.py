@@ -12,9 +12,12 @@ instead of passing for an empty street; a frame with rows of other views only ha
 """
 
 import csv
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -23,41 +26,61 @@ from curate.errors import DataError
 from curate.geometry.similarity import Similarity, wrap_angle
 
 View = tuple[Similarity, Detections]
-Record = Mapping[str, Mapping[int, View]]
-"""The views of each frame, by number."""
 
 _NUMBERS = (
     "view", "flip_y", "rotation_rad", "scale", "score",
     "x", "y", "z", "length", "width", "height", "yaw",
 )  # fmt: skip
 _COLUMNS = ("frame", "category", *_NUMBERS)
+BLOCK_ROWS = 4096  # checked at once
 
 
 @dataclass(frozen=True)
 class TableRecord:
-    """A `Record` from a CSV file.
+    """A `Record` that looks its answers up in a CSV file, however long that is.
 
     Attributes:
         path: the file.
-        frames: what it holds.
+        order: where each of `_COLUMNS` stands in a row.
+        names: (n,) the frame of each run of neighbouring rows, as UTF-8, sorted.
+        places: (n, 3) where each run begins and ends in the file, and its first line.
     """
 
     path: Path
-    frames: Record
+    order: tuple[int, ...]
+    names: np.ndarray
+    places: np.ndarray
 
     @classmethod
     def read(cls, path: Path) -> "TableRecord":
-        """The record in a file; see `read_record`."""
-        return cls(path, read_record(path))
+        """Checks every row of a file and notes where its frames stand.
+
+        Raises:
+            DataError: the file is missing or no CSV file, a column is missing, or a row has a wrong
+                number of fields or a value that cannot be.
+        """
+        try:
+            with path.open("rb") as file:
+                rows = _Rows(path, file)
+                order = rows.header()
+                runs = [_checked(path, block) for block in rows.blocks(order)]
+        except FileNotFoundError:
+            raise DataError(f"{path}: no such file of recorded detections") from None
+        except (OSError, UnicodeDecodeError, csv.Error) as error:
+            raise DataError(f"{path}: cannot be read as CSV: {error}") from error
+        names = np.concatenate([names for names, _ in runs] or [np.empty(0, dtype="S1")])
+        places = np.concatenate([places for _, places in runs] or [np.empty((0, 3), np.int64)])
+        sort = np.argsort(names, kind="stable")
+        return cls(path, order, names[sort], places[sort])
 
     @property
     def has_views(self) -> bool:
         """Its columns say that it may; a copy without boxes leaves no row."""
         return True
 
-    def frame_ids(self) -> tuple[str, ...]:
+    def frame_ids(self) -> Iterator[str]:
         """The recorded frames, in sorted order."""
-        return tuple(sorted(self.frames))
+        return (name.decode() for name in np.unique(self.names))
 
     def answer(self, frame_id: str) -> Detections:
         """What was recorded for the frame as it is; DataError where nothing was recorded."""
@@ -69,27 +92,99 @@ class TableRecord:
         return [view for number, view in sorted(self._views(frame_id).items()) if number]
 
     def _views(self, frame_id: str) -> Mapping[int, View]:
-        if frame_id not in self.frames:
+        key = np.bytes_(frame_id.encode())
+        first, last = (int(np.searchsorted(self.names, key, side)) for side in ("left", "right"))
+        if first == last:
             raise DataError(f"no recorded detections for frame {frame_id} in {self.path}")
-        return self.frames[frame_id]
+        fields: list[list[str]] = []
+        lines: list[int] = []
+        with self.path.open("rb") as file:
+            for begin, end, line in self.places[first:last].tolist():
+                file.seek(begin)
+                text = file.read(end - begin).decode()
+                rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row]
+                fields += [[row[place] for place in self.order] for row in rows]
+                lines += range(line, line + len(rows))
+        return _views_of(self.path, fields, lines)
 
 
-def read_record(path: Path) -> Record:
-    """The views of each frame in a CSV file of recorded detections.
+@dataclass(frozen=True)
+class _Block:
+    """Some rows: their fields in the order of `_COLUMNS`, and where each begins, ends, its line."""
+
+    rows: Sequence[Sequence[str]]
+    places: np.ndarray
+
+
+class _Rows:
+    """The rows of an open CSV file, with the places where they stand."""
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path = path
+        self._end = 0
+        self._reader = csv.reader(self._lines(file))
+
+    def _lines(self, file: BinaryIO) -> Iterator[str]:
+        for line in file:
+            self._end += len(line)
+            yield line.decode()
+
+    def header(self) -> tuple[int, ...]:
+        """Where each of `_COLUMNS` stands; DataError where one is missing."""
+        header = next(self._reader, [])
+        missing = [name for name in _COLUMNS if name not in header]
+        if missing:
+            raise DataError(f"{self.path}:1: no column {', '.join(missing)} in the header")
+        self._width = len(header)
+        return tuple(header.index(name) for name in _COLUMNS)
+
+    def blocks(self, order: Sequence[int]) -> Iterator[_Block]:
+        """All rows, some at a time; DataError for one with a wrong number of fields."""
+        placed = self._placed(order)
+        while block := list(islice(placed, BLOCK_ROWS)):
+            yield _Block([row for row, _ in block], np.array([place for _, place in block]))
+
+    def _placed(self, order: Sequence[int]) -> Iterator[tuple[list[str], tuple[int, int, int]]]:
+        begin = self._end
+        for row in self._reader:
+            line = self._reader.line_num
+            if row and len(row) != self._width:
+                raise DataError(
+                    f"{self.path}:{line}: {len(row)} fields, the header has {self._width}"
+                )
+            if row:
+                yield [row[place] for place in order], (begin, self._end, line)
+            begin = self._end
+
+
+def _checked(path: Path, block: _Block) -> tuple[np.ndarray, np.ndarray]:
+    """The frames of the runs of neighbouring rows in a block, and their places.
 
     Raises:
-        DataError: the file is missing or no CSV file, a column is missing, or a row has a wrong
-            number of fields or a value that cannot be.
+        DataError: a row has a value that cannot be.
     """
-    rows, lines = _read_rows(path)
+    _views_of(path, block.rows, block.places[:, 2].tolist())
+    names = np.array([row[0].encode() for row in block.rows])
+    first = np.flatnonzero(np.append(True, names[1:] != names[:-1]))
+    last = np.append(first[1:], len(names)) - 1
+    begin, end, line = block.places[first, 0], block.places[last, 1], block.places[first, 2]
+    return names[first], np.column_stack([begin, end, line])
+
+
+def _views_of(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> dict[int, View]:
+    """The views in some rows, by number; those of one frame where the rows are of one frame.
+
+    Raises:
+        DataError: a row has a value that cannot be, or rows of one view do not agree.
+    """
     numbers = _parse_numbers(path, rows, lines)
     _refuse_impossible(path, lines, numbers)
     similarities, scores = numbers[:, 1:4], numbers[:, 4]
     boxes = numbers[:, 5:].copy()
     boxes[:, 6] = wrap_angle(boxes[:, 6])
     categories = as_categories([row[1] for row in rows])
-    record: dict[str, dict[int, View]] = {}
-    for (frame_id, view), index in _rows_by_view(rows, numbers[:, 0]).items():
+    views: dict[int, View] = {}
+    for (_, view), index in _rows_by_view(rows, numbers[:, 0]).items():
         own = similarities[index[0]]
         odd = index[(similarities[index] != own).any(axis=1)]
         if len(odd):
@@ -98,33 +193,11 @@ def read_record(path: Path) -> Record:
                 f"{lines[index[0]]}, which is of the same frame and view"
             )
         similarity = Similarity(bool(own[0]), float(own[1]), float(own[2]))
-        found = Detections(boxes[index], scores[index], categories[index])
-        record.setdefault(frame_id, {})[view] = (similarity, found)
-    return record
+        views[view] = (similarity, Detections(boxes[index], scores[index], categories[index]))
+    return views
 
 
-def _read_rows(path: Path) -> tuple[list[list[str]], list[int]]:
-    """The fields of each row in the order of `_COLUMNS`, and each row's line in the file."""
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.reader(file)
-            header = next(reader, [])
-            missing = [name for name in _COLUMNS if name not in header]
-            if missing:
-                raise DataError(f"{path}:1: no column {', '.join(missing)} in the header")
-            rows = [(row, reader.line_num) for row in reader if row]
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file of recorded detections") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read as CSV: {error}") from error
-    for row, line in rows:
-        if len(row) != len(header):
-            raise DataError(f"{path}:{line}: {len(row)} fields, the header has {len(header)}")
-    order = [header.index(name) for name in _COLUMNS]
-    return [[row[place] for place in order] for row, _ in rows], [line for _, line in rows]
-
-
-def _parse_numbers(path: Path, rows: list[list[str]], lines: list[int]) -> np.ndarray:
+def _parse_numbers(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> np.ndarray:
     """(n, 12) the columns of `_NUMBERS`."""
     numbers = np.empty((len(rows), len(_NUMBERS)))
     for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
@@ -135,7 +208,7 @@ def _parse_numbers(path: Path, rows: list[list[str]], lines: list[int]) -> np.nd
     return numbers
 
 
-def _refuse_impossible(path: Path, lines: list[int], numbers: np.ndarray) -> None:
+def _refuse_impossible(path: Path, lines: Sequence[int], numbers: np.ndarray) -> None:
     """DataError at the first row that no detector can have answered."""
     view, flip_y, rotation_rad, scale, score = numbers[:, :5].T
     identity = (flip_y == 0) & (rotation_rad == 0) & (scale == 1)
@@ -155,7 +228,9 @@ def _refuse_impossible(path: Path, lines: list[int], numbers: np.ndarray) -> Non
             raise DataError(f"{path}:{lines[int(np.argmax(rows))]}: {fault}")
 
 
-def _rows_by_view(rows: list[list[str]], views: np.ndarray) -> Mapping[tuple[str, int], np.ndarray]:
+def _rows_by_view(
+    rows: Sequence[Sequence[str]], views: np.ndarray
+) -> Mapping[tuple[str, int], np.ndarray]:
     """The rows of each frame and view, in the order of the file."""
     groups: dict[tuple[str, int], list[int]] = {}
     for index, (row, view) in enumerate(zip(rows, views, strict=True)):
