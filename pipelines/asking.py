@@ -36,7 +36,7 @@ def _ask_sqlite(path: Path, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any
     except sqlite3.Error as error:
         raise DatabaseError(f"{path}: {error}") from error
     connection.execute("PRAGMA query_only = ON")
-    connection.set_authorizer(_authorize)
+    connection.set_authorizer(may_read)
     try:
         cursor = connection.execute(sql)
     except (sqlite3.Error, sqlite3.Warning) as error:
@@ -48,8 +48,8 @@ def _ask_sqlite(path: Path, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any
     return [column[0] for column in cursor.description], iter(cursor)
 
 
-def _authorize(action: int, _first: str | None, second: str | None, *_: str | None) -> int:
-    """SQLite asks this before each thing that a statement would do."""
+def may_read(action: int, _first: str | None, second: str | None, *_: str | None) -> int:
+    """SQLite asks this before each thing that a statement would do; only reading is allowed."""
     if action == sqlite3.SQLITE_FUNCTION and second in FORBIDDEN_FUNCTIONS:
         return sqlite3.SQLITE_DENY
     return sqlite3.SQLITE_OK if action in ALLOWED else sqlite3.SQLITE_DENY
