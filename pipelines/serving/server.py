@@ -29,6 +29,32 @@ def listen(host: str, port: int) -> socket.socket:
         ) from error
 
 
+def make_server(application: Any) -> Any:
+    """The server of an ASGI application; its `run` takes the sockets.
+
+    It says nothing of single requests, and gives slow readers three seconds at the end.
+    """
+    import uvicorn
+
+    config = uvicorn.Config(
+        application,
+        log_level="error",
+        access_log=False,
+        lifespan="on",
+        server_header=False,
+        ws="none",
+        limit_concurrency=64,
+        timeout_graceful_shutdown=3,
+    )
+    return uvicorn.Server(config)
+
+
+def address(taken: socket.socket) -> str:
+    """The URL of what a socket listens to."""
+    host, port = taken.getsockname()[:2]
+    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+
+
 def serve(
     application: Any, taken: socket.socket, told: Callable[[str], None], *, browse: bool
 ) -> None:
@@ -40,28 +66,13 @@ def serve(
         told: is given the address.
         browse: whether to show it in a browser.
     """
-    import uvicorn
-
-    host, port = taken.getsockname()[:2]
-    shown = f"[{host}]" if ":" in host else host
-    url = f"http://{shown}:{port}/"
-    config = uvicorn.Config(
-        application,
-        log_level="error",
-        access_log=False,
-        lifespan="on",
-        server_header=False,
-        ws="none",
-        limit_concurrency=64,
-        timeout_graceful_shutdown=3,
-    )
-    told(url)
+    told(address(taken))
     if browse:
         # The socket listens already: the first request waits until the server runs.
-        webbrowser.open(url)
+        webbrowser.open(address(taken))
     with taken:
         try:
-            uvicorn.Server(config).run(sockets=[taken])
+            make_server(application).run(sockets=[taken])
         except KeyboardInterrupt:
             # uvicorn has ended in good order and passes the signal on.
             return
