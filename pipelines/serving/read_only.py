@@ -18,13 +18,16 @@ _PRAGMAS = frozenset(
     {"database_list", "foreign_key_list", "index_list", "schema_version", "table_info",
      "table_xinfo"}
 )  # fmt: skip
+# One call of these can run for minutes, and no time limit reaches into a call.
+_SLOW_FUNCTIONS = frozenset({"printf", "format"})
 # These name files of the machine, or show raw pages.
 _HIDDEN_TABLES = ("pragma_", "sqlite_dbpage", "dbstat")
 _COUNT_LIMIT_MS = 300
-# The longest text that curate stores is a round's configuration; a question needs no more, and
-# zeroblob(1e9) in a thousand rows would fill the memory.
+# The longest text that curate stores is a round's configuration, some kilobytes. A question needs
+# no more: zeroblob(1e9) in a thousand rows would fill the memory, and replace() of long texts takes
+# the square of their length.
 _LIMITS = {
-    sqlite3.SQLITE_LIMIT_LENGTH: 100_000,
+    sqlite3.SQLITE_LIMIT_LENGTH: 30_000,
     sqlite3.SQLITE_LIMIT_SQL_LENGTH: 20_000,
     sqlite3.SQLITE_LIMIT_COLUMN: 100,
     sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 100,
@@ -113,5 +116,7 @@ def _authorize(action: int, first: str | None, second: str | None, *_: str | Non
         harmless = name in _PRAGMAS and (name != "schema_version" or second is None)
         return sqlite3.SQLITE_OK if harmless else sqlite3.SQLITE_DENY
     if action == sqlite3.SQLITE_READ and name.startswith(_HIDDEN_TABLES):
+        return sqlite3.SQLITE_DENY
+    if action == sqlite3.SQLITE_FUNCTION and (second or "").lower() in _SLOW_FUNCTIONS:
         return sqlite3.SQLITE_DENY
     return may_read(action, first, second)

@@ -53,11 +53,12 @@ READS_ELSEWHERE = (
 )
 TOO_MUCH = (
     "SELECT zeroblob(1000000000)",
-    "SELECT hex(zeroblob(90000))",
+    "SELECT hex(zeroblob(20000))",
     "SELECT printf('%.*c', 1000000000, 'x')",
-    "SELECT replace(hex(zeroblob(40000)), '0', '00000000')",
-    f"SELECT {', '.join(['zeroblob(99999)'] * 101)}",
-    "SELECT group_concat(hex(zeroblob(40000))) FROM frame",
+    "SELECT FORMAT('%1000000000d', 1)",
+    "SELECT replace(hex(zeroblob(10000)), '0', '00000000')",
+    f"SELECT {', '.join(['zeroblob(29999)'] * 101)}",
+    "SELECT group_concat(hex(zeroblob(10000))) FROM frame",
     f"SELECT 1 WHERE 'a' LIKE '{'%a' * 200}'",
     "SELECT 1" + " UNION ALL SELECT 1" * 50,
     "SELECT " + "(" * 300 + "1" + ")" * 300,
