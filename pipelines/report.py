@@ -34,14 +34,16 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
     number = newest_round(workspace) if round_number is None else round_number
     policy = policy or workspace.config.run.method
     labels = read_columns(workspace, number, policy)
+    score = labels.numbers["score"]
+    raised = np.where(score < 0.5, labels.weights, 0.0)
     sections = [
         summary(workspace, labels, number),
         distributions(labels),
         by_category(labels),
         *beside_others(workspace, number, policy),
         *_changes(workspace, labels, number, policy),
-        _extremes(workspace, labels, "Most doubted: high score, low weight", 1),
-        _extremes(workspace, labels, "Kept against their score: low score, high weight", -1),
+        _shown(workspace, labels, "Most doubted: high score, low weight", score - labels.weights),
+        _shown(workspace, labels, "Kept against a low score: below 0.5, greatest weight", raised),
         *_reliability(workspace, number, policy),
     ]
     title = f"Round {number}, weights by {policy}"
@@ -89,16 +91,15 @@ def _changed(
         yield _close_up(workspace, each.frame, label, caption)
 
 
-def _extremes(workspace: Workspace, labels: LabelColumns, title: str, sign: int) -> Section:
-    """The labels whose score is farthest above the weight, or with sign -1 below it."""
-    doubt = sign * (labels.numbers["score"] - labels.weights)
-    first = np.argsort(-doubt, kind="stable")[:_PICTURES]
+def _shown(workspace: Workspace, labels: LabelColumns, title: str, rank: np.ndarray) -> Section:
+    """Pictures of the labels with the highest (n,) rank; those without any are not worth one."""
+    first = np.argsort(-rank, kind="stable")[:_PICTURES]
     figures = []
-    for i in first[doubt[first] > 0].tolist():
+    for i in first[rank[first] > 0].tolist():
         frame = labels.frame_names[labels.frames[i]]
         label = LabelShown(labels.boxes[i], float(labels.weights[i]))
         figures.append(_close_up(workspace, frame, label, _told(labels, i, frame)))
-    return Section(title, "" if figures else "None.", figures=figures)
+    return Section(title, "" if figures else "There is none.", figures=figures)
 
 
 def _told(labels: LabelColumns, i: int, frame: str) -> str:
