@@ -115,8 +115,8 @@ def _listed(
     found = []
     for old, new in changes.largest(count)[0].tolist():
         side, row = (after, new) if new >= 0 else (before, old)
-        pair = np.flatnonzero(changes.pairs[:, 0] == old) if old >= 0 and new >= 0 else ()
-        overlap = float(changes.iou[pair[0]]) if len(pair) else None
+        pair = changes.iou[changes.pairs[:, 0] == old] if old >= 0 and new >= 0 else np.zeros(0)
+        overlap = float(pair[0]) if len(pair) else None
         found.append(
             ChangedLabel(
                 _kind(new, overlap),

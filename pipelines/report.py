@@ -108,7 +108,7 @@ def _told(labels: LabelColumns, i: int, frame: str) -> str:
     shown = {"score": "score", "weight": "weight", "loss": "L", "points": "points",
              "rho_diff": "rho_diff", "rho_anno": "rho_anno"}  # fmt: skip
     numbers = ", ".join(
-        f"{word} {own[name]:.3g}" for name, word in shown.items() if not np.isnan(own[name])
+        f"{word} {_figure(own[name])}" for name, word in shown.items() if not np.isnan(own[name])
     )
     reasons = {
         "no reprediction matched it": np.isnan(own["loss"]),
@@ -121,6 +121,10 @@ def _told(labels: LabelColumns, i: int, frame: str) -> str:
     return f"{category} {labels.k[i]} in frame {frame}: {numbers}" + "".join(
         f"; {reason}" for reason in found
     )
+
+
+def _figure(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def _reliability(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:

@@ -17,8 +17,8 @@ _BANDS = (0.0, 20.0, 40.0, 60.0, np.inf)
 _TOLD = {
     "weight": "the weight v",
     "score": "the detector's score s",
-    "rho_diff": "the point prior, Eq. 8",
-    "rho_anno": "the semantic prior, Eq. 9",
+    "rho_diff": "the point prior (Eq. 8)",
+    "rho_anno": "the semantic prior (Eq. 9)",
     "rho_det": "the product of the priors",
 }
 
@@ -34,7 +34,7 @@ def summary(workspace: Workspace, labels: LabelColumns, number: int) -> Section:
         ("weight above 0", f"{kept:,} ({kept / n:.1%})"),
         ("weight above 0.5", f"{trusted:,} ({trusted / n:.1%})"),
         ("sum of weights", f"{weights.sum():,.1f}"),
-        ("matched by a reprediction", f"{matched:,} ({matched / n:.1%})"),
+        ("matched again", f"{matched:,} ({matched / n:.1%})"),
     ]
     ages = labels.numbers["lambda_u"][~np.isnan(labels.numbers["lambda_u"])]
     if len(ages):
@@ -93,8 +93,8 @@ def by_category(labels: LabelColumns) -> Section:
                 rows.append((category, place, *_sums(labels, here)))
     rows.append((ALL, "", *_sums(labels, everything)))
     columns = (
-        "category", "distance", "labels", "weight > 0", "share", "sum of weights", "mean weight",
-        "mean score",
+        "category", "distance", "labels", "weight > 0", "share kept", "sum of weights",
+        "mean weight", "mean score",
     )  # fmt: skip
     return Section("Labels by category and distance", columns=columns, rows=rows)
 
@@ -121,12 +121,12 @@ def beside_others(workspace: Workspace, number: int, policy: str) -> Iterator[Se
         yield Section("Beside other policies", note, columns, rows)
 
 
-def _sums(labels: LabelColumns, here: np.ndarray) -> tuple[int, int, str, float, float, float]:
+def _sums(labels: LabelColumns, here: np.ndarray) -> tuple[int, int, float, float, float, float]:
     """Labels, kept ones, their share, and the sum and means of weight and score."""
     weights = labels.weights[here]
     count, kept = int(here.sum()), int((weights > 0).sum())
     score = float(labels.numbers["score"][here].mean())
-    return count, kept, f"{kept / count:.0%}", float(weights.sum()), float(weights.mean()), score
+    return count, kept, kept / count, float(weights.sum()), float(weights.mean()), score
 
 
 def _age(workspace: Workspace, number: int) -> str:

@@ -28,7 +28,7 @@ table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabula
 th, td { padding: 3px 12px 3px 0; border-bottom: 1px solid var(--line); text-align: right; }
 th { color: var(--faint); font-weight: 500; }
 th:first-child, td.text { text-align: left; } tr.all td { font-weight: 600; }
-.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px;
+.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(170px, 1fr)); gap: 12px;
   margin: 12px 0; }
 .facts div { padding: 8px 12px; background: var(--panel); border-radius: 6px; min-width: 0; }
 .facts dt { font-size: 13px; color: var(--faint); }
