@@ -67,8 +67,9 @@ def large_workspace(folder: Path, labels: tuple[int, ...]) -> Workspace:
     document = toy_document(folder / "kitti", folder / "detector.txt")
     document["dataset"]["kind"] = "large_workspace:EndlessKitti"
     workspace = initialise(folder / "work", make_config(document, "test"), "0.25", "")
+    workspace.database.close()
     with closing(sqlite3.connect(workspace.root / "curate.db")) as connection:
-        connection.executescript("PRAGMA synchronous = OFF; PRAGMA cache_size = -200000; BEGIN")
+        connection.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF; BEGIN")
         frames = max(labels) // PER_FRAME
         _add_frames(connection, frames)
         for number, count in enumerate(labels, start=1):

@@ -62,6 +62,8 @@ def application(served: Served, host: str) -> Iterator[Any]:
     # Whatever plugins a user has installed for other servers: some of them write.
     for foreign, _ in pm.list_plugin_distinfo():
         pm.unregister(foreign)
+    # Its own pages of errors come with a trace in the terminal, all local values included.
+    talkative = pm.unregister(name="datasette.handle_exception")
     frames = None if served.workspace is None else FramePages(served.workspace)
     plugin = CuratePlugin(host, frames)
     pm.register(plugin, name=NAME)
@@ -75,6 +77,7 @@ def application(served: Served, host: str) -> Iterator[Any]:
         yield datasette.app()
     finally:
         pm.unregister(plugin)
+        pm.register(talkative, name="datasette.handle_exception")
 
 
 def _metadata(served: Served) -> dict[str, Any]:

@@ -73,7 +73,8 @@ def _refusal(scope: Scope, names: frozenset[str] | None) -> tuple[int, str] | No
     if foreign and headers.get(b"sec-fetch-dest") != "document":
         return 403, "not for pages of other sites"
     path = scope["path"]
-    if path.startswith(("/-/", "/_internal")) and not path.startswith(_INNER):
+    # Two slashes would begin another site's name where such a path were redirected to.
+    if path.startswith(("//", "/-/", "/_internal")) and not path.startswith(_INNER):
         return 404, "no such page"
     return None
 

@@ -60,9 +60,9 @@ class CuratePlugin:
 
         return [(r"^/-/frame$", page), (r"^/-/picture$", picture)]
 
-    @hookimpl(tryfirst=True)
-    def handle_exception(self, datasette: Any, exception: Exception) -> Any:
-        """An error as a page, in one line, and without a trace in the terminal."""
+    @hookimpl
+    def handle_exception(self, datasette: Any, request: Any, exception: Exception) -> Any:
+        """An error as a page or as JSON, in one line, and without a trace in the terminal."""
 
         async def page() -> Response:
             status = int(getattr(exception, "status", 500))
@@ -74,6 +74,8 @@ class CuratePlugin:
                 )
             if status >= 500:
                 _LOG.warning("%s: %s", type(exception).__name__, told)
+            if request.path.endswith(".json"):
+                return Response.json({"ok": False, "error": told}, status=status)
             text = await datasette.render_template(
                 ["error.html"], {"status": status, "error": told}
             )
