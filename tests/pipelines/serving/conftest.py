@@ -14,9 +14,9 @@ def weighted(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     return weighted_workspace(tmp_path_factory.mktemp("a%3Fmode=rwc&b?c #d"))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def pages(weighted: Workspace) -> Iterator[Pages]:
-    """Its pages, with a short time limit."""
+    """Its pages, with a short time limit; Datasette has one set of hooks for all its servers."""
     pytest.importorskip("datasette", reason="the extra [serve] is not installed")
     from dataclasses import replace
 

@@ -6,7 +6,7 @@ import sqlite3
 import cv2
 import numpy as np
 import pytest
-from serving import Pages, running
+from serving import Pages
 
 from db.models import Base
 from pipelines.asking import ask
@@ -95,27 +95,3 @@ def test_a_new_export_is_seen_without_a_new_start(pages: Pages) -> None:
     after = pages.get("/labels.json", sql="SELECT count(*) FROM label", _shape="arrayfirst").text
     path.write_bytes(held)
     assert json.loads(after)[0] < json.loads(before)[0]
-
-
-def test_a_file_alone_is_served_without_pictures(
-    pages: Pages, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where no workspace is near; hostile words in it stay words."""
-    from pipelines.serving.sources import choose
-
-    path = tmp_path / "foreign.sqlite"
-    path.write_bytes((pages.workspace.root / "exports" / "labels.sqlite").read_bytes())
-    evil = "<script>alert(1)</script>"
-    with sqlite3.connect(path) as connection:
-        connection.execute("UPDATE label SET category = ?", (evil,))
-    connection.close()
-    monkeypatch.chdir(tmp_path)
-    served = choose(None, None, path)
-    assert served.workspace is None
-    with running(served, pages.workspace) as alone:
-        text = alone.get("/labels/weighted_labels").text
-        assert "&lt;script&gt;alert" in text
-        assert evil not in text
-        assert "/-/frame?" not in text
-        assert alone.get("/-/picture", frame="000003").status == 404
-        assert alone.get("/workspace").status == 404
