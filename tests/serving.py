@@ -18,7 +18,7 @@ from pipelines.workspace import Workspace
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back."""
+    """What came back; the names of headers are in small letters."""
 
     status: int
     headers: Mapping[str, str]
@@ -60,7 +60,8 @@ class Pages:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120)
         connection.request(method, path + query, body=body, headers=dict(headers or {}))
         answer = connection.getresponse()
-        found = Answer(answer.status, dict(answer.getheaders()), answer.read())
+        names = {name.lower(): value for name, value in answer.getheaders()}
+        found = Answer(answer.status, names, answer.read())
         connection.close()
         return found
 

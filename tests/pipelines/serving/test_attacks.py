@@ -217,7 +217,7 @@ def test_a_page_of_another_site_can_only_link(pages: Pages) -> None:
 def test_every_answer_says_what_a_browser_may_load(pages: Pages) -> None:
     """Refusals too; no other site is named."""
     for path in ("/", "/nowhere", "/-/databases", "/-/picture?frame=000003", "/-/static/app.css"):
-        headers = {name.lower(): value for name, value in pages.get(path).headers.items()}
+        headers = pages.get(path).headers
         assert headers["content-security-policy"].startswith("default-src 'none'")
         assert "http" not in headers["content-security-policy"]
         assert headers["x-content-type-options"] == "nosniff"
