@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import sqlite3
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
@@ -65,7 +66,8 @@ class CuratePlugin:
         """An error as a page or as JSON, in one line, and without a trace in the terminal."""
 
         async def page() -> Response:
-            status = int(getattr(exception, "status", 500))
+            wrong_sql = isinstance(exception, sqlite3.Error | sqlite3.Warning)
+            status = int(getattr(exception, "status", 400 if wrong_sql else 500))
             told = getattr(exception, "message", None) or str(exception) or type(exception).__name__
             if getattr(exception, "title", None) == "SQL Interrupted":
                 told = (

@@ -123,10 +123,10 @@ def connection(pages: Pages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def content(pages: Pages) -> str:
-    """A hash of every file of the workspace but SQLite's shared memory."""
+    """A hash of every file of the workspace but SQLite's shared memory and an empty journal."""
     digest = hashlib.sha256()
     for path in sorted(pages.workspace.root.rglob("*")):
-        if path.is_file() and not path.name.endswith("-shm"):
+        if path.is_file() and path.stat().st_size and not path.name.endswith("-shm"):
             digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
 
