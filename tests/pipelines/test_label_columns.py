@@ -1,12 +1,17 @@
 """The columns of a round do not depend on the order in which a database gives its rows."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipelines.label_columns import NUMBERS, _joined, _ordered
 
 
+# How long an example takes says nothing on a busy machine.
+_PATIENT = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@_PATIENT
 @given(st.permutations(range(12)))
 def test_any_order_of_rows_gives_the_same_columns(order: list[int]) -> None:
     """By name of the frame, then by k; each row stays whole."""
@@ -25,6 +30,7 @@ def test_any_order_of_rows_gives_the_same_columns(order: list[int]) -> None:
     assert (found.boxes[:, 0] == was).all()
 
 
+@_PATIENT
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=6))
 def test_chunks_are_joined_in_their_order(sizes: list[int]) -> None:
     """Empty ones too, and the list is used up."""
