@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 
 from pipelines.label_columns import NUMBERS, _joined, _ordered
 
-
 # How long an example takes says nothing on a busy machine.
 _PATIENT = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
