@@ -16,7 +16,9 @@ ALLOWED = frozenset(
     {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
 )
 SERVER_ROWS = 1000  # that a server sends at once
-FORBIDDEN_FUNCTIONS = frozenset({"load_extension", "readfile", "writefile", "edit"})
+FORBIDDEN_FUNCTIONS = frozenset(
+    {"load_extension", "readfile", "writefile", "edit", "fts3_tokenizer"}
+)
 
 
 def ask(url: URL, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
@@ -37,7 +39,7 @@ def _ask_sqlite(path: Path, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any
     except sqlite3.Error as error:
         raise DatabaseError(f"{path}: {error}") from error
     connection.execute("PRAGMA query_only = ON")
-    connection.set_authorizer(_authorize)
+    connection.set_authorizer(may_read)
     try:
         cursor = connection.execute(sql)
     except (sqlite3.Error, sqlite3.Warning) as error:
@@ -49,8 +51,8 @@ def _ask_sqlite(path: Path, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any
     return [column[0] for column in cursor.description], iter(cursor)
 
 
-def _authorize(action: int, _first: str | None, second: str | None, *_: str | None) -> int:
-    """SQLite asks this before each thing that a statement would do."""
+def may_read(action: int, _first: str | None, second: str | None, *_: str | None) -> int:
+    """SQLite asks this before each thing that a statement would do; only reading is allowed."""
     if action == sqlite3.SQLITE_FUNCTION and second in FORBIDDEN_FUNCTIONS:
         return sqlite3.SQLITE_DENY
     return sqlite3.SQLITE_OK if action in ALLOWED else sqlite3.SQLITE_DENY

@@ -112,11 +112,11 @@ def _listed(
     changes: LabelChanges, before: LabelColumns, after: LabelColumns, count: int
 ) -> list[ChangedLabel]:
     """The most changed labels."""
-    iou = dict(zip(map(tuple, changes.pairs.tolist()), changes.iou.tolist(), strict=True))
     found = []
     for old, new in changes.largest(count)[0].tolist():
         side, row = (after, new) if new >= 0 else (before, old)
-        overlap = iou.get((old, new))
+        pair = changes.iou[changes.pairs[:, 0] == old] if old >= 0 and new >= 0 else np.zeros(0)
+        overlap = float(pair[0]) if len(pair) else None
         found.append(
             ChangedLabel(
                 _kind(new, overlap),

@@ -54,32 +54,55 @@ def read_columns(workspace: Workspace, round_number: int, policy: str) -> LabelC
     """
     labels = WEIGHTED_LABELS.c
     values = (*BOX_COLUMNS, *NUMBERS)
-    query = (
-        select(labels.frame, labels.k, labels.category, *(labels[name] for name in values))
-        .where(labels.round == round_number, labels.policy == policy)
-        .order_by(labels.frame, labels.k)
-    )
+    # Not ordered: the database would write millions of whole rows to its disk to sort them.
+    query = select(
+        labels.frame, labels.k, labels.category, *(labels[name] for name in values)
+    ).where(labels.round == round_number, labels.policy == policy)
     frames: dict[str, int] = {}
     categories = {name: i for i, name in enumerate(workspace.config.dataset.categories)}
     keys, tables = [np.zeros((0, 3), np.int64)], [np.zeros((0, len(values)))]
     with workspace.database.reading() as connection:
         result = connection.execution_options(stream_results=True).execute(query)
         for rows in result.partitions(_CHUNK):
-            keys.append(np.array([
-                (frames.setdefault(row[0], len(frames)), row[1],
-                 categories.setdefault(row[2], len(categories)))
-                for row in rows
-            ], dtype=np.int64))  # fmt: skip
-            tables.append(np.array([tuple(row[3:]) for row in rows], dtype=np.float64))
-    key, table = np.concatenate(keys), np.concatenate(tables)
+            names, numbers, kinds, *columns = zip(*rows, strict=True)
+            places = [frames.setdefault(name, len(frames)) for name in names]
+            own = [categories.setdefault(name, len(categories)) for name in kinds]
+            keys.append(np.array([places, numbers, own], dtype=np.int64).T)
+            tables.append(np.array(columns, dtype=np.float64).T)
+    key, table = _joined(keys), _joined(tables)
     if not len(key):
         raise WorkspaceError(
             f"round {round_number} has no labels weighted by {policy}; "
             f"run `curate solve --round {round_number} --policy {policy}`"
         )
+    return _ordered(list(frames), tuple(categories), key, table)
+
+
+def _joined(chunks: list[np.ndarray]) -> np.ndarray:
+    """All chunks below each other; each is let go as soon as it is copied."""
+    end = sum(map(len, chunks))
+    whole = np.empty((end, chunks[0].shape[1]), chunks[0].dtype)
+    while chunks:
+        chunk = chunks.pop()
+        whole[end - len(chunk) : end] = chunk
+        end -= len(chunk)
+    return whole
+
+
+def _ordered(
+    names: list[str], categories: tuple[str, ...], key: np.ndarray, table: np.ndarray
+) -> LabelColumns:
+    """The columns by frame and k, whatever the order in which the database gave them."""
+    rank = np.empty(len(names), np.int64)
+    rank[np.argsort(np.array(names), kind="stable")] = np.arange(len(names))
+    frames = rank[key[:, 0]]
+    order = np.lexsort([key[:, 1], frames])
+    if (order[1:] < order[:-1]).any():
+        frames, key, table = frames[order], key[order], table[order]
     numbers = {name: table[:, 7 + i] for i, name in enumerate(NUMBERS)}
-    names = list(frames), tuple(categories)
-    return LabelColumns(names[0], key[:, 0], key[:, 1], key[:, 2], names[1], table[:, :7], numbers)
+    return LabelColumns(
+        sorted(names), frames, key[:, 1], key[:, 2], categories, table[:, :7], numbers
+    )
 
 
 def as_rounds(before: LabelColumns, after: LabelColumns) -> tuple[RoundLabels, RoundLabels]:

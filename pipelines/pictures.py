@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from curate.errors import ConfigError, DataError
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.viewing.bird_eye import draw_bird_eye
@@ -44,14 +46,28 @@ def draw_view(
     """
     number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
-    found = read_frame(workspace, name, number, policy)
+    picture = frame_picture(workspace, name, number, policy)
+    path = output or workspace.root / "pictures" / f"round-{number:02d}-{name}-{policy}.png"
+    if path.is_dir() or not path.parent.is_dir():
+        raise ConfigError(f"--output {path}: name a file in a folder that exists")
+    save_png(path, picture)
+    return path
+
+
+def frame_picture(workspace: Workspace, name: str, round_number: int, policy: str) -> np.ndarray:
+    """Image and bird's eye view of any frame as (height, width, 3) uint8 RGB.
+
+    Raises:
+        ConfigError: no frame has that name.
+    """
+    found = read_frame(workspace, name, round_number, policy)
     frame = workspace.dataset.read(name, image=True)
     counts = count_points_in_boxes(frame.points, found.labels.boxes)
     labels = ShownLabels(
         found.labels.boxes, found.labels.categories, found.labels.scores, found.weights, counts
     )
-    title = f"frame {name} ({found.split}), round {number}, weights by {policy}"
-    picture = draw_frame(
+    title = f"frame {name} ({found.split}), round {round_number}, weights by {policy}"
+    return draw_frame(
         frame,
         labels,
         found.truth_boxes,
@@ -59,11 +75,6 @@ def draw_view(
         human_boxes=found.human_boxes,
         title=title,
     )
-    path = output or workspace.root / "pictures" / f"round-{number:02d}-{name}-{policy}.png"
-    if path.is_dir() or not path.parent.is_dir():
-        raise ConfigError(f"--output {path}: name a file in a folder that exists")
-    save_png(path, picture)
-    return path
 
 
 def draw_labels(workspace: Workspace, round_number: int, shown: FrameLabels) -> list[Path]:

@@ -123,7 +123,8 @@ def queries_page() -> str:
         "`curate query --named NAME` asks them of the working database, with `--file` of an"
     )
     parts.append(
-        "exported label file where that holds the answer; `curate query --list` lists them.\n"
+        "exported label file where that holds the answer; `curate query --list` lists them, and\n"
+        "[`curate serve`](serve.md) shows their answers in a browser.\n"
     )
     for query in named_queries().values():
         where = "" if query.exported else " Working database only."

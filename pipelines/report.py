@@ -1,7 +1,6 @@
 """The report of a round: one HTML file with figures, changes and the labels worth a look."""
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +9,16 @@ from sqlalchemy import select
 from curate.atomic import replace_file
 from curate.viewing.close_up import LabelShown, draw_close_up
 from curate.viewing.page import Figure, Section, render_page
-from curate.viewing.svg import Mark, histogram, share_curve
+from curate.viewing.svg import share_curve
 from db import bulk
 from pipelines.differences import COLUMNS, Difference, difference_of
 from pipelines.frame_boxes import chosen_round
 from pipelines.label_columns import LabelColumns, read_columns
+from pipelines.report_figures import beside_others, by_category, distributions, summary
 from pipelines.review.human_labels import counts
 from pipelines.workspace import Workspace
 
-_BINS = 40
 _PICTURES = 6
-_BANDS = (0.0, 20.0, 40.0, 60.0, np.inf)
 
 
 def write_report(workspace: Workspace, round_number: int | None, policy: str | None) -> Path:
@@ -37,78 +35,27 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
     number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
     labels = read_columns(workspace, number, policy)
+    score = labels.numbers["score"]
+    raised = np.where(score < 0.5, labels.weights, 0.0)
     sections = [
-        _figures(labels),
-        _categories(labels),
+        summary(workspace, labels, number),
+        distributions(labels),
+        by_category(labels),
+        *beside_others(workspace, number, policy),
         *_changes(workspace, labels, number, policy),
-        _worst(workspace, labels),
+        _shown(workspace, labels, "Most doubted: high score, low weight", score - labels.weights),
+        _shown(workspace, labels, "Kept against a low score: below 0.5, greatest weight", raised),
         *_reliability(workspace, number, policy),
     ]
     title = f"Round {number}, weights by {policy}"
-    kept = int((labels.weights > 0).sum())
-    note = (
-        f"{len(labels):,} labels in {len(labels.frame_names):,} unlabeled frames, {kept:,} with a "
-        f"weight above 0; their weights sum to {labels.weights.sum():,.1f}."
-    )
+    note = f"workspace {workspace.root.name}, data set {workspace.config.dataset.kind}"
     decided = counts(workspace, number)
     if decided:
         told = ", ".join(f"{count:,} {name}" for name, count in decided.items())
-        note += f" People decided on some, whatever the policy says: {told}."
+        note += f". People decided on some labels, whatever the policy says: {told}."
     path = workspace.root / "reports" / f"round-{number:02d}-{policy}.html"
     replace_file(path, render_page(title, note, sections).encode("utf-8"))
     return path
-
-
-def _figures(labels: LabelColumns) -> Section:
-    """Histograms of losses, priors and weights."""
-    loss, age = labels.numbers["loss"], labels.numbers["lambda_u"]
-    matched, ages = loss[~np.isnan(loss)], np.unique(age[~np.isnan(age)])
-    marks = [Mark(float(value), f"λ {value:.3g}") for value in ages[:4]]
-    figures = []
-    if len(matched):
-        counts, edges = np.histogram(matched, _BINS, (0, max(float(matched.max()), 1e-9)))
-        unmatched = f"{len(loss) - len(matched):,} labels without a matched reprediction left out"
-        figures.append(Figure(histogram(counts, edges, "consistency loss L", marks), unmatched))
-    told = {
-        "weight": "weight v; 0 means ignore",
-        "score": "the detector's score s",
-        "rho_diff": "point prior, Eq. 8",
-        "rho_anno": "semantic prior, Eq. 9",
-        "rho_det": "product of the priors",
-    }
-    for name, caption in told.items():
-        values = labels.numbers[name]
-        values = values[~np.isnan(values)]
-        if len(values):
-            figures.append(Figure(histogram(*np.histogram(values, 20, (0, 1)), name), caption))
-    return Section("Losses, priors and weights", figures=figures)
-
-
-def _categories(labels: LabelColumns) -> Section:
-    """A row per category and distance."""
-    distance = np.hypot(labels.boxes[:, 0], labels.boxes[:, 1])
-    band = np.digitize(distance, _BANDS[1:])
-    rows = []
-    for c, category in enumerate(labels.category_names):
-        for b, (near, far) in enumerate(pairwise(_BANDS)):
-            here = (labels.categories == c) & (band == b)
-            if here.any():
-                place = f"{near:.0f}-{far:.0f} m" if np.isfinite(far) else f"from {near:.0f} m"
-                weights = labels.weights[here]
-                kept = int((weights > 0).sum())
-                total, mean = float(weights.sum()), float(weights.mean())
-                score = float(labels.numbers["score"][here].mean())
-                rows.append((category, place, int(here.sum()), kept, total, mean, score))
-    columns = (
-        "category",
-        "distance",
-        "labels",
-        "weight > 0",
-        "sum of weights",
-        "mean",
-        "mean score",
-    )
-    return Section("Labels by category and distance", columns=columns, rows=rows)
 
 
 def _changes(
@@ -149,23 +96,40 @@ def _changed(
         yield _close_up(workspace, each.frame, label, caption)
 
 
-def _worst(workspace: Workspace, labels: LabelColumns) -> Section:
-    """Labels that the detector is surest of and the weight is not."""
-    doubt = labels.numbers["score"] - labels.weights
+def _shown(workspace: Workspace, labels: LabelColumns, title: str, rank: np.ndarray) -> Section:
+    """Pictures of the labels with the highest (n,) rank; those without any are not worth one."""
+    first = np.argsort(-rank, kind="stable")[:_PICTURES]
     figures = []
-    for i in np.argsort(-doubt, kind="stable")[:_PICTURES].tolist():
+    for i in first[rank[first] > 0].tolist():
         frame = labels.frame_names[labels.frames[i]]
-        category = labels.category_names[labels.categories[i]]
-        told = ", ".join(
-            f"{name} {labels.numbers[column][i]:.3g}"
-            for name, column in (("score", "score"), ("weight", "weight"), ("L", "loss"),
-                                 ("points", "points"), ("rho_anno", "rho_anno"))
-            if not np.isnan(labels.numbers[column][i])
-        )  # fmt: skip
-        caption = f"{category} {labels.k[i]} in frame {frame}: {told}"
         label = LabelShown(labels.boxes[i], float(labels.weights[i]))
-        figures.append(_close_up(workspace, frame, label, caption))
-    return Section("Most doubted: high score, low weight", figures=figures)
+        figures.append(_close_up(workspace, frame, label, _told(labels, i, frame)))
+    return Section(title, "" if figures else "There is none.", figures=figures)
+
+
+def _told(labels: LabelColumns, i: int, frame: str) -> str:
+    """What a label is, its numbers, and what took its weight away."""
+    own = {name: float(values[i]) for name, values in labels.numbers.items()}
+    shown = {"score": "score", "weight": "weight", "loss": "L", "points": "points",
+             "rho_diff": "rho_diff", "rho_anno": "rho_anno"}  # fmt: skip
+    numbers = ", ".join(
+        f"{word} {_figure(own[name])}" for name, word in shown.items() if not np.isnan(own[name])
+    )
+    reasons = {
+        "no reprediction matched it": np.isnan(own["loss"]),
+        "its loss is above lambda": own["loss"] >= own["lambda_u"],
+        "no pixel of its category": own["rho_anno"] == 0,
+        "no LiDAR point inside": own["points"] == 0,
+    }
+    found = [reason for reason, holds in reasons.items() if holds and own["weight"] <= 0]
+    category = labels.category_names[labels.categories[i]]
+    return f"{category} {labels.k[i]} in frame {frame}: {numbers}" + "".join(
+        f"; {reason}" for reason in found
+    )
+
+
+def _figure(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def _reliability(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:

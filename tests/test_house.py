@@ -100,7 +100,7 @@ def test_every_dependency_is_pinned() -> None:
     }
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    made = ("test", "lint", "bench")  # the extras that `make` installs
+    made = ("test", "lint", "bench", "serve", "browser")  # the extras that `make` installs
     wanted = {
         requirement.split(">")[0].split(";")[0].split("[")[0].strip().lower()
         for requirement in (*project["dependencies"], *chain(*map(extras.get, made)))

@@ -27,7 +27,12 @@ figure img, svg { display: block; width: 100%; height: auto; border-radius: 4px;
 table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums; }
 th, td { padding: 3px 12px 3px 0; border-bottom: 1px solid var(--line); text-align: right; }
 th { color: var(--faint); font-weight: 500; }
-th:first-child, td:first-child { text-align: left; }
+th:first-child, td.text { text-align: left; } tr.all td { font-weight: 600; }
+.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(170px, 1fr)); gap: 12px;
+  margin: 12px 0; }
+.facts div { padding: 8px 12px; background: var(--panel); border-radius: 6px; min-width: 0; }
+.facts dt { font-size: 13px; color: var(--faint); }
+.facts dd { margin: 0; font-size: 20px; overflow-wrap: anywhere; }
 .bar { fill: var(--bar); } .grid { stroke: var(--line); }
 .mark { stroke: var(--mark); stroke-width: 2; }
 .marked { fill: var(--mark); font-size: 12px; }
@@ -35,6 +40,10 @@ th:first-child, td:first-child { text-align: left; }
 .diagonal { stroke: var(--faint); stroke-dasharray: 4 4; }
 .curve { fill: none; stroke: var(--bar); stroke-width: 2; } .dot { fill: var(--bar); }
 """
+
+
+ALL = "all"
+"""What the first or second cell of a row of sums says."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +73,10 @@ class Section:
     Attributes:
         title: its heading.
         note: below the heading, "" for none.
+        facts: values with their names, as tiles.
         columns: heads of its table, none for no table.
-        rows: of the table; floats are shown with four digits, None as nothing.
+        rows: of the table; floats are shown with four digits, None as nothing; a row that begins
+            with ALL is a sum and stands out.
         figures: side by side.
     """
 
@@ -74,6 +85,7 @@ class Section:
     columns: Sequence[str] = ()
     rows: Sequence[Sequence[Any]] = ()
     figures: Sequence[Figure] = ()
+    facts: Sequence[tuple[str, str]] = ()
 
 
 def render_page(title: str, note: str, sections: Iterable[Section]) -> str:
@@ -91,12 +103,15 @@ def _section(section: Section) -> str:
     parts = [f"<section><h2>{escape(section.title)}</h2>"]
     if section.note:
         parts.append(f"<p>{escape(section.note)}</p>")
+    if section.facts:
+        tiles = "".join(
+            f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>"
+            for name, value in section.facts
+        )
+        parts.append(f'<dl class="facts">{tiles}</dl>')
     if section.columns:
         heads = "".join(f"<th>{escape(name)}</th>" for name in section.columns)
-        lines = "\n".join(
-            "<tr>" + "".join(f"<td>{escape(_cell(value))}</td>" for value in row) + "</tr>"
-            for row in section.rows
-        )
+        lines = "\n".join(_row(row) for row in section.rows)
         parts.append(
             f'<div class="scroll"><table><thead><tr>{heads}</tr></thead>'
             f"<tbody>{lines}</tbody></table></div>"
@@ -110,7 +125,20 @@ def _section(section: Section) -> str:
     return "\n".join([*parts, "</section>"])
 
 
+def _row(row: Sequence[Any]) -> str:
+    opening = '<tr class="all">' if ALL in row[:2] else "<tr>"
+    cells = (
+        f'<td class="text">{escape(value)}</td>'
+        if isinstance(value, str)
+        else f"<td>{escape(_cell(value))}</td>"
+        for value in row
+    )
+    return f"{opening}{''.join(cells)}</tr>"
+
+
 def _cell(value: Any) -> str:
     if value is None or value != value:  # noqa: PLR0124 - NaN is not equal to itself
         return ""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)

@@ -24,9 +24,9 @@ def report(
 ) -> None:
     """Write a round's report: one HTML file in reports/ that needs no network.
 
-    Losses with lambda, priors, weights, labels by category and distance, what changed since the
-    round before, the most doubted and the most changed labels as pictures, and the reliability
-    curve where `curate audit` has left one.
+    Losses with lambda, priors, weights, labels by category and distance, other policies, what
+    changed since the round before, doubted, kept and changed labels as pictures, and the
+    reliability curve where `curate audit` has left one.
 
     Example: curate report --round 2
     """

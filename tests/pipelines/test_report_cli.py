@@ -55,13 +55,18 @@ def test_a_report_tells_a_round_its_changes_and_its_audit(
     first = Path(out.removeprefix("report: ").strip())
     assert first == root / "reports" / "round-01-pspsl.html"
     headings, text = read(first)
-    assert [heading.split()[0] for heading in headings] == ["Losses,", "Labels", "Most"]
+    assert [heading.split()[0] for heading in headings] == [
+        "The", "Losses,", "Labels", "Most", "Kept"
+    ]  # fmt: skip
     assert "18 labels in 6 unlabeled frames" in text
     assert "λ" in text
+    assert curate("solve", "--round", 2, "--policy", "uniform", "-w", root)[0] == 0
     assert curate("audit", "--round", 2, "--replicates", 10, "-w", root)[0] == 0
     second = Path(json.loads(curate("report", "--json", "-w", root)[1])["report"])
-    headings, _ = read(second)
+    headings, text = read(second)
     assert "Since round 1" in headings
+    assert "Beside other policies" in headings
+    assert text.count("(this page)") == 1
     assert "Reliability" in headings
 
 

@@ -44,7 +44,7 @@ def test_a_page_is_well_formed_and_loads_nothing():
     picture = Figure.picture(np.zeros((8, 8, 3), np.uint8), EVIL)
     chart = Figure(histogram(np.array([1, 2]), np.array([0, 0.5, 1]), EVIL), EVIL)
     rows = [(EVIL, 1.23456, None, float("nan"))]
-    section = Section(EVIL, EVIL, (EVIL, "b", "c", "d"), rows, [picture, chart])
+    section = Section(EVIL, EVIL, (EVIL, "b", "c", "d"), rows, [picture, chart], [(EVIL, EVIL)])
     reader = Reader()
     text = render_page(EVIL, EVIL, [section])
     reader.feed(text)
@@ -55,6 +55,14 @@ def test_a_page_is_well_formed_and_loads_nothing():
     assert not re.search(r"https?://|url\(|@import", text)
     assert "<td>1.235</td><td></td><td></td>" in text
     assert "prefers-color-scheme: dark" in text
+
+
+def test_numbers_are_written_to_be_read():
+    """Thousands are parted, sums stand out, words stand to the left."""
+    section = Section("t", columns=("a", "b"), rows=[("Car", 1234567), ("all", 98765.4)])
+    text = render_page("t", "", [section])
+    assert '<td class="text">Car</td><td>1,234,567</td>' in text
+    assert '<tr class="all"><td class="text">all</td><td>98,765</td>' in text
 
 
 def bars(svg):

@@ -1,0 +1,64 @@
+"""curate serve: the databases and the pictures in a browser."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import typer
+
+from pipelines.commands.options import WorkspaceOption
+
+if TYPE_CHECKING:
+    from pipelines.serving.application import Served
+
+
+def serve(
+    folder: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Argument(metavar="[WORKSPACE]", help="As --workspace.", show_default=False),
+    ] = None,
+    file: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Serve this exported label file only."),
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes any free one.")] = 8001,
+    host: Annotated[
+        str, typer.Option(help="Where to listen; the default is for this machine only.")
+    ] = "127.0.0.1",
+    time_limit: Annotated[
+        float, typer.Option(min=0.1, max=600, help="Seconds that a question may take.")
+    ] = 10.0,
+    browse: Annotated[bool, typer.Option("--open", help="Show it in a browser.")] = False,
+    workspace: WorkspaceOption = None,
+) -> None:
+    """Serve the labels to a browser: tables, SQL, the named queries, a picture per frame.
+
+    The workspace's database and the exported labels.sqlite are opened for reading only; questions
+    have a time limit. Nothing is loaded from the network. Ctrl-C ends it.
+
+    Example: curate serve --port 8001 --open
+    """
+    from dataclasses import replace
+
+    from pipelines.serving.application import application
+    from pipelines.serving.guard import is_loopback
+    from pipelines.serving.server import listen
+    from pipelines.serving.server import serve as answer
+    from pipelines.serving.sources import choose
+
+    served = replace(choose(folder, workspace, file), time_limit_s=time_limit)
+    with application(served, host) as pages:
+        taken = listen(host, port)
+        if not is_loopback(host):
+            typer.echo(f"warning: whoever reaches {host} reads these labels and pictures", err=True)
+        answer(pages, taken, lambda url: _tell(served, url), browse=browse)
+
+
+def _tell(served: "Served", url: str) -> None:
+    for name, path in served.files.items():
+        typer.echo(f"{name}: {path}")
+    typer.echo(f"serving at {url} until Ctrl-C")
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command."""
+    app.command()(serve)

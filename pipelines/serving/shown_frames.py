@@ -1,0 +1,157 @@
+"""What the page of a frame shows: its picture, its labels, its neighbours, the other weights."""
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import and_, select
+
+from curate.errors import ConfigError
+from curate.viewing.canvas import jpeg
+from db import bulk
+from pipelines.frame_boxes import chosen_round
+from pipelines.pictures import frame_picture
+from pipelines.workspace import Workspace
+
+COLUMNS = (
+    "k", "category", "x", "y", "score", "loss", "points", "points_threshold", "rho_diff",
+    "mask_pixels", "box_pixels", "rho_anno", "rho_det", "lambda_u", "v",
+)  # fmt: skip
+_TABLES = ("consistency", "point_prior", "semantic_prior")
+_KEPT_PICTURES = 24
+
+
+@dataclass(frozen=True)
+class ShownFrame:
+    """A frame in a round under a policy.
+
+    Attributes:
+        name: of the frame.
+        split: of the frame.
+        round: number.
+        policy: whose weights.
+        labels: a row of `COLUMNS` per label.
+        choices: (round, policy) of all weights that the frame has.
+        before: the frame of the same split before this one, None at the start.
+        after: the one after it, None at the end.
+    """
+
+    name: str
+    split: str
+    round: int
+    policy: str
+    labels: tuple[bulk.Row, ...]
+    choices: tuple[tuple[int, str], ...]
+    before: str | None
+    after: str | None
+
+
+class FramePages:
+    """Frames of a workspace as they are asked for; nothing is written.
+
+    Pictures are drawn one at a time, and the last ones are kept in memory.
+
+    Args:
+        workspace: see `Workspace`.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        self._pictures: OrderedDict[tuple[str, int, str], bytes] = OrderedDict()
+        self._drawing = threading.Lock()
+
+    def find(
+        self, name: str | None, key: int | None, round_number: int | None, policy: str | None
+    ) -> ShownFrame:
+        """A frame by name or by key.
+
+        Args:
+            name: None where the key is given.
+            key: frame.id.
+            round_number: None for the last that has predictions.
+            policy: None for the configured one.
+
+        Raises:
+            ConfigError: there is no such frame, or nothing of it in such a round.
+            WorkspaceError: no round has predictions yet.
+        """
+        number = chosen_round(self._workspace, round_number)
+        policy = policy or self._workspace.config.run.method
+        found, name, split = self._key(name, key)
+        choices = self._choices(found)
+        if choices and (number, policy) not in choices:
+            raise ConfigError(f"frame {name} has no weights by {policy} in round {number}")
+        before, after = (self._neighbour(name, split, step) for step in (-1, 1))
+        labels = self._labels(found, number, policy)
+        return ShownFrame(name, split, number, policy, labels, choices, before, after)
+
+    def picture(self, shown: ShownFrame) -> bytes:
+        """The picture of a frame as JPEG."""
+        wanted = (shown.name, shown.round, shown.policy)
+        with self._drawing:
+            if wanted not in self._pictures:
+                self._pictures[wanted] = jpeg(frame_picture(self._workspace, *wanted), quality=88)
+            self._pictures.move_to_end(wanted)
+            if len(self._pictures) > _KEPT_PICTURES:
+                self._pictures.popitem(last=False)
+            return self._pictures[wanted]
+
+    def explanation(self, shown: ShownFrame, k: int) -> str:
+        """What `curate explain` says of a label.
+
+        Raises:
+            WorkspaceError: the policy has not weighted it.
+        """
+        from pipelines.explanation import explain_label
+
+        found = explain_label(self._workspace, shown.name, k, shown.round, shown.policy)
+        return found.as_text()
+
+    def _key(self, name: str | None, key: int | None) -> tuple[int, str, str]:
+        frame = bulk.table("frame")
+        here = frame.c.id == key if name is None else frame.c.frame == name
+        query = select(frame.c.id, frame.c.frame, frame.c.split).where(here)
+        rows = self._ask(query)
+        if not rows:
+            raise ConfigError(f"no frame {key if name is None else repr(name)} in this workspace")
+        return rows[0][0], rows[0][1], rows[0][2]
+
+    def _choices(self, key: int) -> tuple[tuple[int, str], ...]:
+        weight, number = bulk.table("weight"), bulk.table("round").c.number
+        # Round by round: the key of `weight` starts with it.
+        query = (
+            select(weight.c.round, weight.c.policy)
+            .where(weight.c.round.in_(select(number)), weight.c.frame_id == key)
+            .distinct()
+            .order_by(weight.c.round, weight.c.policy)
+        )
+        return tuple((int(row[0]), str(row[1])) for row in self._ask(query))
+
+    def _neighbour(self, name: str, split: str, step: int) -> str | None:
+        frame = bulk.table("frame").c.frame
+        beyond, order = (frame > name, frame) if step > 0 else (frame < name, frame.desc())
+        query = select(frame).where(beyond, bulk.table("frame").c.split == split)
+        rows = self._ask(query.order_by(order).limit(1))
+        return str(rows[0][0]) if rows else None
+
+    def _labels(self, key: int, number: int, policy: str) -> tuple[bulk.Row, ...]:
+        prediction, weight = bulk.table("prediction"), bulk.table("weight")
+        joined: Any = prediction
+        columns = {**prediction.c}
+        for table in (*map(bulk.table, _TABLES), weight):
+            same = [table.c[name] == prediction.c[name] for name in ("round", "frame_id", "k")]
+            own = [weight.c.policy == policy] if table is weight else []
+            joined = joined.outerjoin(table, and_(*same, *own))
+            columns = {**table.c, **columns}
+        query = (
+            select(*(columns[name] for name in COLUMNS))
+            .select_from(joined)
+            .where(prediction.c.round == number, prediction.c.frame_id == key)
+            .order_by(prediction.c.k)
+        )
+        return tuple(self._ask(query))
+
+    def _ask(self, query: Any) -> list[bulk.Row]:
+        with self._workspace.database.reading() as connection:
+            return list(bulk.select(connection, query))

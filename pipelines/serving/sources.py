@@ -1,0 +1,57 @@
+"""Which databases a server shows."""
+
+from pathlib import Path
+
+from curate.errors import ConfigError, WorkspaceError
+from pipelines.serving.application import Served
+from pipelines.workspace import Workspace
+
+WORKING, EXPORTED = "workspace", "labels"
+
+
+def choose(argument: Path | None, option: Path | None, file: Path | None) -> Served:
+    """What the command line asks for.
+
+    Args:
+        argument: the workspace as an argument.
+        option: the workspace as an option.
+        file: an exported label file; then a workspace only adds pictures.
+
+    Raises:
+        ConfigError: both name a workspace, or there is no such file.
+        WorkspaceError: there is no workspace, or nothing of it can be served.
+    """
+    if argument is not None and option is not None:
+        raise ConfigError("serve: name the workspace once, as an argument or with --workspace")
+    folder = argument or option
+    if file is None:
+        return _of_workspace(Workspace.open(folder))
+    if not file.is_file():
+        raise ConfigError(f"--file {file}: no such file; `curate export` writes one")
+    return Served(file.name, {EXPORTED: file}, None, _at_hand(folder))
+
+
+def _of_workspace(workspace: Workspace) -> Served:
+    url, exported = workspace.database.url, workspace.root / "exports" / "labels.sqlite"
+    files = {}
+    if url.get_backend_name() == "sqlite":
+        files[WORKING] = Path(str(url.database))
+    if exported.is_file():
+        files[EXPORTED] = exported
+    if not files:
+        raise WorkspaceError(
+            f"serve: Datasette reads SQLite, and {workspace.root} keeps its rows in "
+            f"{url.get_backend_name()}; write exports/labels.sqlite with `curate export`"
+        )
+    working = WORKING if WORKING in files else None
+    return Served(f"curate: {workspace.root.name}", files, working, workspace)
+
+
+def _at_hand(folder: Path | None) -> Workspace | None:
+    """The workspace, for pictures; none is needed unless it is named."""
+    if folder is not None:
+        return Workspace.open(folder)
+    try:
+        return Workspace.open()
+    except WorkspaceError:
+        return None

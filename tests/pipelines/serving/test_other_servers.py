@@ -1,0 +1,42 @@
+"""curate serve for one file alone, and for a network."""
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+from serving import running
+
+from pipelines.serving.sources import choose
+from pipelines.workspace import Workspace
+
+pytest.importorskip("datasette", reason="the extra [serve] is not installed")
+
+
+def test_a_file_alone_is_served_without_pictures(
+    weighted: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no workspace is near; hostile words in it stay words."""
+    path = tmp_path / "foreign.sqlite"
+    path.write_bytes((weighted.root / "exports" / "labels.sqlite").read_bytes())
+    evil = "<script>alert(1)</script>"
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE label SET category = ?", (evil,))
+    connection.close()
+    monkeypatch.chdir(tmp_path)
+    served = choose(None, None, path)
+    assert served.workspace is None
+    with running(served, weighted) as alone:
+        text = alone.get("/labels/weighted_labels").text
+        assert "&lt;script&gt;alert" in text
+        assert evil not in text
+        assert "/-/frame?" not in text
+        assert alone.get("/-/picture", frame="000003").status == 404
+        assert alone.get("/workspace").status == 404
+
+
+def test_on_an_open_host_any_name_is_answered(weighted: Workspace) -> None:
+    """There the name is not known; the rest of the guard stands."""
+    served = choose(weighted.root, None, None)
+    with running(served, weighted, host="0.0.0.0") as open_pages:  # noqa: S104
+        assert open_pages.get("/", headers={"Host": "lab.example"}).status == 200
+        assert open_pages.get("/-/databases.json").status == 404

@@ -1,0 +1,97 @@
+"""curate serve: every table, question and frame has its page."""
+
+import json
+import sqlite3
+
+import cv2
+import numpy as np
+import pytest
+from serving import Pages
+
+from db.models import Base
+from pipelines.asking import ask
+from pipelines.frame_boxes import newest_round
+from pipelines.named_queries import named_queries
+from pipelines.pictures import frame_picture
+
+pytest.importorskip("datasette", reason="the extra [serve] is not installed")
+
+
+def test_the_first_page_leads_to_both_databases(pages: Pages) -> None:
+    """And lists the questions with their sense."""
+    answer = pages.get("/")
+    assert answer.status == 200
+    assert 'href="/workspace"' in answer.text
+    assert 'href="/labels"' in answer.text
+    assert all(query.description.split("`")[0][:30] in answer.text.replace("&#39;", "'")
+               for query in named_queries().values())  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(Base.metadata.tables))
+def test_a_table_says_what_it_is(pages: Pages, name: str) -> None:
+    """In the words of its model."""
+    answer = pages.get(f"/workspace/{name}")
+    assert answer.status == 200
+    assert "metadata-description" in answer.text
+
+
+@pytest.mark.parametrize("name", named_queries())
+def test_a_named_query_answers_as_curate_query_does(pages: Pages, name: str) -> None:
+    """As many rows, the same columns; those of the working database only there."""
+    query = named_queries()[name]
+    columns, rows = ask(pages.workspace.database.url, query.sql)
+    answer = json.loads(pages.get(f"/workspace/{name}.json", _shape="array").text)
+    assert len(answer) == len(list(rows))
+    assert all(list(row) == list(columns) for row in answer)
+    assert pages.get(f"/workspace/{name}").status == 200
+    assert pages.get(f"/labels/{name}").status == (200 if query.exported else 404)
+
+
+def test_a_label_leads_to_its_frame(pages: Pages) -> None:
+    """From its row, with round and policy; the number of the label to its explanation."""
+    text = pages.get("/labels/weighted_labels").text
+    link = "/-/frame?frame=000002&amp;round=1&amp;policy=pspsl"
+    assert link in text
+    assert f"{link}&amp;k=0" in text
+    assert "/-/frame?id=" in pages.get("/workspace/weight").text
+    page = pages.get(link.replace("&amp;", "&") + "&k=0")
+    assert page.status == 200
+    assert "recomputed" in page.text
+
+
+def test_a_picture_is_the_one_of_curate_view(pages: Pages) -> None:
+    """Nearly: it travels as JPEG."""
+    answer = pages.get("/-/picture", frame="000003")
+    assert (answer.status, answer.headers["content-type"]) == (200, "image/jpeg")
+    shown = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    drawn = frame_picture(pages.workspace, "000003", newest_round(pages.workspace), "pspsl")
+    assert shown.shape == drawn.shape
+    assert np.abs(shown.astype(int) - drawn).mean() < 6
+    assert list((pages.workspace.root / "pictures").iterdir()) == []
+
+
+@pytest.mark.parametrize("split", ["labeled", "unlabeled", "val"])
+def test_every_split_has_pages(pages: Pages, split: str) -> None:
+    """Neighbours are of the same split; by name and by key it is the same frame."""
+    names = pages.workspace.frames(split)
+    first, second = list(names)[:2]
+    answer = pages.get("/-/frame", frame=first)
+    assert answer.status == 200
+    assert f"frame={second}&amp;" in answer.text
+    assert answer.body == pages.get("/-/frame", id=names[first]).body
+
+
+def test_a_new_export_is_seen_without_a_new_start(pages: Pages) -> None:
+    """The file has been replaced, not changed."""
+    path = pages.workspace.root / "exports" / "labels.sqlite"
+    before = pages.get("/labels.json", sql="SELECT count(*) FROM label", _shape="arrayfirst").text
+    held = path.read_bytes()
+    other = path.with_name("other.sqlite")
+    other.write_bytes(held)
+    with sqlite3.connect(other) as connection:
+        connection.execute("DELETE FROM label WHERE k > 0")
+    connection.close()
+    other.replace(path)
+    after = pages.get("/labels.json", sql="SELECT count(*) FROM label", _shape="arrayfirst").text
+    path.write_bytes(held)
+    assert json.loads(after)[0] < json.loads(before)[0]
