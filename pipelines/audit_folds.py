@@ -50,7 +50,7 @@ def _fold_config(workspace: Workspace) -> Config:
     config = workspace.config
     detector, segmenter = config.detector.path, config.segmenter.path
     changes = {
-        "dataset": {"root": config.dataset.root.resolve()},
+        "dataset": {"root": config.dataset.root.resolve(), "split_by": "frame"},
         "detector": {"path": detector and (workspace.root / detector).resolve()},
         "segmenter": {"path": segmenter and segmenter.resolve()},
         "run": {"database": None},

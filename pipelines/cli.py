@@ -10,6 +10,7 @@ from curate.errors import CurateError
 from pipelines.commands import (
     audit,
     bench,
+    check,
     demo,
     diff,
     doctor,
@@ -62,6 +63,7 @@ for command in (
     report,
     evaluate,
     audit,
+    check,
     bench,
 ):
     command.register(app)

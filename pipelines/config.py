@@ -52,6 +52,8 @@ class DatasetSection(Section):
     categories: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_each_once)] = (
         CATEGORIES
     )
+    split_by: Literal["sequence", "frame"] = "sequence"  # frame: neighbours on both sides
+    follow_links: bool = False  # true: links may lead out of root
     options: Options = {}
 
 

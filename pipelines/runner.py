@@ -108,7 +108,13 @@ def run_frames(
 def run_round(
     workspace: Workspace, context: RoundContext, stage: RoundStage, policy: str, progress: Progress
 ) -> Report:
-    """Brings a round stage up to date for a policy."""
+    """Brings a round stage up to date for a policy.
+
+    Raises:
+        LeakageError: what guards the stage does not hold.
+    """
+    if stage.guard:
+        stage.guard(workspace, context, policy)
     frames = plan.complete_frames(workspace, context)
     return run_once(
         workspace,

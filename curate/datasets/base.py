@@ -1,7 +1,7 @@
 """What every data set offers."""
 
-from collections.abc import Mapping
-from typing import Protocol
+from collections.abc import Iterable, Mapping
+from typing import Protocol, runtime_checkable
 
 from curate.detections import Annotations
 from curate.frames import Frame, FrameFiles
@@ -35,3 +35,20 @@ class Dataset(Protocol):
     def annotations(self, frame_id: str) -> Annotations:
         """The frame's ground truth."""
         ...
+
+
+@runtime_checkable
+class Sequenced(Protocol):
+    """A data set that knows which frames were recorded one after the other."""
+
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The sequence (drive, scene, clip) of a frame; None where it is not known."""
+        ...
+
+
+def sequences_of(dataset: Dataset, frames: Iterable[str]) -> Mapping[str, str]:
+    """The sequence of each frame that the data set knows one of."""
+    if not isinstance(dataset, Sequenced):
+        return {}
+    found = {frame: dataset.sequence_of(frame) for frame in frames}
+    return {frame: sequence for frame, sequence in found.items() if sequence is not None}

@@ -18,6 +18,12 @@ def init(
     val: Annotated[
         str, typer.Option(help="Likewise for validation; default: the data set's own val list.")
     ] = "",
+    split_by: Annotated[
+        str, typer.Option(help="sequence, where the data set knows them; or frame, see check.")
+    ] = "sequence",
+    follow_links: Annotated[
+        bool, typer.Option("--follow-links", help="Links may lead out of the root.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the split and of every later draw.")] = 0,
     detector: Annotated[
         str, typer.Option(help="pillars, onnx, recorded or module:Class.")
@@ -50,7 +56,12 @@ def init(
     if not root.is_dir():
         raise ConfigError(f"--root {root}: no such folder")
     document: dict[str, Any] = {
-        "dataset": {"kind": dataset, "root": root.resolve()},
+        "dataset": {
+            "kind": dataset,
+            "root": root.resolve(),
+            "split_by": split_by,
+            "follow_links": follow_links,
+        },
         "detector": {"name": detector, "path": detector_path and detector_path.resolve()},
         "segmenter": {
             "name": segmenter,

@@ -5,11 +5,12 @@ from sqlalchemy import Connection
 from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError, WorkspaceError
 from pipelines import plan
+from pipelines.firewall.rules import enforce
 from pipelines.progress import Progress
 from pipelines.rounds import is_trainable, register_checkpoint
 from pipelines.runner import Report, run_once
 from pipelines.stage import Product
-from pipelines.stages.export import write_label_file
+from pipelines.stages.export import register_label_file, write_label_file
 from pipelines.stages.train_round import train_with_progress, training_settings
 from pipelines.workspace import Workspace
 
@@ -20,6 +21,7 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
     Raises:
         ConfigError: curate cannot train the configured detector.
         WorkspaceError: there are no labeled frames.
+        LeakageError: ground truth would reach what it must not, see `firewall`.
     """
     config = workspace.config
     if not is_trainable(workspace):
@@ -53,9 +55,10 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
         FORMAT_VERSION,
     ]
     path = workspace.root / "checkpoints" / "round-00.safetensors"
+    labels = workspace.root / "exports" / "labeled.sqlite"
+    enforce(workspace, file=labels)
 
     def make() -> Product:
-        labels = workspace.root / "exports" / "labeled.sqlite"
         write_label_file(workspace, labels, 0, "")
         report = train_with_progress(
             labels=labels,
@@ -72,5 +75,6 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
 
     def write(connection: Connection) -> None:
         register_checkpoint(connection, workspace, 0, "", path)
+        register_label_file(connection, workspace, labels, 0, "")
 
     return run_once(workspace, plan.Once(0, "pretrain", ""), plan.digest(key), path, make)
