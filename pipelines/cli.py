@@ -82,7 +82,8 @@ def main() -> None:
     try:
         app()
     except CurateError as error:
-        sys.stderr.write(f"error: {error}\n")
+        # One line, whatever a foreign file has put into it.
+        sys.stderr.write(f"error: {' '.join(str(error).splitlines())}\n")
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         sys.stderr.write("interrupted; run the command again, it continues\n")

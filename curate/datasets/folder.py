@@ -165,8 +165,8 @@ def _read_description(path: Path) -> Mapping[str, Any]:
     """What dataset.toml says; DataError where it cannot be."""
     try:
         told = tomllib.loads(read_bytes(path, "description").decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not TOML: {error}") from None
+    except (RecursionError, ValueError) as error:  # ValueError: also of absurdly long numbers
+        raise DataError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
     unknown = sorted(set(told) - set(_KEYS))
     if unknown:
         raise DataError(f"{path}: unknown key {unknown[0]}; known are {', '.join(_KEYS)}")

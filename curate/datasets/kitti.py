@@ -24,8 +24,12 @@ _log = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 POINT_BYTES = 16  # x, y, z, intensity, float32 each
+# No LiDAR sees farther; maps over the points would fill the memory.
+FARTHEST_METRES = 2000.0
 # KITTI's own development kit says which drive each frame of training/ was taken from.
 _MAPPINGS = ("mapping", "devkit_object/mapping", "devkit/mapping")
+# Focal lengths are thousands of pixels, P2's last column a million at most.
+_LARGEST_ENTRY = 1e9
 CALIBRATION_SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
@@ -160,7 +164,19 @@ def read_points(path: Path) -> np.ndarray:
             f"{path}: {len(bad)} of {len(points)} points are NaN or infinite, "
             f"the first is point {bad[0]}; remove them from the file"
         )
+    refuse_far_points(path, points)
     return points
+
+
+def refuse_far_points(path: Path, points: np.ndarray) -> None:
+    """DataError where a finite point of (n, >=3) is farther than any LiDAR sees."""
+    far = np.abs(points[:, :3]).max(initial=0)
+    if far > FARTHEST_METRES:
+        k = int(np.abs(points[:, :3]).max(axis=1).argmax())
+        raise DataError(
+            f"{path}: point {k} is {far:.4g} m away; points are in metres from the LiDAR, remove "
+            f"those beyond {FARTHEST_METRES:g} m"
+        )
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -215,6 +231,8 @@ def parse_matrix(entries: str, shape: tuple[int, int], place: str) -> np.ndarray
         raise DataError(f"{place}: {len(numbers)} numbers, expected {shape[0]} x {shape[1]}")
     if not np.isfinite(numbers).all():
         raise DataError(f"{place}: holds NaN or infinite numbers")
+    if np.abs(numbers).max() > _LARGEST_ENTRY:
+        raise DataError(f"{place}: holds numbers beyond {_LARGEST_ENTRY:g}")
     return numbers.reshape(shape)
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from curate.detections import Detections, as_categories
+from curate.detectors.recorded.answers import LARGEST
 from curate.errors import DataError
 from curate.geometry.similarity import Similarity, wrap_angle
 
@@ -111,7 +112,8 @@ def _read_rows(path: Path) -> tuple[list[list[str]], list[int]]:
     except FileNotFoundError:
         raise DataError(f"{path}: no such file of recorded detections") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read as CSV: {error}") from error
+        words = " ".join(str(error).split())
+        raise DataError(f"{path}: cannot be read as CSV: {words}") from error
     for row, line in rows:
         if len(row) != len(header):
             raise DataError(f"{path}:{line}: {len(row)} fields, the header has {len(header)}")
@@ -126,7 +128,7 @@ def _parse_numbers(path: Path, rows: list[list[str]], lines: list[int]) -> np.nd
         try:
             numbers[index] = [float(field) for field in row[2:]]
         except ValueError as error:
-            raise DataError(f"{path}:{line}: {error}") from None
+            raise DataError(f"{path}:{line}: {str(error)[:120]}") from None
     return numbers
 
 
@@ -136,6 +138,7 @@ def _refuse_impossible(path: Path, lines: list[int], numbers: np.ndarray) -> Non
     identity = (flip_y == 0) & (rotation_rad == 0) & (scale == 1)
     faults = {
         "a number is NaN or infinite": ~np.isfinite(numbers).all(axis=1),
+        f"a number is beyond {LARGEST:g}": (np.abs(numbers) > LARGEST).any(axis=1),
         "view is not 0, 1, 2, ...": (view < 0) | (view != np.floor(view)),
         "flip_y is neither 0 nor 1": (flip_y != 0) & (flip_y != 1),
         "scale is not positive": scale <= 0,
