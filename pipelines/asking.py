@@ -17,7 +17,9 @@ from curate.errors import ConfigError, DatabaseError
 ALLOWED = frozenset(
     {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
 )
-FORBIDDEN_FUNCTIONS = frozenset({"load_extension", "readfile", "writefile", "edit"})
+FORBIDDEN_FUNCTIONS = frozenset(
+    {"load_extension", "readfile", "writefile", "edit", "fts3_tokenizer"}
+)
 # Of a text or blob: randomblob, printf, replace and group_concat could ask for a gigabyte.
 LONGEST_VALUE = 1 << 22
 MOST_COLUMNS = 500

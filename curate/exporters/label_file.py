@@ -54,7 +54,7 @@ def open_label_file(path: Path) -> Iterator[sqlite3.Connection]:
             rows.execute("PRAGMA cell_size_check = ON")
             _refuse_foreign_tables(rows, path)
             yield rows
-    except (sqlite3.Error, OverflowError) as error:
+    except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
         words = " ".join(str(error).split())
         raise DataError(f"{path}: not a label file: {words}; export it again") from None
 

@@ -18,6 +18,7 @@ import numpy as np
 from torch.utils.data import Dataset
 
 from curate.detections import as_categories
+from curate.errors import DataError
 from curate.exporters.label_file import open_label_file, read_categories, read_meta
 from curate.exporters.sqlite import refuse_leakage
 from curate.frames import Frame
@@ -98,7 +99,7 @@ class WeightedLabels(Dataset[Sample]):
                 "SELECT frame, category, x, y, z, length, width, height, yaw, "  # noqa: S608
                 f"{weight} FROM {table} ORDER BY frame, k"
             )
-            self._boxes.update(_group(rows.execute(query).fetchall(), self.categories))
+            self._boxes.update(_group(path, rows.execute(query).fetchall(), self.categories))
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -121,9 +122,13 @@ _NO_BOXES = (np.zeros((0, 7)), as_categories([]), np.zeros(0))
 
 
 def _group(
-    rows: list[tuple], known: tuple[str, ...]
+    path: Path, rows: list[tuple], known: tuple[str, ...]
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Boxes, categories and weights of each frame; unknown categories are left out."""
+    """Boxes, categories and weights of each frame; unknown categories are left out.
+
+    Raises:
+        DataError: a box is not finite, or a weight not in [0, 1].
+    """
     by_frame: dict[str, list[tuple]] = {}
     for frame, category, *numbers in rows:
         neighbour = NEIGHBOURS.get(category) if category not in known else None
@@ -133,10 +138,24 @@ def _group(
             by_frame.setdefault(frame, []).append((category, *numbers))
     grouped = {}
     for frame, entries in by_frame.items():
-        numbers_of = np.array([entry[1:] for entry in entries], dtype=np.float64)
+        numbers_of = _numbers(path, frame, [entry[1:] for entry in entries])
         names = as_categories([entry[0] for entry in entries])
         grouped[frame] = (numbers_of[:, :7], names, numbers_of[:, 7])
     return grouped
+
+
+def _numbers(path: Path, frame: str, entries: list[tuple]) -> np.ndarray:
+    """(m, 8) boxes and weights; a damaged file may hold anything in their place."""
+    try:
+        numbers = np.array(entries, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.full((len(entries), 8), np.nan)
+    if not np.isfinite(numbers).all() or not ((numbers[:, 7] >= 0) & (numbers[:, 7] <= 1)).all():
+        raise DataError(
+            f"{path}: frame {frame!r} has a box that is not finite or a weight that is not in "
+            "[0, 1]; export it again"
+        )
+    return numbers
 
 
 def _kitti_reader(root: Path) -> Callable[[str], Frame]:

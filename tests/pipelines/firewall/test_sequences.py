@@ -116,5 +116,5 @@ def test_kitti_object_knows_its_drives_by_the_mapping(tmp_path: Path) -> None:
     assert set(split.labeled) in ({"000000", "000002"}, {"000001", "000003"})
     (tmp_path / "ImageSets" / "train.txt").write_text("000000\n000001\n000002\n000004\n")
     (tmp_path / "ImageSets" / "val.txt").write_text("000003\n000005\n")
-    with pytest.raises(LeakageError, match="have frames in both unlabeled and val"):
+    with pytest.raises(LeakageError, match="have frames in both labeled and val"):
         choose_split(KittiDataset(tmp_path), "0.5", "", 2)
