@@ -28,8 +28,11 @@ def open_session(model: Path, threads: int, section: str) -> Any:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
     try:
-        return onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
-    except runtime_errors() as error:
+        # With its fallback, it would print what is wrong and try the same provider again.
+        return onnxruntime.InferenceSession(
+            str(model), options, providers=["CPUExecutionProvider"], enable_fallback=0
+        )
+    except (*runtime_errors(), RuntimeError, ValueError) as error:
         raise ModelError(f"{model}: no usable ONNX model: {first_line(error)}") from error
 
 
