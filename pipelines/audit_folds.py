@@ -1,7 +1,8 @@
 """Held-out folds of X_l: small workspaces inside the workspace, each with its own database.
 
-The teacher of a fold learns from the other folds; the fold itself is its val split. What a fold has
-done it keeps, so an audit that was killed continues.
+The teacher of a fold learns from the other folds; the fold itself is its val split, and made of
+whole sequences where there are enough of them. What a fold has done it keeps, so an audit that was
+killed continues.
 """
 
 from collections.abc import Iterator, Sequence
@@ -9,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.base import sequences_of
 from curate.errors import ConfigError
+from curate.firewall.sequences import group_by_sequence
 from pipelines.config import Config, read_config, write_config
 from pipelines.setup import initialise
 from pipelines.workspace import CONFIG_NAME, Workspace
@@ -27,10 +30,15 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
             f"--folds {folds}: the {len(labeled)} labeled frames make 2 to {len(labeled)} folds"
         )
     seed = workspace.config.run.seed
-    shuffled = np.random.default_rng([seed, folds]).permutation(labeled).tolist()
+    sequences = sequences_of(workspace.dataset, labeled)
+    groups = group_by_sequence(sequences, labeled)
+    whole = len(groups) >= folds
+    if not whole:  # too few sequences to keep them whole
+        groups = {frame: [frame] for frame in labeled}
+    shuffled = np.random.default_rng([seed, folds]).permutation(sorted(groups)).tolist()
     home = workspace.root / "reports" / "audit" / f"{folds}-folds-seed-{seed}"
     for fold in range(folds):
-        held_out = sorted(shuffled[fold::folds])
+        held_out = sorted(frame for name in shuffled[fold::folds] for frame in groups[name])
         root = home / f"fold-{fold + 1}"
         root.mkdir(parents=True, exist_ok=True)
         rest = sorted(set(labeled) - set(held_out))
@@ -38,19 +46,19 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
             _write_list(root / f"{split}.txt", names)
             for split, names in (("labeled", rest), ("val", held_out))
         ]
-        config = _fold_config(workspace)
+        config = _fold_config(workspace, workspace.config.dataset.split_by if whole else "frame")
         if (root / CONFIG_NAME).exists() and read_config(root / CONFIG_NAME) != config:
             # Settings of the workspace have changed since; what depends on them becomes stale.
             write_config(root / CONFIG_NAME, config)
         yield initialise(root, config, *map(str, lists))
 
 
-def _fold_config(workspace: Workspace) -> Config:
+def _fold_config(workspace: Workspace, split_by: str) -> Config:
     """The workspace's settings with absolute paths and the fold's own database."""
     config = workspace.config
     detector, segmenter = config.detector.path, config.segmenter.path
     changes = {
-        "dataset": {"root": config.dataset.root.resolve(), "split_by": "frame"},
+        "dataset": {"root": config.dataset.root.resolve(), "split_by": split_by},
         "detector": {"path": detector and (workspace.root / detector).resolve()},
         "segmenter": {"path": segmenter and segmenter.resolve()},
         "run": {"database": None},

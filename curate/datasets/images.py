@@ -96,7 +96,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int] | None:
 
 def _unreadable(content: bytes, path: Path) -> DataError:
     return DataError(
-        f"{path}: no readable PNG or JPEG image ({len(content)} bytes); fetch the file again"
+        f"{path}: no readable image (PNG or JPEG, {len(content)} bytes); fetch the file again"
     )
 
 
