@@ -10,6 +10,8 @@ from typing import Self
 
 import numpy as np
 
+from curate.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -18,15 +20,31 @@ class Calibration:
     Attributes:
         projection: (3, 4) rectified camera frame to image pixels (KITTI's P2).
         lidar_to_camera: (4, 4) LiDAR frame to rectified camera frame (KITTI's R0_rect * Tr).
+        lidar_to_map: (4, 4) pose of the LiDAR at the time of the sweep in the frame of a map, where
+            the data set knows it.
     """
 
     projection: np.ndarray
     lidar_to_camera: np.ndarray
+    lidar_to_map: np.ndarray | None = None
 
     @property
     def lidar_to_image(self) -> np.ndarray:
         """(3, 4) LiDAR frame to homogeneous image pixels."""
         return np.asarray(self.projection @ self.lidar_to_camera)
+
+    def pose_in_map(self) -> np.ndarray:
+        """(4, 4) LiDAR frame to the frame of the map.
+
+        Raises:
+            ConfigError: the data set has no poses.
+        """
+        if self.lidar_to_map is None:
+            raise ConfigError(
+                "boxes in the frame of a map need the vehicle's poses, which this data set does "
+                "not have; nuScenes' results belong to a workspace with dataset.kind = 'nuscenes'"
+            )
+        return self.lidar_to_map
 
 
 @dataclass(frozen=True)

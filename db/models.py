@@ -80,6 +80,7 @@ class Frame(Base):
     __table_args__ = (
         UniqueConstraint("dataset", "frame"),
         UniqueConstraint("id", "split"),
+        Index("ix_frame_frame", "frame"),
         CheckConstraint("split IN ('labeled', 'unlabeled', 'val')", name="split"),
         CheckConstraint(
             "split <> 'unlabeled' OR label_path IS NULL", name="unlabeled_has_no_label"
@@ -113,7 +114,7 @@ class SplitList(Base):
     path: Mapped[str | None] = mapped_column(Text, comment="of the file")
     frames: Mapped[int] = mapped_column(Integer, comment="how many")
     sha256: Mapped[str] = mapped_column(Text, comment="of names")
-    names: Mapped[str] = mapped_column(Text, comment="the sorted frame ids, one per line")
+    names: Mapped[str] = mapped_column(Text, comment="the sorted names, one per line")
 
 
 class GroundTruth(Base):
@@ -301,6 +302,103 @@ class Weight(Base):
     lambda_u: Mapped[float | None] = mapped_column(Float(53), comment="Eq. 4; null where unused")
     rho_det: Mapped[float | None] = mapped_column(Float(53), comment="product of the priors")
     v: Mapped[Share]
+
+
+class LabelCount(Base):
+    """How many labels a policy has weighed in a round; written by solve together with `weight`.
+
+    Counting millions of them anew would take seconds.
+    """
+
+    __tablename__ = "label_count"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
+    policy: Mapped[str] = mapped_column(Text, primary_key=True)
+    category: Mapped[str] = mapped_column(Text, primary_key=True)
+    labels: Mapped[int] = mapped_column(Integer, comment="that the policy did not drop")
+    kept: Mapped[int] = mapped_column(Integer, comment="with a weight above 0")
+    trusted: Mapped[int] = mapped_column(Integer, comment="with a weight above 0.5")
+    weight: Mapped[float] = mapped_column(Float(53), comment="sum of the weights")
+
+
+class Review(Base):
+    """Labels that were handed to an editor, and when the answer was taken back."""
+
+    __tablename__ = "review"
+
+    id: Mapped[str] = mapped_column(Text, primary_key=True, comment="hash of its manifest")
+    round: Mapped[int] = mapped_column(Integer, comment="whose labels")
+    policy: Mapped[str] = mapped_column(Text, comment="whose weights chose them")
+    editor: Mapped[str] = mapped_column(Text, comment="kitti | labelcloud | cvat")
+    frames: Mapped[int] = mapped_column(Integer)
+    boxes: Mapped[int] = mapped_column(Integer, comment="in all, those for context included")
+    asked: Mapped[int] = mapped_column(Integer, comment="of the boxes")
+    exported_at: Mapped[str] = mapped_column(Text, comment="ISO 8601, UTC")
+    imported_at: Mapped[str | None] = mapped_column(Text, comment="ISO 8601, UTC; null = not yet")
+
+
+class HumanLabel(Box, Base):
+    """What a person decided about an object of an unlabeled frame; it counts in later rounds too.
+
+    The key holds the frame's split as well, so a row for a labeled or val frame cannot exist. The
+    box is the object's; of a rejected label the one that was refused.
+    """
+
+    __tablename__ = "human_label"
+    __table_args__ = (
+        ForeignKeyConstraint(["frame_id", "split"], ["frame.id", "frame.split"]),
+        CheckConstraint("split = 'unlabeled'", name="only_unlabeled"),
+        CheckConstraint("decision IN ('accepted', 'rejected', 'moved', 'added')", name="decision"),
+        Index("ix_human_label_review", "review"),
+        {"sqlite_with_rowid": False},
+    )
+
+    frame_id: Mapped[Key]
+    n: Mapped[Key]
+    split: Mapped[Name]
+    review: Mapped[str] = mapped_column(ForeignKey("review.id"))
+    item: Mapped[int | None] = mapped_column(
+        Integer, comment="number of the box in the review; null = added"
+    )
+    decision: Mapped[str] = mapped_column(Text, comment="accepted | rejected | moved | added")
+    category: Mapped[Name]
+    from_round: Mapped[int] = mapped_column(Integer, comment="it counts in this round and later")
+    seen_x: Mapped[float | None] = mapped_column(
+        Float(53), sort_order=1, comment="metres, LiDAR frame: the box as it was shown; null = none"
+    )
+    seen_y: Mapped[Metres | None] = mapped_column(sort_order=1)
+    seen_z: Mapped[Metres | None] = mapped_column(sort_order=1)
+    seen_length: Mapped[Metres | None] = mapped_column(sort_order=1)
+    seen_width: Mapped[Metres | None] = mapped_column(sort_order=1)
+    seen_height: Mapped[Metres | None] = mapped_column(sort_order=1)
+    seen_yaw: Mapped[Radians | None] = mapped_column(sort_order=1)
+    reviewer: Mapped[str] = mapped_column(Text, sort_order=2, comment="who decided")
+    decided_at: Mapped[str] = mapped_column(Text, sort_order=2, comment="ISO 8601, UTC")
+
+
+class HumanMatch(Base):
+    """A prediction that a human label speaks for, so that no object is labeled twice.
+
+    A rejected one weighs 0 whatever a policy says; others give way to the human label's own box.
+    """
+
+    __tablename__ = "human_match"
+    __table_args__ = _evidence(
+        ForeignKeyConstraint(
+            ["frame_id", "n"], ["human_label.frame_id", "human_label.n"], ondelete="CASCADE"
+        ),
+        Index("ix_human_match_label", "frame_id", "n"),
+    )
+
+    round: Mapped[Key]
+    frame_id: Mapped[Key]
+    k: Mapped[Key]
+    n: Mapped[int] = mapped_column(Integer, comment="human_label.n")
+    iou: Mapped[float] = mapped_column(Float(53), comment="BEV IoU with its box, or the one seen")
+    leads: Mapped[int] = mapped_column(
+        Integer, comment="1 if the human label stands in weighted_labels under this k"
+    )
 
 
 class _Audited:

@@ -1,7 +1,7 @@
 """Opening a database: pragmas, migrations, and errors in our own words."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,21 +9,25 @@ from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError
-from db.views import create_views
+from db.claims import claimed, round_resources
+from db.views import create_views, drop_views
 
 # A writer that finds another one waits this long before it gives up.
 BUSY_TIMEOUT_MS = 30_000
+# On a server two processes may find an old schema at once; this number of theirs is one lock.
+_MIGRATION_LOCK = 0x637572617465  # "curate" in ASCII
 
 
 class Database:
     """A migrated database behind one engine.
 
     Args:
-        url: an SQLAlchemy URL, e.g. "sqlite:////data/run/curate.db".
+        url: an SQLAlchemy URL, e.g. "sqlite:////data/run/curate.db", or
+            "postgresql://user@host/curate", which psycopg 3 answers.
 
     Raises:
         ConfigError: the URL is none, or its driver is not installed.
@@ -33,21 +37,41 @@ class Database:
     def __init__(self, url: str | URL) -> None:
         self.url = parse_url(url) if isinstance(url, str) else url
         self.engine = _engine(self.url)
-        with _own_words(self.url.database):
+        with self._own_words():
             self._migrate()
+
+    @property
+    def name(self) -> str:
+        """The database as messages call it: a path, or a URL without its password."""
+        if self.engine.dialect.name == "sqlite":
+            return str(self.url.database)
+        return self.url.set(drivername=self.url.get_backend_name()).render_as_string()
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection for queries."""
-        with _own_words(self.url.database), self.engine.connect() as connection:
+        with self._own_words(), self.engine.connect() as connection:
             yield connection
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """One transaction: all of it is kept, or nothing."""
         writer = self.engine.execution_options(sqlite_begin="IMMEDIATE")
-        with _own_words(self.url.database), writer.begin() as connection:
+        with self._own_words(), writer.begin() as connection:
             yield connection
+
+    @contextmanager
+    def claiming_round(self, number: int, policy: str | None, purpose: str) -> Iterator[None]:
+        """Keeps every other process off a round, or off what a policy makes of it.
+
+        Raises:
+            DatabaseError: another process works on it; the message says who.
+        """
+        resources = round_resources(number, policy)
+        with ExitStack() as held:
+            with self._own_words():
+                held.enter_context(claimed(self.engine, resources, purpose))
+            yield
 
     def close(self) -> None:
         """Gives every connection back."""
@@ -63,27 +87,53 @@ class Database:
             return
         if current is not None and current not in {r.revision for r in script.walk_revisions()}:
             raise DatabaseError(
-                f"{self.url.database}: written by a newer curate (schema {current}); update curate"
+                f"{self.name}: written by a newer curate (schema {current}); update curate"
             )
         with self.writing() as connection:
+            if self.engine.dialect.name == "postgresql":
+                connection.execute(text(f"SELECT pg_advisory_xact_lock({_MIGRATION_LOCK})"))
             config.attributes["connection"] = connection
+            drop_views(connection)
             command.upgrade(config, "head")
             create_views(connection)
 
+    @contextmanager
+    def _own_words(self) -> Iterator[None]:
+        """Turns the driver's errors into one line that names the database and the remedy."""
+        try:
+            yield
+        except DBAPIError as error:
+            raise self._translated(error.orig or error) from error
+        except self.engine.dialect.loaded_dbapi.Error as error:
+            # The bulk paths speak to the driver itself.
+            raise self._translated(error) from error
 
-def parse_url(text: str) -> URL:
+    def _translated(self, error: BaseException) -> DatabaseError | LeakageError:
+        message = "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+        if "ground truth of an unlabeled frame" in message:
+            return LeakageError(f"{self.name}: {message} must not be stored")
+        remedies = _REMEDIES[self.engine.dialect.name]
+        remedy = next((each for sign, each in remedies.items() if sign in message), "")
+        return DatabaseError(f"{self.name}: {message}{remedy}")
+
+
+def parse_url(address: str) -> URL:
     """An SQLAlchemy URL.
 
     Raises:
         ConfigError: it is none.
     """
     try:
-        return make_url(text)
+        url = make_url(address)
     except ArgumentError as error:
+        # The text is not repeated: it may hold a password.
         raise ConfigError(
-            f"database {text!r}: no SQLAlchemy URL; write postgresql+psycopg://USER@HOST/NAME, or "
-            "leave it out for curate.db in the workspace"
+            "run.database: no URL of a database; write postgresql://USER@HOST/NAME, or leave it "
+            "out for curate.db in the workspace"
         ) from error
+    if url.drivername in {"postgres", "postgresql"}:
+        return url.set(drivername="postgresql+psycopg")
+    return url
 
 
 def _engine(url: URL) -> Engine:
@@ -96,6 +146,9 @@ def _engine(url: URL) -> Engine:
             f"database {url!r}: {error}; for PostgreSQL, "
             "pip install 'curate-pseudo-labels[postgres]'"
         ) from error
+    if engine.dialect.name not in _REMEDIES:
+        known = " and ".join(_REMEDIES)
+        raise ConfigError(f"database {url!r}: curate keeps its tables in {known} only")
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_pragmas)
         event.listen(engine, "begin", _begin)
@@ -119,24 +172,24 @@ def _begin(connection: Connection) -> None:
     connection.exec_driver_sql(f"BEGIN {mode}")
 
 
-@contextmanager
-def _own_words(name: str | None) -> Iterator[None]:
-    """Turns the driver's errors into one line that names the database and the remedy."""
-    try:
-        yield
-    except DBAPIError as error:
-        if "ground truth of an unlabeled frame" in str(error.orig):
-            raise LeakageError(f"{name}: {error.orig} must not be stored") from error
-        raise DatabaseError(f"{name}: {error.orig}{_remedy(str(error.orig))}") from error
-
-
-def _remedy(message: str) -> str:
-    remedies = {
+_REMEDIES = {
+    "sqlite": {
         "malformed": "; restore a backup, or rebuild it with `sqlite3 OLD .recover | sqlite3 NEW`",
         "not a database": "; this file is damaged or of another kind, move it away or restore it",
         "locked": "; another process is writing, wait for it or end it",
         "readonly": "; give yourself write permission on the file and its folder",
         "unable to open": "; check that the folder exists and can be written",
         "full": "; free space on the disk and run the command again, finished frames are kept",
-    }
-    return next((remedy for sign, remedy in remedies.items() if sign in message), "")
+    },
+    "postgresql": {
+        "password": "; put the password into ~/.pgpass or PGPASSWORD",
+        "role": "; check the user in run.database of curate.toml",
+        "does not exist": "; make it with `createdb`, or mend run.database of curate.toml",
+        "permission denied": "; let its owner grant you the rights to create and write tables",
+        "read-only": "; this server only answers, write to its primary",
+        "No space left": "; free space on the server and run the command again, finished frames "
+        "are kept",
+        "connection": "; check that the server runs, and run.database of curate.toml; then run the "
+        "command again, finished frames are kept",
+    },
+}

@@ -13,7 +13,8 @@ _VIEWS = {
                p.x, p.y, p.z, p.length, p.width, p.height, p.yaw,
                p.score, c.loss, pp.points, pp.points_threshold, pp.rho_diff,
                sp.mask_pixels, sp.box_pixels, sp.rho_anno, w.rho_det,
-               w.lambda_u, w.policy, w.v AS weight
+               w.lambda_u, CASE WHEN h.n IS NULL THEN 'detector' ELSE 'human' END AS provenance,
+               w.policy, CASE WHEN h.n IS NULL THEN w.v ELSE 0.0 END AS weight
         FROM weight AS w
         JOIN prediction AS p ON p.round = w.round AND p.frame_id = w.frame_id AND p.k = w.k
         JOIN frame AS f ON f.id = w.frame_id
@@ -23,7 +24,20 @@ _VIEWS = {
             ON pp.round = w.round AND pp.frame_id = w.frame_id AND pp.k = w.k
         LEFT JOIN semantic_prior AS sp
             ON sp.round = w.round AND sp.frame_id = w.frame_id AND sp.k = w.k
-        WHERE f.split = 'unlabeled'
+        LEFT JOIN human_match AS m
+            ON m.round = w.round AND m.frame_id = w.frame_id AND m.k = w.k
+        LEFT JOIN human_label AS h ON h.frame_id = m.frame_id AND h.n = m.n
+        WHERE f.split = 'unlabeled' AND (h.n IS NULL OR h.decision = 'rejected')
+        UNION ALL
+        SELECT t.round, f.frame, COALESCE(m.k, 1000000 + h.n), h.category,
+               h.x, h.y, h.z, h.length, h.width, h.height, h.yaw,
+               1.0, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, 'human', t.variant, 1.0
+        FROM human_label AS h
+        JOIN frame AS f ON f.id = h.frame_id
+        JOIN task AS t ON t.stage = 'solve' AND t.frame_id IS NULL AND t.round >= h.from_round
+        LEFT JOIN human_match AS m
+            ON m.round = t.round AND m.frame_id = h.frame_id AND m.n = h.n AND m.leads = 1
+        WHERE h.decision <> 'rejected'
     """,
     "evaluation": """
         SELECT e.source, f.frame, e.side, e.k, e.category, e.outcome, e.matched_k, e.iou, e.score,
@@ -43,7 +57,12 @@ _VIEWS = {
 
 
 def create_views(connection: Connection) -> None:
-    """(Re)creates every view."""
+    """Creates every view."""
     for name, query in _VIEWS.items():
-        connection.execute(text(f"DROP VIEW IF EXISTS {name}"))
         connection.execute(text(f"CREATE VIEW {name} AS {query}"))
+
+
+def drop_views(connection: Connection) -> None:
+    """Drops every view, so that the tables beneath can change."""
+    for name in _VIEWS:
+        connection.execute(text(f"DROP VIEW IF EXISTS {name}"))

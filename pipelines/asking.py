@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import URL, create_engine
+from sqlalchemy import URL, Connection, CursorResult, NullPool, create_engine
 from sqlalchemy.exc import DBAPIError
 
 from curate.errors import ConfigError, DatabaseError
@@ -17,6 +17,7 @@ from curate.errors import ConfigError, DatabaseError
 ALLOWED = frozenset(
     {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
 )
+SERVER_ROWS = 1000  # that a server sends at once
 FORBIDDEN_FUNCTIONS = frozenset(
     {"load_extension", "readfile", "writefile", "edit", "fts3_tokenizer"}
 )
@@ -26,7 +27,8 @@ MOST_COLUMNS = 500
 LONGEST_SQL = 1 << 20
 # SQLite looks at the clock after so many steps of its machine.
 _STEPS = 10_000
-_FETCHED = 1_000
+# SQLSTATE query_canceled, in every language of the server.
+_TIMED_OUT = "57014"
 
 
 def ask(
@@ -95,9 +97,7 @@ def _own_words(path: Path, error: Exception, seconds: float) -> ConfigError | Da
     if "file is not a database" in message or "malformed" in message:
         return DatabaseError(f"{path}: {message}")
     if "interrupted" in message:
-        return ConfigError(
-            f"query: given up after {seconds:g} seconds; ask for less, or allow more with --seconds"
-        )
+        return _given_up(seconds)
     return ConfigError(_explain(message))
 
 
@@ -111,26 +111,56 @@ def _authorize(action: int, _first: str | None, second: str | None, *_: str | No
 def _ask_server(
     url: URL, sql: str, seconds: float
 ) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
-    """Asks PostgreSQL, in a transaction that can only read."""
-    connection = create_engine(url).connect().execution_options(postgresql_readonly=True)
+    """The answer of a PostgreSQL server, a part at a time.
+
+    The question becomes DECLARE ... CURSOR FOR, in the protocol that takes one statement only, in a
+    read-only transaction: whatever is not a question is no valid SQL there.
+    """
+    engine = create_engine(url, poolclass=NullPool)
     try:
-        connection.exec_driver_sql(f"SET LOCAL statement_timeout = {int(seconds * 1000)}")
-        # Prepared, so that several statements in one text are refused: the first of them could
-        # end the transaction that can only read.
-        cursor = connection.connection.cursor()
-        cursor.execute(sql, prepare=True)  # type: ignore[call-arg]
+        connection = engine.connect()
     except DBAPIError as error:
-        raise ConfigError(_explain(str(error.orig))) from error
-    except connection.dialect.loaded_dbapi.Error as error:
-        raise ConfigError(_explain(" ".join(str(error).split()))) from error
-    if cursor.description is None:
-        raise ConfigError("query: not a question; write a SELECT")
-    return [column[0] for column in cursor.description], _fetched(cursor)
+        raise DatabaseError(f"{url.render_as_string()}: {_one_line(error.orig)}") from error
+    end = time.monotonic() + seconds
+    try:
+        reading = connection.execution_options(postgresql_readonly=True)
+        reading.exec_driver_sql(f"SET LOCAL statement_timeout = {max(1, round(seconds * 1000))}")
+        reading = reading.execution_options(stream_results=True, max_row_buffer=SERVER_ROWS)
+        result = reading.exec_driver_sql(sql)
+    except DBAPIError as error:
+        connection.close()
+        raise _servers_words(error, seconds) from error
+    return list(result.keys()), _server_rows(reading, result, end, seconds)
 
 
-def _fetched(cursor: Any) -> Iterator[tuple[Any, ...]]:
-    while rows := cursor.fetchmany(_FETCHED):
-        yield from map(tuple, rows)
+def _server_rows(
+    connection: Connection, result: CursorResult[Any], end: float, seconds: float
+) -> Iterator[tuple[Any, ...]]:
+    """The rows as they come; the server's clock starts anew with each part, so ours runs, too."""
+    with connection:
+        try:
+            for row in result:
+                if time.monotonic() > end:
+                    raise _given_up(seconds)
+                yield tuple(row)
+        except DBAPIError as error:
+            raise _servers_words(error, seconds) from error
+
+
+def _servers_words(error: DBAPIError, seconds: float) -> ConfigError:
+    if getattr(error.orig, "sqlstate", None) == _TIMED_OUT:
+        return _given_up(seconds)
+    return ConfigError(_explain(_one_line(error.orig)))
+
+
+def _given_up(seconds: float) -> ConfigError:
+    return ConfigError(
+        f"query: given up after {seconds:g} seconds; ask for less, or allow more with --seconds"
+    )
+
+
+def _one_line(error: BaseException | None) -> str:
+    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
 def _explain(message: str) -> str:

@@ -63,8 +63,6 @@ def open_segmenter(config: Config) -> Segmenter:
     Raises:
         ConfigError: none is configured, or it needs a path.
     """
-    from curate.segmenters.classes import class_map
-
     section = config.segmenter
     path = segmenter_path(config)
     if path is None:
@@ -78,10 +76,22 @@ def open_segmenter(config: Config) -> Segmenter:
     segmenter: Segmenter = registry.SEGMENTERS.build(
         name,
         path,
-        offered={"classes": lambda: class_map(classes), "seed": lambda: config.run.seed},
+        offered={"classes": lambda: _class_map(name, classes), "seed": lambda: config.run.seed},
         options=section.options,
     )
     return segmenter
+
+
+def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, ...]]:
+    from curate.segmenters.classes import CLASS_MAPS, class_map
+
+    if classes is None:
+        raise ConfigError(
+            f"segmenter '{segmenter}': nobody says what its class numbers mean: set "
+            f"segmenter.classes to one of {', '.join(CLASS_MAPS)}, or segmenter.options.classes "
+            "to a table like {Car = [7]}"
+        )
+    return class_map(classes)
 
 
 def segmenter_path(config: Config) -> Path | None:

@@ -25,13 +25,13 @@ from pipelines import plan
 from pipelines.assembly import open_policy
 from pipelines.audit_folds import open_folds
 from pipelines.config import Config
+from pipelines.evidence import read_evidence
 from pipelines.progress import Progress
 from pipelines.round import active
 from pipelines.rounds import is_trainable, open_round
 from pipelines.runner import Report, open_executor, run_frames
 from pipelines.stage import FrameStage, RoundContext
 from pipelines.stages.pretrain import pretrain
-from pipelines.stages.solve import read_evidence
 from pipelines.workspace import Workspace
 
 POLICIES = ("pspsl", "spsl", "threshold", "uniform")

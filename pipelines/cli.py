@@ -24,6 +24,7 @@ from pipelines.commands import (
     query,
     report,
     repredict,
+    review,
     run,
     score,
     simulate,
@@ -61,6 +62,7 @@ for command in (
     view,
     diff,
     report,
+    review,
     evaluate,
     audit,
     check,
@@ -71,6 +73,11 @@ COMMANDS = tuple(
     command.name or getattr(command.callback, "__name__", "")
     for command in app.registered_commands
     if not command.hidden
+) + tuple(
+    f"{group.typer_instance.info.name} {command.name}"
+    for group in app.registered_groups
+    if group.typer_instance
+    for command in group.typer_instance.registered_commands
 )
 
 

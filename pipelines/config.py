@@ -1,5 +1,6 @@
 """The configuration of a workspace, `curate.toml`: sections, defaults, and what they may hold."""
 
+import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -73,7 +74,7 @@ class SegmenterSection(Section):
 
     name: str = "none"
     path: Path | None = None
-    classes: str = "voc"
+    classes: str | None = None  # whose numbers: voc, coco, cityscapes, ... (docs/segmenters.md)
     options: Options = {}
 
 
@@ -133,7 +134,7 @@ class TrainSection(Section):
     learning_rate: Positive = 5e-3  # peak, from scratch
     round_learning_rate: Positive = 3e-3  # peak, from the teacher
     threads: AtLeastOne = 1
-    zero_weight: Literal["ignore", "background"] = "ignore"
+    zero_weight: Literal["method", "ignore", "background"] = "method"  # see docs/methods.md
     start: Literal["teacher", "scratch"] = "teacher"
     teacher: Literal["method", "student", "ema"] = "method"  # what teaches the next round
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999  # per 1/10,000 of the training
@@ -203,24 +204,45 @@ def make_config(document: Mapping[str, Any], source: str) -> Config:
         raise ConfigError(f"{source}: {faults}") from error
 
 
+def change_setting(document: dict[str, Any], setting: str) -> None:
+    """Sets section.key=value in a document; the value as in TOML, anything else is a string.
+
+    Raises:
+        ConfigError: it is not of that form.
+    """
+    place, equals, text = setting.partition("=")
+    *sections, key = place.strip().split(".")
+    if not (equals and sections and key and all(sections)):
+        raise ConfigError(f"--set {setting}: write section.key=value, e.g. solve.self_paced=false")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()
+    for section in sections:
+        if not isinstance(document.get(section), dict):
+            document[section] = {}
+        document = document[section]
+    document[key] = value
+
+
 def write_config(path: Path, config: Config) -> None:
     """Writes every setting as TOML, defaults included, so that a user sees what can be set."""
     document = config.model_dump(mode="json", exclude_none=True)
     lines = []
     for section, settings in document.items():
-        lines += [f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in settings.items())]
+        lines += [f"[{section}]", *(f"{key} = {toml(value)}" for key, value in settings.items())]
         lines.append("")
     replace_file(path, "\n".join(lines).encode())
 
 
-def _toml(value: Any) -> str:
+def toml(value: Any) -> str:
+    """A value in TOML's notation."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
+        return json.dumps(value, ensure_ascii=False)  # TOML's strings are escaped as JSON's are
     if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
+        return f"[{', '.join(map(toml, value))}]"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{_toml(k)} = {_toml(v)}' for k, v in value.items())}}}"
+        return f"{{{', '.join(f'{toml(k)} = {toml(v)}' for k, v in value.items())}}}"
     return repr(value)

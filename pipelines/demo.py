@@ -17,13 +17,13 @@ import typer
 
 from curate.detections import CATEGORIES
 from curate.errors import CurateError
-from curate.evaluation.kitti_ap import FIGURES
+from curate.evaluation import kitti_ap
 from curate.evaluation.kitti_rules import LOOSE_OVERLAPS
 from pipelines.commands.options import print_report, print_table
 from pipelines.config import Config, make_config
-from pipelines.evaluation import detect_val, evaluate_detections
+from pipelines.evaluation import detect_val, val_objects
 from pipelines.label_quality import label_quality
-from pipelines.progress import Bar
+from pipelines.progress import Bar, reaching
 from pipelines.round import stage
 from pipelines.rounds import open_round
 from pipelines.runner import run_round
@@ -132,20 +132,13 @@ def _simulate(demo: Demo, say: Say) -> None:
     total = demo.frames + demo.val
     say(f"1. Simulate {total} LiDAR-camera frames in KITTI's format.\n")
     with Bar().track("simulate", total) as advance:
-        done = 0
-
-        def progress(now: int, _total: int) -> None:
-            nonlocal done
-            advance(now - done, "")
-            done = now
-
         simulate(
             demo.data,
             total,
             demo.seed,
             val_frames=demo.val,
             workers=demo.processes,
-            progress=progress,
+            progress=reaching(advance),
         )
     say(f"   {total} frames in {_shown(demo.data)} ({time.perf_counter() - start:.1f} s)")
 
@@ -192,10 +185,10 @@ def _print_quality(workspace: Workspace) -> None:
 def _print_detectors(workspace: Workspace) -> None:
     rows = []
     for name, path in _detectors(workspace):
-        found = detect_val(workspace, path, Bar())
-        strict = evaluate_detections(workspace, found).ap_r40[:, :, 1]
-        loose = evaluate_detections(workspace, found, LOOSE_OVERLAPS).ap_r40[:, :, 1]
-        bev, box = FIGURES.index("bev"), FIGURES.index("3d")
+        objects = val_objects(workspace, detect_val(workspace, path, Bar()))
+        strict = kitti_ap.evaluate(*objects).ap_r40[:, :, 1]
+        loose = kitti_ap.evaluate(*objects, min_overlaps=LOOSE_OVERLAPS).ap_r40[:, :, 1]
+        bev, box = kitti_ap.FIGURES.index("bev"), kitti_ap.FIGURES.index("3d")
         means = (loose[:, box], loose[:, bev], strict[:, box], strict[:, bev])
         rows.append((name, *map(float, loose[:, box]), *(float(mean.mean()) for mean in means)))
     columns = ("detector", *CATEGORIES, "3D mean", "BEV mean", "3D strict", "BEV strict")

@@ -6,8 +6,6 @@ from pathlib import Path
 from curate.datasets.kitti_labels import KittiObjects, from_annotations, from_detections
 from curate.detections import Detections
 from curate.errors import FramesFailed, WorkspaceError
-from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
-from curate.evaluation.kitti_rules import MIN_OVERLAPS
 from pipelines import plan
 from pipelines.executors.base import FrameJob
 from pipelines.progress import Progress
@@ -17,6 +15,9 @@ from pipelines.runner import open_executor
 from pipelines.stage import FrameStage
 from pipelines.stages.predict import Predict
 from pipelines.workspace import Workspace
+
+ValObjects = tuple[list[KittiObjects], list[KittiObjects]]
+"""Ground truth and detections of the val frames, frame by frame."""
 
 
 def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str, Detections]:
@@ -61,18 +62,7 @@ def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]
     return {name: stored[key] for name, key in keys.items()}
 
 
-def evaluate_detections(
-    workspace: Workspace,
-    found: Mapping[str, Detections],
-    min_overlaps: Mapping[str, float] = MIN_OVERLAPS,
-) -> KittiEvaluation:
-    """The KITTI evaluation of detections of val frames; overlaps are KITTI's unless given."""
-    return evaluate(*val_objects(workspace, found), min_overlaps=min_overlaps)
-
-
-def val_objects(
-    workspace: Workspace, found: Mapping[str, Detections]
-) -> tuple[list[KittiObjects], list[KittiObjects]]:
+def val_objects(workspace: Workspace, found: Mapping[str, Detections]) -> ValObjects:
     """Ground truth and detections of the val frames in KITTI's form, in the order of their names.
 
     Raises:

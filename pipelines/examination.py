@@ -9,6 +9,7 @@ from curate.errors import ConfigError, CurateError
 from curate.evaluation.examination import Finding, examine_detections, examine_frame
 from curate.frames import Frame
 from pipelines.assembly import open_detector, open_segmenter
+from pipelines.config import Config
 from pipelines.rounds import newest_checkpoint
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace import Workspace
@@ -58,14 +59,29 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     checked(found, config)
     if isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
-        told = f"{len(views)} recorded augmented copies of this frame"
-        findings.append(Finding("views", "ok" if views else "suspect", told))
+        findings.append(
+            Finding("views", "ok", f"{len(views)} recorded augmented copies of this frame")
+            if views
+            else _no_views(config)
+        )
         for similarity, moved in views:
             back = examine_detections(
                 seen.with_points(similarity.apply_to_points(seen.points)), moved, ()
             )
             findings += [one for one in back if one.check == "boxes" and one.state == "wrong"]
     return findings
+
+
+def _no_views(config: Config) -> Finding:
+    """A record without a second pass is fine for methods that need none."""
+    if config.run.method == "pspsl" and not config.solve.self_paced:
+        return Finding("views", "ok", "none recorded; the priors alone weigh")
+    return Finding(
+        "views",
+        "suspect",
+        "no second pass over augmented copies, so no label has a consistency loss: name passes in "
+        "detector.options, or set solve.self_paced = false",
+    )
 
 
 def _segmenter(workspace: Workspace, frame: Frame) -> Sequence[Finding]:

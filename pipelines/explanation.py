@@ -1,18 +1,24 @@
 """Every number behind one weight, and the weight recomputed from them."""
 
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import func, select, text
+from sqlalchemy import Select, and_, func, select, text
 
 from curate.errors import WorkspaceError
-from curate.weighting.self_paced import easiness
+from curate.priors.points import point_trust
+from curate.priors.semantic import semantic_trust
+from curate.weighting.base import Age, Evidence
+from curate.weighting.self_paced import age_parameter, easiness
 from db import bulk
 from db.views import WEIGHTED_LABELS
-from pipelines.config import Config
+from pipelines.assembly import semantic_settings
+from pipelines.config import Config, make_config
 from pipelines.registry import PRIORS
+from pipelines.review.told import tell_decision
 from pipelines.workspace import Workspace
 
 
@@ -88,11 +94,31 @@ def explain_label(
         WorkspaceError: the policy has not weighted such a label in that round.
     """
     label = _label(workspace, frame, k, round_number, policy)
+    if label["provenance"] == "human":
+        return _human(workspace, label)
+    return _computed(workspace, label)
+
+
+def _human(workspace: Workspace, label: dict[str, Any]) -> Explanation:
+    """What people decided; with the numbers behind the policy's own weight where they rejected."""
+    told = tell_decision(workspace, label)
+    if label["weight"] == 0 and told.policy_weight is not None:
+        alone = _computed(workspace, {**label, "weight": told.policy_weight})
+        return replace(alone, label=label, lines=(*alone.lines, told.lines[0]))
+    lines = (*_head(_numbers(label)), *told.lines)
+    nothing = Recomputed(None, None, None, math.nan)
+    return Explanation(label, (), None, nothing, None, lines)
+
+
+def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
+    """The numbers behind a policy's weight."""
+    frame, k = label["frame"], label["k"]
     views = _views(workspace, label["round"], frame, k)
     config = _stored_config(workspace, label["round"])
     age = _age(workspace, config, label) if label["lambda_u"] is not None else None
     evidence = _evidence(config, label, views)
-    recomputed = _weight(label, evidence, age)
+    alone = not views and not _self_paced(config, label["policy"])
+    recomputed = _weight(label, evidence, age, alone=alone)
     lines = _lines(config, label, views, age, evidence, recomputed)
     return Explanation(label, views, age, evidence, recomputed, tuple(lines))
 
@@ -123,7 +149,8 @@ def _stored_config(workspace: Workspace, round_number: int) -> Config:
     table = bulk.table("round")
     query = select(table.c.config).where(table.c.number == round_number)
     with workspace.database.reading() as connection:
-        return Config.model_validate_json(connection.execute(query).scalar_one())
+        stored = connection.execute(query).scalar_one()
+    return make_config(json.loads(stored), f"settings stored of round {round_number}")
 
 
 def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple[View, ...]:
@@ -144,11 +171,8 @@ def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple
 def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgeParameter | None:
     """Eq. 4 over the losses that share the label's lambda; None without any."""
     scope, quantile = _schedule(config, label["policy"])
-    labels, number = WEIGHTED_LABELS.c, bulk.table("round")
-    same = {"round", "policy", *({scope} - {"round"})}
-    query = select(labels.loss).where(
-        *(labels[name] == label[name] for name in same), labels.loss.is_not(None)
-    )
+    number = bulk.table("round")
+    query = _losses(label, scope)
     rounds = select(number.c.rounds).where(number.c.number == label["round"])
     with workspace.database.reading() as connection:
         losses = np.array([row[0] for row in bulk.select(connection, query)])
@@ -156,9 +180,32 @@ def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgePara
     if not len(losses):
         return None
     hardest = float(losses.max() if quantile is None else np.quantile(losses, quantile))
-    share, mean = label["round"] / last, float(losses.mean())
-    lambda_u = min(share * hardest + (1 - share) * mean, float(losses.max()))
+    lambda_u = _lambda(losses, Age(label["round"], last), quantile)
+    mean = float(losses.mean())
     return AgeParameter(label["round"], last, scope, len(losses), hardest, mean, lambda_u)
+
+
+def _lambda(losses: np.ndarray, age: Age, quantile: float | None) -> float:
+    """Eq. 4 of losses that share their lambda."""
+    zeros = np.zeros(len(losses))
+    evidence = Evidence(zeros.astype(np.int64), zeros.astype(np.str_), score=zeros, loss=losses)
+    return float(age_parameter(evidence, age, quantile=quantile)[0])
+
+
+def _losses(label: dict[str, Any], scope: str) -> Select[tuple[float]]:
+    """The losses that share a label's lambda; the policy saw those that people decided on too."""
+    weight, loss = bulk.table("weight"), bulk.table("consistency")
+    frame, prediction = bulk.table("frame"), bulk.table("prediction")
+    keys = ("round", "frame_id", "k")
+    tables = weight.join(loss, and_(*(loss.c[key] == weight.c[key] for key in keys)))
+    tables = tables.join(prediction, and_(*(prediction.c[key] == weight.c[key] for key in keys)))
+    tables = tables.join(frame, frame.c.id == weight.c.frame_id)
+    places = {"category": prediction.c.category, "frame": frame.c.frame}
+    same = () if scope == "round" else (places[scope] == label[scope],)
+    return select(loss.c.loss).select_from(tables).where(
+        weight.c.round == label["round"], weight.c.policy == label["policy"],
+        frame.c.split == "unlabeled", loss.c.loss.is_not(None), *same,
+    )  # fmt: skip
 
 
 def _schedule(config: Config, policy: str) -> tuple[str, float | None]:
@@ -194,35 +241,38 @@ def _rho_diff(_config: Config, label: dict[str, Any]) -> float | None:
     """Eq. 8."""
     if label["points"] is None:
         return None
-    threshold: float = label["points_threshold"]
-    return float(min(label["points"], threshold) / threshold)
+    return float(point_trust(*(np.array(label[name]) for name in ("points", "points_threshold"))))
 
 
 def _rho_anno(config: Config, label: dict[str, Any]) -> float | None:
     """Eq. 9."""
-    score, box_pixels = label["score"], label["box_pixels"]
-    if box_pixels is None:
+    if label["box_pixels"] is None:
         return None
-    if box_pixels == 0:
-        return float(score) if config.semantic.outside == "neutral" else 0.0
-    share = label["mask_pixels"] / box_pixels
-    means = {
-        "geometric": math.sqrt(score * share),
-        "product": score * share,
-        "arithmetic": (score + share) / 2,
-    }
-    return float(means[config.semantic.mean])
+    score, mask_pixels, box_pixels = (
+        np.array(label[name]) for name in ("score", "mask_pixels", "box_pixels")
+    )
+    return float(semantic_trust(score, mask_pixels, box_pixels, semantic_settings(config)))
 
 
-def _weight(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> float | None:
+def _self_paced(config: Config, policy: str) -> bool:
+    """Whether the policy weighs by the consistency loss."""
+    section = config.solve
+    own = section.options.get(policy, {}).get("self_paced", section.self_paced)
+    return policy != "pspsl" or bool(own)
+
+
+def _weight(
+    label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None, *, alone: bool
+) -> float | None:
     """The weight by Eqs. 7 and 11; None for policies that do not use them.
 
-    A label that matched has a lambda unless the policy was told to do without: it weighs rho_det.
+    A label that matched has a lambda unless the policy was told to do without: it weighs rho_det,
+    as do all where the priors are `alone`, without a second pass.
     """
     if label["policy"] not in {"spsl", "pspsl"}:
         return None
     if evidence.loss is None:
-        return 0.0
+        return evidence.rho_det if alone else 0.0
     if age is None:
         return evidence.rho_det
     v = float(easiness(np.array([evidence.loss]), np.array([age.lambda_u]))[0])
@@ -237,21 +287,15 @@ def _lines(
     evidence: Recomputed,
     recomputed: float | None,
 ) -> list[str]:
-    number = {
-        name: "none" if value is None else f"{value:.4f}" if isinstance(value, float) else value
-        for name, value in label.items()
-    }
+    number = _numbers(label)
     section = config.repredict
-    lines = [
-        "round {round}, frame {frame}, label {k}: {category}, score {score}".format(**number),
-        "  box            x {x}  y {y}  z {z}  l {length}  w {width}  h {height}  yaw {yaw}".format(
-            **number
-        ),
-    ]
+    lines = _head(number)
     lines += [f"  {_view_line(view)}" for view in views]
     lines.append(
         f"  consistency    L = {section.score_weight:g} (-ln s') + {section.box_weight:g} box loss"
         f", mean over matched views = {number['loss']}"
+        if views
+        else "  consistency    no second pass over augmented copies, so no L"
     )
     if label["points"] is not None:
         lines.append(
@@ -274,7 +318,7 @@ def _lines(
     lines.append(f"  priors         rho_det = {' * '.join(factors) or '1'} = {number['rho_det']}")
     lines.append(_age_line(config, label["policy"], age, str(number["lambda_u"])))
     formulas = {"spsl": "1 - L / lambda, Eq. 7", "pspsl": "rho_det (1 - L / lambda), Eq. 11"}
-    if label["lambda_u"] is None and label["loss"] is not None:
+    if label["lambda_u"] is None and not _self_paced(config, label["policy"]):
         formulas["pspsl"] = "rho_det, without the self-paced term"
     formula = formulas.get(label["policy"], "see curate solve --help")
     lines.append(f"  policy         {label['policy']}: v = {formula}")
@@ -284,6 +328,24 @@ def _lines(
         if not math.isclose(recomputed, label["weight"], abs_tol=1e-6):
             lines.append("  they differ: settings have changed since; `curate solve` weighs again")
     return lines
+
+
+def _numbers(label: dict[str, Any]) -> dict[str, Any]:
+    """The columns of a label as they are printed."""
+    return {
+        name: "none" if value is None else f"{value:.4f}" if isinstance(value, float) else value
+        for name, value in label.items()
+    }
+
+
+def _head(number: dict[str, Any]) -> list[str]:
+    """Which label it is, and where."""
+    return [
+        "round {round}, frame {frame}, label {k}: {category}, score {score}".format(**number),
+        "  box            x {x}  y {y}  z {z}  l {length}  w {width}  h {height}  yaw {yaw}".format(
+            **number
+        ),
+    ]
 
 
 def _age_line(config: Config, policy: str, age: AgeParameter | None, stored: str) -> str:

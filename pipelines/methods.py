@@ -1,10 +1,10 @@
-"""The methods that can be compared: each a policy, and who teaches the next round, by one word.
+"""The methods that can be compared: each a policy and how its student learns, by one word.
 
 The name of a method is the name of its policy, under which its weights and students are stored.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from curate.errors import ConfigError
@@ -12,21 +12,26 @@ from pipelines.config import Config
 from pipelines.registry import POLICIES
 
 TeacherMode = Literal["student", "ema"]
+ZeroWeight = Literal["ignore", "background"]
 
 
 @dataclass(frozen=True)
 class Method:
-    """How labels are weighed and who teaches the next round.
+    """How labels are weighed, what a weight of 0 is, and who teaches the next round.
 
     Attributes:
         policy: of `POLICIES`, or package.module:Class.
         teacher: the "student" itself, or the moving average of its weights ("ema").
         note: what it is, in one line.
+        zero_weight: what a label of weight 0 is to the student: "background", as nearly all of
+            them are none (docs/results.md), or a region to "ignore" where the method has a band of
+            doubt between what it keeps and what it drops.
     """
 
     policy: str
     teacher: TeacherMode
     note: str
+    zero_weight: ZeroWeight = "background"
 
 
 METHODS: Final[Mapping[str, Method]] = {
@@ -45,8 +50,11 @@ METHODS: Final[Mapping[str, Method]] = {
             "pspsl", "student", "PSPSL-3D: v = rho_det (1 - L / lambda) (An et al. 2023, Eq. 11)"
         ),
         Method("threshold", "student", "every label with a score from 0.3 on weighs 1"),
-        Method("st3d", "student", "keep, ignore, drop with a memory (ST3D, Yang et al. 2021)"),
-        Method("hssda", "ema", "two thresholds from the data (HSSDA, Liu et al. 2023)"),
+        Method(
+            "st3d", "student", "keep, ignore, drop with a memory (ST3D, Yang et al. 2021)",
+            "ignore",
+        ),
+        Method("hssda", "ema", "two thresholds from the data (HSSDA, Liu et al. 2023)", "ignore"),
     )
 }  # fmt: skip
 
@@ -78,7 +86,11 @@ def with_method(config: Config, name: str) -> Config:
     )
 
 
-def teacher_mode(config: Config, policy: str) -> TeacherMode:
-    """Who teaches after a round under a policy: what `train.teacher` says, or the method."""
-    configured = config.train.teacher
-    return method_named(policy).teacher if configured == "method" else configured
+def method_of(config: Config, policy: str) -> Method:
+    """The method of a policy, save where `train.teacher` or `train.zero_weight` is set."""
+    method, section = method_named(policy), config.train
+    if section.teacher != "method":
+        method = replace(method, teacher=section.teacher)
+    if section.zero_weight != "method":
+        method = replace(method, zero_weight=section.zero_weight)
+    return method

@@ -9,7 +9,7 @@ from curate.viewing.canvas import save_png
 from curate.viewing.frame_view import draw_frame
 from curate.viewing.overlay import draw_overlay
 from curate.viewing.tags import ShownLabels
-from pipelines.frame_boxes import newest_round, read_frame
+from pipelines.frame_boxes import chosen_round, read_frame
 from pipelines.labels import FrameLabels, read_labels
 from pipelines.workspace import Workspace
 
@@ -40,9 +40,9 @@ def draw_view(
 
     Raises:
         ConfigError: no frame has that name, or a picture cannot be written to `output`.
-        WorkspaceError: no round has predictions yet.
+        WorkspaceError: the round has no predictions.
     """
-    number = newest_round(workspace) if round_number is None else round_number
+    number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
     found = read_frame(workspace, name, number, policy)
     frame = workspace.dataset.read(name, image=True)
@@ -51,7 +51,14 @@ def draw_view(
         found.labels.boxes, found.labels.categories, found.labels.scores, found.weights, counts
     )
     title = f"frame {name} ({found.split}), round {number}, weights by {policy}"
-    picture = draw_frame(frame, labels, found.truth_boxes, found.repredictions, title=title)
+    picture = draw_frame(
+        frame,
+        labels,
+        found.truth_boxes,
+        found.repredictions,
+        human_boxes=found.human_boxes,
+        title=title,
+    )
     path = output or workspace.root / "pictures" / f"round-{number:02d}-{name}-{policy}.png"
     if path.is_dir() or not path.parent.is_dir():
         raise ConfigError(f"--output {path}: name a file in a folder that exists")

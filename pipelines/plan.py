@@ -18,6 +18,7 @@ from sqlalchemy import ColumnElement, Connection, select
 
 from curate.errors import WorkspaceError
 from db import bulk
+from pipelines.assembly import open_policy
 from pipelines.round import active, frames_before, stage
 from pipelines.stage import FrameStage, RoundContext, RoundStage
 from pipelines.workspace import Workspace
@@ -161,6 +162,20 @@ def complete_frames(
     return [key for key in frames if all(of.get(key) == "done" for of in states.values())]
 
 
+def frames_to_weigh(workspace: Workspace, context: RoundContext, policy: str) -> list[int]:
+    """The complete frames; none while some wait for a policy that uses no label of theirs.
+
+    Raises:
+        WorkspaceError: frames wait whose labels the policy uses.
+    """
+    try:
+        return complete_frames(workspace, context)
+    except WorkspaceError:
+        if open_policy(workspace.config, policy).uses_unlabeled:
+            raise
+        return []
+
+
 def round_fingerprint(
     workspace: Workspace, context: RoundContext, of: RoundStage, policy: str, frames: Sequence[int]
 ) -> str:
@@ -177,7 +192,7 @@ def round_state(workspace: Workspace, context: RoundContext, of: RoundStage, pol
     if not stored:
         return "waiting"
     try:
-        frames = complete_frames(workspace, context)
+        frames = frames_to_weigh(workspace, context, policy)
     except WorkspaceError:
         return "stale"
     current = round_fingerprint(workspace, context, of, policy, frames)

@@ -21,6 +21,14 @@ class Progress(Protocol):
         ...
 
 
+class Reach(Protocol):
+    """Takes how much is done in all, and of how much."""
+
+    def __call__(self, done: int, total: int, note: str = "", /) -> None:
+        """Shows it, with a word on how it goes."""
+        ...
+
+
 class Silent:
     """Shows nothing."""
 
@@ -28,6 +36,18 @@ class Silent:
     def track(self, what: str, total: int) -> Iterator[Advance]:  # noqa: ARG002
         """Yields a function that does nothing."""
         yield lambda _step, _note: None
+
+
+def reaching(advance: Advance) -> Reach:
+    """Moves `advance` for work that tells how much is done in all, not how much more."""
+    before = 0
+
+    def reach(done: int, _total: int, note: str = "") -> None:
+        nonlocal before
+        advance(done - before, note)
+        before = done
+
+    return reach
 
 
 class Bar:
@@ -63,7 +83,19 @@ def _bar(what: str, total: int) -> Iterator[Advance]:
         transient=True,
     ) as bar:
         task = bar.add_task(what, total=total, note="")
-        yield lambda step, note: bar.update(task, advance=step, note=note)
+        start, done = time.monotonic(), 0
+
+        def advance(step: int, note: str) -> None:
+            nonlocal done
+            done += step
+            bar.update(task, advance=step, note=f"{_rate(done, start)} {note}")
+
+        yield advance
+
+
+def _rate(done: int, start: float) -> str:
+    """How many are done in a second."""
+    return f"{done / max(time.monotonic() - start, 1e-9):.3g}/s"
 
 
 @contextmanager
@@ -78,7 +110,8 @@ def _lines(what: str, total: int) -> Iterator[Advance]:
         if now - start > QUIET_S and now - last > LINE_EVERY_S:
             last = now
             left = (now - start) * (total - done) / max(done, 1)
-            sys.stderr.write(f"  {what} {done}/{total}, {left:.0f} s left {note}\n")
+            rate = _rate(done, start)
+            sys.stderr.write(f"  {what} {done}/{total}, {rate}, {left:.0f} s left {note}\n")
             sys.stderr.flush()
 
     yield advance

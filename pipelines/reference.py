@@ -87,7 +87,7 @@ def schema_page() -> str:
         "## weighted_labels (view)",
         "",
         "Every label of an unlabeled frame with its evidence, a row per policy, in the working",
-        "database and in every exported file:",
+        "database and in every exported file; where provenance is human, people decided:",
         "",
         f"```text\n{_wrapped(names)}\n```",
         "",

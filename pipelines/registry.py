@@ -63,7 +63,8 @@ class Registry:
         """
         factory = self.load(name)
         signature = inspect.signature(factory)
-        keywords = {key: make() for key, make in offered.items() if key in signature.parameters}
+        wanted = signature.parameters.keys() - options.keys()
+        keywords = {key: make() for key, make in offered.items() if key in wanted}
         try:
             signature.bind(*given, **(keywords := keywords | dict(options)))
         except TypeError as error:
@@ -83,6 +84,7 @@ DATASETS = Registry(
         "kitti": "curate.datasets.kitti:KittiDataset",
         "kitti-raw": "curate.datasets.kitti_raw:KittiRawDataset",
         "folder": "curate.datasets.folder:FolderDataset",
+        "nuscenes": "curate.datasets.nuscenes:NuScenesDataset",
     },
 )
 DETECTORS = Registry(
@@ -98,6 +100,7 @@ SEGMENTERS = Registry(
     {
         "onnx": "curate.segmenters.onnx:OnnxSegmenter",
         "saved": "curate.segmenters.saved:SavedSegmenter",
+        "instances": "curate.segmenters.instances:InstanceSegmenter",
         "degraded": "curate.segmenters.degraded:DegradedSegmenter",
     },
 )
@@ -134,6 +137,8 @@ EXPORTERS = Registry(
         "openpcdet": "curate.exporters.openpcdet:OpenPCDetExporter",
         "st3d": "curate.exporters.st3d:ST3DExporter",
         "mmdet3d": "curate.exporters.mmdet3d:MMDet3DExporter",
+        "parquet": "curate.exporters.parquet:ParquetExporter",
+        "nuscenes": "curate.exporters.nuscenes:NuScenesExporter",
     },
 )
 EXECUTORS = Registry(
@@ -141,6 +146,14 @@ EXECUTORS = Registry(
     {
         "serial": "pipelines.executors.serial:SerialExecutor",
         "process": "pipelines.executors.process:ProcessExecutor",
+    },
+)
+EDITORS = Registry(
+    "editor",
+    {
+        "kitti": "curate.review.editors.kitti:KittiEditor",
+        "labelcloud": "curate.review.editors.labelcloud:LabelCloudEditor",
+        "cvat": "curate.review.editors.cvat:CvatEditor",
     },
 )
 # Detectors that `pretrain` and `train-round` can train; the others are brought by the user.

@@ -13,8 +13,9 @@ from curate.viewing.page import Figure, Section, render_page
 from curate.viewing.svg import Mark, histogram, share_curve
 from db import bulk
 from pipelines.differences import COLUMNS, Difference, difference_of
-from pipelines.frame_boxes import newest_round
+from pipelines.frame_boxes import chosen_round
 from pipelines.label_columns import LabelColumns, read_columns
+from pipelines.review.human_labels import counts
 from pipelines.workspace import Workspace
 
 _BINS = 40
@@ -33,7 +34,7 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
     Raises:
         WorkspaceError: the policy has weighted nothing in that round.
     """
-    number = newest_round(workspace) if round_number is None else round_number
+    number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
     labels = read_columns(workspace, number, policy)
     sections = [
@@ -49,6 +50,10 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
         f"{len(labels):,} labels in {len(labels.frame_names):,} unlabeled frames, {kept:,} with a "
         f"weight above 0; their weights sum to {labels.weights.sum():,.1f}."
     )
+    decided = counts(workspace, number)
+    if decided:
+        told = ", ".join(f"{count:,} {name}" for name, count in decided.items())
+        note += f" People decided on some, whatever the policy says: {told}."
     path = workspace.root / "reports" / f"round-{number:02d}-{policy}.html"
     replace_file(path, render_page(title, note, sections).encode("utf-8"))
     return path

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import Connection, func, select
 
@@ -10,7 +11,7 @@ from curate.errors import WorkspaceError
 from db import bulk
 from pipelines.registry import TRAINABLE
 from pipelines.stage import RoundContext, Teacher
-from pipelines.workspace import SPLITS, Workspace, sha256
+from pipelines.workspace import Workspace, sha256
 
 
 def is_trainable(workspace: Workspace) -> bool:
@@ -36,8 +37,9 @@ def open_round(
     Raises:
         WorkspaceError: the detector that would answer in the round does not exist yet, or the
             workspace has no frames.
+        DatabaseError: another process works on the round with other settings.
     """
-    if not workspace.frames(*SPLITS):
+    if not _has_frames(workspace):
         raise WorkspaceError(
             f"{workspace.root}: holds no frames, its init was interrupted; "
             "run `curate init` again with the same arguments"
@@ -53,16 +55,38 @@ def open_round(
         "number": number,
         "rounds": rounds,
         "teacher_id": teacher_id,
-        "config": json.dumps(workspace.config.model_dump(mode="json")),
+        "config": _recorded_config(workspace),
         "code_version": curate.__version__,
         "seed": workspace.config.run.seed,
     }
-    table = bulk.table("round")
-    with workspace.database.writing() as connection:
+    _record_round(workspace, row)
+    return RoundContext(number, rounds, workspace.config.run.seed, teacher)
+
+
+def _recorded_config(workspace: Workspace) -> str:
+    """The configuration as JSON, without what says where and by how many the work is done.
+
+    Several processes that differ only in this share a round; and the URL may hold a password.
+    """
+    exclude = {"run": {"executor", "workers", "database"}, "train": {"threads"}}
+    return json.dumps(workspace.config.model_dump(mode="json", exclude=exclude))
+
+
+def _record_round(workspace: Workspace, row: dict[str, Any]) -> None:
+    """Stores a round; one that another process works on keeps its settings."""
+    table, number = bulk.table("round"), row["number"]
+    query = select(*(table.c[name] for name in row)).where(table.c.number == number)
+    with workspace.database.reading() as connection:
+        stored = bulk.select(connection, query)
+    if stored == [tuple(row.values())]:
+        return
+    with (
+        workspace.database.claiming_round(number, None, "a change of its settings"),
+        workspace.database.writing() as connection,
+    ):
         changed = connection.execute(table.update().where(table.c.number == number).values(**row))
         if changed.rowcount == 0:
             connection.execute(table.insert().values(**row))
-    return RoundContext(number, rounds, workspace.config.run.seed, teacher)
 
 
 def peek_round(workspace: Workspace, number: int) -> RoundContext | None:
@@ -151,6 +175,11 @@ def _brought(workspace: Workspace) -> tuple[int, Teacher]:
             register_checkpoint(connection, workspace, 0, "", path)
             found = bulk.select(connection, query)
     return found[0][0], Teacher(path, digest)
+
+
+def _has_frames(workspace: Workspace) -> bool:
+    with workspace.database.reading() as connection:
+        return bool(bulk.select(connection, select(bulk.table("frame").c.id).limit(1)))
 
 
 def _students(workspace: Workspace) -> set[int]:

@@ -78,7 +78,23 @@ def run_frames(
     *,
     split: str = "unlabeled",
 ) -> Report:
-    """Brings a stage up to date for every frame of a split that can be worked on."""
+    """Brings a stage up to date for every frame of a split that can be worked on.
+
+    Raises:
+        DatabaseError: another process works on the round; the message says who.
+    """
+    with workspace.database.claiming_round(context.number, None, stage.name):
+        return _run_frames(workspace, context, stage, executor, progress, split)
+
+
+def _run_frames(
+    workspace: Workspace,
+    context: RoundContext,
+    stage: FrameStage,
+    executor: Executor,
+    progress: Progress,
+    split: str,
+) -> Report:
     start = time.perf_counter()
     waiting = plan.waiting_frames(workspace, context, stage, split)
     before = plan.counts(workspace, context, stage, split)
@@ -111,18 +127,20 @@ def run_round(
     """Brings a round stage up to date for a policy.
 
     Raises:
+        DatabaseError: another process works on the round, or on the same policy in it.
         LeakageError: what guards the stage does not hold.
     """
-    if stage.guard:
-        stage.guard(workspace, context, policy)
-    frames = plan.complete_frames(workspace, context)
-    return run_once(
-        workspace,
-        plan.Once(context.number, stage.name, policy),
-        plan.round_fingerprint(workspace, context, stage, policy, frames),
-        stage.file(workspace, context, policy) if stage.file else None,
-        lambda: stage.run(workspace, RoundJob(context, policy, frames), progress),
-    )
+    with workspace.database.claiming_round(context.number, policy, stage.name):
+        if stage.guard:
+            stage.guard(workspace, context, policy)
+        frames = plan.frames_to_weigh(workspace, context, policy)
+        return run_once(
+            workspace,
+            plan.Once(context.number, stage.name, policy),
+            plan.round_fingerprint(workspace, context, stage, policy, frames),
+            stage.file(workspace, context, policy) if stage.file else None,
+            lambda: stage.run(workspace, RoundJob(context, policy, frames), progress),
+        )
 
 
 def run_once(
@@ -276,15 +294,19 @@ class _Writer:
         )
 
     def _forget_weights(self, connection: Connection, keys: Sequence[int]) -> None:
-        """Removes the tasks of the policies that have weighted labels of these frames."""
-        task, weight = bulk.table("task"), bulk.table("weight")
+        """Removes tasks and counts of the policies that have weighed labels of these frames."""
+        task, weight, count = map(bulk.table, ("task", "weight", "label_count"))
         weighted = (weight.c.round == self.context.number, weight.c.frame_id.in_(keys))
+        policies = select(weight.c.policy).where(*weighted)
         connection.execute(
             task.delete().where(
                 task.c.round == self.context.number,
                 task.c.stage == "solve",
-                task.c.variant.in_(select(weight.c.policy).where(*weighted)),
+                task.c.variant.in_(policies),
             )
+        )
+        connection.execute(
+            count.delete().where(count.c.round == self.context.number, count.c.policy.in_(policies))
         )
 
     def _row(self, key: int, state: str, error: str | None, seconds: float) -> bulk.Row:

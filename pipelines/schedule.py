@@ -13,7 +13,12 @@ from pipelines.workspace import Workspace
 
 
 def run_all(
-    workspace: Workspace, rounds: int | None, progress: Progress, *, train: bool = True
+    workspace: Workspace,
+    rounds: int | None,
+    progress: Progress,
+    *,
+    train: bool = True,
+    evidence: bool = True,
 ) -> Iterator[Report]:
     """Brings every stage of every round up to date, and says what each did as it ends.
 
@@ -25,6 +30,8 @@ def run_all(
         rounds: E; None for the configured number.
         progress: see `Progress`.
         train: whether students are trained; without them only the first round can be run.
+        evidence: whether frames are predicted and scored; false only for a policy that uses no
+            unlabeled frames.
     """
     trained = train and is_student_trained(workspace)
     policy = workspace.config.run.method
@@ -37,6 +44,7 @@ def run_all(
             context = open_round(workspace, number, rounds)
             for stage in active(workspace.config.run.priors):
                 if isinstance(stage, FrameStage):
-                    yield run_frames(workspace, context, stage, executor, progress)
+                    if evidence:
+                        yield run_frames(workspace, context, stage, executor, progress)
                 elif trained or stage.name != "train-round":
                     yield run_round(workspace, context, stage, policy, progress)

@@ -14,6 +14,7 @@ from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
 from curate.firewall.sequences import choose_sequences, group_by_sequence, straddling
+from curate.segmenters.classes import CLASS_MAPS, class_map
 from db import bulk
 from pipelines import registry
 from pipelines.config import Config
@@ -84,6 +85,24 @@ def _refuse_absent(config: Config) -> None:
             raise ConfigError(f"{section} '{name}' needs a path: give --{section}-path")
         if path is not None and not path.exists():
             raise ConfigError(f"--{section}-path {path}: no such file")
+    _refuse_undeclared_classes(config)
+
+
+def _refuse_undeclared_classes(config: Config) -> None:
+    """ConfigError where nobody says what the numbers of a segmenter's classes mean."""
+    name, section = config.segmenter.name, config.segmenter
+    if section.classes is not None:
+        class_map(section.classes)
+    elif (
+        name in registry.SEGMENTERS.classes
+        and registry.SEGMENTERS.takes(name, "classes")
+        and "classes" not in section.options
+    ):
+        raise ConfigError(
+            f"segmenter '{name}': say what its class numbers mean: --segmenter-classes "
+            f"{', '.join(CLASS_MAPS)}; or a table of your own: --set "
+            '"segmenter.options.classes={Car=[7]}"'
+        )
 
 
 def choose_split(
@@ -134,8 +153,8 @@ def _refuse_straddling(sequences: Mapping[str, str], split: Split) -> None:
     for (one, other), names in shared.items():
         raise LeakageError(
             f"{len(names)} sequences ({named(names)}) have frames in both {one} and {other}, which "
-            "are near-duplicates of each other: give whole sequences, or split by frame all the "
-            "same with --split-by frame"
+            "are near-duplicates of each other: give whole sequences (a list may hold their "
+            "names), or split by frame all the same with --split-by frame"
         )
 
 
@@ -182,11 +201,13 @@ def _choose(
 
 
 def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
-    """The frames that a file names, each once."""
+    """The frames that a file names, each once; a sequence of the pool stands for its frames."""
     try:
         names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"--{split} {path}: no list of frame ids: {error}") from error
+    groups = group_by_sequence(sequences_of(dataset, pool), pool)
+    names = [frame for name in names for frame in groups.get(name, (name,))]
     unknown = sorted(set(names) - set(pool))
     if unknown:
         raise ConfigError(f"--{split} {path}: frame {unknown[0]} is not among the training frames")

@@ -10,14 +10,18 @@ from curate.evaluation.kitti_ap import KittiEvaluation
 from curate.evaluation.kitti_outcomes import Outcomes, object_outcomes
 from curate.evaluation.kitti_rules import DIFFICULTIES
 from db import bulk
-from pipelines.evaluation import val_objects
+from pipelines.evaluation import ValObjects
 from pipelines.workspace import Workspace
 
 OVERLAP, DIFFICULTY = "3d", "hard"
 
 
 def store_evaluation(
-    workspace: Workspace, source: str, found: Mapping[str, Detections], figures: KittiEvaluation
+    workspace: Workspace,
+    source: str,
+    found: Mapping[str, Detections],
+    objects: ValObjects,
+    figures: KittiEvaluation,
 ) -> Mapping[str, int]:
     """Replaces what is stored of a source, and counts the objects by their outcome.
 
@@ -27,11 +31,12 @@ def store_evaluation(
         workspace: see `Workspace`.
         source: whose detections, as people will ask for it.
         found: detections of the val frames.
+        objects: the same in KITTI's form, with the ground truth.
         figures: their evaluation.
     """
     keys = workspace.frames("val")
     of_objects, of_detections = object_outcomes(
-        *val_objects(workspace, found),
+        *objects,
         metric=OVERLAP,
         difficulty=DIFFICULTY,
         min_overlaps=figures.min_overlaps,

@@ -17,7 +17,7 @@ from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from db.session import Database, parse_url
 from pipelines import registry
-from pipelines.config import Config, read_config, write_config
+from pipelines.config import Config, make_config, read_config, write_config
 
 CONFIG_NAME = "curate.toml"
 SPLITS = ("labeled", "unlabeled", "val")
@@ -69,10 +69,14 @@ class Workspace:
         return cls(root, config, Database(_url(root, config)))
 
     def with_settings(self, section: str, **changes: Any) -> "Workspace":
-        """The same workspace with other settings in a section, for this command only."""
-        current = getattr(self.config, section)
-        changed = current.model_validate({**dict(current), **changes})
-        return replace(self, config=self.config.model_copy(update={section: changed}))
+        """The same workspace with other settings in a section, for this command only.
+
+        Raises:
+            ConfigError: a setting is wrong.
+        """
+        changed = {**dict(getattr(self.config, section)), **changes}
+        config = make_config({**dict(self.config), section: changed}, "command line")
+        return replace(self, config=config)
 
     @cached_property
     def dataset(self) -> Dataset:

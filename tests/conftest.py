@@ -1,17 +1,21 @@
 """Data that tests share: real KITTI frames where they are, and small handmade ones otherwise."""
 
 import os
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import postgres_server
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from toys import write_toy_kitti
+
+from db.session import Database
 
 ROOT = Path(__file__).parent.parent
 
 # How long an example takes says nothing on a busy machine.
-settings.register_profile("curate")
+settings.register_profile("curate", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("curate")
 
 
@@ -32,6 +36,40 @@ def kitti_root() -> Path:
 def kitti_eval_root() -> Path:
     """Made-up labels and results with the AP that the official devkit prints for them."""
     return _shared("CURATE_KITTI_EVAL", "kitti_eval")
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[postgres_server.PostgresServer]:
+    """A PostgreSQL server with a migrated template, where its binaries are installed."""
+    reason = postgres_server.unavailable()
+    if reason is not None:
+        pytest.skip(reason)
+    with postgres_server.running_server() as server:
+        server.execute(f"CREATE DATABASE {postgres_server.TEMPLATE}")
+        Database(server.url(postgres_server.TEMPLATE)).close()
+        yield server
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Tests of a module with ENGINES go through the database on each of them."""
+    engines = getattr(metafunc.module, "ENGINES", ())
+    if engines and "engine" in metafunc.fixturenames:
+        metafunc.parametrize("engine", engines, indirect=True)
+
+
+@pytest.fixture
+def engine(request: pytest.FixtureRequest) -> str:
+    """Where the tables are: sqlite, unless the module says otherwise."""
+    return getattr(request, "param", "sqlite")
+
+
+@pytest.fixture
+def new_url(engine: str, request: pytest.FixtureRequest) -> Callable[[], str | None]:
+    """A function that gives each workspace a database of its own: its file, or one on a server."""
+    if engine == "sqlite":
+        return lambda: None
+    server = request.getfixturevalue("postgres")
+    return lambda: server.new_database(postgres_server.TEMPLATE)
 
 
 @pytest.fixture

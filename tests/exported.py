@@ -32,7 +32,7 @@ def toy_frame(name: str) -> Frame:
 def toy_labels(points: tuple[int | None, ...] = (12, None, 3)) -> LabelSet:
     """Labeled frame 000000 with a car and a van, unlabeled 000001 with three labels."""
     files = [(f"velodyne/00000{i}.bin", f"image_2/00000{i}.png", "c") for i in range(2)]
-    evidence = (20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "pspsl")
+    evidence = (20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "detector", "pspsl")
     return LabelSet(
         description=LabelFileDescription(
             "kitti", Path("/data"), ("Car", "Pedestrian", "Cyclist"), 1, "pspsl", "1"

@@ -4,11 +4,17 @@ import os
 import re
 import shlex
 import shutil
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+
+from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti_labels import from_detections, write_objects
+from curate.detectors.recorded import RecordedDetector
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -76,16 +82,43 @@ def test_the_commands_on_your_data(tmp_path: Path) -> None:
 
 @pytest.mark.kitti
 def test_the_commands_with_your_detector(tmp_path: Path, kitti_root: Path) -> None:
-    """A real detector's record and a real segmenter."""
-    frames = tmp_path / "few"
+    """From a real detector's KITTI result files to weights, a picture and a report."""
+    frames, results = tmp_path / "few", tmp_path / "results"
     for folder in ("velodyne", "image_2", "calib", "label_2"):
         (frames / folder).mkdir(parents=True)
         for path in sorted((kitti_root / "training" / folder).iterdir())[:4]:
             shutil.copy(path, frames / folder)
+    write_results(results, frames, kitti_root / "recorded" / "pointgnn_T0.csv")
     replace = {
         "KITTI/training": str(frames),
-        "detections.csv": str(kitti_root / "recorded" / "pointgnn_T0.csv"),
+        "results": str(results),
         "deeplab.onnx": str(kitti_root / "segmenter" / "deeplabv3_mnv2_pascal_quant.onnx"),
     }
     printed = run_all(commands("With your detector and your segmenter"), tmp_path, replace)
     assert "labels in exports/round-01-pspsl.sqlite" in printed
+    assert "wrong " not in printed
+    with closing(sqlite3.connect(tmp_path / "work2" / "exports" / "labels.sqlite")) as file:
+        sql = "SELECT frame, weight FROM weighted_labels"
+        weights = file.execute(sql).fetchall()
+    written = [line for path in results.iterdir() for line in path.read_text().splitlines()]
+    labeled = {path.stem for path in results.iterdir()} - {frame for frame, _ in weights}
+    assert len(labeled) == 1
+    own = (results / f"{labeled.pop()}.txt").read_text().splitlines()
+    assert len(weights) == len(written) - len(own)
+    assert any(weight > 0 for _, weight in weights)
+    picture = re.search(r"^picture: (.*)$", printed, re.MULTILINE)
+    report = re.search(r"^report: (.*)$", printed, re.MULTILINE)
+    assert picture is not None
+    assert report is not None
+    assert Path(picture[1]).read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in Path(report[1]).read_text()
+
+
+def write_results(folder: Path, root: Path, record: Path) -> None:
+    """Result files as KITTI's benchmark takes them, of what a detector answered."""
+    dataset, detector = KittiDataset(root), RecordedDetector(record)
+    folder.mkdir()
+    for name in dataset.frame_ids():
+        frame = dataset.read(name, points=False)
+        found = from_detections(detector.predict(frame), frame.calibration, frame.image_size)
+        write_objects(folder / f"{name}.txt", found)

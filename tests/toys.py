@@ -82,8 +82,10 @@ def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: b
 
 
 def dawdle() -> None:
-    """Lets a test stop the process in the middle of its work."""
+    """Lets a test stop the process in the middle of its work, or hold it at a gate: a file."""
     time.sleep(float(os.environ.get("TOY_DELAY_S", "0")))
+    while "TOY_GATE" in os.environ and Path(os.environ["TOY_GATE"]).exists():
+        time.sleep(0.02)
 
 
 class ToyDetector:

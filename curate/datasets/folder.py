@@ -1,7 +1,8 @@
 """Any folder of point files and images with one calibration, described in ROOT/dataset.toml.
 
 points = "lidar"              # folder of FRAME.bin, .pcd, .ply or .npy
-images = "camera"             # folder of FRAME.png or .jpg
+images = "camera"             # folder of FRAME.png or .jpg; where there are none, instead:
+# image_size = [1242, 375]    # width and height of what the camera of the calibration sees
 labels = "label_2"            # optional: KITTI label files of the labeled frames
 splits = "lists"              # optional: folder of train.txt, val.txt
 sequence_separator = "_"      # optional: frames are named SEQUENCE_NUMBER, split at the last of it
@@ -23,12 +24,12 @@ import numpy as np
 
 from curate.datasets.clouds import CLOUD_SUFFIXES, read_cloud
 from curate.datasets.containment import check_frame_id, refuse_escape
-from curate.datasets.images import read_image, read_image_size
+from curate.datasets.images import read_sized_image
 from curate.datasets.kitti import (
     IMAGE_SUFFIXES,
     read_bytes,
     read_calibration,
-    read_frame_list,
+    read_frame_lists,
     visible_files,
 )
 from curate.datasets.kitti_labels import read_objects, to_annotations
@@ -39,7 +40,7 @@ from curate.frames import Calibration, Frame, FrameFiles
 DESCRIPTION = "dataset.toml"
 _FOLDERS = ("points", "images", "labels", "splits")
 _TEXTS = (*_FOLDERS, "sequence_separator")
-_KEYS = (*_TEXTS, "columns", "intensity_scale", "calibration")
+_KEYS = (*_TEXTS, "image_size", "columns", "intensity_scale", "calibration")
 
 
 class FolderDataset:
@@ -50,8 +51,8 @@ class FolderDataset:
         follow_links: whether links and names in dataset.toml may lead out of it.
 
     Raises:
-        DataError: the description is missing or malformed, or names no images (a data set without
-            a camera has no calibration to project boxes with, and is not read).
+        DataError: the description is missing or malformed, or names neither images nor their size
+            (which points a detector saw, and every 2D box, follow from what the camera sees).
     """
 
     name = "folder"
@@ -79,12 +80,12 @@ class FolderDataset:
         """The lists of the folder `splits`, by file name."""
         if "splits" not in self._told:
             return {}
-        lists = sorted(visible_files(self.root / self._told["splits"], "*.txt"))
-        self._refuse_escape(*lists)
-        return {path.stem: read_frame_list(path) for path in lists}
+        return read_frame_lists(
+            self.root / self._told["splits"], None if self.follow_links else self.root
+        )
 
     def files(self, frame_id: str) -> FrameFiles:
-        """Where the frame's files lie; the calibration is that of all frames.
+        """Where the frame's files lie, or an image would; the calibration is that of all frames.
 
         Raises:
             DataError: there is no such frame.
@@ -92,7 +93,7 @@ class FolderDataset:
         check_frame_id(frame_id)
         if frame_id not in self._points:
             raise DataError(f"{self.root / self._told['points']}: no point file of {frame_id}")
-        folder = self.root / self._told["images"]
+        folder = self.root / self._told.get("images", "images")
         images = [folder / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
         calibration = self._told["calibration"]
         label = self._label(frame_id)
@@ -123,8 +124,20 @@ class FolderDataset:
         if points:
             scale = float(self._told.get("intensity_scale", 1.0))
             sweep = read_cloud(files.points, int(self._told.get("columns", 4)), scale)
-        pixels = read_image(files.image) if image else None
-        return Frame(frame_id, sweep, self._calibration, read_image_size(files.image), pixels)
+        size, pixels = self._seen(files.image, pixels=image)
+        return Frame(frame_id, sweep, self._calibration, size, pixels)
+
+    def _seen(self, image: Path, *, pixels: bool) -> tuple[tuple[int, int], np.ndarray | None]:
+        """Size and pixels of an image; the size is known without images too."""
+        if "images" in self._told:
+            return read_sized_image(image, pixels=pixels)
+        if pixels:
+            raise DataError(
+                f"{self._path}: no key images, but the pixels of {image.stem} are needed; "
+                "name the folder of images"
+            )
+        width, height = self._told["image_size"]
+        return (width, height), None
 
     def annotations(self, frame_id: str) -> Annotations:
         """The frame's ground truth in the LiDAR frame.
@@ -173,16 +186,31 @@ def _read_description(path: Path) -> Mapping[str, Any]:
     for key in ("points", "calibration"):
         if key not in told:
             raise DataError(f"{path}: no key {key}")
-    if "images" not in told:
+    if "images" not in told and "image_size" not in told:
         raise DataError(
             f"{path}: no key images; data sets without a camera are not read: which points a "
-            "detector saw, and every 2D box, come from the image and its calibration"
+            "detector saw, and every 2D box, come from the image and its calibration; "
+            "where only the images are missing, write image_size = [width, height]"
+        )
+    if "images" in told and "image_size" in told:
+        raise DataError(
+            f"{path}: image_size is for data sets without images; leave one of them out"
         )
     wrong = [key for key in _TEXTS if not isinstance(told.get(key, ""), str)]
+    wrong += [] if _is_size(told.get("image_size", [1, 1])) else ["image_size"]
     wrong += [key for key in ("columns", "intensity_scale") if not _positive(told.get(key, 1))]
     if wrong or not isinstance(told["calibration"], str | dict) or told.get("columns", 4) < 3:
         raise DataError(f"{path}: {(wrong or ['calibration or columns'])[0]} cannot be that")
     return told
+
+
+def _is_size(value: object) -> bool:
+    """Whether it is width and height in pixels."""
+    return (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(isinstance(side, int) and _positive(side) for side in value)
+    )
 
 
 def _positive(value: object) -> bool:

@@ -41,6 +41,19 @@ def read_image_size(path: Path) -> tuple[int, int]:
     return _claimed_size(header, path)
 
 
+def read_sized_image(path: Path, *, pixels: bool) -> tuple[tuple[int, int], np.ndarray | None]:
+    """(width, height) of an image file, and as `read_image` its pixels where they are wanted.
+
+    Raises:
+        DataError: the file is missing, truncated or no image.
+    """
+    if not pixels:
+        return read_image_size(path), None
+    image = read_image(path)
+    height, width = image.shape[:2]
+    return (width, height), image
+
+
 def decode_image(path: Path, mode: int) -> np.ndarray:
     """The pixels of an image file as OpenCV decodes them under `mode` (cv2.IMREAD_...).
 

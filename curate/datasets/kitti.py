@@ -14,7 +14,7 @@ import numpy as np
 
 from curate.atomic import replace_file
 from curate.datasets.containment import check_frame_id, refuse_escape
-from curate.datasets.images import read_image, read_image_size
+from curate.datasets.images import read_sized_image
 from curate.datasets.kitti_labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
@@ -126,11 +126,8 @@ class KittiDataset:
         files = self.files(frame_id)
         sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
         calibration = read_calibration(files.calibration)
-        if not image:
-            return Frame(frame_id, sweep, calibration, read_image_size(files.image))
-        pixels = read_image(files.image)
-        height, width = pixels.shape[:2]
-        return Frame(frame_id, sweep, calibration, (width, height), pixels)
+        size, pixels = read_sized_image(files.image, pixels=image)
+        return Frame(frame_id, sweep, calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
         """The frame's ground truth in the LiDAR frame, DontCare regions included.
@@ -261,6 +258,22 @@ def read_drives(folder: Path) -> Mapping[str, str]:
 def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
     """The files of a folder without hidden ones: macOS strews ._ files over foreign disks."""
     return (path for path in folder.glob(pattern) if not path.name.startswith("."))
+
+
+def read_frame_lists(folder: Path, within: Path | None) -> Mapping[str, tuple[str, ...]]:
+    """The frame lists of a folder by file name; none where it is not there.
+
+    Args:
+        folder: of the lists.
+        within: the root that links must not lead out of; None where they may.
+
+    Raises:
+        DataError: a list names something that is no frame id, or lies elsewhere.
+    """
+    paths = sorted(visible_files(folder, "*.txt"))
+    if within is not None:
+        refuse_escape(within, *paths)
+    return {path.stem: read_frame_list(path) for path in paths}
 
 
 def read_frame_list(path: Path) -> tuple[str, ...]:

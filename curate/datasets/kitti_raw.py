@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from curate.datasets.containment import check_frame_id, refuse_escape
-from curate.datasets.images import read_image, read_image_size
+from curate.datasets.images import read_sized_image
 from curate.datasets.kitti import (
     parse_matrix,
     read_bytes,
-    read_frame_list,
+    read_frame_lists,
     read_points,
     visible_files,
 )
@@ -73,10 +73,7 @@ class KittiRawDataset:
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """The lists of ROOT/ImageSets, by file name."""
-        lists = sorted(visible_files(self.root / "ImageSets", "*.txt"))
-        if not self.follow_links:
-            refuse_escape(self.root, *lists)
-        return {path.stem: read_frame_list(path) for path in lists}
+        return read_frame_lists(self.root / "ImageSets", None if self.follow_links else self.root)
 
     def sequence_of(self, frame_id: str) -> str | None:
         """The drive of a frame."""
@@ -112,8 +109,7 @@ class KittiRawDataset:
         files = self.files(frame_id)
         sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
         calibration = read_raw_calibration(files.calibration.parent)
-        pixels = read_image(files.image) if image else None
-        size = read_image_size(files.image)
+        size, pixels = read_sized_image(files.image, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:

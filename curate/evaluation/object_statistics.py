@@ -6,11 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from curate.datasets.kitti_labels import KittiObjects
-from curate.evaluation.kitti_rules import COUNTED, DIFFICULTIES, label_states
+from curate.evaluation.kitti_rules import COUNTED, DIFFICULTIES, MAX_TRUNCATIONS, label_states
 
 QUANTILES = (0.1, 0.5, 0.9)
-# From this share of an object outside the image on, KITTI does not call it easy any more.
-_TRUNCATED = 0.15
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,7 @@ class ObjectStatistics:
             are among those of the next.
         occluded: share with occlusion level 1 or more.
         mostly_occluded: share with level 2 or more.
-        truncated: share of which more than 0.15 lies outside the image.
+        truncated: share of which too much lies outside the image for KITTI to call them easy.
         distances: quantiles of the distance from the camera in metres, see `QUANTILES`.
     """
 
@@ -63,7 +61,7 @@ def _of_category(frames: Sequence[KittiObjects], category: str) -> ObjectStatist
         counted=tuple(number / frame_count for number in counted),
         occluded=_share(occluded >= 1),
         mostly_occluded=_share(occluded >= 2),
-        truncated=_share(truncated > _TRUNCATED),
+        truncated=_share(truncated > MAX_TRUNCATIONS[0]),
         distances=tuple(
             float(np.quantile(distances, share)) if count else np.nan for share in QUANTILES
         ),

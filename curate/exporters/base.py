@@ -1,6 +1,6 @@
 """What every exporter offers: the labels of a round as files for trainers."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -12,8 +12,10 @@ BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 WEIGHTED_LABEL_COLUMNS = (
     "round", "frame", "k", "category", *BOX_COLUMNS,
     "score", "loss", "points", "points_threshold", "rho_diff", "mask_pixels", "box_pixels",
-    "rho_anno", "rho_det", "lambda_u", "policy", "weight",
+    "rho_anno", "rho_det", "lambda_u", "provenance", "policy", "weight",
 )  # fmt: skip
+PROVENANCES = ("detector", "human")
+"""Whose a label is: a prediction that a policy weighs, or what a person decided in a review."""
 GROUND_TRUTH_COLUMNS = ("frame", "k", "category", *BOX_COLUMNS, "truncated", "occluded")
 FRAME_COLUMNS = ("frame", "split", "points", "image", "calibration")
 
@@ -21,6 +23,18 @@ FRAME_COLUMNS = ("frame", "split", "points", "image", "calibration")
 _NAMED_FRAMES = 5
 
 Row = tuple[Any, ...]
+
+
+class Rows(Protocol):
+    """Rows that can be counted and walked through again; they need not be in memory."""
+
+    def __len__(self) -> int:
+        """How many there are."""
+        ...
+
+    def __iter__(self) -> Iterator[Row]:
+        """From the first on."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -67,7 +81,7 @@ class LabelSet:
     description: LabelFileDescription
     frames: Sequence[Row]
     ground_truth: Sequence[Row]
-    labels: Sequence[Row]
+    labels: Rows
     read: Callable[[str], Frame]
     read_points: Callable[[str], Frame]
 
@@ -90,6 +104,17 @@ class LabelSet:
                 f"labels to export belong to frames outside the unlabeled split: {named(strays)}; "
                 "export labels of unlabeled frames only"
             )
+
+    @property
+    def categories(self) -> frozenset[str]:
+        """The categories that ground truth or labels have; not all need be ones to be learned."""
+        of_truth, of_labels = (
+            columns.index("category") for columns in (GROUND_TRUTH_COLUMNS, WEIGHTED_LABEL_COLUMNS)
+        )
+        return frozenset(
+            {str(row[of_truth]) for row in self.ground_truth}
+            | {str(row[of_labels]) for row in self.labels}
+        )
 
 
 class Exporter(Protocol):

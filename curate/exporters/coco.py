@@ -43,8 +43,7 @@ class CocoExporter:
 
 def _document(labels: LabelSet) -> dict[str, Any]:
     about = labels.description
-    truth = {str(row[2]) for row in labels.ground_truth} | {str(row[3]) for row in labels.labels}
-    names = [*about.categories, *sorted(truth - set(about.categories))]
+    names = [*about.categories, *sorted(labels.categories - set(about.categories))]
     ids = {name: number for number, name in enumerate(names, start=1)}
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []

@@ -49,9 +49,8 @@ class MMDet3DExporter:
 
 
 def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
-    found = {str(row[2]) for row in labels.ground_truth} | {str(row[3]) for row in labels.labels}
     own = [name for name in labels.description.categories if name not in _KITTI_ORDER]
-    rest = sorted(found - {*_KITTI_ORDER, *own})
+    rest = sorted(labels.categories - {*_KITTI_ORDER, *own})
     numbers = {name: number for number, name in enumerate((*_KITTI_ORDER, *own, *rest))}
     infos = []
     for position, objects in enumerate(frame_objects(labels)):

@@ -8,6 +8,7 @@ import numpy as np
 
 from curate.detections import Detections
 from curate.errors import DataError
+from curate.evaluation.kitti_rules import MAX_OCCLUSIONS, MAX_TRUNCATIONS, MIN_HEIGHTS
 from curate.exporters.base import (
     BOX_COLUMNS,
     GROUND_TRUTH_COLUMNS,
@@ -17,8 +18,6 @@ from curate.exporters.base import (
 )
 
 UNKNOWN = -1
-# KITTI's limits of easy, moderate and hard: height in pixels, occlusion level, truncated share.
-_DIFFICULTIES = ((40, 0, 0.15), (25, 1, 0.3), (25, 2, 0.5))
 
 
 @dataclass(frozen=True)
@@ -87,8 +86,8 @@ def difficulties(boxes_2d: np.ndarray, truncated: np.ndarray, occluded: np.ndarr
     """
     found = np.full(len(boxes_2d), -1, dtype=np.int32)
     height = boxes_2d[:, 3] - boxes_2d[:, 1]
-    for level in reversed(range(len(_DIFFICULTIES))):
-        least, most_occluded, most_truncated = _DIFFICULTIES[level]
+    limits = zip(MIN_HEIGHTS, MAX_OCCLUSIONS, MAX_TRUNCATIONS, strict=True)
+    for level, (least, most_occluded, most_truncated) in reversed(list(enumerate(limits))):
         within = (height >= least) & (occluded <= most_occluded) & (truncated <= most_truncated)
         found[within] = level
     return found

@@ -70,6 +70,7 @@ CREATE TABLE label (
     rho_anno REAL,              -- Eq. 9
     rho_det REAL,               -- rho_diff * rho_anno
     lambda_u REAL,              -- age parameter, Eq. 4
+    provenance TEXT NOT NULL CHECK (provenance IN ('detector', 'human')),
     policy TEXT NOT NULL,
     weight REAL NOT NULL CHECK (weight BETWEEN 0 AND 1),  -- v; 0 is an ignore region
     split TEXT GENERATED ALWAYS AS ('unlabeled') VIRTUAL,

@@ -1,12 +1,17 @@
 """Projection from the LiDAR frame into the image (KITTI: Geiger et al., IJRR 2013, eq. 8)."""
 
 import numpy as np
+from numba import njit
 
 from curate.frames import Calibration
 from curate.geometry.boxes import box_corners
 
 # What is nearer to the camera than this is cut away: at depth 0 the projection has no bounds.
 _NEAR_METRES = 0.1
+
+# A point this near to the border of the view, relative to the terms of its projection, is left to
+# NumPy's own rounding.
+_UNDECIDED = 1e-10
 
 # The twelve edges of `box_corners`: bottom ring, top ring, verticals.
 _EDGE_STARTS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3])
@@ -42,9 +47,38 @@ def in_view(
         calibration: of the frame.
         image_size: (width, height) in pixels.
     """
-    pixels, depth = project_points(points, calibration)
-    inside = (pixels >= 0) & (pixels < np.asarray(image_size))
-    return inside.all(axis=1) & (depth > 0)
+    width, height = image_size
+    columns = np.asarray(points)
+    seen, doubtful = _in_view(columns, calibration.lidar_to_image, float(width), float(height))
+    if len(doubtful):
+        pixels, depth = project_points(columns[doubtful], calibration)
+        inside = (pixels >= 0) & (pixels < np.asarray(image_size))
+        seen[doubtful] = inside.all(axis=1) & (depth > 0)
+    return seen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _in_view(
+    points: np.ndarray, matrix: np.ndarray, width: float, height: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The kernel of `in_view`: (n,) bool, and the indices of points that it leaves undecided."""
+    seen = np.zeros(len(points), np.bool_)
+    doubtful = [0 for _ in range(0)]  # typed by its elements
+    size = np.abs(matrix).sum() * _UNDECIDED
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+        margin = size * max(abs(x), abs(y), abs(z), 1.0) * max(width, height)
+        if depth < -margin:
+            continue
+        u = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
+        v = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
+        nearest = min(depth, u, v, width * depth - u, height * depth - v)
+        if nearest > margin:
+            seen[i] = True
+        elif not nearest < -margin:  # NaN too
+            doubtful.append(i)
+    return seen, np.array(doubtful, dtype=np.int64)
 
 
 def image_rectangles(

@@ -31,6 +31,9 @@ class PriorEvidence(Protocol):
 class Prior(Protocol):
     """Trusts or mistrusts each label of a frame; rho_det is the product over the priors.
 
+    A prior that never looks at `frame.points` may have a further attribute, `needs_points`, that is
+    false; the points are then not read for it.
+
     It answers in two steps: measuring looks at what the sensors saw, which may be slow, rating is
     arithmetic on what was measured. Who changes the formula need not measure again.
 

@@ -110,6 +110,12 @@ def points_threshold(
     return max(float(value), 1.0)
 
 
+def point_trust(points: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """rho_diff (Eq. 8) from (n,) point counts m and (n,) thresholds m_th."""
+    rho: np.ndarray = np.minimum(points, thresholds) / thresholds
+    return rho
+
+
 def learn_thresholds(
     samples: Iterable[tuple[Frame, Annotations]],
     categories: Sequence[str],
@@ -179,7 +185,7 @@ class PointPrior:
             ConfigError: a detection's category has no threshold.
         """
         points, threshold = measured["points"], self._threshold_per_label(detections.categories)
-        return PointEvidence(points, threshold, np.minimum(points, threshold) / threshold)
+        return PointEvidence(points, threshold, point_trust(points, threshold))
 
     def score(self, frame: Frame, detections: Detections) -> PointEvidence:
         """Both.

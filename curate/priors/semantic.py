@@ -4,6 +4,7 @@ Source: An et al., Remote Sensing 15(3):627, 2023. Its prose says "arithmetic me
 the share of class pixels, its printed formula is a square root: geometric is the default here.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
@@ -84,6 +85,11 @@ class SemanticPrior:
     def needs_image(self) -> bool:
         """Whether the segmenter reads the image."""
         return self.segmenter is not None and self.segmenter.needs_image
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether the segmenter reads the points; one that does not say so may."""
+        return bool(getattr(self.segmenter, "needs_points", self.segmenter is not None))
 
     def measure(self, frame: Frame, detections: Detections) -> Measured:
         """Segment the frame and look at each box's rectangle; no label, no segmentation.
@@ -170,25 +176,36 @@ def count_pixels(
     mask_pixels = np.zeros(len(rectangles), dtype=np.int64)
     for category in np.unique(categories):
         k = np.flatnonzero(seen & (categories == category))
-        total = _integral(semantic_map, str(category))
+        counted = _classes(semantic_map, str(category))
+        if len(k) == 0:
+            continue
+        # Only what the category's rectangles cover together is looked at.
+        row, column = top[k].min(), left[k].min()
+        part = semantic_map.class_ids[row : bottom[k].max(), column : right[k].max()]
+        total = _integral(part, counted)
+        above, below = top[k] - row, bottom[k] - row
+        before, after = left[k] - column, right[k] - column
         mask_pixels[k] = (
-            total[bottom[k], right[k]]
-            - total[top[k], right[k]]
-            - total[bottom[k], left[k]]
-            + total[top[k], left[k]]
+            total[below, after] - total[above, after] - total[below, before] + total[above, before]
         )
     return mask_pixels, box_pixels
 
 
-def _integral(semantic_map: SemanticMap, category: str) -> np.ndarray:
-    """(height + 1, width + 1) class pixels above and left of each pixel corner."""
+def _integral(class_ids: np.ndarray, counted: Collection[int]) -> np.ndarray:
+    """(h + 1, w + 1) class pixels above and left of each pixel corner of a (h, w) part of a map."""
     import cv2
 
+    counts = np.zeros(256, dtype=np.uint8)
+    counts[list(counted)] = 1
+    if class_ids.size == 0:
+        return np.zeros([side + 1 for side in class_ids.shape], dtype=np.int32)
+    return np.asarray(cv2.integral(cv2.LUT(class_ids, counts)))
+
+
+def _classes(semantic_map: SemanticMap, category: str) -> tuple[int, ...]:
     if category not in semantic_map.category_classes:
         raise ConfigError(
             f"semantic prior: the segmenter has no classes for category {category}; "
             "name the class ids that count for it in the segmenter's class table",
         )
-    counts = np.zeros(256, dtype=np.uint8)
-    counts[list(semantic_map.category_classes[category])] = 1
-    return np.asarray(cv2.integral(counts[semantic_map.class_ids]))
+    return semantic_map.category_classes[category]

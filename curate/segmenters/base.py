@@ -24,7 +24,11 @@ class SemanticMap:
 
 
 class Segmenter(Protocol):
-    """Names the semantic class of every pixel; raises `ModelError` or `DataError`."""
+    """Names the semantic class of every pixel; raises `ModelError` or `DataError`.
+
+    One that never looks at `frame.points` may have a further attribute, `needs_points`, that is
+    false; the points are then not read for it.
+    """
 
     needs_image: bool
 

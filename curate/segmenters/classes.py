@@ -8,6 +8,8 @@ Pascal VOC's, Cityscapes' train ids, and COCO's category ids with 0 as backgroun
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
+import numpy as np
+
 from curate.errors import ConfigError
 
 ClassMap = Mapping[str, tuple[int, ...]]
@@ -16,10 +18,20 @@ CLASS_MAPS: Mapping[str, ClassMap] = MappingProxyType(
     {
         "voc": {"Car": (7,), "Pedestrian": (15,), "Cyclist": (2, 15)},
         "cityscapes": {"Car": (13,), "Pedestrian": (11,), "Cyclist": (12, 18)},
+        "cityscapes-label-ids": {"Car": (26,), "Pedestrian": (24,), "Cyclist": (25, 33)},
         "coco": {"Car": (3,), "Pedestrian": (1,), "Cyclist": (1, 2)},
         "simulated": {"Car": (1,), "Pedestrian": (2,), "Cyclist": (3,)},
     }
 )
+
+# What maps of a class set can hold besides 255, "none of them"; COCO has several numberings.
+_KNOWN_IDS = {
+    "voc": range(21),
+    "cityscapes": range(19),
+    "cityscapes-label-ids": range(34),
+    "simulated": range(4),
+}
+_UNLABELED = 255
 
 
 def class_map(name: str) -> ClassMap:
@@ -45,3 +57,21 @@ def checked_classes(classes: Mapping[str, Sequence[int]]) -> ClassMap:
             if not isinstance(one, int) or not 0 <= one <= 255:
                 raise ConfigError(f"segmenter class {one!r} of {category}: an id is 0 to 255")
     return {category: tuple(ids) for category, ids in classes.items()}
+
+
+def foreign_ids(class_ids: np.ndarray, classes: ClassMap) -> str | None:
+    """What is wrong with (h, w) class ids that the declared class set does not have, else None."""
+    for name, known in _KNOWN_IDS.items():
+        if CLASS_MAPS[name] != classes:
+            continue
+        strange = np.setdiff1d(class_ids, [*known, _UNLABELED])
+        if len(strange):
+            fault = f"holds class {strange[0]}, but the classes of {name} are 0 to {known[-1]}"
+            others = [
+                other
+                for other, ids in _KNOWN_IDS.items()
+                if not len(np.setdiff1d(class_ids, [*ids, _UNLABELED]))
+            ]
+            hint = f"; are they {' or '.join(others)}? See segmenter.classes" if others else ""
+            return fault + hint
+    return None

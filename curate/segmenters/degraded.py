@@ -79,6 +79,7 @@ class DegradedSegmenter:
     """
 
     needs_image = False
+    needs_points = False
 
     def __init__(self, directory: Path, *, seed: int = 0, **rates: Any) -> None:
         self.seed = seed

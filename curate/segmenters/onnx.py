@@ -60,6 +60,7 @@ class OnnxSegmenter:
     """
 
     needs_image = True
+    needs_points = False
 
     def __init__(
         self,

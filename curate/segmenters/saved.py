@@ -7,29 +7,43 @@ import cv2
 import numpy as np
 
 from curate.datasets.images import decode_image
-from curate.errors import DataError
+from curate.errors import ConfigError, DataError
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
-from curate.segmenters.classes import checked_classes
+from curate.segmenters.classes import checked_classes, foreign_ids
+
+_MOST_CLASSES = 256
 
 
 class SavedSegmenter:
-    """A `Segmenter` that reads DIRECTORY/FRAME.png, single-channel, 8 bits, one class id per pixel.
+    """A `Segmenter` that reads DIRECTORY/FRAME.png, single-channel, one class id per pixel.
 
     Args:
         directory: the folder of the maps.
         classes: the class ids that count for each category.
+        divisor: of maps of 16 bits that number the instances too, as class * divisor + instance:
+            1000 for Cityscapes' instanceIds, 256 for KITTI's. What is smaller is a class alone.
 
     Raises:
         DataError: there is no such folder.
-        ConfigError: a class id is out of range.
+        ConfigError: a class id or the divisor is out of range.
     """
 
     needs_image = False
+    needs_points = False
 
-    def __init__(self, directory: Path, classes: Mapping[str, Sequence[int]]) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        classes: Mapping[str, Sequence[int]],
+        *,
+        divisor: int | None = None,
+    ) -> None:
+        if divisor is not None and not (isinstance(divisor, int) and divisor > 1):
+            raise ConfigError(f"segmenter divisor {divisor!r}: a whole number above 1")
         self.directory = Path(directory)
         self.classes = checked_classes(classes)
+        self.divisor = divisor
         if not self.directory.is_dir():
             raise DataError(f"{self.directory}: no such folder of semantic maps")
 
@@ -37,16 +51,31 @@ class SavedSegmenter:
         """The frame's saved map.
 
         Raises:
-            DataError: there is no map, or it is no map of the frame's image.
+            DataError: there is no map, it is no map of the frame's image, or its class ids are
+                others than those declared.
         """
         path = self.directory / f"{frame.frame_id}.png"
-        class_ids = decode_image(path, cv2.IMREAD_UNCHANGED)
+        class_ids = self._class_ids(path, decode_image(path, cv2.IMREAD_UNCHANGED))
         width, height = frame.image_size
-        if class_ids.ndim != 2 or class_ids.dtype != np.uint8:
-            raise DataError(f"{path}: expected one channel of 8 bits, a class id per pixel")
         if class_ids.shape != (height, width):
             raise DataError(
                 f"{path}: the map is {class_ids.shape[1]} x {class_ids.shape[0]} pixels, "
                 f"the image of the frame {width} x {height}"
             )
+        if fault := foreign_ids(class_ids, self.classes):
+            raise DataError(f"{path}: {fault}")
         return SemanticMap(class_ids, self.classes)
+
+    def _class_ids(self, path: Path, pixels: np.ndarray) -> np.ndarray:
+        """(h, w) uint8 class ids of what the file holds."""
+        if pixels.ndim == 2 and pixels.dtype == np.uint8:
+            return pixels
+        if pixels.ndim == 2 and pixels.dtype == np.uint16 and self.divisor is not None:
+            class_ids = np.where(pixels < self.divisor, pixels, pixels // self.divisor)
+            if class_ids.max(initial=0) < _MOST_CLASSES:
+                return class_ids.astype(np.uint8)
+            raise DataError(f"{path}: class {class_ids.max()} with divisor {self.divisor}")
+        raise DataError(
+            f"{path}: expected one channel of 8 bits, a class id per pixel; for 16 bits of class "
+            "and instance set segmenter.options.divisor"
+        )

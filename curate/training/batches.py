@@ -69,10 +69,13 @@ class Batches:
         for place, index in enumerate(self._chosen(step)):
             generator = np.random.default_rng([self._settings.seed, step, place])
             sample = self._augmentation.apply(self._sample(index), self.bank, generator)
-            pillars.append(encode_points(sample.points, self._preset))
+            ground = sample.ground
+            pillars.append(encode_points(ground.lowered(sample.points), self._preset))
             ids = np.array([names.index(name) for name in sample.categories], dtype=np.int64)
             targets.append(
-                encode_boxes(sample.boxes, ids, sample.weights, len(names), self._preset)
+                encode_boxes(
+                    ground.lowered(sample.boxes), ids, sample.weights, len(names), self._preset
+                )
             )
         slots_per_frame = 4 * self._preset.cells[0] * self._preset.cells[1]
         slots = [frame.slots + i * slots_per_frame for i, frame in enumerate(pillars)]

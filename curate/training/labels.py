@@ -22,8 +22,8 @@ from curate.errors import DataError
 from curate.exporters.label_file import open_label_file, read_categories, read_meta
 from curate.exporters.sqlite import refuse_leakage
 from curate.frames import Frame
+from curate.geometry.ground import GroundMap
 from curate.geometry.projection import in_view
-from curate.training.ground import GroundMap
 
 # Ground truth that looks like a category without being one: neither object nor background of it.
 NEIGHBOURS: Final = {"Van": "Car", "Person_sitting": "Pedestrian"}

@@ -7,6 +7,7 @@ import numpy as np
 from curate.geometry.boxes import bev_corners
 from curate.viewing.canvas import Canvas, Colour
 from curate.viewing.legend import (
+    HUMAN_DASHES,
     REPREDICTION_DASHES,
     STRIP_HEIGHT,
     TITLE_HEIGHT,
@@ -19,6 +20,7 @@ from curate.viewing.palette import (
     FAINT_TEXT,
     GRID,
     GROUND_TRUTH,
+    HUMAN,
     TEXT,
     height_shades,
     weight_colours,
@@ -69,6 +71,7 @@ def draw_bird_eye(
     truth_boxes: np.ndarray | None = None,
     *,
     repredictions: ShownRepredictions | None = None,
+    human_boxes: np.ndarray | None = None,
     region: Region = _DEFAULT_REGION,
     title: str = "",
 ) -> np.ndarray:
@@ -79,6 +82,7 @@ def draw_bird_eye(
         labels: coloured by weight, the highest on top, with captions where there is room.
         truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None where it is unknown.
         repredictions: dashed, in the colour of the label that each was matched with.
+        human_boxes: (h, 7) what people decided on, in long dashes; None for none.
         region: what to show, and how large.
         title: written at the top.
 
@@ -95,6 +99,8 @@ def draw_bird_eye(
         _draw_label(canvas, footprints[index], labels.colour(int(index)), emphasis[index])
     if repredictions is not None:
         _draw_repredictions(canvas, region, repredictions)
+    if human_boxes is not None:
+        canvas.dashes(_sides(human_boxes, region), HUMAN, 2.0, HUMAN_DASHES)
     if truth_boxes is not None:
         _draw_truth(canvas, region, truth_boxes)
     anchors = np.concatenate([footprints.min(axis=1), footprints.max(axis=1)], axis=1)
@@ -105,6 +111,7 @@ def draw_bird_eye(
         truth=truth_boxes is not None,
         repredictions=repredictions is not None,
         unweighted=bool(np.isnan(labels.weights).any()),
+        human=human_boxes is not None and len(human_boxes) > 0,
     )
     _draw_scale_bar(canvas, region)
     return canvas.finish()

@@ -17,6 +17,7 @@ def draw_frame(
     truth_boxes: np.ndarray | None = None,
     repredictions: ShownRepredictions | None = None,
     *,
+    human_boxes: np.ndarray | None = None,
     title: str = "",
 ) -> np.ndarray:
     """The picture.
@@ -26,6 +27,7 @@ def draw_frame(
         labels: coloured by weight.
         truth_boxes: (m, 7) ground truth in the LiDAR frame; None where it is unknown.
         repredictions: None where none are to be shown.
+        human_boxes: (h, 7) what people decided on; None for none.
         title: written at the top.
 
     Returns:
@@ -42,6 +44,7 @@ def draw_frame(
         labels,
         truth_boxes,
         repredictions=repredictions,
+        human_boxes=human_boxes,
         title=title,
         legend=False,
     )
@@ -52,6 +55,7 @@ def draw_frame(
         labels,
         truth_boxes,
         repredictions=repredictions,
+        human_boxes=human_boxes,
         region=replace(region, y_min=-half, y_max=half),
     )
     return np.concatenate([overlay, below])

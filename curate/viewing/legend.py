@@ -6,6 +6,7 @@ from curate.viewing.canvas import Canvas, Colour, text_width
 from curate.viewing.palette import (
     FAINT_TEXT,
     GROUND_TRUTH,
+    HUMAN,
     IGNORED,
     PANEL,
     TEXT,
@@ -19,6 +20,7 @@ TITLE_HEIGHT = 36
 # Lengths of a dash and a gap in pixels: line styles tell apart whose box it is.
 REPREDICTION_DASHES = (6.0, 4.0)
 TRUTH_DOTS = (1.5, 3.0)
+HUMAN_DASHES = (12.0, 3.0)
 
 _BAR_PIXELS = 150
 _GAP = 28.0
@@ -32,7 +34,12 @@ def draw_title(canvas: Canvas, title: str, note: str) -> None:
 
 
 def draw_legend(
-    canvas: Canvas, *, truth: bool, repredictions: bool = False, unweighted: bool = False
+    canvas: Canvas,
+    *,
+    truth: bool,
+    repredictions: bool = False,
+    unweighted: bool = False,
+    human: bool = False,
 ) -> None:
     """The strip at the bottom: the weight scale, and the line styles and colours that occur."""
     top = canvas.height - STRIP_HEIGHT
@@ -45,6 +52,8 @@ def draw_legend(
     if repredictions:
         left = _swatch(canvas, left, baseline, "prediction", TEXT)
         left = _swatch(canvas, left, baseline, "reprediction", TEXT, REPREDICTION_DASHES)
+    if human:
+        left = _swatch(canvas, left, baseline, "human", HUMAN, HUMAN_DASHES)
     if truth:
         _swatch(canvas, left, baseline, "ground truth", GROUND_TRUTH, TRUTH_DOTS)
 

@@ -7,6 +7,7 @@ from curate.geometry.boxes import box_corners
 from curate.geometry.projection import image_rectangles
 from curate.viewing.canvas import Canvas, Colour
 from curate.viewing.legend import (
+    HUMAN_DASHES,
     REPREDICTION_DASHES,
     STRIP_HEIGHT,
     TITLE_HEIGHT,
@@ -14,7 +15,7 @@ from curate.viewing.legend import (
     draw_legend,
     draw_title,
 )
-from curate.viewing.palette import BACKGROUND, GROUND_TRUTH, weight_colours
+from curate.viewing.palette import BACKGROUND, GROUND_TRUTH, HUMAN, weight_colours
 from curate.viewing.tags import ShownLabels, ShownRepredictions, draw_tags
 
 _LEAST_WIDTH = 1200
@@ -34,6 +35,7 @@ def draw_overlay(
     truth_boxes: np.ndarray | None = None,
     *,
     repredictions: ShownRepredictions | None = None,
+    human_boxes: np.ndarray | None = None,
     title: str = "",
     legend: bool = True,
 ) -> np.ndarray:
@@ -45,6 +47,7 @@ def draw_overlay(
         labels: coloured by weight, far ones first, with captions where there is room.
         truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None where it is unknown.
         repredictions: dashed, in the colour of the label that each was matched with.
+        human_boxes: (h, 7) what people decided on, in long dashes; None for none.
         title: written above the image.
         legend: false leaves out the strip below it, where another picture brings it.
 
@@ -74,6 +77,9 @@ def draw_overlay(
         _draw_strokes(
             canvas, strokes, labels.colour(int(index)), stroke, shade=0.22 if weight > 0 else 0.0
         )
+    if human_boxes is not None:
+        for strokes in box_strokes(human_boxes, calibration, (width, height)):
+            canvas.dashes(strokes * factor + offset, HUMAN, 2.0, HUMAN_DASHES)
     rectangles = image_rectangles(labels.boxes, calibration, (width, height))
     anchors = rectangles * factor + np.tile(offset, 2)
     bounds = np.array([0, TITLE_HEIGHT, shown[0], TITLE_HEIGHT + shown[1]])
@@ -85,6 +91,7 @@ def draw_overlay(
             truth=truth_boxes is not None,
             repredictions=repredictions is not None,
             unweighted=bool(np.isnan(labels.weights).any()),
+            human=human_boxes is not None and len(human_boxes) > 0,
         )
     return canvas.finish()
 

@@ -51,6 +51,10 @@ class ShownLabels:
         weight = f"{self.weights[index]:.2f}" if self.weights[index] > 0 else ""
         return weight, f"{self.categories[index]} {self.scores[index]:.2f}{points}"
 
+    def short_caption(self, index: int) -> str:
+        """What is written where the caption finds no room; empty for nothing."""
+        return "" if self.points is None else str(self.points[index])
+
 
 @dataclass(frozen=True)
 class ShownRepredictions:
@@ -69,7 +73,7 @@ def draw_tags(canvas: Canvas, labels: ShownLabels, anchors: np.ndarray, bounds: 
     """Writes each label's caption beside its box where there is room, high weights first.
 
     A caption that would cover another one, or more than a little of any box, is left out; where
-    the number of points alone finds room, that is written.
+    the short one, the number of points, finds room, that is written.
 
     Args:
         canvas: drawn on.
@@ -87,11 +91,9 @@ def draw_tags(canvas: Canvas, labels: ShownLabels, anchors: np.ndarray, bounds: 
             continue
         taken.append(place)
         _draw_tag(canvas, place, labels.caption(int(index)), labels.colour(int(index)))
-    if labels.points is None:
-        return
     for index in left_out:
-        short = ("", str(labels.points[index]))
-        place = _place_tag(short, index, anchors, taken, bounds)
+        short = ("", labels.short_caption(index))
+        place = _place_tag(short, index, anchors, taken, bounds) if short[1] else None
         if place is not None:
             taken.append(place)
             _draw_tag(canvas, place, short, labels.colour(index))

@@ -158,7 +158,9 @@ class Weights:
 class Policy(Protocol):
     """Weighs the labels of a round.
 
-    A policy that wants `Evidence.memory` has a further attribute, `remembers`, that is true.
+    A policy that wants `Evidence.memory` has a further attribute, `remembers`, that is true. One
+    that looks only at some of the columns category, score, iou and loss may name them in a further
+    attribute, `reads`; the others are then not read for it, and hold NaN or "".
     """
 
     @property

@@ -14,6 +14,7 @@ class Baseline:
 
     name: ClassVar[str] = "baseline"
     uses_unlabeled: ClassVar[bool] = False
+    reads: ClassVar[tuple[str, ...]] = ()
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
         """0 for every label."""

@@ -35,6 +35,11 @@ class SPSL:
         """Raises ConfigError for a setting without meaning."""
         _check(self.name, self.scope, self.quantile)
 
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The columns that it looks at."""
+        return ("loss", "category") if self.scope == "category" else ("loss",)
+
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
         """The weight of every label; 0 where no reprediction matched."""
         lambda_u = age_parameter(evidence, age, self.scope, self.quantile)
@@ -49,7 +54,8 @@ class PSPSL:
         scope: as in `SPSL`.
         quantile: as in `SPSL`.
         self_paced: false leaves the factor 1 - L / lambda out: v = rho_det of every label that
-            matched, to see what the schedule is good for.
+            matched, to see what the schedule is good for; of every label where none of the round
+            matched, for a detector without a second pass.
     """
 
     scope: Scope = "round"
@@ -62,10 +68,16 @@ class PSPSL:
         """Raises ConfigError for a setting without meaning."""
         _check(self.name, self.scope, self.quantile)
 
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The columns that it looks at."""
+        return ("loss", "category") if self.scope == "category" else ("loss",)
+
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
         """The weight of every label; 0 where no reprediction matched."""
         if not self.self_paced:
-            return Weights.without_age(np.where(evidence.matched, evidence.rho_det, 0.0))
+            asked = evidence.matched | (not evidence.matched.any())
+            return Weights.without_age(np.where(asked, evidence.rho_det, 0.0))
         lambda_u = age_parameter(evidence, age, self.scope, self.quantile)
         return Weights(evidence.rho_det * easiness(evidence.loss, lambda_u), lambda_u)
 

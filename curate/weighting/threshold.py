@@ -23,6 +23,7 @@ class Threshold:
     per_category: Mapping[str, float] = field(default_factory=dict)
     name: ClassVar[str] = "threshold"
     uses_unlabeled: ClassVar[bool] = True
+    reads: ClassVar[tuple[str, ...]] = ("category", "score")
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a threshold that is no score."""

@@ -23,6 +23,7 @@ class UDACurriculum:
 
     name: ClassVar[str] = "uda-cl"
     uses_unlabeled: ClassVar[bool] = True
+    reads: ClassVar[tuple[str, ...]] = ("loss",)
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
         """1 or 0 for every label."""

@@ -18,6 +18,7 @@ class Uniform:
 
     name: ClassVar[str] = "uniform"
     uses_unlabeled: ClassVar[bool] = True
+    reads: ClassVar[tuple[str, ...]] = ()
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
         """1 for every label."""

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import curate
-from curate.evaluation.kitti_ap import KittiEvaluation
-from curate.evaluation.kitti_rules import LOOSE_OVERLAPS, MIN_OVERLAPS
+from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
 from pipelines.assembly import device
-from pipelines.bench.grid import Job
+from pipelines.bench.grid import Job, looks_at_unlabeled
 from pipelines.bench.metered import Metered
 from pipelines.bench.results import JobResult, LabelFigures, write_result
 from pipelines.bench.settings import Bench
+from pipelines.bench.tables import RULES
 from pipelines.config import write_config
-from pipelines.evaluation import detect_val, evaluate_detections
+from pipelines.evaluation import detect_val, val_objects
 from pipelines.label_quality import label_quality
 from pipelines.methods import METHODS
 from pipelines.round import active
@@ -49,7 +49,7 @@ def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
     if job.method is None:
         reports = _share(workspace, progress)
     else:
-        reports = list(run_all(workspace, None, progress))
+        reports = list(run_all(workspace, None, progress, evidence=looks_at_unlabeled(job)))
     found = _evaluate(workspace, newest_checkpoint(workspace), progress)
     result = JobResult(
         ratio=job.ratio,
@@ -122,12 +122,13 @@ def _copy_database(source: Path, target: Path) -> None:
 
 def _evaluate(workspace: Workspace, checkpoint: Path, progress: Metered) -> Evaluated:
     """How good a detector is on val, at KITTI's overlaps and at loose ones."""
-    found = detect_val(workspace, checkpoint, progress)
-    categories = [name for name in workspace.config.dataset.categories if name in MIN_OVERLAPS]
-    rules = {"kitti": MIN_OVERLAPS, "loose": LOOSE_OVERLAPS}
+    objects = val_objects(workspace, detect_val(workspace, checkpoint, progress))
+    categories = workspace.config.dataset.categories
     figures = {
-        name: evaluate_detections(workspace, found, {each: rule[each] for each in categories})
-        for name, rule in rules.items()
+        name: evaluate(
+            *objects, min_overlaps={each: rule[each] for each in categories if each in rule}
+        )
+        for name, rule in RULES.items()
     }
     return Evaluated(
         {name: _averages(evaluation) for name, evaluation in figures.items()},

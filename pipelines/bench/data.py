@@ -3,7 +3,7 @@
 from curate.errors import DataError
 from pipelines.bench.running import Say
 from pipelines.bench.settings import SYNTHETIC, Bench
-from pipelines.progress import Progress
+from pipelines.progress import Progress, reaching
 from pipelines.workspace import open_dataset
 
 
@@ -30,13 +30,6 @@ def _simulate(
     from curate.datasets.synthetic import simulate
 
     with progress.track("simulate", frames + val) as advance:
-        done = 0
-
-        def show(now: int, _total: int) -> None:
-            nonlocal done
-            advance(now - done, "")
-            done = now
-
-        seed = bench.settings.data_seed or 0
+        seed, show = bench.settings.data_seed or 0, reaching(advance)
         simulate(bench.data, frames + val, seed, val_frames=val, workers=workers, progress=show)
     say(f"{frames} simulated training frames and {val} for validation in {bench.data}")

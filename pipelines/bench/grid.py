@@ -6,6 +6,8 @@ from pathlib import Path
 
 from pipelines.bench.settings import Axes
 from pipelines.config import Config
+from pipelines.methods import METHODS
+from pipelines.registry import POLICIES
 from pipelines.round import active
 from pipelines.stage import FrameStage
 
@@ -85,12 +87,17 @@ def waiting(axes: Axes, root: Path) -> list[Job]:
     return [job for job in unfinished if job.method is not None or job in needed]
 
 
+def looks_at_unlabeled(job: Job) -> bool:
+    """Whether it predicts and scores frames of X_u; later rounds of the baseline need not."""
+    return job.method is None or bool(POLICIES.load(METHODS[job.method].policy).uses_unlabeled)
+
+
 def work(job: Job, config: Config, sizes: Sizes) -> Mapping[str, int]:
     """Optimiser steps, and frames by stage."""
     section = config.train
     first = job.method is None
     steps = section.pretrain_steps if first else section.round_steps * config.run.rounds
-    passes = 1 if first else config.run.rounds - 1
+    passes = 1 if first else (config.run.rounds - 1) * looks_at_unlabeled(job)
     frames = passes * (sizes.train - sizes.labeled(job.ratio))
     return {TRAIN: steps, **dict.fromkeys(frame_stages(config), frames), EVALUATE: sizes.val}
 

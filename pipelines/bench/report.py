@@ -105,7 +105,8 @@ class BenchReport:
                 yield f"`{name}`: {METHODS[name].note}"
         yield (
             f"equal optimiser steps: every method trains {settings.rounds} x {settings.steps} "
-            f"steps from the same teacher, itself {settings.steps} steps on X_l; batches, "
+            f"steps from the same teacher, itself {settings.teacher_steps or settings.steps} steps "
+            "on X_l; batches, "
             "augmentation and learning rates are the same"
         )
         yield (
@@ -205,6 +206,8 @@ def command(bench: Bench) -> str:
     words.append(f"--ratios {','.join(f'{ratio:g}' for ratio in axes.ratios)}")
     words.append(f"--seeds {','.join(map(str, axes.seeds))}")
     words.append(f"--steps {settings.steps} --rounds {settings.rounds}")
+    if settings.teacher_steps is not None:
+        words.append(f"--teacher-steps {settings.teacher_steps}")
     words += [f"--set {override}" for override in settings.overrides]
     return " ".join(words)
 

@@ -1,7 +1,6 @@
 """What all cells of a bench have in common, and the configuration that follows from it."""
 
 import json
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from pydantic import ValidationError
 
 from curate.atomic import replace_file
 from curate.errors import ConfigError, DataError, WorkspaceError
-from pipelines.config import AtLeastOne, Config, Section, make_config
+from pipelines.config import AtLeastOne, Config, Section, change_setting, make_config
 from pipelines.methods import METHODS, with_method
 from pipelines.registry import TRAINABLE
 
@@ -23,7 +22,7 @@ OWN = {
     "dataset.kind": "--data",
     "dataset.root": "--data",
     "run.method": "--methods",
-    "train.pretrain_steps": "--steps",
+    "train.pretrain_steps": "--teacher-steps",
     "train.round_steps": "--steps",
     "train.threads": "--workers",
     "run.rounds": "--rounds",
@@ -42,7 +41,8 @@ class BenchSettings(Section):
         frames: training frames to simulate; None for a folder.
         val: validation frames to simulate; None for a folder.
         data_seed: of the simulation; None for a folder.
-        steps: optimiser steps of the teacher's training, and again of every round.
+        steps: optimiser steps of every round.
+        teacher_steps: of the teacher's training; None for as many.
         rounds: E.
         overrides: "section.key=value", for every method.
     """
@@ -52,6 +52,7 @@ class BenchSettings(Section):
     val: AtLeastOne | None = None
     data_seed: int | None = None
     steps: AtLeastOne = 1200
+    teacher_steps: AtLeastOne | None = None
     rounds: AtLeastOne = 2
     overrides: tuple[str, ...] = ()
 
@@ -104,7 +105,10 @@ class Bench:
         document: dict[str, Any] = {
             "dataset": {"root": self.data},
             "segmenter": {"name": "simulated" if self.simulated else "none"},
-            "train": dict.fromkeys(("pretrain_steps", "round_steps"), self.settings.steps),
+            "train": {
+                "pretrain_steps": self.settings.teacher_steps or self.settings.steps,
+                "round_steps": self.settings.steps,
+            },
             "run": {"rounds": self.settings.rounds, "seed": seed},
         }
         _merge(document, overrides)
@@ -201,25 +205,11 @@ def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
     """The overrides as a document."""
     document: dict[str, Any] = {}
     for override in overrides:
-        key, equals, text = override.partition("=")
-        path = key.strip().split(".")
-        if not equals or len(path) < 2:
-            raise ConfigError(f"--set {override}: write section.key=value")
-        if key.strip() in OWN:
-            raise ConfigError(f"--set {override}: decided by {OWN[key.strip()]}")
-        value: Any = _value(text.strip())
-        for name in reversed(path):
-            value = {name: value}
-        _merge(document, value)
+        key = override.partition("=")[0].strip()
+        if key in OWN:
+            raise ConfigError(f"--set {override}: decided by {OWN[key]}")
+        change_setting(document, override)
     return document
-
-
-def _value(text: str) -> Any:
-    """A value in TOML's notation; anything else is a string."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
 
 
 def _merge(document: dict[str, Any], other: Mapping[str, Any]) -> None:

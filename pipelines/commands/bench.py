@@ -52,9 +52,11 @@ def bench(
     ] = None,
     steps: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(
-            min=1, help="Optimiser steps of the teacher and of each round. Default: 1200."
-        ),
+        typer.Option(min=1, help="Optimiser steps of each round. Default: 1200."),
+    ] = None,
+    teacher_steps: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=1, help="Optimiser steps of the teacher. Default: those of a round."),
     ] = None,
     rounds: Annotated[
         Optional[int],  # noqa: UP045
@@ -86,7 +88,8 @@ def bench(
     share may not change. Ablations: --set train.zero_weight=background, --set solve.scope=frame.
 
     Prints tables (AP R40, recall, labels) and leaves results.md, results.json, curve.png in DIR.
-    On KITTI: --data KITTI --set segmenter.name=onnx --set segmenter.path=deeplab.onnx.
+    On KITTI: --data KITTI --set segmenter.name=onnx --set segmenter.path=deeplab.onnx --set
+    segmenter.classes=voc.
 
     Example: curate bench bench --methods baseline,pspsl --ratios 0.08 --seeds 0 --steps 300
     """
@@ -101,6 +104,7 @@ def bench(
         "val": val,
         "data_seed": data_seed,
         "steps": steps,
+        "teacher_steps": teacher_steps,
         "rounds": rounds,
         "overrides": tuple(map(_absolute, override)) if override else None,
     }

@@ -16,6 +16,9 @@ from pipelines.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from curate.datasets.kitti_labels import KittiObjects
     from curate.evaluation.kitti_ap import KittiEvaluation
     from pipelines.workspace import Workspace
 
@@ -72,11 +75,10 @@ def evaluate(
     if labels is not None and results is not None:
         if store:
             raise ConfigError("evaluate: --store needs a workspace, not --labels and --results")
-        from curate.evaluation.kitti_ap import evaluate as compare
         from curate.evaluation.kitti_folders import read_folders
 
         _, truth, answers = read_folders(labels, results, _read_ids(frames) if frames else None)
-        found = compare(truth, answers)
+        found = _compare(truth, answers)
     else:
         if round_number is not None and checkpoint is not None:
             raise ConfigError("evaluate: give --round or --checkpoint, not both")
@@ -108,7 +110,7 @@ def _evaluate_val(
 ) -> "tuple[KittiEvaluation, str]":
     """The evaluation on the val frames, and what to say of it."""
     from curate.errors import WorkspaceError
-    from pipelines.evaluation import detect_val, evaluate_detections, stored_val
+    from pipelines.evaluation import detect_val, stored_val, val_objects
     from pipelines.progress import Bar
     from pipelines.rounds import newest_checkpoint
     from pipelines.stored_evaluation import store_evaluation
@@ -122,13 +124,27 @@ def _evaluate_val(
             raise WorkspaceError(f"--checkpoint {path}: no such file")
         source = workspace.relative(path)
         answers = detect_val(workspace, path, Bar())
-    found = evaluate_detections(workspace, answers)
+    objects = val_objects(workspace, answers)
+    found = _compare(*objects)
     notes = f"{source} on {len(answers)} val frames"
     if store:
-        counts = store_evaluation(workspace, source, answers, found)
+        counts = store_evaluation(workspace, source, answers, objects, found)
         tail = ", ".join(f"{counts.get(name, 0)} {word}" for name, word in OUTCOMES.items())
         notes += f"; stored as source '{source}': {tail} objects"
     return found, notes
+
+
+def _compare(
+    labels: "Sequence[KittiObjects]", results: "Sequence[KittiObjects]"
+) -> "KittiEvaluation":
+    """The evaluation; says what takes so long where it must be compiled first."""
+    from curate.compiled import is_compiled
+    from curate.evaluation import kitti_ap, kitti_matching
+
+    kitti_ap.check_frames(labels, results)  # a fault is told alone
+    if not is_compiled(kitti_matching.tally):
+        typer.echo("compiling the evaluation, once: this takes some ten seconds", err=True)
+    return kitti_ap.evaluate(labels, results)
 
 
 def _print(figures: dict[str, Any]) -> None:

@@ -13,7 +13,9 @@ def export(
     file_format: Annotated[
         str,
         typer.Option(
-            "--format", help="sqlite, csv, coco, kitti, openpcdet, st3d, mmdet3d or module:Class."
+            "--format",
+            help="sqlite, parquet, csv, coco, kitti, openpcdet, st3d, mmdet3d, nuscenes or "
+            "module:Class.",
         ),
     ] = "sqlite",
     output: Annotated[

@@ -10,8 +10,12 @@ def init(
     directory: Annotated[Path, typer.Argument(help="Folder for the workspace.")],
     root: Annotated[Path, typer.Option(help="Folder of the data set.")],
     dataset: Annotated[
-        str, typer.Option(help="kitti, kitti-raw, folder or module:Class.")
+        str, typer.Option(help="kitti, kitti-raw, folder, nuscenes or module:Class.")
     ] = "kitti",
+    dataset_option: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(help="NAME=VALUE of the data set, such as camera=CAM_BACK; repeatable."),
+    ] = None,
     labeled: Annotated[
         str, typer.Option(help="Share of the training frames that is labeled, or a file of ids.")
     ] = "0.04",
@@ -33,15 +37,22 @@ def init(
         typer.Option(help="File or folder of a detector that you bring."),
     ] = None,
     segmenter: Annotated[
-        str, typer.Option(help="onnx, saved, simulated, degraded, none or module:Class.")
+        str, typer.Option(help="onnx, saved, instances, simulated, none or module:Class.")
     ] = "none",
     segmenter_path: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Model, or folder of saved maps."),
+        typer.Option(help="Model, folder of saved maps, or file of masks."),
     ] = None,
     segmenter_classes: Annotated[
-        str, typer.Option(help="voc, coco, cityscapes or simulated.")
-    ] = "voc",
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Whose class numbers: voc, coco, cityscapes, cityscapes-label-ids."),
+    ] = None,
+    settings: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--set", help="Any setting of curate.toml, section.key=value; repeat it for several."
+        ),
+    ] = None,
 ) -> None:
     """Make a workspace: curate.toml, curate.db, which frames are labeled, their ground truth.
 
@@ -50,17 +61,19 @@ def init(
     Example: curate init work --root data/simulated --labeled 0.06 --segmenter simulated
     """
     from curate.errors import ConfigError
-    from pipelines.config import make_config
+    from pipelines.config import change_setting, make_config
     from pipelines.setup import initialise
 
     if not root.is_dir():
         raise ConfigError(f"--root {root}: no such folder")
+    run = {"seed": seed, "priors": ("points",) if segmenter == "none" else ("points", "semantic")}
     document: dict[str, Any] = {
         "dataset": {
             "kind": dataset,
             "root": root.resolve(),
             "split_by": split_by,
             "follow_links": follow_links,
+            "options": dict(map(_option, dataset_option or ())),
         },
         "detector": {"name": detector, "path": detector_path and detector_path.resolve()},
         "segmenter": {
@@ -68,17 +81,31 @@ def init(
             "path": segmenter_path and segmenter_path.resolve(),
             "classes": segmenter_classes,
         },
-        "run": {
-            "seed": seed,
-            "priors": ("points",) if segmenter == "none" else ("points", "semantic"),
-        },
+        "run": run,
     }
+    for setting in settings or ():
+        change_setting(document, setting)
     workspace = initialise(directory, make_config(document, "curate init"), labeled, val)
     counts = {split: len(workspace.frames(split)) for split in ("labeled", "unlabeled", "val")}
     typer.echo(
         f"{workspace.root}: {counts['labeled']} labeled, {counts['unlabeled']} unlabeled and "
         f"{counts['val']} val frames; settings in curate.toml"
     )
+
+
+def _option(text: str) -> tuple[str, Any]:
+    """Name and value, which is TOML where it can be and else a text; ConfigError without a =."""
+    import tomllib
+
+    from curate.errors import ConfigError
+
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise ConfigError(f"--dataset-option {text}: give NAME=VALUE, e.g. camera=CAM_BACK")
+    try:
+        return name, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, value
 
 
 def register(app: typer.Typer) -> None:

@@ -26,17 +26,11 @@ def simulate(
     Example: curate simulate data/simulated --frames 400 --seed 0
     """
     from curate.datasets.synthetic import simulate as run
-    from pipelines.progress import Bar
+    from pipelines.progress import Bar, reaching
 
     with Bar().track("simulate", frames) as advance:
-        done = 0
-
-        def progress(now: int, _total: int) -> None:
-            nonlocal done
-            advance(now - done, "")
-            done = now
-
-        run(directory, frames, seed, val_frames=val, workers=workers, progress=progress)
+        shown = reaching(advance)
+        run(directory, frames, seed, val_frames=val, workers=workers, progress=shown)
     typer.echo(
         f"{frames} frames in {directory}, as KITTI lays them out; labels in training/label_2"
     )

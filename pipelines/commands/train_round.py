@@ -1,5 +1,7 @@
 """curate train-round: a student from the exported labels."""
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
@@ -34,7 +36,8 @@ def train_round(
     A killed training continues from its last snapshot. With --command any trainer does it: in the
     command {labels}, {output}, {teacher}, {round} and {policy} are replaced, and CURATE_LABELS,
     CURATE_OUTPUT and so on are in its environment; no shell runs it. It writes one file, {output}.
-    docs/training.md shows how v is made to count.
+    docs/training.md shows how v is made to count. Once it has trained the student that teaches the
+    next round, it is written into curate.toml, so that later rounds are trained with it too.
 
     Example: curate train-round --command "python train.py {labels} {output}"
     """
@@ -47,6 +50,25 @@ def train_round(
         train={name: value for name, value in changes.items() if value is not None},
         as_json=as_json,
     )
+    told = {"command": command, "labels_format": labels_format}
+    _remember(workspace, policy, {name: value for name, value in told.items() if value is not None})
+
+
+def _remember(folder: Path | None, policy: str | None, told: Mapping[str, str]) -> None:
+    """Writes how the next teacher was trained into curate.toml, where later rounds look."""
+    from pipelines.config_file import change_settings
+    from pipelines.workspace import CONFIG_NAME, Workspace
+
+    if not told:
+        return
+    workspace = Workspace.open(folder)
+    current = workspace.config.train.model_dump()
+    new = {name: value for name, value in told.items() if current[name] != value}
+    if new and policy in (None, workspace.config.run.method):
+        change_settings(workspace.root / CONFIG_NAME, "train", new)
+        typer.echo(
+            f"{CONFIG_NAME}: [train] now says {' and '.join(new)}, for later rounds too", err=True
+        )
 
 
 def register(app: typer.Typer) -> None:

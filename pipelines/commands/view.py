@@ -1,4 +1,4 @@
-"""curate view: a picture of one frame."""
+"""curate view: pictures or a 3D recording of frames."""
 
 from pathlib import Path
 from typing import Annotated, Optional
@@ -15,7 +15,14 @@ from pipelines.commands.options import (
 
 
 def view(
-    frame: Annotated[str, typer.Argument(help="Frame id, e.g. 000008.")],
+    frames: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Argument(metavar="FRAME...", help="Frame ids, e.g. 000008.", show_default=False),
+    ] = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="The unlabeled frames that have labels, by name.")
+    ] = False,
+    limit: Annotated[int, typer.Option(min=1, help="With --all: no more frames than this.")] = 50,
     round_number: Annotated[
         Optional[int],  # noqa: UP045
         typer.Option("--round", min=1, help="Round; default: the last with predictions."),
@@ -23,25 +30,49 @@ def view(
     policy: PolicyOption = None,
     output: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="PNG file; default: one in the workspace's folder pictures."),
+        typer.Option(help="PNG file of one frame; default: in the workspace's folder pictures."),
+    ] = None,
+    recording: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--rerun", help="Write an .rrd recording of all frames, not pictures."),
     ] = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a frame: its image and a bird's eye view with all boxes, coloured by weight.
+    """Draw frames: image and bird's eye view with all boxes, coloured by weight.
 
     Predictions are solid, repredictions dashed, ground truth dotted; ground truth of labeled and
-    val frames only. Each label tells its weight, score and LiDAR points where there is room.
+    val frames only. Each label tells its weight, score and LiDAR points where there is room. A
+    recording holds points, image, boxes and the evidence of each label, with a time line over the
+    frames; look at it with `rerun FILE` (pip install 'curate-pseudo-labels[rerun]').
 
     Example: curate view 000008 --round 1 --policy pspsl --output 000008.png
     """
+    from curate.errors import ConfigError
+    from pipelines.frame_boxes import chosen_round, labeled_by
     from pipelines.pictures import draw_view
 
-    path = draw_view(open_workspace(workspace), frame, round_number, policy, output)
-    if as_json:
-        print_json({"picture": str(path)})
+    opened = open_workspace(workspace)
+    if bool(frames) == every:
+        raise ConfigError("name frames to draw, or give --all")
+    number = chosen_round(opened, round_number)
+    method = policy or opened.config.run.method
+    names = frames or labeled_by(opened, number, method, limit)
+    if output is not None and (recording is not None or len(names) > 1):
+        raise ConfigError("--output is for the picture of one frame; leave it out")
+    if recording is not None:
+        from pipelines.recording import record_frames
+
+        path = record_frames(opened, names, number, method, recording)
+        paths, found = [path], {"recording": str(path), "frames": len(names)}
     else:
-        typer.echo(f"picture: {path}")
+        paths = [draw_view(opened, name, number, method, output) for name in names]
+        found = {"picture": str(paths[0])} if len(paths) == 1 else {"pictures": paths}
+    if as_json:
+        print_json(found)
+    else:
+        for path in paths:
+            typer.echo(f"{'recording' if recording else 'picture'}: {path}")
 
 
 def register(app: typer.Typer) -> None:

@@ -3,5 +3,6 @@ SELECT round, policy, count(*) AS labels, count(loss) AS matched,
        min(loss) AS least_loss, avg(loss) AS mean_loss, max(loss) AS greatest_loss,
        min(lambda_u) AS least_lambda, max(lambda_u) AS greatest_lambda
 FROM weighted_labels
+WHERE provenance = 'detector'
 GROUP BY round, policy
 ORDER BY round, policy

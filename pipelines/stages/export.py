@@ -1,11 +1,13 @@
 """export: the weighted labels of a round as files that trainers read."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import ColumnElement, Connection, Select, func, select
 
 import curate
 from curate.errors import WorkspaceError
@@ -17,15 +19,18 @@ from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
 from pipelines.firewall.rules import enforce
 from pipelines.progress import Progress
+from pipelines.review.human_labels import fingerprint
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.workspace import Workspace, sha256
 
 CURRENT = "labels.sqlite"
+_CHUNK = 10_000
 
 
-def settings(_workspace: Workspace, _context: RoundContext, _policy: str) -> Settings:
-    """What the exported file depends on beside weights and ground truth."""
-    return {"format": 1}
+def settings(workspace: Workspace, context: RoundContext, _policy: str) -> Settings:
+    """What the exported file depends on beside weights and ground truth: what people decided."""
+    human = fingerprint(workspace, context.number)
+    return {"format": 1} if human is None else {"format": 1, "human": human}
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
@@ -86,7 +91,7 @@ def export_as(
     """
     enforce(workspace, round_number)
     labels = label_set(workspace, round_number, policy)
-    if not labels.labels:
+    if not len(labels.labels):
         raise WorkspaceError(
             f"round {round_number} has no labels weighted by {policy}; "
             f"run `curate solve --policy {policy}`"
@@ -104,23 +109,50 @@ def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:
         policy=policy,
         code_version=curate.__version__,
     )
+    labels = StoredLabels(workspace, round_number, policy)
     with workspace.database.reading() as connection:
-        labels = _labels(connection, round_number, policy)
-        frames = _frames(connection, {label[1] for label in labels})
+        frames = _frames(connection, labels.frames(connection))
         truth = _ground_truth(connection)
     read = partial(workspace.dataset.read, points=False)
     return LabelSet(description, frames, truth, labels, read, workspace.dataset.read)
 
 
-def _labels(connection: Connection, round_number: int, policy: str) -> Sequence[bulk.Row]:
-    """The rows of `weighted_labels` of a round and policy."""
-    labels = WEIGHTED_LABELS.c
-    query = (
-        select(WEIGHTED_LABELS)
-        .where(labels.round == round_number, labels.policy == policy)
-        .order_by(labels.frame, labels.k)
-    )
-    return bulk.select(connection, query)
+@dataclass(frozen=True)
+class StoredLabels:
+    """The rows of `weighted_labels` of a round and policy, by frame and k, read as they are walked.
+
+    Attributes:
+        workspace: that holds them.
+        round_number: that made them.
+        policy: that weighted them.
+    """
+
+    workspace: Workspace
+    round_number: int
+    policy: str
+
+    def __len__(self) -> int:
+        """How many there are."""
+        with self.workspace.database.reading() as connection:
+            return int(connection.execute(self._of(func.count())).scalar_one())
+
+    def __iter__(self) -> Iterator[bulk.Row]:
+        """A few thousand at a time: two million labels would fill the memory."""
+        query = self._of(*WEIGHTED_LABELS.c).order_by(WEIGHTED_LABELS.c.frame, WEIGHTED_LABELS.c.k)
+        with self.workspace.database.reading() as connection:
+            result = connection.execution_options(stream_results=True).execute(query)
+            for rows in result.partitions(_CHUNK):
+                yield from map(tuple, rows)
+
+    def frames(self, connection: Connection) -> set[str]:
+        """The frames that have labels."""
+        query = self._of(WEIGHTED_LABELS.c.frame).distinct()
+        return {row[0] for row in bulk.select(connection, query)}
+
+    def _of(self, *columns: ColumnElement[Any]) -> Select[Any]:
+        labels = WEIGHTED_LABELS.c
+        chosen = (labels.round == self.round_number, labels.policy == self.policy)
+        return select(*columns).select_from(WEIGHTED_LABELS).where(*chosen)
 
 
 def _frames(connection: Connection, with_labels: set[str]) -> list[bulk.Row]:

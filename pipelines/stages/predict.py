@@ -1,7 +1,9 @@
 """predict: l = f(x; w), the teacher's boxes with low scores too."""
 
-from collections.abc import Iterator, Mapping
+import logging
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,8 @@ from pipelines.config import Config
 from pipelines.executors.base import FrameJob, FrameRows
 from pipelines.stage import RoundContext, Settings
 from pipelines.workspace import Workspace, open_dataset, sha256
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -45,7 +49,7 @@ def visible(frame: Frame, config: Config) -> Frame:
     """The frame as the detector sees it: only points in the camera's view, if so configured."""
     if not config.detector.camera_view:
         return frame
-    seen = in_view(frame.points[:, :3], frame.calibration, frame.image_size)
+    seen = in_view(frame.points, frame.calibration, frame.image_size)
     return frame.with_points(frame.points[seen])
 
 
@@ -53,9 +57,11 @@ def checked(found: Detections, config: Config) -> Detections:
     """The detections of the configured categories and scores, by falling score.
 
     Raises:
-        ModelError: a box is not finite or has no size.
+        ModelError: a box is not finite or has no size, or a category is written in other letters.
     """
     wanted = np.isin(found.categories, config.dataset.categories)
+    if not wanted.all():
+        _report_others(np.unique(found.categories[~wanted]).tolist(), config)
     found = found.select(wanted & (found.scores >= config.detector.minimum_score))
     numbers = np.column_stack([found.boxes, found.scores])
     wrong = ~np.isfinite(numbers).all(axis=1) | (found.boxes[:, 3:6] <= 0).any(axis=1)
@@ -65,6 +71,30 @@ def checked(found: Detections, config: Config) -> Detections:
             f"{np.round(numbers[wrong][0], 3).tolist()} (x, y, z, l, w, h, yaw, score)"
         )
     return found.select(np.argsort(-found.scores, kind="stable"))
+
+
+def _report_others(others: Sequence[str], config: Config) -> None:
+    """Says which categories are left out; ModelError where a name is ours in other letters."""
+    ours = {name.lower(): name for name in config.dataset.categories}
+    for name in others:
+        if name.lower() in ours:
+            raise ModelError(
+                f"the detector answers '{name}', the data set's category is '{ours[name.lower()]}':"
+                f' set detector.options.rename = {{"{name}" = "{ours[name.lower()]}"}}, or '
+                "dataset.categories"
+            )
+        _warn_once(name, config.dataset.categories)
+
+
+@cache
+def _warn_once(name: str, ours: tuple[str, ...]) -> None:
+    """Once per process and name."""
+    _log.warning(
+        "the detector answers '%s', none of the data set's categories (%s): such boxes are left "
+        "out; detector.options.rename of a recorded detector translates names",
+        name,
+        ", ".join(ours),
+    )
 
 
 def prediction_rows(found: Detections) -> list[tuple[object, ...]]:

@@ -6,6 +6,7 @@ from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError, WorkspaceError
 from pipelines import plan
 from pipelines.firewall.rules import enforce
+from pipelines.methods import METHODS
 from pipelines.progress import Progress
 from pipelines.rounds import is_trainable, register_checkpoint
 from pipelines.runner import Report, run_once
@@ -56,7 +57,6 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
     ]
     path = workspace.root / "checkpoints" / "round-00.safetensors"
     labels = workspace.root / "exports" / "labeled.sqlite"
-    enforce(workspace, file=labels)
 
     def make() -> Product:
         write_label_file(workspace, labels, 0, "")
@@ -64,7 +64,11 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
             labels=labels,
             output=path,
             settings=training_settings(
-                workspace, config.train.pretrain_steps, config.train.learning_rate, 0, "student"
+                workspace,
+                config.train.pretrain_steps,
+                config.train.learning_rate,
+                0,
+                METHODS["baseline"],
             ),
             start=None,
             read=workspace.dataset.read,
@@ -77,4 +81,6 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
         register_checkpoint(connection, workspace, 0, "", path)
         register_label_file(connection, workspace, labels, 0, "")
 
-    return run_once(workspace, plan.Once(0, "pretrain", ""), plan.digest(key), path, make)
+    with workspace.database.claiming_round(0, None, "pretrain"):
+        enforce(workspace, file=labels)
+        return run_once(workspace, plan.Once(0, "pretrain", ""), plan.digest(key), path, make)

@@ -46,7 +46,7 @@ class Repredict(Predict):
                 for v, ((_, found), loss) in enumerate(zip(views, losses, strict=True))
                 for row in _reprediction_rows(found, loss)
             ],
-            "consistency": _consistency_rows(losses),
+            "consistency": _consistency_rows(losses, len(job.predictions)),
         }
 
     def views(self, frame_id: str) -> list[View]:
@@ -108,9 +108,10 @@ def _reprediction_rows(found: Detections, loss: Consistency) -> list[tuple[Any, 
     return rows
 
 
-def _consistency_rows(losses: Sequence[Consistency]) -> list[tuple[Any, ...]]:
+def _consistency_rows(losses: Sequence[Consistency], count: int) -> list[tuple[Any, ...]]:
+    """A row per label; without any view each says that there is no evidence."""
     if not losses:
-        return []
+        return [(k, None, 0, 0) for k in range(count)]
     mean = mean_over_views(losses)
     return [
         (k, None if np.isnan(loss) else float(loss), len(losses), int(matched))

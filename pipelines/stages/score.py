@@ -49,7 +49,8 @@ class Score:
         """The rows of the prior's table."""
         if job.predictions is None:
             raise WorkspaceError(f"frame {job.frame} came without its predictions")
-        frame = self.dataset.read(job.frame, image=self.prior.needs_image)
+        points = getattr(self.prior, "needs_points", True)
+        frame = self.dataset.read(job.frame, points=points, image=self.prior.needs_image)
         return self.rows(self.prior.score(frame, job.predictions))
 
     def rows(self, evidence: PriorEvidence) -> FrameRows:

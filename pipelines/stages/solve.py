@@ -1,22 +1,22 @@
 """solve: the weight of every label under a policy, in closed form over the whole round."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import repeat
 
 import numpy as np
-from sqlalchemy import Connection, Select, and_, select
+from sqlalchemy import Connection
 
-from curate.detections import as_categories, empty_boxes
-from curate.errors import WorkspaceError
-from curate.weighting.base import Evidence, Memory, Policy, Weights
+from curate.weighting.base import Evidence, Policy, Weights
 from db import bulk
-from db.models import BOX_COLUMNS
 from pipelines.assembly import open_policy
+from pipelines.evidence import LabelKeys, read_evidence, read_memory, solved_fingerprint
 from pipelines.progress import Progress
-from pipelines.registry import PRIORS
+from pipelines.review.human_labels import refresh_matches
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
-from pipelines.stages.score import table_of
 from pipelines.workspace import Workspace
+
+TRUSTED = 0.5  # a label of a greater weight counts as trusted
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
@@ -40,17 +40,29 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     context, policy = job.context, job.policy
     opened = open_policy(workspace.config, policy)
     looks_back = context.number > 1 and remembers(opened)
-    keys, evidence = read_evidence(workspace, context.number, job.frames, boxes=looks_back)
+    keys, evidence = read_evidence(
+        workspace,
+        context.number,
+        job.frames,
+        boxes=looks_back,
+        columns=getattr(opened, "reads", None),
+    )
     if looks_back:
         evidence = replace(evidence, memory=read_memory(workspace, context.number - 1, policy))
     weights = opened.weigh(evidence, context.age)
-    rows = _rows(context.number, keys, policy, weights, evidence)
-    weight = bulk.table("weight")
+    counts = _counts(context.number, policy, keys, weights)
 
     def write(connection: Connection) -> None:
-        mine = (weight.c.round == context.number, weight.c.policy == policy)
-        connection.execute(weight.delete().where(*mine))
-        bulk.insert(connection, "weight", rows)
+        with bulk.replacing(connection, "weight", len(keys)):
+            for name in ("weight", "label_count"):
+                table = bulk.table(name)
+                mine = (table.c.round == context.number, table.c.policy == policy)
+                connection.execute(table.delete().where(*mine))
+            for rows in _rows(context.number, keys, policy, weights, evidence):
+                bulk.insert(connection, "weight", rows)
+        bulk.insert(connection, "label_count", counts)
+        refresh_matches(connection, context.number)
+        bulk.refresh_statistics(connection)
 
     trusted, total = int((weights.v > 0).sum()), float(weights.v.sum())
     summary = f"{len(keys)} labels, {trusted} with weight > 0, their weights sum to {total:.1f}"
@@ -63,82 +75,6 @@ def remembers(policy: Policy) -> bool:
     return bool(getattr(policy, "remembers", False))
 
 
-def read_memory(workspace: Workspace, round_number: int, policy: str) -> Memory:
-    """The labels of a round that a policy has weighed and not dropped.
-
-    Raises:
-        WorkspaceError: the policy has not weighed that round.
-    """
-    weight, prediction = bulk.table("weight"), bulk.table("prediction")
-    same = and_(*(weight.c[key] == prediction.c[key] for key in ("round", "frame_id", "k")))
-    columns = [
-        prediction.c[name] for name in ("frame_id", "category", "score", "iou", *BOX_COLUMNS)
-    ]
-    query = (
-        select(*columns, weight.c.v)
-        .select_from(weight.join(prediction, same))
-        .where(weight.c.round == round_number, weight.c.policy == policy)
-        .order_by(prediction.c.frame_id, prediction.c.k)
-    )
-    if solved_fingerprint(workspace, round_number, policy) is None:
-        raise WorkspaceError(
-            f"policy {policy} remembers round {round_number}, which it has not weighed; "
-            f"run `curate solve --policy {policy} --round {round_number}`"
-        )
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, query)
-    frame_index, category, *numbers = zip(*rows, strict=True) if rows else [()] * (5 + 7)
-    score, iou, *boxes, v = (np.array(column, dtype=np.float64) for column in numbers)
-    return Memory(
-        frame_index=np.array(frame_index, dtype=np.int64),
-        category=as_categories(category),
-        score=score,
-        iou=iou,
-        boxes=np.stack(boxes, axis=1),
-        v=v,
-    )
-
-
-def read_evidence(
-    workspace: Workspace, round_number: int, frames: Sequence[int], *, boxes: bool = False
-) -> tuple[list[tuple[int, int]], Evidence]:
-    """The evidence of all labels of some frames, and their keys (frame_id, k).
-
-    The boxes, which few policies look at, are read where they are asked for.
-    """
-    priors = workspace.config.run.priors
-    wanted = set(frames)
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, _evidence_query(round_number, priors, boxes=boxes))
-    rows = [row for row in rows if row[0] in wanted]
-    places = len(BOX_COLUMNS) if boxes else 0
-    columns = zip(*rows, strict=True) if rows else [()] * (6 + len(priors) + places)
-    frame_index, k, category, score, iou, loss, *more = columns
-    rho, box = more[: len(priors)], more[len(priors) :]
-    return list(zip(frame_index, k, strict=True)), Evidence(
-        frame_index=np.array(frame_index, dtype=np.int64),
-        category=np.array(category, dtype=np.str_),
-        score=np.array(score, dtype=np.float64),
-        loss=np.array(loss, dtype=np.float64),
-        rho={
-            PRIORS.load(prior).rho_column: np.array(column, dtype=np.float64)
-            for prior, column in zip(priors, rho, strict=True)
-        },
-        iou=np.array(iou, dtype=np.float64),
-        boxes=np.array(box, dtype=np.float64).T if boxes else empty_boxes(),
-    )
-
-
-def solved_fingerprint(workspace: Workspace, round_number: int, policy: str) -> str | None:
-    """What the stored weights of a round and policy were made from; None where there are none."""
-    task = bulk.table("task")
-    mine = {"round": round_number, "stage": "solve", "variant": policy}
-    query = select(task.c.fingerprint).where(*(task.c[name] == at for name, at in mine.items()))
-    with workspace.database.reading() as connection:
-        found = bulk.select(connection, query)
-    return found[0][0] if found else None
-
-
 def _memory_fingerprint(workspace: Workspace, context: RoundContext, policy: str) -> str | None:
     """What a policy that remembers has stored of the round before."""
     if context.number == 1 or not remembers(open_policy(workspace.config, policy)):
@@ -146,40 +82,31 @@ def _memory_fingerprint(workspace: Workspace, context: RoundContext, policy: str
     return solved_fingerprint(workspace, context.number - 1, policy)
 
 
-def _evidence_query(
-    round_number: int, priors: Sequence[str], *, boxes: bool
-) -> Select[tuple[object, ...]]:
-    prediction, consistency = bulk.table("prediction"), bulk.table("consistency")
-    tables = [bulk.table(table_of(prior)) for prior in priors]
-    source = prediction
-    for table in (consistency, *tables):
-        same = and_(*(table.c[key] == prediction.c[key] for key in ("round", "frame_id", "k")))
-        source = source.outerjoin(table, same)  # type: ignore[assignment]
-    columns = [prediction.c[name] for name in ("frame_id", "k", "category", "score", "iou")]
-    box = BOX_COLUMNS if boxes else ()
-    rho = [
-        table.c[PRIORS.load(prior).rho_column] for prior, table in zip(priors, tables, strict=True)
-    ]
-    return (
-        select(*columns, consistency.c.loss, *rho, *(prediction.c[name] for name in box))
-        .select_from(source)
-        .where(prediction.c.round == round_number)
-        .order_by(prediction.c.frame_id, prediction.c.k)
-    )
-
-
 def _rows(
-    round_number: int,
-    keys: Sequence[tuple[int, int]],
-    policy: str,
-    weights: Weights,
-    evidence: Evidence,
-) -> list[bulk.Row]:
-    ages = np.where(np.isnan(weights.lambda_u), None, weights.lambda_u).tolist()  # type: ignore[call-overload]
+    round_number: int, keys: LabelKeys, policy: str, weights: Weights, evidence: Evidence
+) -> Iterator[list[bulk.Row]]:
+    """The rows of `weight`, a block at a time."""
+    columns = (keys.frame_id, keys.k, weights.lambda_u, evidence.rho_det, weights.v)
+    for start in range(0, len(keys), bulk.BLOCK_ROWS):
+        block = slice(start, start + bulk.BLOCK_ROWS)
+        kept = ~weights.dropped[block]
+        frame_id, k, age, rho, v = (column[block][kept].tolist() for column in columns)
+        # NaN differs from itself; the database knows null.
+        ages = [None if each != each else each for each in age]  # noqa: PLR0124
+        yield list(zip(repeat(round_number), frame_id, k, repeat(policy), ages, rho, v))
+
+
+def _counts(round_number: int, policy: str, keys: LabelKeys, weights: Weights) -> list[bulk.Row]:
+    """The rows of `label_count`."""
+    kept, size = ~weights.dropped, len(keys.category_names)
+    category, v = keys.category[kept], weights.v[kept]
+    columns = [
+        np.bincount(category[chosen], minlength=size).tolist()
+        for chosen in (slice(None), v > 0, v > TRUSTED)
+    ]
+    columns.append(np.bincount(category, weights=v, minlength=size).tolist())
     return [
-        (round_number, frame_id, k, policy, age, rho, v)
-        for (frame_id, k), age, rho, v, dropped in zip(
-            keys, ages, evidence.rho_det.tolist(), weights.v.tolist(), weights.dropped, strict=True
-        )
-        if not dropped
+        (round_number, policy, name, *row)
+        for name, row in zip(keys.category_names, zip(*columns, strict=True), strict=True)
+        if row[0]
     ]

@@ -10,8 +10,8 @@ from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError
 from curate.frames import Frame
 from pipelines.assembly import device
-from pipelines.methods import TeacherMode, teacher_mode
-from pipelines.progress import Progress
+from pipelines.methods import Method, method_of
+from pipelines.progress import Progress, reaching
 from pipelines.rounds import is_trainable, register_checkpoint
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
@@ -26,7 +26,7 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
     section = workspace.config.train
     if section.command is not None:
         return {"command": section.command, "labels_format": section.labels_format}
-    teacher = teacher_mode(workspace.config, policy)
+    method = method_of(workspace.config, policy)
     return {
         **section.model_dump(
             mode="json",
@@ -39,8 +39,9 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
                 "labels_format",
             },
         ),
-        "teacher": teacher,
-        "ema_decay": section.ema_decay if teacher == "ema" else None,
+        "teacher": method.teacher,
+        "zero_weight": method.zero_weight,
+        "ema_decay": section.ema_decay if method.teacher == "ema" else None,
         "seed": context.seed,
         "device": workspace.config.detector.device,
         "checkpoint": FORMAT_VERSION,
@@ -90,7 +91,7 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
             section.round_steps,
             section.round_learning_rate,
             job.context.number,
-            teacher_mode(workspace.config, job.policy),
+            method_of(workspace.config, job.policy),
         ),
         start=job.context.teacher.path if section.start == "teacher" else None,
         read=workspace.dataset.read,
@@ -104,7 +105,7 @@ def training_settings(
     steps: int,
     learning_rate: float,
     round_number: int,
-    teacher: TeacherMode,
+    method: Method,
 ) -> "TrainingSettings":
     """The trainer's settings.
 
@@ -121,9 +122,9 @@ def training_settings(
         "unlabeled_batch_size": section.unlabeled_batch_size,
         "learning_rate": learning_rate,
         "threads": section.threads,
-        "zero_weight": section.zero_weight,
+        "zero_weight": method.zero_weight,
         "pasted": section.pasted,
-        "teacher": teacher,
+        "teacher": method.teacher,
         "ema_decay": section.ema_decay,
         "seed": workspace.config.run.seed + round_number,
         "device": device(workspace.config),
@@ -148,11 +149,9 @@ def train_with_progress(
     from curate.training.trainer import train
 
     with progress.track(output.stem, settings.steps) as advance:
-        done = 0
+        reach = reaching(advance)
 
-        def show(step: int, _steps: int, loss: float) -> None:
-            nonlocal done
-            advance(step - done, f"loss {loss:.2f}")
-            done = step
+        def show(step: int, steps: int, loss: float) -> None:
+            reach(step, steps, f"loss {loss:.2f}")
 
         return train(labels, output, settings, start=start, read=read, progress=show)

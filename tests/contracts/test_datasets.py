@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from contracts.samples import assert_one_line, assert_same, sample_of
 from dataset_layouts import write_toy_folder, write_toy_raw
+from nuscenes_scenes import write_nuscenes
 from toys import write_toy_kitti
 
 from curate.errors import DataError
@@ -18,6 +19,7 @@ SAMPLES: Mapping[str, Callable[[Path], None]] = {
     "kitti": lambda root: write_toy_kitti(root, frames=4, val=1),
     "kitti-raw": write_toy_raw,
     "folder": write_toy_folder,
+    "nuscenes": write_nuscenes,
 }
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from contracts.samples import assert_one_line, sample_of
+from scipy.spatial.transform import Rotation
 from toys import SIZES
 
 from curate.detections import CATEGORIES
@@ -23,6 +24,11 @@ from curate.exporters.base import (
     LabelSet,
 )
 from pipelines.registry import EXPORTERS
+
+# Of the LiDAR in a map, for formats that need one.
+MAP_POSE = np.eye(4)
+MAP_POSE[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.02, -0.03]).as_matrix()
+MAP_POSE[:3, 3] = [600.0, 1600.0, 1.8]
 
 # Labels by frame: category, x, y, z, length, width, height, yaw, weight, in the order of k.
 Written = Mapping[str, list[tuple]]
@@ -115,6 +121,39 @@ def read_mmdet3d(path: Path) -> Written:
     return {name: rows for name, rows in found.items() if name != "000000"}
 
 
+def read_parquet(path: Path) -> Written:
+    """The rows of the file, whose frames are those that have labels."""
+    from pyarrow import parquet
+
+    found: dict[str, list[tuple]] = {}
+    for row in parquet.read_table(path).to_pylist():
+        numbers = tuple(row[name] for name in (*BOX_COLUMNS, "weight"))
+        found.setdefault(row["frame"], []).append((row["category"], *numbers))
+    return found
+
+
+def read_nuscenes(path: Path) -> Written:
+    """Results and ignored boxes, brought back from the map."""
+    document = json.loads(path.read_text())
+    found = {}
+    for name, results in document["results"].items():
+        assert all(box["weight"] > 0 for box in results)
+        assert all(box["weight"] == 0 for box in document["ignored"][name])
+        rows = []
+        for box in sorted(results + document["ignored"][name], key=lambda box: box["k"]):
+            w, *xyz = box["rotation"]
+            turn = Rotation.from_quat([*xyz, w])
+            back = MAP_POSE[:3, :3].T @ (np.array(box["translation"]) - MAP_POSE[:3, 3])
+            ahead = MAP_POSE[:3, :3].T @ turn.apply([1.0, 0, 0])
+            width, length, height = box["size"]
+            yaw = float(np.arctan2(ahead[1], ahead[0]))
+            category = {"car": "Car", "pedestrian": "Pedestrian", "bicycle": "Cyclist"}
+            name_of = category[box["detection_name"]]
+            rows.append((name_of, *back.tolist(), length, width, height, yaw, box["weight"]))
+        found[name] = rows
+    return found
+
+
 # Reads an export back.
 SAMPLES: Mapping[str, Callable[[Path], Written]] = {
     "sqlite": read_sqlite,
@@ -124,12 +163,18 @@ SAMPLES: Mapping[str, Callable[[Path], Written]] = {
     "openpcdet": read_openpcdet,
     "st3d": read_st3d,
     "mmdet3d": read_mmdet3d,
+    "parquet": read_parquet,
+    "nuscenes": read_nuscenes,
 }
+# Packages of extras, without which an exporter is not tested.
+NEEDS = {"parquet": "pyarrow"}
 
 
 @pytest.fixture(params=sorted(EXPORTERS.classes))
 def exporter(request: pytest.FixtureRequest):
     """Every registered exporter with its default settings."""
+    if request.param in NEEDS:
+        pytest.importorskip(NEEDS[request.param], reason=f"{NEEDS[request.param]} is an extra")
     return EXPORTERS.build(request.param, offered={}, options={})
 
 
@@ -143,6 +188,10 @@ def read_back(exporter) -> Callable[[Path], Written]:
 def labels(frames) -> LabelSet:
     """A labeled frame with one object, and two unlabeled frames with five labels each."""
     rng = np.random.default_rng(0)
+    frames = [
+        replace(frame, calibration=replace(frame.calibration, lidar_to_map=MAP_POSE))
+        for frame in frames
+    ]
     names = [frame.frame_id for frame in frames]
     rows = []
     for name in names[1:]:
@@ -151,7 +200,7 @@ def labels(frames) -> LabelSet:
             box = (*rng.uniform([6, -4, -1], [30, 4, 0]).tolist(), *SIZES[category], float(k - 2))
             # Without counterpart, without priors, weight zero and one: all that there is.
             loss, points = (None, None) if k == 0 else (0.5, 12)
-            evidence = (loss, points, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "pspsl", k / 4)
+            evidence = (loss, points, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "detector", "pspsl", k / 4)
             rows.append((1, name, k, category, *box, 0.7, *evidence))
     return LabelSet(
         description=LabelFileDescription("kitti", Path("/data"), CATEGORIES, 1, "pspsl", "1"),

@@ -76,6 +76,25 @@ def test_weights_do_not_depend_on_the_order_of_the_labels(policy) -> None:
     assert got.dropped.tolist() == expected.dropped[order].tolist()
 
 
+def test_columns_that_a_policy_does_not_read_say_nothing_to_it(policy) -> None:
+    """Where it names what it reads, the rest can be left unread."""
+    labels, reads = evidence(100), getattr(policy, "reads", ("category", "score", "iou", "loss"))
+    nothing = {
+        "category": np.full(100, ""),
+        **dict.fromkeys(("score", "iou"), np.full(100, np.nan)),
+    }
+    blank = {name: column for name, column in nothing.items() if name not in reads}
+    if "loss" not in reads:
+        blank["loss"] = np.full(100, np.nan)
+    expected, got = (
+        policy.weigh(labels, Age(1, 2)),
+        policy.weigh(replace(labels, **blank), Age(1, 2)),
+    )
+    assert got.v.tolist() == expected.v.tolist()
+    assert got.dropped.tolist() == expected.dropped.tolist()
+    assert np.array_equal(got.lambda_u, expected.lambda_u, equal_nan=True)
+
+
 def test_a_policy_goes_by_its_registered_name(policy, request: pytest.FixtureRequest) -> None:
     """So that weights in the database and settings agree."""
     assert policy.name in POLICIES.classes

@@ -1,5 +1,6 @@
 """What every registered segmenter promises."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,11 +30,25 @@ def write_maps(folder: Path, frames: Sequence[Frame]) -> Path:
     return folder
 
 
+def write_instances(folder: Path, frames: Sequence[Frame]) -> Path:
+    """A file of instance masks: a rectangle per class."""
+    polygons = [[left, 5, left + 20, 5, left + 20, 35, left, 35] for left in (30, 60, 90)]
+    objects = [
+        {"image_id": frame.frame_id, "category_id": class_id, "segmentation": [polygon]}
+        for frame in frames
+        for class_id, polygon in enumerate(polygons, start=1)
+    ]
+    path = folder / "instances.json"
+    path.write_text(json.dumps(objects))
+    return path
+
+
 # Gives the file or folder from which the segmenter is made, fit for some frames.
 SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
     "onnx": lambda folder, frames: SHIPPED_SEGMENTER,
     "saved": write_maps,
     "degraded": write_maps,
+    "instances": write_instances,
 }
 
 

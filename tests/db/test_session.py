@@ -1,6 +1,7 @@
 """The database: its schema, its refusals, and its errors in our own words."""
 
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,11 +17,20 @@ from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db import bulk
 from db.models import Base
 from db.session import Database
+from db.views import drop_views
+
+ENGINES = ("sqlite", "postgresql")
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Database:
-    """An empty database."""
+def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
+    """An empty database of either kind."""
+    return Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
+
+
+@pytest.fixture
+def sqlite_database(tmp_path: Path) -> Database:
+    """An empty SQLite database."""
     return Database(f"sqlite:///{tmp_path / 'curate.db'}")
 
 
@@ -42,19 +52,18 @@ def test_migrations_make_the_tables_of_the_models(database: Database) -> None:
     assert difference == [], "make a migration: alembic -x url=... revision --autogenerate"
 
 
-def test_a_database_of_an_older_curate_is_migrated(tmp_path: Path) -> None:
+def test_a_database_of_an_older_curate_is_migrated(database: Database) -> None:
     """Its rows are kept, the new tables and views are there, and its backward step undoes it."""
-    url = f"sqlite:///{tmp_path / 'curate.db'}"
-    database = Database(url)
     _frame(database, "val")
     config = Config()
     config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
     with database.writing() as connection:
         config.attributes["connection"] = connection
+        drop_views(connection)
         command.downgrade(config, "0001")
         assert "audit" not in inspect(connection).get_table_names()
     database.close()
-    with Database(url).reading() as connection:
+    with Database(database.url).reading() as connection:
         assert connection.exec_driver_sql("SELECT count(*) FROM frame").scalar_one() == 1
         for name in ("audit", "audit_slice", "audit_bin", "evaluation", "evaluation_ap"):
             assert connection.exec_driver_sql(f"SELECT count(*) FROM {name}").scalar_one() == 0
@@ -78,10 +87,10 @@ def test_ground_truth_of_an_unlabeled_frame_cannot_be_stored(
 
 
 def test_ground_truth_is_refused_with_foreign_keys_switched_off(
-    database: Database, tmp_path: Path
+    sqlite_database: Database, tmp_path: Path
 ) -> None:
     """The sqlite3 shell, which does not check foreign keys, cannot do it either."""
-    frame_id = _frame(database, "unlabeled")
+    frame_id = _frame(sqlite_database, "unlabeled")
     with sqlite3.connect(tmp_path / "curate.db") as raw:
         raw.execute("PRAGMA foreign_keys = OFF")
         marks = ", ".join("?" * len(bulk.columns("ground_truth")))
@@ -134,10 +143,10 @@ def test_a_damaged_file_is_named_with_a_remedy(tmp_path: Path) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_a_database_of_a_newer_curate_is_refused(database: Database, tmp_path: Path) -> None:
+def test_a_database_of_a_newer_curate_is_refused(database: Database) -> None:
     """Its schema is unknown here."""
     with database.writing() as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
     database.close()
     with pytest.raises(DatabaseError, match="newer curate"):
-        Database(f"sqlite:///{tmp_path / 'curate.db'}")
+        Database(database.url)

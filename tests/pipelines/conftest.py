@@ -1,5 +1,6 @@
 """A toy workspace."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,10 +21,23 @@ def weights_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def workspace(tmp_path: Path, toy_kitti: Path, weights_file: Path) -> Workspace:
-    """Two labeled, six unlabeled and four val frames."""
-    config = make_config(toy_document(toy_kitti, weights_file), "test")
-    return initialise(tmp_path / "work", config, "0.25", "")
+def workspace(
+    tmp_path: Path, toy_kitti: Path, weights_file: Path, new_url: Callable[[], str | None]
+) -> Workspace:
+    """Two labeled, six unlabeled and four val frames, in either database."""
+    document = toy_document(toy_kitti, weights_file) | {"run": {"database": new_url()}}
+    return initialise(tmp_path / "work", make_config(document, "test"), "0.25", "")
+
+
+@pytest.fixture
+def another(workspace: Workspace, new_url: Callable[[], str | None]) -> Callable[[Path], Workspace]:
+    """A function that makes a workspace with the same settings and a database of its own."""
+
+    def make(root: Path) -> Workspace:
+        apart = workspace.with_settings("run", database=new_url())
+        return initialise(root, apart.config, "0.25", "")
+
+    return make
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from curate.errors import ConfigError, FramesFailed, LeakageError, WorkspaceErro
 from curate.geometry.overlap import bev_iou
 from pipelines.audit import EVIDENCE, POLICIES, AuditRequest, run_audit
 from pipelines.audit_folds import open_folds
+from pipelines.evidence import read_evidence
 from pipelines.progress import Silent
 from pipelines.rounds import open_round
-from pipelines.stages.solve import read_evidence
 from pipelines.workspace import Workspace
 
 BIN = "SELECT low, labels, precision FROM audit_bin WHERE category = 'all' AND policy = 'uniform'"

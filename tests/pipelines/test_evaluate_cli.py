@@ -78,6 +78,16 @@ def test_it_shows_r40_and_r11_side_by_side(curate: Curate, folders: tuple[Path, 
     assert "recall 3d > 0.7" in out
 
 
+def test_a_first_evaluation_says_that_it_is_compiled(
+    curate: Curate, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one line beside the figures, which stay JSON."""
+    monkeypatch.setattr("curate.compiled.is_compiled", lambda _kernel: False)
+    code, out, err = evaluate(curate, folders, "--json")
+    assert (code, err) == (0, "compiling the evaluation, once: this takes some ten seconds\n")
+    assert json.loads(out)["objects"]["Car"]
+
+
 def test_a_list_names_the_frames_to_compare(
     curate: Curate, folders: tuple[Path, Path], tmp_path: Path
 ) -> None:

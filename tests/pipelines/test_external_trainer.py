@@ -76,6 +76,41 @@ def test_the_student_of_a_command_teaches_the_next_round(
         assert connection.exec_driver_sql(query).scalar_one() == 18
 
 
+def test_a_command_given_by_hand_trains_later_rounds_too(
+    curate: Curate, exported: Workspace, command: str
+) -> None:
+    """It stands in curate.toml once it has trained, so that no other trainer takes its place."""
+    path = exported.root / "curate.toml"
+    path.write_text("# mine\n" + path.read_text())
+    before = path.read_text()
+    curate("train-round", "--command", python("raise SystemExit(1)"), "-w", exported.root)
+    assert path.read_text() == before
+    code, _, err = curate("train-round", "--command", command, "-w", exported.root)
+    assert code == 0
+    assert err.splitlines()[-1] == ("curate.toml: [train] now says command, for later rounds too")
+    assert path.read_text().startswith("# mine\n")
+    told = Workspace.open(exported.root)
+    assert told.config == exported.with_settings("train", command=command).config
+    done = [(each.round, each.stage) for each in run_all(told, 2, Silent()) if each.done]
+    assert (1, "train-round") not in done
+    assert (2, "train-round") in done
+    assert find_teacher(told, 3)[1].path.read_text() == "student-2"
+
+
+def test_a_student_that_teaches_nobody_is_trained_by_any_command(
+    curate: Curate, exported: Workspace, command: str
+) -> None:
+    """The student of another policy leaves curate.toml as it is."""
+    before = (exported.root / "curate.toml").read_text()
+    for name in ("solve", "export"):
+        assert curate(name, "--policy", "uniform", "-w", exported.root)[0] == 0
+    code, _, err = curate(
+        "train-round", "--policy", "uniform", "--command", command, "-w", exported.root
+    )
+    assert (code, "now says" in err) == (0, False)
+    assert (exported.root / "curate.toml").read_text() == before
+
+
 def test_what_the_trainer_prints_is_streamed(
     capfd: pytest.CaptureFixture, exported: Workspace, command: str
 ) -> None:

@@ -13,8 +13,9 @@ from curate.detectors.pillars.checkpoint import load_checkpoint
 from curate.errors import ConfigError, WorkspaceError
 from pipelines import plan
 from pipelines.config import Config, make_config, write_config
+from pipelines.evidence import read_memory
 from pipelines.executors.serial import SerialExecutor
-from pipelines.methods import METHODS, method_named, teacher_mode, with_method
+from pipelines.methods import METHODS, method_named, method_of, with_method
 from pipelines.progress import Silent
 from pipelines.registry import POLICIES
 from pipelines.round import stage
@@ -23,7 +24,6 @@ from pipelines.runner import run_frames, run_round
 from pipelines.schedule import run_all
 from pipelines.setup import initialise
 from pipelines.stage import FrameStage
-from pipelines.stages.solve import read_memory
 from pipelines.workspace import Workspace, sha256
 
 NAMES = [
@@ -82,15 +82,23 @@ def _cells(line: str) -> list[str]:
 
 
 def test_a_method_is_one_word_in_the_configuration(tmp_path: Path) -> None:
-    """The teacher follows from it, unless it is set."""
+    """Teacher and meaning of a weight of 0 follow from it, unless they are set."""
     config = make_config({"dataset": {"root": tmp_path}}, "test")
-    assert (config.run.method, teacher_mode(config, config.run.method)) == ("pspsl", "student")
+    assert config.run.method == "pspsl"
+    assert method_of(config, "pspsl") == METHODS["pspsl"]
     averaged = with_method(config, "sess")
-    assert (averaged.run.method, teacher_mode(averaged, "sess")) == ("sess", "ema")
+    assert (averaged.run.method, method_of(averaged, "sess").teacher) == ("sess", "ema")
     assert averaged.model_copy(update={"run": config.run}) == config
-    own = make_config({"dataset": {"root": tmp_path}, "train": {"teacher": "student"}}, "test")
-    assert teacher_mode(with_method(own, "sess"), "sess") == "student"
+    own = {"teacher": "student", "zero_weight": "ignore"}
+    own_config = make_config({"dataset": {"root": tmp_path}, "train": own}, "test")
+    found = method_of(with_method(own_config, "sess"), "sess")
+    assert (found.policy, found.teacher, found.zero_weight) == ("sess", "student", "ignore")
     assert method_named("mylab.rules:Mine").teacher == method_named("uniform").teacher == "student"
+
+
+def test_only_bands_of_doubt_are_ignored() -> None:
+    """ST3D and HSSDA drop what they hold to be nothing; elsewhere a weight of 0 says so."""
+    assert [name for name in NAMES if METHODS[name].zero_weight == "ignore"] == ["st3d", "hssda"]
 
 
 def test_an_unknown_method_names_the_known_ones(curate: Curate, workspace: Workspace) -> None:

@@ -12,6 +12,7 @@ from curate.errors import ConfigError
 from pipelines.named_queries import named_queries
 from pipelines.workspace import Workspace
 
+ENGINES = ("sqlite", "postgresql")
 QUERIES = named_queries()
 
 
@@ -51,7 +52,8 @@ def _rounded(rows: list[dict]) -> list[dict]:
 
 def test_the_answers_are_those_of_the_labels(curate: Curate, weighted: Path) -> None:
     """Kept labels add up to those of the view; frames fall into their splits."""
-    sql = "SELECT count(*) AS n, sum(weight > 0) AS kept, max(lambda_u) AS age FROM weighted_labels"
+    kept = "sum(CASE WHEN weight > 0 THEN 1 ELSE 0 END) AS kept"
+    sql = f"SELECT count(*) AS n, {kept}, max(lambda_u) AS age FROM weighted_labels"
     [whole] = json.loads(curate("query", sql, "--json", "-w", weighted)[1])
 
     def ask(name: str) -> list[dict]:

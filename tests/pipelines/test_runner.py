@@ -1,5 +1,6 @@
 """The runner: what is done once, what becomes stale, and what a failure costs."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,10 @@ from pipelines.round import ROUND, stage
 from pipelines.rounds import open_round
 from pipelines.runner import Report, run_frames, run_round
 from pipelines.schedule import run_all
-from pipelines.setup import initialise
 from pipelines.workspace import Workspace
 
+ENGINES = ("sqlite", "postgresql")
+NewWorkspace = Callable[[Path], Workspace]
 FRAME_STAGES = ("predict", "repredict", "points", "semantic")
 
 
@@ -111,12 +113,12 @@ def test_what_left_with_its_prediction_is_made_again(workspace: Workspace) -> No
     ],
 )
 def test_another_formula_is_applied_to_what_was_measured(
-    workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    workspace: Workspace, another: NewWorkspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     section: str, changes: dict, prior: str, rates: bool,
 ) -> None:  # fmt: skip
     """No point or pixel is counted again, and the rows are those of a run from the start."""
     run(workspace)
-    whole = initialise(tmp_path / "whole", workspace.config, "0.25", "")
+    whole = another(tmp_path / "whole")
     run(with_setting(whole, section, **changes))
     measured: list[str] = []
     for kind in (PointPrior, SemanticPrior):
@@ -257,11 +259,11 @@ def test_policies_stand_side_by_side(workspace: Workspace) -> None:
 
 
 def test_the_rows_do_not_depend_on_the_executor(
-    workspace: Workspace, tmp_path: Path, toy_kitti: Path
+    workspace: Workspace, another: NewWorkspace, tmp_path: Path
 ) -> None:
     """Two worker processes write what one serial run writes, to the last bit."""
     run(workspace)
-    other = initialise(tmp_path / "other", workspace.config, "0.25", "")
+    other = another(tmp_path / "other")
     run(with_setting(other, "run", executor="process", workers=2))
     assert dump(other) == dump(workspace)
 

@@ -1,5 +1,6 @@
 """curate view: what it draws, where it leaves it, what it refuses."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,76 @@ def test_a_wrong_call_is_one_line(
     assert code == ConfigError.exit_code
     assert word in err
     assert err.count("\n") == 1
+
+
+def test_several_frames_are_several_pictures(curate: Curate, weighted: Workspace) -> None:
+    """Named, or all with labels up to a limit."""
+    names = list(weighted.frames("unlabeled"))
+    code, out, _ = curate("view", *names[:2], "-w", weighted.root)
+    assert (code, out.count("picture: ")) == (0, 2)
+    code, out, _ = curate("view", "--all", "--limit", 3, "--json", "-w", weighted.root)
+    assert code == 0
+    pictures = json.loads(out)["pictures"]
+    assert len(pictures) == 3
+    assert all(name in path for name, path in zip(names[:3], pictures, strict=True))
+
+
+def test_a_recording_has_a_time_line_over_the_frames(
+    curate: Curate, weighted: Workspace, tmp_path: Path
+) -> None:
+    """Every label with its stored evidence; ground truth of the val frame alone."""
+    rerun = pytest.importorskip("rerun.chunk", reason="the extra [rerun] is not installed")
+    val = next(iter(weighted.frames("val")))
+    names = [*weighted.frames("unlabeled"), val]
+    path = tmp_path / "round.rrd"
+    code, out, err = curate("view", *names, "--rerun", path, "-w", weighted.root)
+    assert (code, out, err) == (0, f"recording: {path}\n", "")
+    rows = {}
+    for chunk in rerun.RrdReader(path).store().stream():
+        for row in chunk.to_record_batch().to_pylist():
+            if row.get("frame") is not None:
+                rows.setdefault((str(chunk.entity_path), row["frame"]), {}).update(row)
+    places = range(len(names))
+    assert [len(rows["/world/predictions", i]["Boxes3D:centers"]) for i in places] == [3] * 7
+    truth = [len(rows["/world/ground_truth", i]["Boxes3D:centers"]) for i in places]
+    assert truth == [0] * 6 + [3]
+    sql = "SELECT frame, loss, rho_det, weight FROM weighted_labels ORDER BY frame, k"
+    stored = json.loads(curate("query", sql, "--json", "-w", weighted.root)[1])
+    for column in ("loss", "rho_det", "weight"):
+        found = [value for i in range(6) for value in rows["/world/predictions", i][column]]
+        assert found == pytest.approx([row[column] for row in stored])
+    assert val in rows["/title", 6]["TextDocument:text"][0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        ([], "--all"),
+        (["FRAME", "--all"], "--all"),
+        (["FRAME", "--rerun", "a.rrd", "--output", "a.png"], "--output"),
+        (["--all", "--output", "a.png"], "--output"),
+    ],
+)
+def test_options_that_exclude_each_other_are_refused(
+    curate: Curate, weighted: Workspace, arguments: list[str], word: str
+) -> None:
+    """One line that names them."""
+    name = next(iter(weighted.frames("unlabeled")))
+    words = [name if each == "FRAME" else each for each in arguments]
+    code, _, err = curate("view", *words, "-w", weighted.root)
+    assert code == ConfigError.exit_code
+    assert word in err
+    assert err.count("\n") == 1
+
+
+def test_a_round_that_is_not_there_is_named(curate: Curate, weighted: Workspace) -> None:
+    """Not an empty picture."""
+    code, _, err = curate("view", "--all", "--round", 7, "-w", weighted.root)
+    assert code == WorkspaceError.exit_code
+    assert "round 7 has no predictions" in err
+    code, _, err = curate("view", "--all", "--policy", "uniform", "-w", weighted.root)
+    assert code == WorkspaceError.exit_code
+    assert "curate solve --round 1 --policy uniform" in err
 
 
 def test_without_predictions_the_remedy_is_named(curate: Curate, workspace: Workspace) -> None:

@@ -8,6 +8,7 @@ import json
 import logging
 import multiprocessing
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -74,7 +75,11 @@ def simulate(
         workers: processes; default one per core.
         progress: called with (frames done, frames).
 
+    Scripts that call it with more than one worker do so below `if __name__ == "__main__":`, since
+    each worker runs the script's other lines.
+
     Raises:
+        CurateError: a worker was killed, or the script lacks that line.
         ConfigError: a number is out of range, or the directory holds another simulation.
         DataError: the directory holds other data or cannot be written, or its simulation.json is
             damaged.
@@ -191,15 +196,20 @@ def _mapped(
     if workers <= 1:
         yield map(task, indices)
         return
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        # A worker that runs its parent's script, which calls without a main guard. The parent says
+        # so, in one line; what multiprocessing would raise here is a page per worker.
+        sys.exit(1)
     with ProcessPoolExecutor(
         workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start_worker
     ) as pool:
         try:
             yield pool.map(task, indices)
-        except BrokenProcessPool as error:
+        except BrokenProcessPool:
             raise CurateError(
-                "a simulation process was killed; run the same command again, it goes on from here"
-            ) from error
+                "a simulation process was killed, or it ran a script that calls `simulate` outside "
+                'of `if __name__ == "__main__":`; mend that, or run the same again: it goes on'
+            ) from None
         finally:
             pool.shutdown(cancel_futures=True)
 

@@ -19,8 +19,8 @@ from curate.detectors.pillars.presets import PRESETS, Preset
 from curate.errors import ModelError
 
 FORMAT = "curate-pillars"
-# Version 2 added the estimate of the IoU.
-FORMAT_VERSION = "2"
+# Version 2 added the estimate of the IoU, version 3 measures heights from the ground.
+FORMAT_VERSION = "3"
 _LENGTH_BYTES = 8  # of the number before a safetensors header, and the header's alignment
 
 # Key in the graph's metadata of the digest of the checkpoint that it was made from. The number

@@ -1,6 +1,7 @@
 """The trained pillar detector: frames in, boxes out, in ONNX Runtime on CPU and torch on a GPU."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from curate.detectors.pillars.checkpoint import (
 from curate.detectors.pillars.encoding import Pillars, decode, encode_points
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
+from curate.geometry.ground import GroundMap
 from curate.geometry.nms import nms_bev
 
 # Scores, box codes and estimated IoU of one frame.
@@ -64,7 +66,8 @@ class PillarDetector:
     def predict(self, frame: Frame) -> Detections:
         """See `curate.detectors.base.Detector`."""
         preset = self._checkpoint.preset
-        pillars = encode_points(frame.points, preset)
+        ground = GroundMap.of(frame.points)
+        pillars = encode_points(ground.lowered(frame.points), preset)
         if len(pillars.slots) == 0:
             return Detections.empty()
         answers = self._answers(pillars)
@@ -75,7 +78,8 @@ class PillarDetector:
             best = nms_bev(found.boxes[of_category], found.scores[of_category], self._nms_iou)
             kept.append(of_category[best])
         index = np.concatenate(kept)
-        return found.select(index[np.argsort(-found.scores[index], kind="stable")])
+        best_first = found.select(index[np.argsort(-found.scores[index], kind="stable")])
+        return replace(best_first, boxes=ground.raised(best_first.boxes))
 
 
 def _onnx_answers(

@@ -1,10 +1,11 @@
 """Between metres and the network: points to pillar features, boxes to targets, answers to boxes.
 
 Center-based detection after Yin et al., "Center-based 3D Object Detection and Tracking", CVPR 2021,
-on pillars after Lang et al., "PointPillars", CVPR 2019. Two things differ. The gaussian of the
-heatmap is as long, wide and turned as the object, not round. And the yaw has two codes, its doubled
+on pillars after Lang et al., "PointPillars", CVPR 2019. Three things differ. The gaussian of the
+heatmap is as long, wide and turned as the object, not round. The yaw has two codes, its doubled
 angle and the angle itself: where front and back of an object look alike the second averages out to
-nothing, the first still holds the axis.
+nothing, the first still holds the axis. And heights are measured from the ground, on which all
+objects stand: what is left to learn of an object's z is half its height.
 
 Beside score and box each cell estimates the 3D IoU of its box with the object, after Hu et al.,
 "AFDetV2", AAAI 2022; 3DIoUMatch (Wang et al., CVPR 2021) filters pseudo-labels by such an estimate.
@@ -75,9 +76,16 @@ class Targets:
 
 
 def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
-    """The pillar features of (n, 4) points in the LiDAR frame; points off the grid are left out."""
+    """The pillar features of (n, 4) points; points off the grid are left out.
+
+    Args:
+        points: in the LiDAR frame, but z measured from the ground (see `GroundMap.lowered`).
+        preset: the grid.
+    """
     x, y, z, intensity = (points[:, axis] for axis in range(4))
-    inside = _within(x, preset.x_range) & _within(y, preset.y_range) & _within(z, preset.z_range)
+    inside = (
+        _within(x, preset.x_range) & _within(y, preset.y_range) & _within(z, preset.height_range)
+    )
     x, y, z, intensity = x[inside], y[inside], z[inside], intensity[inside]
     column = ((x - preset.x_range[0]) / preset.pillar_m).astype(np.int64)
     row = ((y - preset.y_range[0]) / preset.pillar_m).astype(np.int64)
@@ -118,8 +126,8 @@ def encode_boxes(
     """The targets of one frame.
 
     Args:
-        boxes: (n, 7) in the LiDAR frame, sides positive; boxes with a centre off the grid are
-            left out.
+        boxes: (n, 7) in the LiDAR frame but z measured from the ground, sides positive; boxes
+            with a centre off the grid are left out.
         category_ids: (n,) integers in [0, count).
         weights: (n,) v in [0, 1]; 0 marks an ignore region.
         count: number of categories.
@@ -155,7 +163,7 @@ def decode(
     preset: Preset,
     minimum_score: float,
 ) -> Detections:
-    """The boxes in the network's answers, before non-maximum suppression.
+    """The boxes in the network's answers, before non-maximum suppression, z from the ground.
 
     Args:
         scores: (x cells, y cells, categories) in [0, 1]. All cells that reach the threshold answer,

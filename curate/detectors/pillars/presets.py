@@ -15,7 +15,7 @@ class Preset:
         pillar_m: edge of a pillar in metres.
         x_range: lowest and highest x in metres in the LiDAR frame.
         y_range: lowest and highest y.
-        z_range: lowest and highest z of the points that are looked at.
+        height_range: lowest and highest points that are looked at, in metres above the ground.
         pillar_channels: of the point network.
         channels: of the three scales; the first is at two pillars per cell.
         depths: convolutions per scale, after the one that goes down to it.
@@ -26,7 +26,7 @@ class Preset:
     pillar_m: float
     x_range: tuple[float, float]
     y_range: tuple[float, float]
-    z_range: tuple[float, float]
+    height_range: tuple[float, float]
     pillar_channels: int
     channels: tuple[int, int, int]
     depths: tuple[int, int, int]
@@ -50,10 +50,10 @@ PRESETS: Final = {
     preset.name: preset
     for preset in (
         Preset(
-            "small", 0.32, (0.0, 51.2), (-32.0, 32.0), (-3.5, 2.0), 16, (32, 48, 96), (1, 2, 2), 32
+            "small", 0.32, (0.0, 51.2), (-32.0, 32.0), (-1.0, 4.0), 16, (32, 48, 96), (1, 2, 2), 32
         ),
         Preset(
-            "kitti", 0.16, (0.0, 69.12), (-39.68, 39.68), (-3.5, 2.0), 32, (64, 128, 256),
+            "kitti", 0.16, (0.0, 69.12), (-39.68, 39.68), (-1.0, 4.0), 32, (64, 128, 256),
             (2, 4, 4), 64,
         ),
     )

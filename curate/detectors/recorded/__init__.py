@@ -1,4 +1,4 @@
-"""Any detector's saved answers, in place of the detector: CSV, KITTI, OpenPCDet, mmdetection3d."""
+"""Any detector's saved answers, in place of the detector: tables, and other projects' formats."""
 
 from curate.detectors.recorded.detector import RecordedDetector
 

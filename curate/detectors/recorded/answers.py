@@ -3,20 +3,30 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from curate.datasets.kitti_labels import KittiObjects
 from curate.detections import Detections, as_categories
 from curate.errors import DataError
+from curate.frames import Calibration
 from curate.geometry.similarity import wrap_angle
 
 # Metres or radians: boxes are in the LiDAR frame, not on a map.
 LARGEST = 1e6
 
-Answer = Detections | KittiObjects
-"""Of one frame; objects in KITTI's form wait for the frame's calibration."""
+
+class Placed(Protocol):
+    """Boxes in another frame of reference, waiting for the calibration of their frame."""
+
+    def in_lidar(self, calibration: Calibration) -> Detections:
+        """The boxes in the LiDAR's frame of reference; DataError where they cannot be."""
+        ...
+
+
+Answer = Detections | KittiObjects | Placed
+"""Of one frame; what is not in the LiDAR's frame of reference waits for the calibration."""
 
 Answers = Mapping[str, Answer]
 """Of one pass of a detector over a data set, by frame."""

@@ -11,8 +11,9 @@ import numpy as np
 
 from curate.datasets.kitti_labels import KittiObjects, to_detections
 from curate.detections import Detections, as_categories
-from curate.detectors.recorded.answers import Answer, Reading, as_detections
+from curate.detectors.recorded.answers import Answer, Placed, Reading, as_detections
 from curate.detectors.recorded.formats import refuse_unknown_kind, tell_kind
+from curate.detectors.recorded.parquet import ParquetRecord
 from curate.detectors.recorded.passes import PassesRecord
 from curate.detectors.recorded.table import TableRecord
 from curate.errors import ConfigError, DataError
@@ -20,10 +21,26 @@ from curate.frames import Calibration, Frame
 from curate.geometry.similarity import Similarity
 
 _log = logging.getLogger(__name__)
+# Formats with the augmented copies in the same file.
+_TABLES: Mapping[str, Callable[[Path], "Record"]] = {
+    "csv": TableRecord.read,
+    "parquet": ParquetRecord.read,
+}
+
+# What brings boxes in these axes into ours.
+_TURNS = {
+    "forward-left": Similarity(),
+    "right-forward": Similarity(rotation_rad=-np.pi / 2),
+}
 
 
 class Record(Protocol):
     """The answers for frames, and for augmented copies of them."""
+
+    @property
+    def has_views(self) -> bool:
+        """Whether augmented copies were recorded."""
+        ...
 
     def frame_ids(self) -> tuple[str, ...]:
         """The recorded frames, in sorted order."""
@@ -42,19 +59,24 @@ class RecordedDetector:
     """A `Detector` and `RecordedViews` that answers from files.
 
     Args:
-        path: a CSV file, a folder of KITTI result files, OpenPCDet's result.pkl, or mmdetection3d's
-            results (pickle of arrays, JSON, or folder of JSON).
+        path: a CSV or Parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, or
+            mmdetection3d's results (pickle of arrays, JSON, or folder of JSON), or nuScenes'
+            results (JSON).
         minimum_score: boxes below it are left out.
-        kind: of the format: csv, kitti, openpcdet, mmdetection3d, or auto to tell it by suffix and
-            contents.
-        passes: of other formats than CSV, the passes over augmented copies; see `PassesRecord`.
+        kind: of the format: csv, parquet, kitti, openpcdet, mmdetection3d, nuscenes, or auto to
+            tell it by suffix and contents.
+        passes: of other formats than these tables, the passes over augmented copies; see
+            `PassesRecord`.
         classes: the names behind numbered labels, in the order of the model.
         frame_list: a file of frame ids (relative to the folder of `path`) for results that name no
             frames.
         rename: the record's names of categories and ours, e.g. {"car": "Car"}; names that are not
             in it stay.
+        axes: of boxes in a LiDAR's frame: "forward-left" (x forward, y left), or "right-forward" as
+            nuScenes' sensor has them.
         frame_ids: of the data set; recorded frames that are not among them are reported.
-        calibration: of a frame of the data set, by its name, for views in KITTI's form.
+        calibration: of a frame of the data set, by its name, for views in KITTI's or nuScenes'
+            form.
 
     Raises:
         DataError: a file is missing or malformed, or none of its frames is in the data set.
@@ -71,13 +93,17 @@ class RecordedDetector:
         classes: Sequence[str] = (),
         frame_list: str | None = None,
         rename: Mapping[str, str] | None = None,
+        axes: str = "forward-left",
         frame_ids: Sequence[str] = (),
         calibration: Callable[[str], Calibration] | None = None,
     ) -> None:
         refuse_unknown_kind(kind)
+        if axes not in _TURNS:
+            raise ConfigError(f"detector.options.axes '{axes}': use one of {', '.join(_TURNS)}")
         self.path = Path(path)
         self.minimum_score = minimum_score
         self.rename = dict(rename or {})
+        self._turn = _TURNS[axes]
         self._calibration = calibration
         listed = self.path.parent / frame_list if frame_list else None
         self._record = _open(self.path, kind, Reading(tuple(classes), listed), passes)
@@ -104,7 +130,7 @@ class RecordedDetector:
             DataError: nothing was recorded for the frame, or what was is malformed.
         """
         views = self._record.views(frame_id)
-        if isinstance(self._record, PassesRecord) and not views:
+        if not views and not self._record.has_views:
             _warn_once(
                 f"{self.path}: no second pass over augmented copies, so no label has a consistency "
                 "loss, and methods that need one weigh every label 0: name passes in "
@@ -122,16 +148,26 @@ class RecordedDetector:
         calibration: Callable[[str], Calibration] | None,
     ) -> Detections:
         """The answer in the LiDAR frame, with our names, from the lowest score on."""
-        if isinstance(answer, KittiObjects):
+        if not isinstance(answer, Detections):
             if calibration is None:
-                raise ConfigError(f"{self.path}: KITTI results need the calibration of the frames")
-            found = to_detections(answer, calibration(frame_id))
-            place = f"{self.path}: frame {frame_id}"
-            answer = as_detections(place, found.boxes, found.scores, found.categories)
+                raise ConfigError(f"{self.path}: these results need the calibration of the frames")
+            answer = self._placed(frame_id, answer, calibration(frame_id))
+        elif self._turn != Similarity():
+            answer = replace(answer, boxes=self._turn.apply_to_boxes(answer.boxes))
         if self.rename:
             names = [self.rename.get(name, name) for name in answer.categories.tolist()]
             answer = replace(answer, categories=as_categories(names))
         return answer.select(np.flatnonzero(answer.scores >= self.minimum_score))
+
+    def _placed(
+        self, frame_id: str, answer: KittiObjects | Placed, calibration: Calibration
+    ) -> Detections:
+        """The answer in the LiDAR's frame of reference."""
+        if not isinstance(answer, KittiObjects):
+            return answer.in_lidar(calibration)
+        found = to_detections(answer, calibration)
+        place = f"{self.path}: frame {frame_id}"
+        return as_detections(place, found.boxes, found.scores, found.categories)
 
     def _report_strays(self, frame_ids: Sequence[str]) -> None:
         """Says which recorded frames the data set does not have; DataError where it has none."""
@@ -153,11 +189,11 @@ class RecordedDetector:
 
 def _open(path: Path, kind: str, reading: Reading, passes: Sequence[Mapping[str, Any]]) -> Record:
     told = tell_kind(path) if kind == "auto" else kind
-    if told != "csv":
+    if told not in _TABLES:
         return PassesRecord.read(path, told, reading, passes)
     if passes:
-        raise ConfigError(f"{path}: a CSV holds its augmented copies itself, as views 1, 2, ...")
-    return TableRecord.read(path)
+        raise ConfigError(f"{path}: a table holds its augmented copies itself, as views 1, 2, ...")
+    return _TABLES[told](path)
 
 
 @cache

@@ -8,6 +8,7 @@ from typing import Any
 from curate.detectors.recorded.answers import Answers, Reading
 from curate.detectors.recorded.kitti_results import KittiResults
 from curate.detectors.recorded.mmdetection3d import holds_boxes, read_mmdetection3d
+from curate.detectors.recorded.nuscenes import holds_results, read_nuscenes
 from curate.detectors.recorded.openpcdet import read_openpcdet
 from curate.detectors.recorded.plain_pickle import read_plain_pickle
 from curate.errors import ConfigError, DataError
@@ -16,10 +17,11 @@ _LISTS: Mapping[str, Callable[[Path, Sequence[Any], Reading], Answers]] = {
     "openpcdet": read_openpcdet,
     "mmdetection3d": read_mmdetection3d,
 }
-KINDS = ("csv", "kitti", *_LISTS)
+KINDS = ("csv", "parquet", "kitti", *_LISTS, "nuscenes")
+_LIST_SUFFIXES = (".pkl", ".pickle", ".json")
 _EXPECTED = (
-    "a .csv file, a folder of KITTI result files, OpenPCDet's result.pkl, or mmdetection3d's "
-    "results as .pkl, .json or a folder of .json"
+    "a .csv or .parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, or "
+    "mmdetection3d's results as .pkl, .json or a folder of .json, or nuScenes' results as .json"
 )
 
 
@@ -33,14 +35,14 @@ def tell_kind(path: Path) -> str:
         raise DataError(f"{path}: no such file of recorded detections")
     if path.is_dir():
         return "mmdetection3d" if any(path.glob("*.json")) else "kitti"
-    kinds = {".csv": "csv", ".pkl": "list", ".pickle": "list", ".json": "list"}
+    kinds = {".csv": "csv", ".parquet": "parquet"} | dict.fromkeys(_LIST_SUFFIXES, "list")
     if path.suffix.lower() not in kinds:
         raise DataError(f"{path}: no known record of detections; expected {_EXPECTED}")
     return kinds[path.suffix.lower()]
 
 
 def read_answers(path: Path, kind: str, reading: Reading) -> Answers:
-    """The answers of one pass in any format but CSV.
+    """The answers of one pass in any format but tables.
 
     Args:
         path: file or folder.
@@ -53,10 +55,16 @@ def read_answers(path: Path, kind: str, reading: Reading) -> Answers:
     """
     if kind == "kitti":
         return KittiResults(path)
-    entries = _read_list(path)
+    held = _read(path)
+    if holds_results(held) and kind in ("list", "nuscenes"):
+        return read_nuscenes(path, held)
+    if kind == "nuscenes":
+        raise DataError(f"{path}: no nuScenes results: an object with meta and results")
+    if not isinstance(held, list | tuple):
+        raise DataError(f"{path}: holds a {type(held).__name__}, not a list of frames")
     if kind == "list":
-        kind = _tell_list(path, entries)
-    return _LISTS[kind](path, entries, reading)
+        kind = _tell_list(path, held)
+    return _LISTS[kind](path, held, reading)
 
 
 def _tell_list(path: Path, entries: Sequence[Any]) -> str:
@@ -73,8 +81,8 @@ def _tell_list(path: Path, entries: Sequence[Any]) -> str:
     raise DataError(f"{path}: entries of no known format ({keys}); expected {_EXPECTED}")
 
 
-def _read_list(path: Path) -> Sequence[Any]:
-    """The entries of a pickle, a JSON file or a folder of JSON files."""
+def _read(path: Path) -> Any:
+    """What a pickle or a JSON file holds, or the entries of a folder of JSON files."""
     if path.is_dir():
         entries = []
         for file in sorted(path.glob("*.json")):
@@ -83,15 +91,7 @@ def _read_list(path: Path) -> Sequence[Any]:
                 raise DataError(f"{file}: holds no results of a frame")
             entries.append({"frame_id": file.stem, **entry})
         return entries
-    held = _read_json(path) if path.suffix.lower() == ".json" else read_plain_pickle(path)
-    if isinstance(held, Mapping) and "results" in held:
-        raise DataError(
-            f"{path}: nuScenes results are in the global frame and need its ego poses; save the "
-            f"detector's boxes in the LiDAR frame instead: {_EXPECTED}"
-        )
-    if not isinstance(held, list | tuple):
-        raise DataError(f"{path}: holds a {type(held).__name__}, not a list of frames")
-    return held
+    return _read_json(path) if path.suffix.lower() == ".json" else read_plain_pickle(path)
 
 
 def _read_json(path: Path) -> Any:

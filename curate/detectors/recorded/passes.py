@@ -53,6 +53,11 @@ class PassesRecord:
             augmented.append((place, similarity, read_answers(place, kind, reading)))
         return cls(path, read_answers(path, kind, reading), augmented)
 
+    @property
+    def has_views(self) -> bool:
+        """Whether there is a further pass."""
+        return bool(self.augmented)
+
     def frame_ids(self) -> tuple[str, ...]:
         """The frames of the first pass, in sorted order."""
         return tuple(sorted(self.plain))

@@ -51,6 +51,11 @@ class TableRecord:
         """The record in a file; see `read_record`."""
         return cls(path, read_record(path))
 
+    @property
+    def has_views(self) -> bool:
+        """Its columns say that it may; a copy without boxes leaves no row."""
+        return True
+
     def frame_ids(self) -> tuple[str, ...]:
         """The recorded frames, in sorted order."""
         return tuple(sorted(self.frames))

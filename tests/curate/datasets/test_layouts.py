@@ -1,5 +1,6 @@
 """Tests of KITTI raw and of the plain folder: the same frames as in KITTI's object layout."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,9 @@ def test_raw_calibration_is_named_where_it_is_wrong(tmp_path):
     ("line", "other", "message"),
     [
         ('images = "camera"\n', "", "no key images; data sets without a camera are not read"),
+        ('images = "camera"\n', "image_size = [120]\n", "image_size cannot be"),
+        ('images = "camera"\n', "image_size = [120, 0.5]\n", "image_size cannot be"),
+        ('images = "camera"\n', 'images = "camera"\nimage_size = [120, 40]\n', "leave one"),
         ('points = "lidar"\n', "", "no key points"),
         ("intensity_scale = 255\n", "intensity_scale = 0\n", "intensity_scale cannot be"),
         ("intensity_scale = 255\n", "columns = 2\n", "columns cannot be"),
@@ -82,6 +86,22 @@ def test_a_wrong_description_is_one_line(tmp_path, line, other, message):
         FolderDataset(tmp_path).read("000000")
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
+
+
+def test_frames_without_images_have_a_size(tmp_path):
+    """Points and boxes in the image need no pixels; who asks for them is told."""
+    write_toy_folder(tmp_path)
+    expected = FolderDataset(tmp_path).read("000001")
+    path = tmp_path / "dataset.toml"
+    path.write_text(path.read_text().replace('images = "camera"', "image_size = [120, 40]"))
+    shutil.rmtree(tmp_path / "camera")
+    bare = FolderDataset(tmp_path)
+    found = bare.read("000001")
+    assert (found.image_size, found.image) == (expected.image_size, None)
+    np.testing.assert_array_equal(found.points, expected.points)
+    assert len(bare.annotations("000001")) == 3
+    with pytest.raises(DataError, match=r"no key images, but the pixels of 000001 are needed"):
+        bare.read("000001", image=True)
 
 
 def test_the_calibration_may_be_a_kitti_file(tmp_path):

@@ -137,3 +137,17 @@ def test_the_slot_maximum_has_the_gradient_of_scatter_reduce():
     index = slots[:, None].expand(-1, 3)
     (torch.zeros(8, 3).scatter_reduce(0, index, values, "amax") * weights).sum().backward()
     torch.testing.assert_close(ours, values.grad)
+
+
+def test_a_sensor_mounted_higher_sees_the_same_objects_lower(small):
+    """Heights are measured from the ground: the scores stay, the boxes move with the points."""
+    rng = np.random.default_rng(3)
+    ground = np.column_stack([rng.uniform([0, -32], [51, 32], (4000, 2)), np.full(4000, -1.75)])
+    points = np.concatenate([np.column_stack([ground, np.zeros(4000)]), cloud(4000)])
+    points[:, 2] = np.maximum(points[:, 2], -1.75)
+    detector = PillarDetector(small, minimum_score=0.001)
+    best = np.arange(10)
+    found = detector.predict(frame_of(points.astype(np.float32))).select(best)
+    lower = detector.predict(frame_of((points - [0, 0, 0.5, 0]).astype(np.float32))).select(best)
+    np.testing.assert_allclose(lower.scores, found.scores, rtol=1e-3)
+    np.testing.assert_allclose(lower.boxes, found.boxes - [0, 0, 0.5, 0, 0, 0, 0], atol=1e-3)

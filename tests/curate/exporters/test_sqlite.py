@@ -34,7 +34,8 @@ def label(name, k=0, weight=0.5, **changes):
         "x": BOX[0], "y": BOX[1], "z": BOX[2], "length": BOX[3], "width": BOX[4],
         "height": BOX[5], "yaw": BOX[6], "score": 0.9, "loss": 0.2, "points": 30,
         "points_threshold": 60.0, "rho_diff": 0.5, "mask_pixels": 80, "box_pixels": 100,
-        "rho_anno": 0.8, "rho_det": 0.4, "lambda_u": 1.5, "policy": "pspsl", "weight": weight,
+        "rho_anno": 0.8, "rho_det": 0.4, "lambda_u": 1.5,
+        "provenance": "detector", "policy": "pspsl", "weight": weight,
     } | changes  # fmt: skip
     return tuple(row.values())
 
@@ -70,7 +71,7 @@ def test_the_view_has_exactly_the_documented_columns_in_order(tmp_path):
     assert names == (
         "round, frame, k, category, x, y, z, length, width, height, yaw, score, loss, points, "
         "points_threshold, rho_diff, mask_pixels, box_pixels, rho_anno, rho_det, lambda_u, "
-        "policy, weight"
+        "provenance, policy, weight"
     )
 
 

@@ -35,6 +35,25 @@ def test_only_points_before_the_camera_and_inside_the_image_are_in_view():
     assert seen.tolist() == [True, False, True, False, False, False]
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_view_is_that_of_the_projected_points(dtype):
+    """Point by point, those on the very border among them, as NumPy rounds them."""
+    generator = np.random.default_rng(0)
+    turn = np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    turned = Calibration(CAMERA.projection, CAMERA.lidar_to_camera @ np.eye(4))
+    turned.lidar_to_camera[:3, :3] @= turn
+    u, v = np.meshgrid(np.linspace(-1, 102, 104), np.linspace(-1, 82, 84))
+    rays = np.column_stack([np.ones(u.size), (50 - u.ravel()) / 100, (40 - v.ravel()) / 100])
+    border = np.concatenate([rays * depth for depth in (-3, 0.0, 0.1, 7, 80)])
+    points = np.concatenate([border @ turn, generator.normal(0, 30, (20_000, 3))]).astype(dtype)
+    for camera in (CAMERA, turned):
+        pixels, depth = project_points(points, camera)
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels < np.array(SIZE))).all(axis=1) & (depth > 0)
+        assert 1000 < inside.sum() < len(points)
+        assert np.array_equal(in_view(points, camera, SIZE), inside)
+
+
 def test_a_cube_ahead_has_the_rectangle_of_its_near_face():
     """Sides of 2 m at 9 m: plus and minus 100 / 9 pixels around the centre."""
     rectangle = image_rectangles(np.array([[10.0, 0, 0, 2, 2, 2, 0]]), CAMERA, SIZE)

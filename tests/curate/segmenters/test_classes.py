@@ -1,5 +1,8 @@
 """Tests of the tables of semantic classes."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from curate.datasets.synthetic.scene import SEMANTIC_CLASSES
@@ -22,15 +25,16 @@ def test_the_simulated_classes_are_those_of_the_simulator():
 
 def test_people_on_bicycles_are_no_pedestrians_where_the_classes_tell_them_apart():
     """Cityscapes has riders; VOC and COCO only persons, who count for both."""
-    riders = class_map("cityscapes")
-    assert not set(riders["Cyclist"]) & set(riders["Pedestrian"])
+    for name in ("cityscapes", "cityscapes-label-ids"):
+        riders = class_map(name)
+        assert not set(riders["Cyclist"]) & set(riders["Pedestrian"])
     for name in ("voc", "coco"):
         assert set(class_map(name)["Pedestrian"]) < set(class_map(name)["Cyclist"])
 
 
 def test_an_unknown_table_is_named_with_the_known_ones():
     """The error lists what can be used."""
-    with pytest.raises(ConfigError, match="unknown class set 'ade': use one of cityscapes, coco"):
+    with pytest.raises(ConfigError, match="unknown class set 'ade': use one of cityscapes, city"):
         class_map("ade")
 
 
@@ -39,3 +43,18 @@ def test_ids_that_no_map_can_hold_are_refused(one):
     """A semantic map has 8 bits per pixel."""
     with pytest.raises(ConfigError, match="of Car: an id is 0 to 255"):
         checked_classes({"Car": [one]})
+
+
+def test_the_page_shows_the_tables():
+    """docs/segmenters.md names the numbers that are built in."""
+    page = (Path(__file__).parents[3] / "docs" / "segmenters.md").read_text()
+    numbers = r" \| ([\d, ]+)" * 3
+    rows = re.findall(rf"^\| `([\w-]+)`.*?{numbers} \|$", page, re.MULTILINE)
+    shown = {
+        name: {
+            category: tuple(map(int, ids.split(",")))
+            for category, ids in zip(CATEGORIES, columns, strict=True)
+        }
+        for name, *columns in rows
+    }
+    assert shown == {name: CLASS_MAPS[name] for name in CLASS_MAPS if name != "simulated"}

@@ -7,6 +7,7 @@ from toys import toy_calibration
 
 from curate.errors import ConfigError, DataError
 from curate.frames import Frame
+from curate.segmenters.classes import class_map
 from curate.segmenters.saved import SavedSegmenter
 
 FRAME = Frame("000001", np.zeros((0, 4), np.float32), toy_calibration(), (12, 5))
@@ -43,6 +44,39 @@ def test_a_map_that_does_not_fit_is_refused(tmp_path, class_ids, message):
     with pytest.raises(DataError, match=message) as caught:
         SavedSegmenter(tmp_path, CLASSES).segment(FRAME)
     assert "000001.png" in str(caught.value)
+
+
+def test_instances_are_told_by_the_divisor(tmp_path):
+    """Cityscapes' instanceIds: class * 1000 + instance, classes without instances as they are."""
+    values = np.array([26001, 26999, 24000, 7, 255, 33001], np.uint16)
+    save(tmp_path, np.tile(values, (5, 2)))
+    classes = class_map("cityscapes-label-ids")
+    found = SavedSegmenter(tmp_path, classes, divisor=1000).segment(FRAME)
+    assert found.class_ids.dtype == np.uint8
+    assert found.class_ids[0, :6].tolist() == [26, 26, 24, 7, 255, 33]
+    with pytest.raises(DataError, match="class 330 with divisor 100"):
+        SavedSegmenter(tmp_path, classes, divisor=100).segment(FRAME)
+    with pytest.raises(ConfigError, match="divisor 1: a whole number above 1"):
+        SavedSegmenter(tmp_path, classes, divisor=1)
+
+
+@pytest.mark.parametrize(
+    ("declared", "present", "message"),
+    [
+        ("cityscapes", 26, "class 26, .* cityscapes are 0 to 18; are they cityscapes-label-ids"),
+        ("voc", 33, "class 33, .* voc are 0 to 20; are they cityscapes-label-ids"),
+        ("simulated", 13, "class 13, .* simulated are 0 to 3; are they voc or cityscapes or"),
+        ("cityscapes-label-ids", 90, "class 90, .* cityscapes-label-ids are 0 to 33$"),
+    ],
+)
+def test_maps_of_another_class_set_are_refused(tmp_path, declared, present, message):
+    """Cityscapes' label ids read as train ids would make every car a bus or nothing."""
+    class_ids = np.zeros((5, 12), np.uint8)
+    class_ids[0, :2] = present, 255
+    save(tmp_path, class_ids)
+    with pytest.raises(DataError, match=message):
+        SavedSegmenter(tmp_path, class_map(declared)).segment(FRAME)
+    assert SavedSegmenter(tmp_path, class_map("coco")).segment(FRAME).class_ids[0, 0] == present
 
 
 def test_missing_and_unreadable_maps_are_named(tmp_path):

@@ -27,7 +27,21 @@ def make_labels(toy_kitti, tmp_path):
                 if split == "labeled":
                     truth.append((frame, k, category, *box, 0.0, 0))
                 else:
-                    evidence = (0.9, 0.2, 30, 60.0, 0.5, 80, 100, 0.8, 0.4, 1.5, "pspsl", weight)
+                    evidence = (
+                        0.9,
+                        0.2,
+                        30,
+                        60.0,
+                        0.5,
+                        80,
+                        100,
+                        0.8,
+                        0.4,
+                        1.5,
+                        "detector",
+                        "pspsl",
+                        weight,
+                    )
                     labels.append((1, frame, k, category, *box, *evidence))
         write_labels(
             tmp_path / name,

@@ -229,6 +229,13 @@ def test_without_the_self_paced_term_the_priors_alone_decide():
         assert np.isnan(weights.lambda_u).all()
 
 
+def test_without_a_second_pass_the_priors_alone_weigh_every_label():
+    """Where no label has a loss, nobody was asked again; with the self-paced term all weigh 0."""
+    labels = evidence([np.nan, np.nan], [[0.5, 0.4], [0.5, 1.0]])
+    assert PSPSL(self_paced=False).weigh(labels, Age(1, 3)).v.tolist() == [0.25, 0.4]
+    assert PSPSL().weigh(labels, Age(1, 3)).v.tolist() == [0.0, 0.0]
+
+
 @pytest.mark.parametrize("name", ["rho_diff", "rho_anno"])
 def test_each_prior_alone(name):
     """The other one is not asked, so it does not count."""

@@ -26,7 +26,7 @@ from pipelines.rounds import open_round
 from pipelines.setup import initialise
 
 ROOT = Path(__file__).parents[3]
-GIVE_UP_S = 600
+GIVE_UP_S = 3600
 # Two rounds of few steps, snapshots that a kill finds, and labels although nothing was learned yet.
 OPTIONS = (
     *("--methods", "baseline,pspsl", "--ratios", "0.25", "--seeds", "3"),
@@ -109,6 +109,15 @@ def test_a_killed_grid_goes_on_and_ends_as_if_it_had_not_been(
         assert first_round(folder, Job(0.25, 3, method)) == first_round(folder, shared)
         labels = read_result(folder, Job(0.25, 3, method)).labels
         assert [each.round for each in labels] == [1, 2]
+    looked = {method: later_frames(folder, Job(0.25, 3, method)) for method in whole.axes.methods}
+    assert looked["baseline"] == 0 < looked["pspsl"]
+
+
+def later_frames(root: Path, job: Job) -> int:
+    """How many frames a cell has predicted in rounds of its own."""
+    with sqlite3.connect(job.folder(root) / "curate.db") as database:
+        query = "SELECT count(*) FROM task WHERE stage = 'predict' AND round > 1"
+        return database.execute(query).fetchone()[0]
 
 
 def make_whole(root: Path, like: Path) -> Bench:

@@ -60,6 +60,11 @@ def test_the_work_of_a_job(toy_kitti: Path, tmp_path: Path) -> None:
     assert shared == {"train": 7, "predict": 6, "repredict": 6, "points": 6, "evaluate": 4}
     cell = work(Job(0.25, 0, "pspsl"), bench.config(0, "pspsl"), sizes)
     assert cell == {"train": 21, "predict": 12, "repredict": 12, "points": 12, "evaluate": 4}
+    longer = make_bench(tmp_path / "longer", toy_kitti, steps=7, teacher_steps=20, rounds=3)
+    assert work(Job(0.25, 0), longer.config(0), sizes)["train"] == 20
+    assert work(Job(0.25, 0, "pspsl"), longer.config(0, "pspsl"), sizes)["train"] == 21
+    alone = work(Job(0.25, 0, "baseline"), bench.config(0, "baseline"), sizes)
+    assert alone == {"train": 21, "predict": 0, "repredict": 0, "points": 0, "evaluate": 4}
 
 
 def test_costs_follow_what_was_measured() -> None:

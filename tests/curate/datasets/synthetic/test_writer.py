@@ -98,6 +98,22 @@ simulate(Path({str(root)!r}), {FRAMES}, {SEED}, workers=2)
     assert not list(root.rglob("*.partial"))
 
 
+def test_a_script_without_main_guard_is_told_so(tmp_path):
+    """In the last line, without a page from every worker; nothing hangs."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from pathlib import Path\nfrom curate.datasets.synthetic import simulate\n"
+        f"simulate(Path({str(tmp_path / 'data')!r}), 3, {SEED}, workers=2)\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[4])}
+    ended = subprocess.run(
+        [sys.executable, script], env=environment, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 1
+    assert 'outside of `if __name__ == "__main__":`' in ended.stderr.splitlines()[-1]
+    assert ended.stderr.count("Traceback") == 1
+
+
 def test_a_frame_that_lost_a_file_is_made_again(simulated, tmp_path):
     """A label without its image is no whole frame."""
     simulate(tmp_path / "data", 1, SEED, workers=1)
@@ -154,7 +170,7 @@ def test_numbers_out_of_range_are_refused(tmp_path, arguments, message):
     assert not (tmp_path / "data").exists()
 
 
-def wait_until(happened, seconds=60):
+def wait_until(happened, seconds=600):
     """Polls until something happened; fails the test if it does not."""
     end = time.monotonic() + seconds
     while not happened():

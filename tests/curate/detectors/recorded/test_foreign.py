@@ -6,6 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from toys import toy_calibration
 
 from curate.datasets.kitti import KittiDataset
@@ -22,6 +23,8 @@ BOXES = np.array([
 ])  # fmt: skip
 FOUND = Detections(BOXES, np.array([0.9, 0.25]), as_categories(["Car", "Pedestrian"]))
 CLASSES = ("Pedestrian", "Cyclist", "Car")
+TO_MAP = Rotation.from_euler("zyx", [2.0, 0.02, -0.03])
+MAP_ORIGIN = np.array([600.0, 1600.0, 1.8])
 FRAMES = {"000001": FOUND, "000002": Detections.empty()}
 
 
@@ -30,7 +33,10 @@ def tilted_calibration():
     plain = toy_calibration()
     moved = plain.lidar_to_camera.copy()
     moved[:3, 3] = [0.3, -0.1, -0.27]
-    return Calibration(plain.projection, moved)
+    pose = np.eye(4)
+    pose[:3, :3] = TO_MAP.as_matrix()
+    pose[:3, 3] = MAP_ORIGIN
+    return Calibration(plain.projection, moved, pose)
 
 
 def frame(frame_id):
@@ -93,6 +99,37 @@ def write_inferencer(folder, frames=FRAMES):
     return folder
 
 
+def nuscenes(frames=FRAMES):
+    """Content of nuScenes' results: the task's names, sizes width first, in the map."""
+    names = {"Car": "car", "Pedestrian": "pedestrian"}
+    return {
+        frame_id: [
+            {
+                "sample_token": frame_id,
+                "translation": (MAP_ORIGIN + TO_MAP.apply(box[:3])).tolist(),
+                "size": [box[4], box[3], box[5]],
+                "rotation": np.roll(
+                    (TO_MAP * Rotation.from_euler("z", box[6])).as_quat(), 1
+                ).tolist(),
+                "velocity": [0.0, 0.0],
+                "detection_name": names[category],
+                "detection_score": score,
+                "attribute_name": "",
+            }
+            for box, score, category in zip(
+                found.boxes.tolist(), found.scores.tolist(), found.categories, strict=True
+            )
+        ]
+        for frame_id, found in frames.items()
+    }
+
+
+def write_nuscenes(path, frames=FRAMES):
+    """One JSON file."""
+    path.write_text(json.dumps({"meta": {"use_lidar": True}, "results": nuscenes(frames)}))
+    return path
+
+
 FORMATS = {
     "kitti": (write_kitti, {}),
     "openpcdet.pkl": (write_openpcdet, {}),
@@ -101,6 +138,7 @@ FORMATS = {
         {"classes": CLASSES, "frame_list": "order.txt"},
     ),
     "preds": (write_inferencer, {"classes": CLASSES}),
+    "nuscenes.json": (write_nuscenes, {}),
 }
 
 
@@ -228,13 +266,12 @@ def test_numbered_labels_need_their_names(tmp_path):
 @pytest.mark.parametrize(
     ("name", "held", "message"),
     [
-        ("a.json", {"meta": {}, "results": {}}, "nuScenes results are in the global frame"),
         ("a.json", {"a": 1}, "holds a dict, not a list of frames"),
         ("a.json", [], "holds no frames"),
         ("a.json", [{"a": 1}], r"no known format \(a\)"),
         ("a.json", [3], r"no known format \(int\)"),
         ("a.json", [{"boxes_lidar": []}], "no frame_id, name, score"),
-        ("a.parquet", [], "no known record of detections; expected a .csv file"),
+        ("a.feather", [], "no known record of detections; expected a .csv or .parquet file"),
     ],
 )
 def test_other_contents_are_refused_by_name(tmp_path, name, held, message):
@@ -256,7 +293,9 @@ def test_the_format_can_be_named(tmp_path):
     """An unknown name is refused, and so is a folder without results."""
     path = write_openpcdet(tmp_path / "a.pkl")
     assert len(RecordedDetector(path, kind="openpcdet").frame_ids()) == 2
-    with pytest.raises(ConfigError, match="'yolo': use one of auto, csv, kitti, openpcdet"):
+    with pytest.raises(
+        ConfigError, match="'yolo': use one of auto, csv, parquet, kitti, openpcdet"
+    ):
         RecordedDetector(path, kind="yolo")
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="holds no KITTI result files"):
@@ -271,6 +310,67 @@ def test_a_bad_result_file_fails_its_frame_alone(tmp_path):
     with pytest.raises(DataError, match=r"000003\.txt:1: 3 fields"):
         record.predict(frame("000003"))
     assert len(record.predict(frame("000001"))) == 2
+
+
+def written_results(tmp_path, boxes):
+    """A file with these results of frame 000001."""
+    (tmp_path / "a.json").write_text(json.dumps({"meta": {}, "results": {"000001": boxes}}))
+    return tmp_path / "a.json"
+
+
+BOX = nuscenes()["000001"][0]
+
+
+@pytest.mark.parametrize(
+    ("boxes", "message"),
+    [
+        ([BOX | {"size": BOX["size"][:2]}], "box 0: translation, size, rotation and"),
+        ([BOX | {"translation": [1, "far", 2]}], "box 0: translation, size, rotation and"),
+        ([BOX | {"detection_score": None}], "box 0: translation, size, rotation and"),
+        ([{"translation": [0, 0, 0]}], "box 0: no size, rotation, detection_name"),
+        ([BOX | {"sample_token": "other"}], "box 0: its sample_token is other, another"),
+        ([BOX | {"rotation": [2, 0, 0, 0]}], r"box 0: rotation .* is no unit quaternion"),
+        ([BOX | {"rotation": [0, 0, 0.6, 0.8]}], "box 0 would be tilted by .* w, x, y, z, not x"),
+        ([BOX | {"size": [3.9, 1.6, 1.5]}] * 10, "10 of 10 boxes of .* wider than long"),
+        ({"a": 1}, "expected a list of boxes, not dict"),
+    ],
+)
+def test_usual_mistakes_in_nuscenes_results_are_named(tmp_path, boxes, message):
+    """At once, with frame and box."""
+    path = written_results(tmp_path, boxes)
+    with pytest.raises(DataError, match=message) as caught:
+        RecordedDetector(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_nuscenes_results_in_the_lidar_frame_are_refused(tmp_path):
+    """They would lie hundreds of metres from the vehicle."""
+    path = written_results(tmp_path, [BOX | {"translation": [12.0, 4.0, -0.8]}])
+    with pytest.raises(DataError, match="they are in the frame of the LiDAR or vehicle") as caught:
+        RecordedDetector(path).predict(frame("000001"))
+    assert "results of 000001" in str(caught.value)
+    path = written_results(tmp_path, [BOX | {"translation": [5000.0, 4.0, -0.8]}])
+    with pytest.raises(DataError, match=r"vehicle, which is at \[600.0, 1600.0\] in the map"):
+        RecordedDetector(path).predict(frame("000001"))
+
+
+def test_nuscenes_results_need_poses(tmp_path):
+    """Which KITTI, for one, does not have."""
+    record = RecordedDetector(write_nuscenes(tmp_path / "a.json"))
+    bare = Frame("000001", np.zeros((0, 4), np.float32), toy_calibration(), (120, 40))
+    with pytest.raises(ConfigError, match="need the vehicle's poses"):
+        record.predict(bare)
+
+
+def test_what_is_no_nuscenes_result_is_said(tmp_path):
+    """Where the kind was named."""
+    (tmp_path / "a.json").write_text("[]")
+    with pytest.raises(DataError, match="no nuScenes results: an object with meta and results"):
+        RecordedDetector(tmp_path / "a.json", kind="nuscenes")
+    with pytest.raises(DataError, match="results is no object of sample tokens"):
+        (tmp_path / "a.json").write_text('{"meta": {}, "results": []}')
+        RecordedDetector(tmp_path / "a.json")
 
 
 @pytest.mark.kitti

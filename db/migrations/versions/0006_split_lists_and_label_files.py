@@ -5,8 +5,8 @@ import hashlib
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0004"
-down_revision = "0003"
+revision = "0006"
+down_revision = "0005"
 branch_labels = None
 depends_on = None
 
@@ -30,7 +30,7 @@ def upgrade() -> None:
         sa.Column("path", sa.Text(), nullable=True, comment="of the file"),
         sa.Column("frames", sa.Integer(), nullable=False, comment="how many"),
         sa.Column("sha256", sa.Text(), nullable=False, comment="of names"),
-        sa.Column("names", sa.Text(), nullable=False, comment="the sorted frame ids, one per line"),
+        sa.Column("names", sa.Text(), nullable=False, comment="the sorted names, one per line"),
         sa.PrimaryKeyConstraint("source", "name", name=op.f("pk_split_list")),
         sqlite_with_rowid=False,
     )

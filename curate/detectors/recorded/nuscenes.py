@@ -1,0 +1,163 @@
+"""nuScenes' results of the detection task: boxes in the frame of a map, by sample token.
+
+Source: nuScenes' detection task (nuscenes.org). A JSON object with `meta` and `results`, of which
+the latter maps each sample token to a list of boxes: translation (centre), size (width, length,
+height), rotation (w, x, y, z), detection_name, detection_score; velocity and attribute_name are
+left out. The well-known mistakes are refused by name: sizes in another order, a quaternion that
+begins with x, boxes in the LiDAR's frame of reference.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curate.datasets.nuscenes.names import CATEGORIES
+from curate.detections import Detections, as_categories
+from curate.detectors.recorded.answers import as_detections
+from curate.errors import DataError
+from curate.frames import Calibration
+from curate.geometry.poses import boxes_in_frame, rotation_matrices
+
+_KEYS = ("translation", "size", "rotation", "detection_name", "detection_score")
+_NUMBERS = 11  # translation, size, rotation, score
+# Whose length exceeds the width, whatever the detector.
+_LONG = ("car", "truck", "bus", "trailer", "bicycle", "motorcycle")
+# So many boxes, and so many of them wider than long, are no accident.
+_FEWEST_LONG, _MOST_WIDE = 10, 0.9
+# No box stands so far from upright, as the cosine of the angle; a misread quaternion does.
+_UPRIGHT = 0.7
+_UNIT_SLACK = 0.01
+# No LiDAR sees so far, metres; vehicles are hundreds of metres from their map's origin.
+_FARTHEST = 200.0
+
+
+@dataclass(frozen=True)
+class MapBoxes:
+    """The boxes of one frame in the frame of a map, waiting for the LiDAR's pose.
+
+    Attributes:
+        place: file and frame, for messages.
+        numbers: (n, 11) translation, size (width, length, height), rotation (w, x, y, z), score.
+        names: (n,) names of the task's classes.
+    """
+
+    place: str
+    numbers: np.ndarray
+    names: Sequence[str]
+
+    def in_lidar(self, calibration: Calibration) -> Detections:
+        """The boxes in the LiDAR's frame of reference, under our categories.
+
+        Raises:
+            DataError: they are not where the vehicle is, or no detector can have answered them.
+            ConfigError: the data set has no poses.
+        """
+        centres, sizes, turns = self.numbers[:, :3], self.numbers[:, 3:6], self.numbers[:, 6:10]
+        pose = calibration.pose_in_map()
+        away = np.linalg.norm(centres - pose[:3, 3], axis=1)
+        if len(away) and away.min() > _FARTHEST:
+            place = np.round(centres[0], 1).tolist()
+            near = np.linalg.norm(centres, axis=1).max() < _FARTHEST
+            guess = "they are in the frame of the LiDAR or vehicle" if near else "is it their frame"
+            raise DataError(
+                f"{self.place}: boxes such as {place} are {away.min():.0f} m and more from the "
+                f"vehicle, which is at {np.round(pose[:2, 3], 1).tolist()} in the map; results are "
+                f"in the frame of the map: {guess}?"
+            )
+        boxes = boxes_in_frame(centres, sizes[:, [1, 0, 2]], turns, pose)
+        names = [CATEGORIES.get(name, name) for name in self.names]
+        return as_detections(self.place, boxes, self.numbers[:, 10], as_categories(names))
+
+
+def read_nuscenes(path: Path, held: Mapping[str, Any]) -> Mapping[str, MapBoxes]:
+    """The results of each frame.
+
+    Args:
+        path: the file, for messages.
+        held: what it holds, with `results`.
+
+    Raises:
+        DataError: a result lacks a key or cannot be, or the file shows one of the usual mistakes.
+    """
+    results = held["results"]
+    if not isinstance(results, Mapping):
+        raise DataError(f"{path}: results is no object of sample tokens but {type(results)}")
+    found = {str(token): _frame(path, str(token), boxes) for token, boxes in results.items()}
+    filled = [one for one in found.values() if len(one.names)]
+    if filled:
+        numbers = np.concatenate([one.numbers for one in filled])
+        names = np.array([name for one in filled for name in one.names])
+        _refuse_swapped_sizes(path, numbers[:, 3:6], names)
+    for one in filled:
+        _refuse_rotations(one)
+    return found
+
+
+def holds_results(held: Any) -> bool:
+    """Whether the content of a JSON file looks like nuScenes' results."""
+    return isinstance(held, Mapping) and "results" in held
+
+
+def _frame(path: Path, token: str, boxes: Any) -> MapBoxes:
+    place = f"{path}: results of {token}"
+    if not isinstance(boxes, list):
+        raise DataError(f"{place}: expected a list of boxes, not {type(boxes).__name__}")
+    rows = [_row(f"{place}: box {k}", token, box) for k, box in enumerate(boxes)]
+    names = [str(box["detection_name"]) for box in boxes]
+    return MapBoxes(place, np.array(rows, dtype=np.float64).reshape(-1, _NUMBERS), names)
+
+
+def _row(place: str, token: str, box: Any) -> list[float]:
+    """The eleven numbers of a box."""
+    missing = [key for key in _KEYS if not isinstance(box, Mapping) or key not in box]
+    if missing:
+        raise DataError(f"{place}: no {', '.join(missing)}; expected {', '.join(_KEYS)}")
+    if box.get("sample_token", token) != token:
+        raise DataError(f"{place}: its sample_token is {box['sample_token']}, another frame's")
+    parts = [box[key] for key in ("translation", "size", "rotation")]
+    lengths = [len(part) if isinstance(part, list) else 0 for part in parts]
+    try:
+        numbers = [float(number) for part in parts for number in part]
+        numbers.append(float(box["detection_score"]))
+    except (TypeError, ValueError):
+        numbers = []
+    if lengths != [3, 3, 4] or not np.isfinite(numbers).all() or len(numbers) != _NUMBERS:
+        raise DataError(
+            f"{place}: translation, size, rotation and detection_score are not 3, 3, 4 and 1 "
+            "finite numbers"
+        )
+    return numbers
+
+
+def _refuse_swapped_sizes(path: Path, sizes: np.ndarray, names: np.ndarray) -> None:
+    """DataError where cars and the like are wider than long throughout."""
+    own = sizes[np.isin(names, _LONG)]
+    wide = int(np.sum(own[:, 0] > own[:, 1]))
+    if len(own) >= _FEWEST_LONG and wide > _MOST_WIDE * len(own):
+        raise DataError(
+            f"{path}: {wide} of {len(own)} boxes of {', '.join(_LONG)} would be wider than long: "
+            "nuScenes' size is width, length, height; swap the first two"
+        )
+
+
+def _refuse_rotations(found: MapBoxes) -> None:
+    """DataError at the first rotation that is no upright box's."""
+    turns = found.numbers[:, 6:10]
+    lengths = np.linalg.norm(turns, axis=1)
+    if (np.abs(lengths - 1) > _UNIT_SLACK).any():
+        k = int(np.argmax(np.abs(lengths - 1)))
+        raise DataError(
+            f"{found.place}: box {k}: rotation {turns[k].tolist()} is no unit quaternion "
+            f"(w, x, y, z), its length is {lengths[k]:.3f}"
+        )
+    upright = rotation_matrices(turns)[:, 2, 2]
+    if (upright < _UPRIGHT).any():
+        k = int(np.argmin(upright))
+        angle = np.degrees(np.arccos(np.clip(upright[k], -1, 1)))
+        raise DataError(
+            f"{found.place}: box {k} would be tilted by {angle:.0f} degrees: rotation "
+            f"{turns[k].tolist()} must be w, x, y, z, not x, y, z, w"
+        )

@@ -1,0 +1,120 @@
+"""Weighted labels as nuScenes' results of the detection task, where the data set is nuScenes.
+
+Source: nuScenes' detection task (nuscenes.org). A JSON object with `meta` and `results`: by sample
+token a list of boxes in the frame of the map, size as width, length, height, rotation as w, x, y,
+z. Beside nuScenes' own keys a box has `weight`, v, and `k`. Labels of weight 0 are not among the
+results but, in the same form, in `ignored`, which nuScenes' tools do not read. Velocities are not
+known and written as 0.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from curate.atomic import replace_file
+from curate.datasets.nuscenes.names import detection_name
+from curate.errors import ConfigError, DataError
+from curate.exporters.base import LabelSet
+from curate.exporters.objects import FrameObjects, frame_objects
+from curate.frames import Calibration
+
+_FORMAT = "curate weighted labels, nuScenes"
+
+
+class NuScenesExporter:
+    """An `Exporter` that writes the weighted labels of X_u as nuScenes' results."""
+
+    name: ClassVar[str] = "nuscenes"
+    suffix: ClassVar[str] = ".json"
+
+    def write(self, path: Path, labels: LabelSet) -> int:
+        """See `curate.exporters.base.Exporter`.
+
+        Raises:
+            ConfigError: the data set has no poses.
+            DataError: the calibration of a frame cannot be read, or a category is none of
+                nuScenes'.
+        """
+        _refuse_foreign(path)
+        results: dict[str, list[dict[str, Any]]] = {}
+        ignored: dict[str, list[dict[str, Any]]] = {}
+        for objects in frame_objects(labels):
+            if objects.labeled:
+                continue
+            boxes = _boxes(objects, labels.read(objects.frame_id).calibration)
+            results[objects.frame_id] = [box for box in boxes if box["weight"] > 0]
+            ignored[objects.frame_id] = [box for box in boxes if box["weight"] == 0]
+        about = labels.description
+        document = {
+            "meta": {
+                "use_camera": True,
+                "use_lidar": True,
+                "use_radar": False,
+                "use_map": False,
+                "use_external": False,
+                "description": _FORMAT,
+                "round": about.round,
+                "policy": about.policy,
+                "version": about.code_version,
+            },
+            "results": results,
+            "ignored": ignored,
+        }
+        replace_file(path, json.dumps(document, allow_nan=False).encode())
+        return len(labels.labels)
+
+
+def _boxes(objects: FrameObjects, calibration: Calibration) -> list[dict[str, Any]]:
+    """The labels of a frame in the frame of the map."""
+    pose = calibration.pose_in_map()
+    found = objects.detections
+    centres = found.boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    turns = _quaternions(pose, found.boxes[:, 6])
+    return [
+        {
+            "sample_token": objects.frame_id,
+            "translation": centres[k].tolist(),
+            "size": found.boxes[k, [4, 3, 5]].tolist(),
+            "rotation": turns[k].tolist(),
+            "velocity": [0.0, 0.0],
+            "detection_name": _name(objects, k),
+            "detection_score": float(found.scores[k]),
+            "attribute_name": "",
+            "weight": float(objects.weights[k]),
+            "k": k,
+        }
+        for k in range(len(found))
+    ]
+
+
+def _quaternions(pose: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    """(n, 4) w, x, y, z in the map of boxes with a yaw in the LiDAR's frame."""
+    if len(yaw) == 0:
+        return np.zeros((0, 4))
+    turns = Rotation.from_matrix(pose[:3, :3]) * Rotation.from_euler("z", yaw[:, None])
+    return np.asarray(np.atleast_2d(turns.as_quat())[:, [3, 0, 1, 2]])
+
+
+def _name(objects: FrameObjects, k: int) -> str:
+    category = str(objects.detections.categories[k])
+    name = detection_name(category)
+    if name is None:
+        raise DataError(
+            f"frame {objects.frame_id}: category {category!r} is none of nuScenes' detection task"
+        )
+    return name
+
+
+def _refuse_foreign(path: Path) -> None:
+    """ConfigError where something would be lost that is no former export."""
+    if not path.exists():
+        return
+    try:
+        known = json.loads(path.read_bytes())["meta"]["description"] == _FORMAT
+    except (OSError, ValueError, TypeError, KeyError):
+        known = False
+    if not known:
+        raise ConfigError(f"{path}: is there and is no former export; name another file")

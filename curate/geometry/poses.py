@@ -1,0 +1,65 @@
+"""Rigid poses from quaternions, and boxes in a frame of reference that is turned in all three axes.
+
+Quaternions are (w, x, y, z), scalar first, of unit length.
+"""
+
+import numpy as np
+
+from curate.geometry.similarity import wrap_angle
+
+
+def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) rotations of (n, 4) unit quaternions w, x, y, z."""
+    w, x, y, z = np.asarray(quaternions, dtype=np.float64).reshape(-1, 4).T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1),
+        ],
+        axis=1,
+    )
+
+
+def pose_matrix(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """(4, 4) from the frame of reference that stands at `translation`, turned by `quaternion`."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_matrices(quaternion)[0]
+    pose[:3, 3] = translation
+    return pose
+
+
+def invert_pose(pose: np.ndarray) -> np.ndarray:
+    """Inverse of a (4, 4) rigid pose."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def boxes_in_frame(
+    centres: np.ndarray, sizes: np.ndarray, quaternions: np.ndarray, pose: np.ndarray
+) -> np.ndarray:
+    """Boxes of an outer frame of reference (a map's) in the one that stands at `pose` (a LiDAR's).
+
+    A box keeps its yaw about the inner z: the direction of its length, seen from above. What it is
+    tilted besides, a few degrees where the ground or the sensor is, has no place in seven numbers.
+
+    Args:
+        centres: (n, 3) in the outer frame, metres.
+        sizes: (n, 3) length, width, height.
+        quaternions: (n, 4) w, x, y, z in the outer frame.
+        pose: (4, 4) inner frame to outer frame.
+
+    Returns:
+        (n, 7) x, y, z, length, width, height, yaw in the inner frame.
+    """
+    inverse = invert_pose(pose)
+    ahead = rotation_matrices(quaternions)[:, :, 0] @ inverse[:3, :3].T
+    return np.column_stack(
+        [
+            np.reshape(centres, (-1, 3)) @ inverse[:3, :3].T + inverse[:3, 3],
+            np.reshape(sizes, (-1, 3)),
+            wrap_angle(np.arctan2(ahead[:, 1], ahead[:, 0])),
+        ]
+    )

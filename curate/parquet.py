@@ -1,0 +1,21 @@
+"""Loads pyarrow's Parquet, an extra, where it is used."""
+
+from typing import Any
+
+from curate.errors import ConfigError
+
+
+def load_parquet() -> tuple[Any, Any]:
+    """The modules pyarrow and pyarrow.parquet.
+
+    Raises:
+        ConfigError: pyarrow is not installed.
+    """
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise ConfigError(
+            "Parquet needs pyarrow: pip install 'curate-pseudo-labels[parquet]'"
+        ) from None
+    return pa, parquet

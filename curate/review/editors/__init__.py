@@ -1,0 +1,1 @@
+"""The formats in which boxes go to people and come back."""

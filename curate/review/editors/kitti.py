@@ -1,0 +1,84 @@
+"""KITTI's text format: a line per box, to be edited with anything that writes KITTI labels.
+
+DIRECTORY/label_2/FRAME.txt holds a line of 15 fields per box, line i is box i of the picture;
+DIRECTORY/calib/FRAME.txt is the frame's calibration, which its camera coordinates refer to. Lines
+with a 16th field, a score, are read as well; DontCare regions are passed over.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from curate.datasets.kitti import write_calibration
+from curate.datasets.kitti_labels import (
+    DONT_CARE,
+    RESULT_FIELDS,
+    from_detections,
+    read_objects,
+    to_detections,
+    write_objects,
+)
+from curate.detections import Detections
+from curate.errors import DataError
+from curate.review.answer import EditedBox
+from curate.review.editors.base import Reader
+from curate.review.editors.names import refuse_strangers
+from curate.review.sheet import Sheet
+
+
+class KittiEditor:
+    """An `Editor` of KITTI label files."""
+
+    name: ClassVar[str] = "kitti"
+
+    def write(self, folder: Path, sheet: Sheet, read: Reader) -> None:
+        """See `curate.review.editors.base.Editor`."""
+        (folder / "calib").mkdir()
+        (folder / "label_2").mkdir()
+        for shown in sheet.frames:
+            frame = read(shown.frame)
+            labels = Detections.from_rows(
+                [(box.category, box.score, *box.box, None) for box in shown.boxes]
+            )
+            objects = from_detections(labels, frame.calibration, frame.image_size)
+            unscored = replace(objects, scores=np.full(len(labels), np.nan))
+            write_objects(folder / "label_2" / f"{shown.frame}.txt", unscored)
+            write_calibration(folder / "calib" / f"{shown.frame}.txt", frame.calibration)
+
+    def read(self, answer: Path, sheet: Sheet, read: Reader) -> Mapping[str, Sequence[EditedBox]]:
+        """See `curate.review.editors.base.Editor`."""
+        folder = answer / "label_2" if (answer / "label_2").is_dir() else answer
+        if not folder.is_dir():
+            raise DataError(f"{folder}: no such folder; name the one that holds FRAME.txt files")
+        paths = {
+            path.stem: path for path in sorted(folder.glob("*.txt")) if path.name[0] not in "._"
+        }
+        refuse_strangers(folder, paths, sheet)
+        return {name: _read_file(path, sheet, name, read) for name, path in paths.items()}
+
+
+def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[EditedBox]:
+    lines = [
+        (number, line)
+        for number, line in enumerate(_text(path).splitlines(), start=1)
+        if line.strip()
+    ]
+    scored = bool(lines) and all(len(line.split()) == RESULT_FIELDS for _, line in lines)
+    known = {*sheet.categories, DONT_CARE}
+    objects = read_objects(path, scored=scored, known=known)
+    places = [number for number, line in lines if line.split()[0] != DONT_CARE]
+    found = to_detections(objects, read(name).calibration)
+    return [
+        EditedBox(str(category), tuple(box), f"{path}:{number}")
+        for category, box, number in zip(
+            found.categories, found.boxes.tolist(), places, strict=True
+        )
+    ]
+
+
+def _text(path: Path) -> str:
+    """What is no text is refused by the reader of KITTI's files, in its own words."""
+    return path.read_bytes().decode("utf-8-sig", errors="replace")

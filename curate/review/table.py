@@ -1,0 +1,104 @@
+"""review.csv: a row per box, where a person may write what they think of it.
+
+The column `decision` takes `accept` or `reject`. The row `all` of a frame takes `accept` for all of
+its boxes that came back unchanged and on which nothing else is said. A box on which nothing is said
+and that came back unchanged counts as not looked at.
+"""
+
+import csv
+import io
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from curate.atomic import replace_file
+from curate.errors import DataError
+from curate.review.human_labels import ACCEPTED, REJECTED
+from curate.review.sheet import Sheet
+
+TABLE = "review.csv"
+COLUMNS = ("frame", "box", "asked", "category", "score", "weight", "decision")
+ALL = "all"
+_WORDS = {"accept": ACCEPTED, "accepted": ACCEPTED, "reject": REJECTED, "rejected": REJECTED}
+
+
+@dataclass
+class Words:
+    """What was said outright of a frame's boxes.
+
+    Attributes:
+        boxes: by number: accepted or rejected.
+        accept_rest: whether all others that came back unchanged are accepted.
+    """
+
+    boxes: dict[int, str] = field(default_factory=dict)
+    accept_rest: bool = False
+
+
+def write_table(folder: Path, sheet: Sheet) -> None:
+    """Writes the table with an empty column `decision`."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for frame in sheet.frames:
+        writer.writerow((frame.frame, ALL, "", "", "", "", ""))
+        for number, box in enumerate(frame.boxes, start=1):
+            asked = "yes" if box.asked else "human" if box.human else ""
+            numbers = (f"{box.score:.3f}", f"{box.weight:.3f}")
+            writer.writerow((frame.frame, number, asked, box.category, *numbers, ""))
+    replace_file(folder / TABLE, text.getvalue().encode())
+
+
+def read_table(folder: Path, sheet: Sheet) -> dict[str, Words]:
+    """What was said, by frame; nothing where the table is missing.
+
+    Raises:
+        DataError: a row names no frame or box of the review, or says something else.
+    """
+    path = folder / TABLE
+    if not path.is_file():
+        return {}
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: is not a text file (byte {error.start})") from None
+    # Spreadsheets of some countries save semicolons.
+    delimiter = ";" if ";" in text.partition("\n")[0] else ","
+    rows = csv.DictReader(io.StringIO(text), delimiter=delimiter)
+    if not {"frame", "box", "decision"} <= set(rows.fieldnames or ()):
+        raise DataError(f"{path}:1: needs the columns frame, box and decision")
+    found: dict[str, Words] = {}
+    for row in rows:
+        word = (row["decision"] or "").strip().lower()
+        if word:
+            _take(row, word, f"{path}:{rows.line_num}", sheet, found)
+    return found
+
+
+def _take(
+    row: dict[str, str], word: str, place: str, sheet: Sheet, found: dict[str, Words]
+) -> None:
+    if word not in _WORDS:
+        raise DataError(f"{place}: decision {word!r}; write accept or reject, or nothing")
+    name = _frame(row["frame"], place, sheet)
+    words = found.setdefault(name, Words())
+    if (row["box"] or "").strip().lower() == ALL:
+        if _WORDS[word] == REJECTED:
+            raise DataError(f"{place}: a frame cannot be rejected; reject its boxes")
+        words.accept_rest = True
+        return
+    count = len(next(frame for frame in sheet.frames if frame.frame == name).boxes)
+    number = int(row["box"]) if (row["box"] or "").strip().isdigit() else 0
+    if not 1 <= number <= count:
+        raise DataError(f"{place}: frame {name} has boxes 1 to {count}, not {row['box']!r}")
+    words.boxes[number] = _WORDS[word]
+
+
+def _frame(name: str, place: str, sheet: Sheet) -> str:
+    """The frame of a row; spreadsheets take leading zeros away."""
+    names = [frame.frame for frame in sheet.frames]
+    alike = [each for each in names if each.lstrip("0") == name.strip().lstrip("0")]
+    if name in names:
+        return name
+    if len(alike) != 1:
+        raise DataError(f"{place}: frame '{name}' is not in this review")
+    return alike[0]

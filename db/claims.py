@@ -1,0 +1,158 @@
+"""Claims: what one process works on, no other one touches, and who asks is told who has it.
+
+A claim is held by the kernel (a lock on a file beside an SQLite database) or by the server (an
+advisory lock of a PostgreSQL session). It thus ends with its process, however that ends, and
+nothing stale is ever left behind.
+"""
+
+import os
+import socket
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sqlalchemy import Connection, Engine, text
+
+from curate.errors import DatabaseError
+
+if TYPE_CHECKING:
+    from io import TextIOWrapper
+
+# The first of the two numbers of every advisory lock of curate: "cura" in ASCII.
+_POSTGRES_CLASS = 0x63757261
+_POSTGRES_OWNER = text("""
+    SELECT coalesce(nullif(a.application_name, ''), 'database user ' || a.usename), a.backend_start
+    FROM pg_locks AS l JOIN pg_stat_activity AS a ON a.pid = l.pid
+    WHERE l.locktype = 'advisory' AND l.granted AND l.objsubid = 2 AND l.classid = :class
+          AND l.objid = :key AND l.pid <> pg_backend_pid()
+          AND l.database = (SELECT oid FROM pg_database WHERE datname = current_database())
+    ORDER BY a.backend_start LIMIT 1
+""")
+LONGEST_NAME = 63  # bytes of an application's name that PostgreSQL keeps
+
+
+@dataclass(frozen=True)
+class Resource:
+    """Something that is claimed.
+
+    Attributes:
+        name: as the message calls it, e.g. "round 1".
+        shared: whether others may hold a shared claim of it at the same time.
+    """
+
+    name: str
+    shared: bool = False
+
+
+def round_resources(number: int, policy: str | None = None) -> tuple[Resource, ...]:
+    """What a stage claims: the whole round, or only what a policy makes of it.
+
+    The policies of a round stand side by side, so their stages share the round, which no stage can
+    then change under them.
+    """
+    if policy is None:
+        return (Resource(f"round {number}"),)
+    return (Resource(f"round {number}", shared=True), Resource(f"round {number} of {policy}"))
+
+
+@contextmanager
+def claimed(engine: Engine, resources: Sequence[Resource], purpose: str) -> Iterator[None]:
+    """Holds resources against every other process until the block ends.
+
+    Raises:
+        DatabaseError: another process has one of them; the message says which and since when.
+    """
+    owner = f"{purpose}, process {os.getpid()} on {socket.gethostname()}"
+    with ExitStack() as held:
+        if engine.dialect.name == "postgresql":
+            connection = held.enter_context(_session(engine, owner))
+            for resource in resources:
+                _claim_session(connection, resource)
+        elif engine.url.database:
+            folder = Path(f"{engine.url.database}-locks")
+            for resource in resources:
+                held.enter_context(_claimed_file(folder, resource, owner))
+        yield
+
+
+@contextmanager
+def _session(engine: Engine, owner: str) -> Iterator[Connection]:
+    """A connection of its own, which ends with its claims."""
+    connection = engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+    connection.detach()
+    with connection:
+        name = owner.encode()[:LONGEST_NAME].decode(errors="ignore")
+        set_name = text("SELECT set_config('application_name', :name, false)")
+        connection.execute(set_name, {"name": name})
+        try:
+            yield connection
+        finally:
+            # A server notices the end of a connection only a little later.
+            connection.execute(text("SELECT pg_advisory_unlock_all()"))
+
+
+def _claim_session(connection: Connection, resource: Resource) -> None:
+    place = {"class": _POSTGRES_CLASS, "key": zlib.crc32(resource.name.encode()) & 0x7FFFFFFF}
+    function = f"pg_try_advisory_lock{'_shared' if resource.shared else ''}"
+    taken = connection.execute(text(f"SELECT {function}(:class, :key)"), place).scalar_one()
+    if not taken:
+        found = connection.execute(_POSTGRES_OWNER, place).first()
+        raise _refusal(resource, f"{found[0]}, since {found[1]:%Y-%m-%d %H:%M:%S}" if found else "")
+
+
+@contextmanager
+def _claimed_file(folder: Path, resource: Resource, owner: str) -> Iterator[None]:
+    import fcntl
+
+    path = folder / "".join(c if c.isalnum() else "-" for c in resource.name)
+    mode = fcntl.LOCK_SH if resource.shared else fcntl.LOCK_EX
+    with _opened(path) as file:
+        if not _try_lock(file, mode):
+            raise _refusal(resource, _file_owner(path))
+        if not resource.shared:
+            file.truncate(0)
+            file.write(f"{owner}, since {datetime.now().astimezone():%Y-%m-%d %H:%M:%S}")
+            file.flush()
+        yield
+
+
+def _opened(path: Path) -> "TextIOWrapper":
+    try:
+        path.parent.mkdir(exist_ok=True)
+        return path.open("a+", encoding="utf-8")
+    except OSError as error:
+        raise DatabaseError(
+            f"{path}: {error.strerror}; give yourself write permission on the database's folder"
+        ) from error
+
+
+def _try_lock(file: "TextIOWrapper", mode: int) -> bool:
+    import fcntl
+
+    try:
+        fcntl.flock(file, mode | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _file_owner(path: Path) -> str:
+    """Who holds a file, or one of those that share it: each of them holds another one alone."""
+    import fcntl
+
+    for other in (path, *sorted(path.parent.glob(f"{path.name}-*"))):
+        with other.open(encoding="utf-8") as file:
+            if not _try_lock(file, fcntl.LOCK_SH):
+                return file.read()
+    return ""
+
+
+def _refusal(resource: Resource, owner: str) -> DatabaseError:
+    return DatabaseError(
+        f"{resource.name} is being worked on by {owner or 'another process'}; "
+        "wait until it has ended, or end it"
+    )

@@ -1,0 +1,185 @@
+"""What is known of the labels of a round, read from the database in columns.
+
+Every table of evidence is scanned once in the order of its key and one column at a time: a join of
+them costs a seek per label and table, and rows of many columns cost an object per value at once.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import BigInteger, ColumnElement, Connection, Select, and_, cast, select
+
+from curate.detections import as_categories, empty_boxes
+from curate.errors import WorkspaceError
+from curate.weighting.base import Evidence, Memory
+from db import bulk
+from db.models import BOX_COLUMNS
+from pipelines.registry import PRIORS
+from pipelines.stages.score import table_of
+from pipelines.workspace import Workspace
+
+_K_BITS = 32
+
+
+@dataclass(frozen=True)
+class LabelKeys:
+    """The keys and categories of the n labels of some frames, by frame and k.
+
+    Attributes:
+        frame_id: (n,) int64.
+        k: (n,) int64.
+        category: (n,) int64 place in `category_names`.
+        category_names: those that occur.
+    """
+
+    frame_id: np.ndarray
+    k: np.ndarray
+    category: np.ndarray
+    category_names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.k)
+
+
+def read_evidence(
+    workspace: Workspace,
+    round_number: int,
+    frames: Sequence[int],
+    *,
+    boxes: bool = False,
+    columns: Collection[str] | None = None,
+) -> tuple[LabelKeys, Evidence]:
+    """The evidence of all labels of some frames, and their keys.
+
+    Args:
+        workspace: see `Workspace`.
+        round_number: e.
+        frames: keys of the frames.
+        boxes: whether to read the boxes, which few policies look at.
+        columns: of "category", "score", "iou" and "loss", those to read; None for all. The others
+            are NaN, or "" for the category.
+    """
+    wanted = {"category", "score", "iou", "loss"} if columns is None else set(columns)
+    with workspace.database.reading() as connection:
+        scan = _Scan(connection, round_number, frames)
+        keys = scan.keys()
+        names = as_categories(keys.category_names) if "category" in wanted else None
+        rho = {}
+        for prior in workspace.config.run.priors:
+            column = PRIORS.load(prior).rho_column
+            rho[column] = scan.numbers(table_of(prior), column)
+        return keys, Evidence(
+            frame_index=keys.frame_id,
+            category=scan.blank("") if names is None else names[keys.category],
+            score=scan.numbers("prediction", "score") if "score" in wanted else scan.blank(),
+            loss=scan.numbers("consistency", "loss") if "loss" in wanted else scan.blank(),
+            rho=rho,
+            iou=scan.numbers("prediction", "iou") if "iou" in wanted else scan.blank(),
+            boxes=scan.boxes() if boxes else empty_boxes(),
+        )
+
+
+class _Scan:
+    """Reads columns of a round, aligned with the predictions of some frames."""
+
+    def __init__(self, connection: Connection, round_number: int, frames: Sequence[int]) -> None:
+        self._connection = connection
+        self._round = round_number
+        self._all = self._read_keys("prediction")
+        wanted = np.isin(self._all >> _K_BITS, np.asarray(frames, dtype=np.int64))
+        self._wanted = slice(None) if wanted.all() else np.flatnonzero(wanted)
+
+    def keys(self) -> LabelKeys:
+        """Keys and categories."""
+        own = self._all[self._wanted]
+        category, names = self._categories()
+        return LabelKeys(own >> _K_BITS, own & ((1 << _K_BITS) - 1), category, names)
+
+    def numbers(self, table: str, column: str) -> np.ndarray:
+        """(n,) float64; NaN for null, and where the table has no row of a label."""
+        found = bulk.numbers(self._connection, self._ordered(table, bulk.table(table).c[column]))
+        if len(found) != len(self._all):
+            # Every row belongs to a prediction, so only their number can differ.
+            spread = np.full(len(self._all), np.nan)
+            spread[np.searchsorted(self._all, self._read_keys(table))] = found
+            found = spread
+        return found[self._wanted]
+
+    def boxes(self) -> np.ndarray:
+        """(n, 7) in the LiDAR frame."""
+        return np.stack([self.numbers("prediction", name) for name in BOX_COLUMNS], axis=1)
+
+    def blank(self, value: float | str = np.nan) -> np.ndarray:
+        """(n,) the value in place of a column that nobody asks for; it takes no memory."""
+        return np.broadcast_to(np.array(value), self._all[self._wanted].shape)
+
+    def _categories(self) -> tuple[np.ndarray, tuple[str, ...]]:
+        """(n,) int64 number of each label's category, and the categories by their number."""
+        numbering: dict[str, int] = {}
+        blocks = [np.zeros(0, dtype=np.int64)]
+        query = self._ordered("prediction", bulk.table("prediction").c.category)
+        for names in bulk.stream(self._connection, query):
+            for name in set(names):
+                numbering.setdefault(name, len(numbering))
+            blocks.append(np.fromiter(map(numbering.__getitem__, names), np.int64, len(names)))
+        return np.concatenate(blocks)[self._wanted], tuple(numbering)
+
+    def _read_keys(self, table: str) -> np.ndarray:
+        """(n,) int64 frame and k of each row in one ascending number."""
+        columns = bulk.table(table).c
+        key = cast(columns.frame_id, BigInteger) * (1 << _K_BITS) + columns.k
+        return bulk.integers(self._connection, self._ordered(table, key))
+
+    def _ordered(self, table: str, column: ColumnElement[Any]) -> Select[Any]:
+        columns = bulk.table(table).c
+        return (
+            select(column).where(columns.round == self._round).order_by(columns.frame_id, columns.k)
+        )
+
+
+def read_memory(workspace: Workspace, round_number: int, policy: str) -> Memory:
+    """The labels of a round that a policy has weighed and not dropped.
+
+    Raises:
+        WorkspaceError: the policy has not weighed that round.
+    """
+    weight, prediction = bulk.table("weight"), bulk.table("prediction")
+    same = and_(*(weight.c[key] == prediction.c[key] for key in ("round", "frame_id", "k")))
+    columns = [
+        prediction.c[name] for name in ("frame_id", "category", "score", "iou", *BOX_COLUMNS)
+    ]
+    query = (
+        select(*columns, weight.c.v)
+        .select_from(weight.join(prediction, same))
+        .where(weight.c.round == round_number, weight.c.policy == policy)
+        .order_by(prediction.c.frame_id, prediction.c.k)
+    )
+    if solved_fingerprint(workspace, round_number, policy) is None:
+        raise WorkspaceError(
+            f"policy {policy} remembers round {round_number}, which it has not weighed; "
+            f"run `curate solve --policy {policy} --round {round_number}`"
+        )
+    with workspace.database.reading() as connection:
+        rows = bulk.select(connection, query)
+    frame_index, category, *numbers = zip(*rows, strict=True) if rows else [()] * (5 + 7)
+    score, iou, *boxes, v = (np.array(column, dtype=np.float64) for column in numbers)
+    return Memory(
+        frame_index=np.array(frame_index, dtype=np.int64),
+        category=as_categories(category),
+        score=score,
+        iou=iou,
+        boxes=np.stack(boxes, axis=1),
+        v=v,
+    )
+
+
+def solved_fingerprint(workspace: Workspace, round_number: int, policy: str) -> str | None:
+    """What the stored weights of a round and policy were made from; None where there are none."""
+    task = bulk.table("task")
+    mine = {"round": round_number, "stage": "solve", "variant": policy}
+    query = select(task.c.fingerprint).where(*(task.c[name] == at for name, at in mine.items()))
+    with workspace.database.reading() as connection:
+        found = bulk.select(connection, query)
+    return found[0][0] if found else None

@@ -1,0 +1,251 @@
+"""Tests of nuScenes' reader on a tiny nuScenes whose geometry is known."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nuscenes_scenes import (
+    IMAGE_SIZE,
+    MOUNTED,
+    QUARTER,
+    drawn_boxes,
+    into_camera,
+    sample_token,
+    sweep_of,
+    vehicle_pose,
+    write_nuscenes,
+)
+
+from curate.datasets.base import sequences_of
+from curate.datasets.nuscenes import NuScenesDataset
+from curate.errors import ConfigError, DataError
+from curate.geometry.points_in_boxes import count_points_in_boxes
+from curate.geometry.projection import project_points
+
+SCENES = ("scene-0061", "scene-0103")
+FRAMES = [(number, scene, step) for number, scene in enumerate(SCENES) for step in range(2)]
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory) -> Path:
+    """A folder that no test changes."""
+    root = tmp_path_factory.mktemp("nuscenes")
+    write_nuscenes(root)
+    return root
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    """A folder to be damaged."""
+    write_nuscenes(tmp_path)
+    return tmp_path
+
+
+def change(path: Path, edit) -> None:
+    """Rewrites a table whose records were edited."""
+    records = json.loads(path.read_text())
+    for record in records:
+        edit(record)
+    path.write_text(json.dumps(records))
+
+
+def test_boxes_come_back_from_the_map(kept):
+    """Those that the camera sees, where they were drawn in the LiDAR's frame."""
+    dataset = NuScenesDataset(kept)
+    for number, scene, step in FRAMES:
+        truth = dataset.annotations(sample_token(scene, step))
+        expected = drawn_boxes(number, step)[:3]
+        assert truth.categories.tolist() == ["Car", "Pedestrian", "Cyclist"]
+        np.testing.assert_allclose(truth.boxes[:, :6], expected[:, :6], atol=1e-9)
+        turn = np.angle(np.exp(1j * (truth.boxes[:, 6] - expected[:, 6])))
+        np.testing.assert_allclose(turn, 0, atol=1e-9)
+        assert truth.occluded.tolist() == [2, 1, 1]
+
+
+def test_points_are_in_our_axes(kept):
+    """Forward is x, left is y, intensity in [0, 1]; the objects' points lie in their boxes."""
+    dataset = NuScenesDataset(kept)
+    for number, scene, step in FRAMES:
+        boxes = drawn_boxes(number, step)
+        frame = dataset.read(sample_token(scene, step))
+        written = sweep_of(boxes, number * 100 + step)
+        expected = QUARTER.inv().apply(written[:, :3])
+        np.testing.assert_allclose(frame.points[:, :3], expected, atol=1e-5)
+        np.testing.assert_allclose(frame.points[:, 3], written[:, 3] / 255, atol=1e-6)
+        assert (count_points_in_boxes(frame.points, boxes) >= 30).all()
+
+
+@pytest.mark.parametrize("camera", ["CAM_FRONT", "CAM_BACK"])
+def test_points_project_by_way_of_the_map(kept, camera):
+    """The vehicle has moved on between the sweep and the image."""
+    dataset = NuScenesDataset(kept, camera=camera)
+    mounted = next(each for each in MOUNTED if each.channel == camera)
+    for number, scene, step in FRAMES:
+        frame = dataset.read(sample_token(scene, step), image=True)
+        points = drawn_boxes(number, step)[:, :3]
+        pixels, depth = project_points(points, frame.calibration)
+        expected = into_camera(points, number, step, mounted)
+        np.testing.assert_allclose(np.column_stack([pixels, depth]), expected, atol=1e-6)
+        assert frame.image_size == IMAGE_SIZE
+
+
+def test_the_camera_decides_which_objects_count(kept):
+    """The one behind is seen by the camera at the back alone."""
+    found = NuScenesDataset(kept, camera="CAM_BACK").annotations(sample_token(SCENES[0], 0))
+    np.testing.assert_allclose(found.boxes[:, :3], drawn_boxes(0, 0)[3:, :3], atol=1e-9)
+    assert found.truncated.tolist() == pytest.approx([0.0], abs=1e-6)
+
+
+def test_the_pose_of_the_lidar_is_known(kept):
+    """Its origin in the map, and its x axis along the vehicle's."""
+    calibration = NuScenesDataset(kept).read(sample_token(SCENES[1], 1), points=False).calibration
+    pose, lidar = vehicle_pose(1, 1), MOUNTED[0]
+    np.testing.assert_allclose(
+        calibration.lidar_to_map[:3, 3], pose.place + pose.turn.apply(lidar.place)
+    )
+    expected = (pose.turn * lidar.turn * QUARTER).as_matrix()
+    np.testing.assert_allclose(calibration.lidar_to_map[:3, :3], expected, atol=1e-12)
+    ahead = pose.turn.inv().apply(calibration.lidar_to_map[:3, 0])
+    assert ahead[0] > 0.99
+
+
+def test_objects_without_points_are_left_out(kept):
+    """By num_lidar_pts, which the table counts."""
+    found = NuScenesDataset(kept, minimum_points=29).annotations(sample_token(SCENES[0], 0))
+    assert found.categories.tolist() == ["Car", "Pedestrian"]
+
+
+def test_other_names_can_be_asked_for(kept):
+    """The task's own, for a detector that was trained on them."""
+    dataset = NuScenesDataset(kept, rename={})
+    found = dataset.annotations(sample_token(SCENES[0], 0))
+    assert found.categories.tolist() == ["car", "pedestrian", "bicycle"]
+
+
+def test_scenes_are_whole_on_each_side(kept):
+    """The official lists of v1.0-mini; other versions have none."""
+    dataset = NuScenesDataset(kept)
+    splits = dataset.splits()
+    tokens = {scene: {sample_token(scene, step) for step in range(2)} for scene in SCENES}
+    assert set(splits["train"]) == tokens["scene-0061"]
+    assert set(splits["val"]) == tokens["scene-0103"]
+    for scene, own in tokens.items():
+        assert set(sequences_of(dataset, own).values()) == {scene}
+    assert dataset.sequence_of("stranger") is None
+
+
+def test_another_version_has_no_lists(tmp_path):
+    """Not everything in nuScenes' layout is nuScenes."""
+    write_nuscenes(tmp_path, version="v1.0-ours")
+    assert NuScenesDataset(tmp_path).splits() == {}
+    write_nuscenes(tmp_path / "full", version="v1.0-trainval", scenes=("scene-0001", "scene-0003"))
+    lists = NuScenesDataset(tmp_path / "full").splits()
+    assert set(lists["val"]) == {sample_token("scene-0003", step) for step in range(2)}
+
+
+def test_key_frames_without_files_are_left_out(root):
+    """The data set comes in parts."""
+    first = sample_token(SCENES[0], 0)
+    files = NuScenesDataset(root).files(first)
+    files.image.unlink()
+    assert first not in NuScenesDataset(root).frame_ids()
+    assert len(NuScenesDataset(root).frame_ids()) == 3
+    for path in (root / "samples" / "LIDAR_TOP").iterdir():
+        path.unlink()
+    with pytest.raises(DataError, match="4 of 4 key frames have no files, such as samples/LIDAR"):
+        NuScenesDataset(root).frame_ids()
+
+
+def test_the_version_and_the_camera_are_asked_for(root):
+    """By the names that there are."""
+    with pytest.raises(ConfigError, match=r"camera 'CAM_TOP': use one of CAM_BACK, CAM_FRONT"):
+        NuScenesDataset(root, camera="CAM_TOP").frame_ids()
+    with pytest.raises(ConfigError, match=r"no version v1\.0-test; .* to one of v1\.0-mini"):
+        NuScenesDataset(root, version="v1.0-test")
+    (root / "v1.0-test").mkdir()
+    (root / "v1.0-test" / "sample_data.json").write_text("[]")
+    with pytest.raises(ConfigError, match=r"several versions; .* one of v1\.0-mini, v1\.0-test"):
+        NuScenesDataset(root)
+    assert len(NuScenesDataset(root, version="v1.0-mini").frame_ids()) == 4
+    with pytest.raises(DataError, match=r"name the folder with samples/ and v1\.0"):
+        NuScenesDataset(root / "v1.0-mini")
+
+
+@pytest.mark.parametrize(
+    ("table", "edit", "message"),
+    [
+        ("ego_pose", {"rotation": [1, 1, 0, 0]}, "is no unit quaternion"),
+        ("ego_pose", {"translation": [1, None, 0]}, "translation is not 3 finite numbers"),
+        ("ego_pose", {"token": "other"}, "no record .* which sample_data.json refers to"),
+        ("calibrated_sensor", {"rotation": [1, 0, 0]}, "rotation is not 4 finite numbers"),
+        ("calibrated_sensor", {"camera_intrinsic": []}, "camera_intrinsic is not 3 x 3 finite"),
+        ("sample", {"scene_token": "none"}, "or none with a scene"),
+    ],
+)
+def test_a_record_that_cannot_be_is_named(root, table, edit, message):
+    """With its table, in one line."""
+    change(root / "v1.0-mini" / f"{table}.json", lambda record: record.update(edit))
+    with pytest.raises(DataError, match=message) as caught:
+        NuScenesDataset(root).frame_ids()
+    assert f"{table}.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("table", ["scene", "sample_data", "sample_annotation"])
+@pytest.mark.parametrize("damage", ["cut", "gone", "words"])
+def test_a_damaged_table_is_named(root, table, damage):
+    """Missing, cut off in the middle, or something else."""
+    path, name = root / "v1.0-mini" / f"{table}.json", sample_token(SCENES[0], 0)
+    content = path.read_bytes()
+    dataset = NuScenesDataset(root)
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(content[: len(content) // 2] if damage == "cut" else b"no table")
+    with pytest.raises(DataError, match=f"{table}.json") as caught:
+        dataset.annotations(name)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_instance_without_category_is_named(root):
+    """Its annotation has no name."""
+    change(
+        root / "v1.0-mini" / "instance.json", lambda record: record.update({"category_token": "x"})
+    )
+    with pytest.raises(DataError, match=r"instance\.json: no instance .* with a category"):
+        NuScenesDataset(root).annotations(sample_token(SCENES[0], 0))
+
+
+def test_a_frame_that_does_not_exist_is_named(kept):
+    """Frames go by sample tokens, not by those of sample_data."""
+    with pytest.raises(DataError, match="no key frame 000001; frames are named by their sample"):
+        NuScenesDataset(kept).read("000001")
+
+
+def test_truth_of_other_frames_is_not_decoded(root):
+    """A record of theirs may hold anything."""
+    path = root / "v1.0-mini" / "sample_annotation.json"
+    other = sample_token(SCENES[1], 0)
+
+    def spoil(record):
+        if record["sample_token"] == other:
+            record["translation"] = "secret"
+
+    change(path, spoil)
+    dataset = NuScenesDataset(root)
+    assert len(dataset.annotations(sample_token(SCENES[0], 0))) == 3
+    with pytest.raises(DataError, match="translation is not 3 finite numbers"):
+        dataset.annotations(other)
+
+
+def test_tables_may_be_larger_than_a_piece(kept, monkeypatch):
+    """Records that lie across two pieces are whole."""
+    from curate.datasets.nuscenes import tables
+
+    whole = NuScenesDataset(kept)
+    name = sample_token(SCENES[1], 1)
+    monkeypatch.setattr(tables, "_PIECE_BYTES", 97)
+    pieces = NuScenesDataset(kept)
+    assert pieces.frame_ids() == whole.frame_ids()
+    np.testing.assert_array_equal(pieces.annotations(name).boxes, whole.annotations(name).boxes)

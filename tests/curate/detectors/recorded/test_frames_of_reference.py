@@ -1,0 +1,240 @@
+"""Every recorded format by one property: the same boxes, written as the format has it, come back.
+
+The writers here know nothing of curate's conversions: they turn and shift with scipy's rotations.
+"""
+
+import csv
+import json
+import pickle
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from strategies import similarities
+
+from curate.detections import Detections, as_categories
+from curate.detectors.recorded import RecordedDetector
+from curate.detectors.recorded.formats import KINDS
+from curate.errors import ConfigError
+from curate.frames import Calibration, Frame
+from curate.geometry.similarity import Similarity
+
+NAMES = ("Car", "Pedestrian", "Cyclist")
+FRAME = "000001"
+# From the LiDAR (x forward, y left, z up) to a camera (x right, y down, z forward).
+LOOKING_AHEAD = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Where the sensors are.
+
+    Attributes:
+        to_camera: LiDAR to camera, and where the LiDAR is seen from there.
+        to_map: LiDAR to map, and where it is.
+    """
+
+    to_camera: tuple[Rotation, np.ndarray]
+    to_map: tuple[Rotation, np.ndarray]
+
+    @property
+    def calibration(self) -> Calibration:
+        """The same in matrices."""
+        projection = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]])
+        camera, place = np.eye(4), np.eye(4)
+        for matrix, (turn, origin) in ((camera, self.to_camera), (place, self.to_map)):
+            matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), origin
+        return Calibration(projection, camera, place)
+
+
+def write_csv(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
+    """As curate has it."""
+    header = "frame,category,score,x,y,z,length,width,height,yaw,view,flip_y,rotation_rad,scale"
+    with path.with_suffix(".csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header.split(","))
+        for box, score, name in rows_of(found):
+            writer.writerow([FRAME, name, score, *box, 0, 0, 0, 1])
+    return path.with_suffix(".csv"), {}
+
+
+def write_parquet(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
+    """As curate has it, with a yaw that may be any number of turns away."""
+    arrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    order = ("x", "y", "z", "length", "width", "height", "yaw")
+    columns = dict(zip(order, found.boxes.T, strict=True))
+    columns["yaw"] = columns["yaw"] + 4 * np.pi
+    names = {"frame": [FRAME] * len(found), "category": found.categories.tolist()}
+    table = arrow.table(names | columns | {"score": found.scores})
+    parquet.write_table(table, path.with_suffix(".parquet"))
+    return path.with_suffix(".parquet"), {}
+
+
+def write_kitti(path: Path, found: Detections, rig: Rig) -> tuple[Path, dict]:
+    """Camera frame, centre of the bottom, height width length, rotation_y about the y downwards."""
+    turn, origin = rig.to_camera
+    lines = []
+    for box, score, name in rows_of(found):
+        x, y, z = turn.apply(box[:3]) + origin
+        length, width, height = box[3:6]
+        # Seen from above, KITTI's angle grows clockwise from the camera's x, which is our -y.
+        rotation_y = -(box[6] + np.pi / 2)
+        numbers = (height, width, length, x, y + height / 2, z, rotation_y, score)
+        lines.append(f"{name} -1 -1 0 0 0 1 1 {' '.join(f'{number:.12f}' for number in numbers)}\n")
+    path.mkdir()
+    (path / f"{FRAME}.txt").write_text("".join(lines))
+    return path, {}
+
+
+def write_openpcdet(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
+    """As here, with velocities."""
+    boxes = np.column_stack([found.boxes, np.ones((len(found), 2))])
+    entry = {"frame_id": FRAME, "name": found.categories, "score": found.scores}
+    path.with_suffix(".pkl").write_bytes(pickle.dumps([entry | {"boxes_lidar": boxes}]))
+    return path.with_suffix(".pkl"), {}
+
+
+def write_mmdetection3d(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
+    """The centre of the bottom, and numbered names."""
+    boxes = [[*box[:2], box[2] - box[5] / 2, *box[3:]] for box in found.boxes.tolist()]
+    entry = {
+        "frame_id": FRAME,
+        "bboxes_3d": boxes,
+        "scores_3d": found.scores.tolist(),
+        "labels_3d": [NAMES.index(name) for name in found.categories],
+    }
+    path.with_suffix(".json").write_text(json.dumps([entry]))
+    return path.with_suffix(".json"), {"classes": NAMES}
+
+
+def write_nuscenes(path: Path, found: Detections, rig: Rig) -> tuple[Path, dict]:
+    """In the map, width before length, a quaternion with w first."""
+    turn, origin = rig.to_map
+    results = []
+    for box, score, name in rows_of(found):
+        x, y, z, w = (turn * Rotation.from_euler("z", box[6])).as_quat().tolist()
+        results.append({
+            "translation": (turn.apply(box[:3]) + origin).tolist(),
+            "size": [box[4], box[3], box[5]],
+            "rotation": [w, x, y, z],
+            "detection_name": {"Car": "car", "Pedestrian": "pedestrian"}.get(name, "bicycle"),
+            "detection_score": score,
+        })  # fmt: skip
+    document = {"meta": {}, "results": {FRAME: results}}
+    path.with_suffix(".json").write_text(json.dumps(document))
+    return path.with_suffix(".json"), {}
+
+
+WRITERS: dict[str, Callable[[Path, Detections, Rig], tuple[Path, dict]]] = {
+    "csv": write_csv,
+    "parquet": write_parquet,
+    "kitti": write_kitti,
+    "openpcdet": write_openpcdet,
+    "mmdetection3d": write_mmdetection3d,
+    "nuscenes": write_nuscenes,
+}
+
+
+def rows_of(found: Detections):
+    """Box, score and name of each."""
+    return zip(found.boxes.tolist(), found.scores.tolist(), found.categories.tolist(), strict=True)
+
+
+small_turns = st.tuples(*[st.floats(-0.05, 0.05)] * 2)
+places = st.tuples(*[st.floats(-2.0, 2.0)] * 3).map(np.array)
+rigs = st.builds(
+    lambda camera, offset, heading, tilt, place: Rig(
+        (Rotation.from_euler("xy", camera) * LOOKING_AHEAD, offset),
+        (Rotation.from_euler("zyx", [heading, *tilt]), place * [900, 900, 1]),
+    ),
+    small_turns, places, st.floats(-3.1, 3.1), small_turns, places,
+)  # fmt: skip
+boxes = st.tuples(
+    st.floats(2, 60), st.floats(-30, 30), st.floats(-3, 3),
+    st.floats(2.1, 9), st.floats(0.3, 2.0), st.floats(0.3, 4), st.floats(-np.pi, np.pi),
+)  # fmt: skip
+answers = st.lists(
+    st.tuples(boxes, st.floats(0.01, 1), st.sampled_from(NAMES)), min_size=1, max_size=5
+).map(
+    lambda rows: Detections(
+        np.array([row[0] for row in rows]),
+        np.array([row[1] for row in rows]),
+        as_categories([row[2] for row in rows]),
+    )
+)
+
+
+def assert_equal(one: Detections, other: Detections) -> None:
+    """To a micrometre; yaw as a direction."""
+    np.testing.assert_allclose(one.boxes[:, :6], other.boxes[:, :6], atol=1e-6)
+    turn = one.boxes[:, 6] - other.boxes[:, 6]
+    np.testing.assert_allclose(np.abs(np.sin(turn / 2)), 0, atol=1e-7)
+    assert ((one.boxes[:, 6] > -np.pi) & (one.boxes[:, 6] <= np.pi)).all()
+    np.testing.assert_allclose(one.scores, other.scores, atol=1e-9)
+    assert one.categories.tolist() == other.categories.tolist()
+
+
+def test_every_format_is_here() -> None:
+    """A new one needs a writer."""
+    assert set(WRITERS) == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@settings(max_examples=15, deadline=None)
+@given(found=answers, rig=rigs)
+def test_the_same_boxes_come_back(kind: str, found: Detections, rig: Rig) -> None:
+    """Whatever frame of reference, origin, order of sizes and angle the format has."""
+    with tempfile.TemporaryDirectory() as folder:
+        path, options = WRITERS[kind](Path(folder) / "results", found, rig)
+        record = RecordedDetector(path, **options)
+        frame = Frame(FRAME, np.zeros((0, 4), np.float32), rig.calibration, (1200, 360))
+        assert_equal(record.predict(frame), found)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in WRITERS if kind not in ("csv", "parquet")])
+@settings(max_examples=8, deadline=None)
+@given(found=answers, rig=rigs, similarity=similarities.filter(lambda a: a != Similarity()))
+def test_the_boxes_of_a_copy_come_back(
+    kind: str, found: Detections, rig: Rig, similarity: Similarity
+) -> None:
+    """A second pass is written with the same sensors, and inverted afterwards."""
+    # What a scale of 0.1 to 10 does to a street is beyond what results can be.
+    similarity = Similarity(similarity.flip_y, similarity.rotation_rad, 1.0)
+    if similarity == Similarity():
+        similarity = Similarity(flip_y=True)
+    moved = Detections(similarity.apply_to_boxes(found.boxes), found.scores, found.categories)
+    with tempfile.TemporaryDirectory() as folder:
+        path, options = WRITERS[kind](Path(folder) / "results", found, rig)
+        second, _ = WRITERS[kind](Path(folder) / "second", moved, rig)
+        one = {"path": second.name, "flip_y": similarity.flip_y}
+        one["rotation_rad"] = similarity.rotation_rad
+        record = RecordedDetector(
+            path, passes=[one], calibration=lambda _: rig.calibration, **options
+        )
+        [(told, seen)] = record.views(FRAME)
+        back = Detections(told.invert_boxes(seen.boxes), seen.scores, seen.categories)
+        assert_equal(back, found)
+
+
+@pytest.mark.parametrize("kind", ["csv", "openpcdet", "mmdetection3d"])
+def test_boxes_in_the_axes_of_nuscenes_sensor_come_back(kind: str, tmp_path: Path) -> None:
+    """There x is to the right and y forward; what is in the camera's frame or a map's stays."""
+    boxes = np.array([[12.0, 3.0, -0.8, 4.0, 1.8, 1.5, 0.3], [9.0, -4.0, 0.1, 1.0, 0.8, 1.7, 3.1]])
+    found = Detections(boxes, np.array([0.9, 0.5]), as_categories(["Car", "Pedestrian"]))
+    quarter = Rotation.from_euler("z", 90, degrees=True)
+    there = np.column_stack([quarter.apply(boxes[:, :3]), boxes[:, 3:6], boxes[:, 6] + np.pi / 2])
+    rig = Rig((LOOKING_AHEAD, np.zeros(3)), (Rotation.identity(), np.zeros(3)))
+    written = Detections(there, found.scores, found.categories)
+    path, options = WRITERS[kind](tmp_path / "results", written, rig)
+    frame = Frame(FRAME, np.zeros((0, 4), np.float32), rig.calibration, (1200, 360))
+    record = RecordedDetector(path, axes="right-forward", **options)
+    assert_equal(record.predict(frame), found)
+    with pytest.raises(ConfigError, match="axes 'up': use one of forward-left, right-forward"):
+        RecordedDetector(path, axes="up", **options)

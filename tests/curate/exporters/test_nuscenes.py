@@ -1,0 +1,82 @@
+"""Weighted labels as nuScenes' results."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exported import BOXES, SCORES, toy_frame, toy_labels
+from nuscenes_scenes import into_map, sample_token, vehicle_pose, write_nuscenes
+
+from curate.datasets.nuscenes import NuScenesDataset
+from curate.detectors.recorded import RecordedDetector
+from curate.errors import ConfigError, DataError
+from curate.exporters.nuscenes import NuScenesExporter
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """A tiny nuScenes."""
+    write_nuscenes(tmp_path / "nuscenes")
+    return NuScenesDataset(tmp_path / "nuscenes")
+
+
+def labels_of(dataset):
+    """The toy labels, of two frames of nuScenes."""
+    labels = toy_labels()
+    first, second = (sample_token("scene-0061", 0), sample_token("scene-0103", 1))
+    names = {"000000": first, "000001": second}
+    return replace(
+        labels,
+        frames=[(names[row[0]], *row[1:]) for row in labels.frames],
+        ground_truth=[(names[row[0]], *row[1:]) for row in labels.ground_truth],
+        labels=[(row[0], names[row[1]], *row[2:]) for row in labels.labels],
+        read=lambda name: dataset.read(name, points=False),
+    )
+
+
+def test_boxes_are_in_the_map(dataset, tmp_path):
+    """As scipy brings them there; a label of weight 0 is not among the results."""
+    assert NuScenesExporter().write(tmp_path / "a.json", labels_of(dataset)) == 3
+    document = json.loads((tmp_path / "a.json").read_text())
+    name = sample_token("scene-0103", 1)
+    assert list(document["results"]) == [name]
+    kept, [ignored] = document["results"][name], document["ignored"][name]
+    assert [box["detection_name"] for box in kept] == ["car", "car"]
+    assert (ignored["detection_name"], ignored["weight"], ignored["k"]) == ("pedestrian", 0, 1)
+    expected = into_map(np.array(BOXES), vehicle_pose(1, 1))
+    for box in [*kept, ignored]:
+        right = expected[box["k"]]
+        np.testing.assert_allclose(box["translation"], right["translation"], atol=1e-8)
+        np.testing.assert_allclose(box["size"], right["size"])
+        same = abs(np.dot(box["rotation"], right["rotation"]))
+        assert same == pytest.approx(1, abs=1e-12)
+    assert set(document["meta"]) >= {
+        "use_camera", "use_lidar", "use_radar", "use_map", "use_external",
+    }  # fmt: skip
+
+
+def test_our_results_are_a_record(dataset, tmp_path):
+    """Written and read, the boxes are what they were."""
+    NuScenesExporter().write(tmp_path / "a.json", labels_of(dataset))
+    record = RecordedDetector(tmp_path / "a.json", frame_ids=dataset.frame_ids())
+    found = record.predict(dataset.read(sample_token("scene-0103", 1), points=False))
+    expected = np.array(BOXES)[[0, 2]]
+    np.testing.assert_allclose(found.boxes, expected, atol=1e-9)
+    assert found.scores.tolist() == [SCORES[0], SCORES[2]]
+    assert found.categories.tolist() == ["Car", "Car"]
+
+
+def test_another_data_set_is_refused(tmp_path):
+    """It has no map."""
+    with pytest.raises(ConfigError, match="need the vehicle's poses"):
+        NuScenesExporter().write(tmp_path / "a.json", toy_labels())
+    assert toy_frame("000001").calibration.lidar_to_map is None
+
+
+def test_a_category_that_nuscenes_does_not_have_is_refused(dataset, tmp_path):
+    """Its tools would stop at it."""
+    labels = labels_of(dataset)
+    rows = [(*row[:3], "Tram", *row[4:]) for row in labels.labels]
+    with pytest.raises(DataError, match="category 'Tram' is none of nuScenes'"):
+        NuScenesExporter().write(tmp_path / "a.json", replace(labels, labels=rows))

@@ -1,0 +1,101 @@
+"""Weighted labels as Parquet."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from exported import toy_labels
+
+from curate.errors import ConfigError, DataError
+from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
+from curate.exporters.parquet import ParquetExporter
+
+parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+
+
+def test_every_column_comes_back_to_the_last_bit(tmp_path):
+    """In the order of the view; what is unknown is null."""
+    labels = toy_labels()
+    assert ParquetExporter().write(tmp_path / "a.parquet", labels) == 3
+    table = parquet.read_table(tmp_path / "a.parquet")
+    assert tuple(table.column_names) == WEIGHTED_LABEL_COLUMNS
+    assert [tuple(row.values()) for row in table.to_pylist()] == labels.labels
+
+
+def test_columns_have_types_units_and_meanings(tmp_path):
+    """Whatever reads the file sees what a number is."""
+    ParquetExporter().write(tmp_path / "a.parquet", toy_labels())
+    schema = parquet.read_schema(tmp_path / "a.parquet")
+    types = {field.name: str(field.type) for field in schema}
+    assert {types[name] for name in ("x", "yaw", "score", "loss", "weight")} == {"double"}
+    assert {types[name] for name in ("round", "k", "points")} == {"int32"}
+    assert "string" in types["frame"]
+    assert schema.field("x").metadata[b"unit"] == b"m"
+    assert schema.field("yaw").metadata[b"unit"] == b"rad"
+    assert all(field.metadata[b"meaning"] for field in schema)
+    assert [field.name for field in schema if field.nullable] == [
+        "loss", "points", "points_threshold", "rho_diff", "mask_pixels", "box_pixels", "rho_anno",
+        "rho_det", "lambda_u",
+    ]  # fmt: skip
+
+
+def test_the_file_says_what_it_is_about(tmp_path):
+    """Frame of reference, units, round, policy, version."""
+    ParquetExporter().write(tmp_path / "a.parquet", toy_labels())
+    told = parquet.read_schema(tmp_path / "a.parquet").metadata
+    said = {key.decode().removeprefix("curate."): value.decode() for key, value in told.items()}
+    assert said["frame_of_reference"].startswith("LiDAR: x forward, y left, z up")
+    assert said["units"] == "metres, radians"
+    assert (said["round"], said["policy"], said["version"]) == ("1", "pspsl", "1")
+    assert (said["dataset"], said["root"]) == ("kitti", "/data")
+    assert json.loads(said["categories"]) == ["Car", "Pedestrian", "Cyclist"]
+
+
+def test_rows_are_written_in_groups(tmp_path):
+    """As they come, without holding all of them."""
+    labels = toy_labels()
+    taken = []
+
+    class Streamed:
+        """Rows that cannot be indexed."""
+
+        def __len__(self):
+            return len(labels.labels)
+
+        def __iter__(self):
+            for row in labels.labels:
+                taken.append(row)
+                yield row
+
+    streamed = replace(labels, labels=Streamed())
+    assert ParquetExporter(rows_per_group=2).write(tmp_path / "a.parquet", streamed) == 3
+    found = parquet.ParquetFile(tmp_path / "a.parquet").metadata
+    assert [found.row_group(i).num_rows for i in range(found.num_row_groups)] == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("score", None, "frame 000001: label 2 has no score"),
+        ("k", 2**40, "column k: not all of it is int32"),
+        ("points", "many", "column points: not all of it is int32"),
+    ],
+)
+def test_a_value_that_does_not_fit_is_named(tmp_path, column, value, message):
+    """In one line, and no file is left."""
+    labels = toy_labels()
+    row = list(labels.labels[-1])
+    row[WEIGHTED_LABEL_COLUMNS.index(column)] = value
+    with pytest.raises(DataError, match=message) as caught:
+        ParquetExporter().write(
+            tmp_path / "a.parquet", replace(labels, labels=[*labels.labels[:-1], tuple(row)])
+        )
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_pyarrow_the_extra_is_named(monkeypatch):
+    """One line that can be pasted."""
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(ConfigError, match=r"pip install 'curate-pseudo-labels\[parquet\]'"):
+        ParquetExporter()

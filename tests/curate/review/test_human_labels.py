@@ -1,0 +1,93 @@
+"""Which predictions a person's decisions speak for."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from curate.detections import as_categories
+from curate.review.human_labels import (
+    REFUSED_IOU,
+    SAME_OBJECT_IOU,
+    HumanLabels,
+    entangled,
+    speak_for,
+    superseded,
+)
+
+BOX = np.array([20.0, 1.0, -0.5, 4.0, 2.0, 1.6, 0.0])
+
+
+def labels(*rows: tuple[str, str, np.ndarray]) -> HumanLabels:
+    """From decision, category and box; none was moved."""
+    boxes = np.array([box for _, _, box in rows]).reshape(-1, 7)
+    decisions, categories = ([row[i] for row in rows] for i in (0, 1))
+    return HumanLabels(as_categories(decisions), as_categories(categories), boxes, boxes)
+
+
+def along(share: float) -> np.ndarray:
+    """The box moved along itself until its IoU with the former place is `share`."""
+    moved = BOX.copy()
+    moved[0] += BOX[3] * (1 - share) / (1 + share)
+    return moved
+
+
+def test_an_object_takes_whatever_overlaps_it() -> None:
+    """Of any category, from an IoU of 0.1 on; what overlaps most leads."""
+    boxes = np.stack([along(SAME_OBJECT_IOU + 0.02), along(0.8), along(SAME_OBJECT_IOU - 0.02)])
+    spoken = speak_for(boxes, as_categories(["Car", "Van", "Car"]), labels(("added", "Car", BOX)))
+    assert spoken.label.tolist() == [0, 0, -1]
+    assert spoken.leads.tolist() == [False, True, False]
+    np.testing.assert_allclose(spoken.iou, [SAME_OBJECT_IOU + 0.02, 0.8, 0], atol=1e-9)
+
+
+def test_a_refusal_holds_for_its_category_and_place() -> None:
+    """From an IoU of 0.3 on; the same place with another category is a claim of its own."""
+    boxes = np.stack([along(REFUSED_IOU + 0.02), along(REFUSED_IOU - 0.02), BOX])
+    names = as_categories(["Car", "Car", "Pedestrian"])
+    spoken = speak_for(boxes, names, labels(("rejected", "Car", BOX)))
+    assert spoken.label.tolist() == [0, -1, -1]
+    assert not spoken.leads.any()
+
+
+def test_objects_come_before_refusals() -> None:
+    """Where both could speak for a prediction, it is the object that does."""
+    both = labels(("rejected", "Car", BOX), ("accepted", "Car", along(0.4)))
+    assert speak_for(BOX[None], as_categories(["Car"]), both).label.tolist() == [1]
+
+
+def test_without_boxes_nothing_is_spoken_for() -> None:
+    """Empty on either side."""
+    assert (
+        len(speak_for(np.zeros((0, 7)), as_categories([]), labels(("added", "Car", BOX))).label)
+        == 0
+    )
+    assert speak_for(BOX[None], as_categories(["Car"]), labels()).label.tolist() == [-1]
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.floats(0, 60), st.floats(-20, 20)), min_size=1, max_size=8))
+def test_every_object_leads_at_most_one_prediction(places: list[tuple[float, float]]) -> None:
+    """And only one that it speaks for."""
+    boxes = np.tile(BOX, (len(places), 1))
+    boxes[:, :2] = places
+    human = labels(*(("accepted", "Car", box) for box in boxes[::2]))
+    spoken = speak_for(boxes, as_categories(["Car"] * len(boxes)), human)
+    assert (spoken.label[::2] >= 0).all()
+    led = spoken.label[spoken.leads]
+    assert len(led) == len(set(led.tolist()))
+    assert (led >= 0).all()
+
+
+def test_a_later_decision_takes_the_place_of_an_earlier_one() -> None:
+    """About the same object; a refusal only of one of its own category."""
+    former = labels(("accepted", "Car", BOX))
+    assert superseded(former, labels(("moved", "Van", along(0.7)))).tolist() == [True]
+    assert superseded(former, labels(("rejected", "Car", BOX))).tolist() == [True]
+    assert superseded(former, labels(("rejected", "Pedestrian", BOX))).tolist() == [False]
+    assert superseded(former, labels(("added", "Car", along(0.2)))).tolist() == [False]
+
+
+def test_objects_in_each_other_are_found() -> None:
+    """A refused box may lie in an object."""
+    assert entangled(labels(("accepted", "Car", BOX), ("accepted", "Van", along(0.9)))) == [(0, 1)]
+    assert entangled(labels(("accepted", "Car", BOX), ("rejected", "Van", BOX))) == []

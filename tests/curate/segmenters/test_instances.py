@@ -1,0 +1,140 @@
+"""Instance masks in COCO's JSON as semantic maps, and what the semantic prior makes of them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from oracles import run_lengths
+from toys import SIZES, toy_calibration
+
+from curate.detections import Detections, as_categories
+from curate.errors import ConfigError, DataError
+from curate.frames import Frame
+from curate.geometry.projection import image_rectangles
+from curate.priors.semantic import SemanticPrior
+from curate.segmenters.classes import class_map
+from curate.segmenters.instances import InstanceSegmenter
+
+COCO = class_map("coco")
+FRAME = Frame("000007", np.zeros((0, 4), np.float32), toy_calibration(), (120, 40))
+
+
+def rectangle(left: int, top: int, right: int, bottom: int) -> list[list[float]]:
+    """A polygon over whole pixels."""
+    return [[left, top, right, top, right, bottom, left, bottom]]
+
+
+def encoded(class_ids: np.ndarray) -> dict:
+    """Compressed run lengths of what is not 0."""
+    return {
+        "size": list(class_ids.shape),
+        "counts": run_lengths.compress(run_lengths.runs((class_ids > 0).tolist())),
+    }
+
+
+def save(path: Path, held: object) -> Path:
+    """As JSON."""
+    path.write_text(json.dumps(held))
+    return path
+
+
+CAR = {"image_id": 7, "category_id": 3, "segmentation": rectangle(10, 5, 30, 25), "score": 0.9}
+PERSON = {"image_id": 7, "category_id": 1, "segmentation": rectangle(25, 0, 40, 40), "score": 0.6}
+GHOST = {**CAR, "segmentation": rectangle(0, 0, 120, 40), "score": 0.3}
+
+
+def expected() -> np.ndarray:
+    """The car over the person, and nothing of the ghost."""
+    class_ids = np.zeros((40, 120), np.uint8)
+    class_ids[0:40, 25:40] = 1
+    class_ids[5:25, 10:30] = 3
+    return class_ids
+
+
+@pytest.mark.parametrize("form", ["results", "document", "folder"])
+def test_every_form_says_the_same(tmp_path: Path, form: str) -> None:
+    """A list of results, COCO's document, a file per frame: higher scores on top, low ones out."""
+    objects = [CAR, GHOST, PERSON]
+    if form == "results":
+        path = save(tmp_path / "a.json", objects)
+    elif form == "document":
+        images = [{"id": 7, "file_name": "image_2/000007.png"}]
+        path = save(tmp_path / "a.json", {"images": images, "annotations": objects})
+    else:
+        path = save(tmp_path / "000007.json", objects).parent
+    segmenter = InstanceSegmenter(path, COCO)
+    found = segmenter.segment(FRAME)
+    np.testing.assert_array_equal(found.class_ids, expected())
+    assert found.category_classes == COCO
+    assert not segmenter.needs_image
+
+
+def test_run_lengths_and_polygons_are_the_same_object(tmp_path: Path) -> None:
+    """Compressed, as detectors write them."""
+    mask = expected() == 3
+    coded = {**CAR, "segmentation": encoded(mask.astype(np.uint8))}
+    found = InstanceSegmenter(save(tmp_path / "a.json", [coded]), COCO).segment(FRAME)
+    np.testing.assert_array_equal(found.class_ids == 3, mask)
+
+
+def test_an_object_of_another_class_hides_what_is_behind_it(tmp_path: Path) -> None:
+    """A bus in front of a car; its number means no category here."""
+    bus = {**CAR, "category_id": 6, "segmentation": rectangle(20, 0, 40, 40), "score": 0.95}
+    found = InstanceSegmenter(save(tmp_path / "a.json", [bus, CAR]), COCO).segment(FRAME)
+    assert (found.class_ids[:, 20:40] == 0).all()
+    assert (found.class_ids[5:25, 10:20] == 3).all()
+
+
+def test_the_semantic_prior_counts_the_pixels_of_masks(tmp_path: Path) -> None:
+    """A mask over the left half of a car's rectangle: S / A is the share of its columns."""
+    boxes = np.array([[10.0, 0, -0.8, *SIZES["Car"], 0.0]])
+    rectangles = image_rectangles(boxes, FRAME.calibration, FRAME.image_size)
+    left, _, right, _ = rectangles[0]
+    middle = round((left + right) / 2)
+    half = {**CAR, "segmentation": rectangle(0, 0, middle, 40)}
+    prior = SemanticPrior(InstanceSegmenter(save(tmp_path / "a.json", [half]), COCO))
+    cars = Detections(boxes, np.array([0.81]), as_categories(["Car"]))
+    evidence = prior.score(FRAME, cars)
+    columns = np.arange(np.floor(left + 0.5), np.floor(right + 0.5) + 1)
+    share = (columns < middle).mean()
+    assert evidence.rho_anno == pytest.approx(np.sqrt(0.81 * share))
+    assert 0.4 < share < 0.6
+
+
+def test_a_frame_without_objects_is_not_a_frame_without_masks(tmp_path: Path) -> None:
+    """Listed among the images: an empty map. Not listed: an error with the remedy."""
+    document = {"images": [{"id": 1, "file_name": "000007.png"}], "annotations": []}
+    found = InstanceSegmenter(save(tmp_path / "a.json", document), COCO).segment(FRAME)
+    assert not found.class_ids.any()
+    with pytest.raises(DataError, match=r"no masks for frame 000007; .*images"):
+        InstanceSegmenter(save(tmp_path / "b.json", [{**CAR, "image_id": 8}]), COCO).segment(FRAME)
+
+
+@pytest.mark.parametrize(
+    ("held", "message"),
+    [
+        ({"annotations": 3}, "no list of instance masks"),
+        ([3], "no list of instance masks"),
+        ([{"category_id": 3}], "no image_id"),
+        ({"images": [{"id": 1}], "annotations": []}, "no file_name"),
+        ([{"image_id": 7, "category_id": 3}], "object 0 has no segmentation"),
+        ([{**CAR, "score": "high"}], "the score is 'high'"),
+        ([CAR, {**CAR, "segmentation": {"size": [20, 60], "counts": [1200]}}],
+         "object 1: the mask is 60 x 20 pixels, the image 120 x 40"),
+    ],
+)  # fmt: skip
+def test_malformed_masks_are_named(tmp_path: Path, held: object, message: str) -> None:
+    """File, object and fault in one line."""
+    path = save(tmp_path / "a.json", held)
+    with pytest.raises(DataError) as caught:
+        InstanceSegmenter(path, COCO).segment(FRAME)
+    assert message in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_score_out_of_range_is_refused(tmp_path: Path) -> None:
+    """Before any frame."""
+    with pytest.raises(ConfigError, match=r"minimum_score 1\.5"):
+        InstanceSegmenter(save(tmp_path / "a.json", []), COCO, minimum_score=1.5)

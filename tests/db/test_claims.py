@@ -1,0 +1,64 @@
+"""Claims: who may work on a round beside whom, on either engine."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from curate.errors import DatabaseError
+from db.session import Database
+
+ENGINES = ("sqlite", "postgresql")
+
+
+@pytest.fixture
+def pair(tmp_path: Path, new_url: Callable[[], str | None]) -> tuple[Database, Database]:
+    """One database as two processes see it; a claim belongs to an open file or to a session."""
+    url = new_url() or f"sqlite:///{tmp_path / 'curate.db'}"
+    return Database(url), Database(url)
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "word"),
+    [
+        ((1, None), (1, None), "round 1 is being worked on by predict"),
+        ((1, None), (1, "pspsl"), "round 1 is being worked on by predict"),
+        ((1, "pspsl"), (1, None), "round 1 is being worked on by predict"),
+        ((1, "pspsl"), (1, "pspsl"), "round 1 of pspsl is being worked on by predict"),
+    ],
+)
+def test_what_is_claimed_is_refused_with_its_owner(
+    pair: tuple[Database, Database], mine: tuple, theirs: tuple, word: str
+) -> None:
+    """One line: what, by whom, since when, what to do; afterwards it is free."""
+    with pair[0].claiming_round(*mine, "predict"):
+        with pytest.raises(DatabaseError) as refused, pair[1].claiming_round(*theirs, "solve"):
+            pass
+        message = str(refused.value)
+        assert message.startswith(word)
+        assert f"process {os.getpid()} on " in message
+        assert ", since 2" in message
+        assert "\n" not in message
+    with pair[1].claiming_round(*theirs, "solve"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs"),
+    [((1, None), (2, None)), ((1, "spsl"), (1, "pspsl")), ((1, "spsl"), (11, None))],
+)
+def test_what_does_not_collide_runs_side_by_side(
+    pair: tuple[Database, Database], mine: tuple, theirs: tuple
+) -> None:
+    """Different rounds, and the policies of one round."""
+    with pair[0].claiming_round(*mine, "solve"), pair[1].claiming_round(*theirs, "solve"):
+        pass
+
+
+def test_an_error_ends_the_claim(pair: tuple[Database, Database]) -> None:
+    """Whatever went wrong while it was held."""
+    with pytest.raises(ZeroDivisionError), pair[0].claiming_round(1, None, "predict"):
+        raise ZeroDivisionError
+    with pair[1].claiming_round(1, None, "predict"):
+        pass

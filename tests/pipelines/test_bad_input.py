@@ -1,0 +1,174 @@
+"""Bad input as a user brings it to the command line: each is one clear line, or just works."""
+
+import os
+import pickle
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pipelines_cli import Curate
+
+from curate.datasets.kitti import KittiDataset
+from curate.errors import ConfigError, DataError, FramesFailed
+from pipelines.stages import predict
+from pipelines.workspace import Workspace
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+def write_results(path: Path, root: Path, **changes) -> Path:
+    """OpenPCDet results that are the truth, or a change of it per key."""
+    dataset, entries = KittiDataset(root), []
+    for name in dataset.frame_ids():
+        truth = dataset.annotations(name)
+        entry = {
+            "frame_id": name,
+            "name": truth.categories,
+            "boxes_lidar": truth.boxes,
+            "score": np.full(len(truth.boxes), 0.9),
+        }
+        entries.append(entry | {key: change(entry[key]) for key, change in changes.items()})
+    path.write_bytes(pickle.dumps(entries))
+    return path
+
+
+def begin(curate: Curate, work: Path, root: Path, results: Path) -> tuple[int, str, str]:
+    """A workspace with recorded results, and its predictions."""
+    code, _, err = curate(
+        "init", work, "--root", root, "--labeled", "0.25",
+        "--detector", "recorded", "--detector-path", results,
+    )  # fmt: skip
+    assert code == 0, err
+    return curate("predict", "-w", work)
+
+
+def test_names_in_other_letters_fail_every_frame_with_the_remedy(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """Lower case would leave no label at all; the setting that mends it is printed, and works."""
+    results = write_results(tmp_path / "a.pkl", toy_kitti, name=np.char.lower)
+    work = tmp_path / "w"
+    code, _, err = begin(curate, work, toy_kitti, results)
+    assert code == FramesFailed.exit_code
+    assert "answers 'car', the data set's category is 'Car'" in err
+    setting = re.search(r"detector\.options\.(rename = )\{", err)
+    assert setting is not None
+    toml = work / "curate.toml"
+    table = 'options = {rename = {car = "Car", pedestrian = "Pedestrian", cyclist = "Cyclist"}}'
+    toml.write_text(re.sub(r"(?<=camera_view = true\n)options = \{\}", table, toml.read_text()))
+    code, out, err = curate("predict", "-w", work)
+    assert code == 0, err
+    assert "18 rows" in out
+
+
+def test_unknown_names_are_left_out_and_told_once(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The others stay."""
+    predict._warn_once.cache_clear()
+    results = write_results(
+        tmp_path / "a.pkl", toy_kitti, name=lambda names: np.char.replace(names, "Cyclist", "Bike")
+    )
+    code, out, _ = begin(curate, tmp_path / "w", toy_kitti, results)
+    assert code == 0
+    assert "12 rows" in out
+    told = [message for message in caplog.messages if "'Bike'" in message]
+    assert len(told) == 1
+    assert "rename" in told[0]
+
+
+def test_results_for_other_frames_end_the_command(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """None of the recorded frames exists: the error shows how the data set names its frames."""
+    results = write_results(tmp_path / "a.pkl", toy_kitti, frame_id=lambda name: f"drive_{name}")
+    code, _, err = begin(curate, tmp_path / "w", toy_kitti, results)
+    assert code == DataError.exit_code
+    assert "results for frames that do not exist (drive_000000" in err
+    assert "named like 000000" in err
+    assert "Traceback" not in err
+
+
+def test_camera_boxes_taken_for_lidar_boxes_are_found_out(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """Axes right, down, forward: no box holds points, and doctor ends with a fault."""
+    results = write_results(
+        tmp_path / "a.pkl",
+        toy_kitti,
+        boxes_lidar=lambda boxes: np.column_stack([-boxes[:, 1], -boxes[:, 2], boxes[:, 0],
+                                                   boxes[:, 3:]]),
+    )  # fmt: skip
+    begin(curate, tmp_path / "w", toy_kitti, results)
+    code, out, _ = curate("doctor", "-w", tmp_path / "w")
+    assert code == 1
+    assert re.search(r"^wrong +boxes", out, re.MULTILINE)
+
+
+def test_a_pickle_that_runs_code_runs_nothing_from_the_command_line(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """Armed: the usual reader makes the folder."""
+    results, pwned = tmp_path / "a.pkl", tmp_path / "pwned"
+    results.write_bytes(b"cos\nmkdir\n(V" + str(pwned).encode() + b"\ntR.")
+    code, _, err = begin(curate, tmp_path / "w", toy_kitti, results)
+    assert code == DataError.exit_code
+    assert "refused, the pickle names os.mkdir" in err
+    assert not pwned.exists()
+    pickle.loads(results.read_bytes())
+    assert pwned.exists()
+
+
+def test_sql_that_writes_leaves_the_database_as_it_was(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """Byte by byte, whatever is tried."""
+    assert curate("predict", "-w", workspace.root)[0] == 0
+    path = workspace.root / "curate.db"
+    before = path.read_bytes()
+    for sql in (
+        "DELETE FROM prediction",
+        "WITH x AS (SELECT 1) UPDATE frame SET split = 'val'",
+        "PRAGMA journal_mode = DELETE",
+        f"VACUUM INTO '{workspace.root / 'copy.db'}'",
+        f"ATTACH '{workspace.root / 'other.db'}' AS other",
+    ):
+        code, _, err = curate("query", sql, "-w", workspace.root)
+        assert code == ConfigError.exit_code, sql
+        assert err.count("\n") == 1
+    assert path.read_bytes() == before
+    assert not list(workspace.root.glob("*o*.db"))
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+def test_a_report_needs_no_network(curate: Curate, workspace: Workspace, tmp_path: Path) -> None:
+    """In a browser whose every connection fails, all pictures show and nothing was asked for."""
+    for command in ("predict", "repredict", "score", "solve"):
+        assert curate(command, "-w", workspace.root)[0] == 0
+    _, out, _ = curate("report", "-w", workspace.root)
+    text = Path(out.removeprefix("report: ").strip()).read_text()
+    # The page runs no script; the copy gets one that writes down what the browser made of it.
+    page = tmp_path / "report.html"
+    page.write_text(
+        text + "<script>addEventListener('load', () => {"
+        "const shown = [...document.images].filter(i => i.complete && i.naturalWidth > 0);"
+        "const asked = performance.getEntriesByType('resource').map(e => e.name)"
+        ".filter(name => !name.startsWith('data:'));"
+        "document.title = `shown ${shown.length}/${document.images.length} asked ${asked.length}`"
+        "})</script>"
+    )
+    ended = subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--proxy-server=127.0.0.1:9",
+         f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=10000",
+         "--dump-dom", page.as_uri()],
+        capture_output=True, text=True, check=False, timeout=300,
+        env=os.environ | {"HOME": str(tmp_path)},
+    )  # fmt: skip
+    title = re.search(r"<title>shown (\d+)/(\d+) asked (\d+)</title>", ended.stdout)
+    assert title is not None, ended.stderr
+    shown, pictures, asked = map(int, title.groups())
+    assert shown == pictures > 0
+    assert asked == 0

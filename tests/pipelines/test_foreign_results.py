@@ -1,0 +1,115 @@
+"""A foreign detector's result files without a second pass, and what a new user does with them."""
+
+import json
+from pathlib import Path
+
+import pytest
+from pipelines_cli import Curate
+
+from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti_labels import from_detections, write_objects
+from curate.detections import Detections
+from curate.errors import ConfigError
+
+
+@pytest.fixture
+def results(tmp_path: Path, toy_kitti: Path) -> Path:
+    """KITTI result files of a detector that finds what is there, with a score of 0.9."""
+    dataset = KittiDataset(toy_kitti)
+    folder = tmp_path / "results"
+    folder.mkdir()
+    for name in dataset.frame_ids():
+        frame, truth = dataset.read(name), dataset.annotations(name)
+        found = Detections(truth.boxes, truth.alpha + 0.9, truth.categories)
+        objects = from_detections(found, frame.calibration, frame.image_size)
+        write_objects(folder / f"{name}.txt", objects)
+    return folder
+
+
+def begin(curate: Curate, work: Path, root: Path, results: Path, *more: object) -> None:
+    """A workspace over the result files."""
+    code, _, err = curate(
+        "init", work, "--root", root, "--labeled", "0.25",
+        "--detector", "recorded", "--detector-path", results, *more,
+    )  # fmt: skip
+    assert code == 0, err
+
+
+def test_without_a_second_pass_labels_are_kept_with_weight_0(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path
+) -> None:
+    """No evidence is weight 0, not a label that vanishes; doctor names the remedy."""
+    work = tmp_path / "work"
+    begin(curate, work, toy_kitti, results)
+    code, out, _ = curate("doctor", "-w", work)
+    assert code == 0
+    assert "solve.self_paced = false" in out
+    code, out, err = curate("run", "-w", work)
+    assert code == 0, err
+    assert "18 labels, 0 with weight > 0" in out
+    sql = "SELECT count(*) AS n, count(loss) AS losses, sum(weight) AS v FROM weighted_labels"
+    [row] = json.loads(curate("query", sql, "--json", "-w", work)[1])
+    assert row == {"n": 18, "losses": 0, "v": 0.0}
+
+
+def test_the_priors_alone_weigh_where_the_setting_says_so(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path
+) -> None:
+    """Every label weighs rho_det, and explain works it out again."""
+    work = tmp_path / "work"
+    begin(curate, work, toy_kitti, results, "--set", "solve.self_paced=false")
+    assert "the priors alone weigh" in curate("doctor", "-w", work)[1]
+    code, _, err = curate("run", "-w", work)
+    assert code == 0, err
+    sql = "SELECT frame, k, rho_det, weight FROM weighted_labels ORDER BY weight DESC"
+    rows = json.loads(curate("query", sql, "--json", "-w", work)[1])
+    assert len(rows) == 18
+    assert all(row["weight"] == row["rho_det"] > 0 for row in rows)
+    code, out, _ = curate("explain", rows[0]["frame"], rows[0]["k"], "-w", work)
+    assert code == 0
+    assert "no second pass over augmented copies" in out
+    assert f"recomputed     {rows[0]['weight']:.4f}" in out
+    assert "differ" not in out
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("self_paced=false", "write section.key=value"),
+        ("solve.self_paced", "write section.key=value"),
+        ("solve.self_paced=perhaps", "solve.self_paced"),
+        ("solve.selfpaced=true", "solve.selfpaced"),
+        ("run.seed.first=3", "run.seed"),
+    ],
+)
+def test_a_wrong_setting_is_refused(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, setting: str, message: str
+) -> None:
+    """Before a workspace is made."""
+    code, _, err = curate("init", tmp_path / "w", "--root", toy_kitti, "--set", setting)
+    assert code == ConfigError.exit_code
+    assert message in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "w").exists()
+
+
+def test_whose_class_numbers_a_segmenter_answers_must_be_said(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """By name, or as a table; a guess would weigh by the wrong pixels."""
+    (tmp_path / "maps").mkdir()
+    words = [
+        "--root", toy_kitti, "--labeled", "0.25",
+        "--segmenter", "saved", "--segmenter-path", tmp_path / "maps",
+    ]  # fmt: skip
+    code, _, err = curate("init", tmp_path / "w", *words)
+    assert code == ConfigError.exit_code
+    assert "--segmenter-classes voc, cityscapes, cityscapes-label-ids, coco" in err
+    code, _, err = curate("init", tmp_path / "w", *words, "--segmenter-classes", "ade")
+    assert code == ConfigError.exit_code
+    assert "unknown class set 'ade'" in err
+    table = "segmenter.options.classes={Car=[13], Pedestrian=[11], Cyclist=[18]}"
+    code, _, err = curate("init", tmp_path / "w", *words, "--set", table)
+    assert code == 0, err
+    code, out, _ = curate("doctor", "-w", tmp_path / "w")
+    assert "000" in out

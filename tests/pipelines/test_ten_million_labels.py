@@ -1,0 +1,40 @@
+"""Ten million labels: solved for another policy and age, and asked the common questions.
+
+The figures of docs/scale.md; CURATE_PROOF_LABELS takes fewer, CURATE_PROOF_URL another database.
+"""
+
+import json
+import os
+import resource
+import time
+from pathlib import Path
+
+import pytest
+from labels_at_scale import EACH, filled_workspace
+from sqlalchemy import text
+from test_label_queries import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRUSTED, solved
+
+LABELS = int(os.environ.get("CURATE_PROOF_LABELS", "10_000_000"))
+SOLVES_S, FIRST_ROW_S = 60.0, 0.05
+
+
+@pytest.mark.slow
+def test_ten_million_labels(tmp_path: Path) -> None:
+    """Each solve within a minute of CPU time, each first row within 50 ms."""
+    url = os.environ.get("CURATE_PROOF_URL")
+    workspace = filled_workspace(tmp_path / "work", LABELS // EACH, url)
+    figures: dict[str, float] = {}
+    for name, policy, rounds in (("first", "pspsl", 3), ("age", "pspsl", 4), ("policy", "uda", 4)):
+        start = time.process_time()
+        solved(workspace, policy, rounds)
+        figures[f"solve, {name}"] = time.process_time() - start
+    for question in (TRUSTED, HEAVIEST, FRAME, FRAME_OF_ROUND, COUNTS):
+        with workspace.database.reading() as connection:
+            streaming = connection.execution_options(stream_results=True)
+            start = time.perf_counter()
+            assert streaming.execute(text(question)).fetchone()
+            figures[question] = time.perf_counter() - start
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps({"labels": LABELS, "peak MiB": memory, **figures}, indent=1))  # noqa: T201 - what it is for
+    assert all(figures[name] < SOLVES_S for name in figures if name.startswith("solve"))
+    assert all(figures[name] < FIRST_ROW_S for name in figures if name.startswith("SELECT"))
