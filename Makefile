@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: venv demo test prove bench lint docs clean
+.PHONY: venv demo test prove fuzz bench lint docs clean
 
 venv: $(READY)
 
@@ -16,6 +16,12 @@ test: $(READY)
 
 prove: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# Coverage-guided, where atheris is installed: make fuzz READER="label file" SECONDS=600
+READER ?= labels
+SECONDS ?= 60
+fuzz: $(READY)
+	cd tests && PYTHONPATH=.:.. ../$(BIN)/python -m fuzzing.guided "$(READER)" $(SECONDS)
 
 # One thread per library; ratios and frames per second, written to docs/benchmarks.{json,md}.
 bench: $(READY)

@@ -78,3 +78,7 @@ class FrameFiles:
     image: Path
     calibration: Path
     label: Path | None
+
+    def paths(self) -> tuple[Path, ...]:
+        """Those that the frame has."""
+        return (self.points, self.image, self.calibration, *((self.label,) if self.label else ()))

@@ -27,9 +27,13 @@ def open_session(model: Path, threads: int, section: str) -> Any:
     # Waiting threads would take the cores from the other workers.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
+    refusals: tuple[type[Exception], ...] = (*runtime_errors(), RuntimeError, ValueError)
     try:
-        return onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
-    except runtime_errors() as error:
+        # With its fallback, it would print what is wrong and try the same provider again.
+        return onnxruntime.InferenceSession(
+            str(model), options, providers=["CPUExecutionProvider"], enable_fallback=0
+        )
+    except refusals as error:
         raise ModelError(f"{model}: no usable ONNX model: {first_line(error)}") from error
 
 

@@ -99,6 +99,24 @@ class Frame(Base):
     )
 
 
+class SplitList(Base):
+    """The lists of frames as `curate init` found and chose them; the firewall compares."""
+
+    __tablename__ = "split_list"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    source: Mapped[str] = mapped_column(
+        Text, primary_key=True, comment="chosen | dataset (its own) | file (given to init)"
+    )
+    name: Mapped[str] = mapped_column(
+        Text, primary_key=True, comment="labeled | unlabeled | val, or of the data set's list"
+    )
+    path: Mapped[str | None] = mapped_column(Text, comment="of the file")
+    frames: Mapped[int] = mapped_column(Integer, comment="how many")
+    sha256: Mapped[str] = mapped_column(Text, comment="of names")
+    names: Mapped[str] = mapped_column(Text, comment="the sorted names, one per line")
+
+
 class GroundTruth(Base):
     """What annotators wrote, for labeled and val frames only.
 
@@ -529,6 +547,18 @@ class EvaluationAp(Base):
     objects: Mapped[int] = mapped_column(Integer, comment="that count")
     ap_r40: Mapped[float | None] = mapped_column(Float(53), comment="percent")
     ap_r11: Mapped[float | None] = mapped_column(Float(53), comment="percent")
+
+
+class LabelFile(Base):
+    """An exported label file as it was written; the firewall notices what changed since."""
+
+    __tablename__ = "label_file"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    path: Mapped[str] = mapped_column(Text, primary_key=True, comment="relative to the workspace")
+    round: Mapped[int] = mapped_column(Integer, comment="0 = ground truth of X_l alone")
+    policy: Mapped[Name]
+    sha256: Mapped[str] = mapped_column(Text, comment="of the file")
 
 
 class Task(Base):

@@ -1,7 +1,9 @@
 """Read-only questions in SQL."""
 
 import sqlite3
+import time
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,36 +21,84 @@ SERVER_ROWS = 1000  # that a server sends at once
 FORBIDDEN_FUNCTIONS = frozenset(
     {"load_extension", "readfile", "writefile", "edit", "fts3_tokenizer"}
 )
+# Of a text or blob: randomblob, printf, replace and group_concat could ask for a gigabyte.
+LONGEST_VALUE = 1 << 22
+MOST_COLUMNS = 500
+LONGEST_SQL = 1 << 20
+# SQLite looks at the clock after so many steps of its machine.
+_STEPS = 10_000
+# SQLSTATE query_canceled, in every language of the server.
+_TIMED_OUT = "57014"
 
 
-def ask(url: URL, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
+def ask(
+    url: URL, sql: str, seconds: float = 60.0
+) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
     """The columns and the rows of a question.
 
+    Args:
+        url: of the database.
+        sql: one SELECT.
+        seconds: after which the question is given up, also while its rows are taken.
+
     Raises:
-        ConfigError: the SQL is wrong, or does more than read.
+        ConfigError: the SQL is wrong, does more than read, or takes too long or too much.
         DatabaseError: the database cannot be opened.
     """
     if url.get_backend_name() == "sqlite":
-        return _ask_sqlite(Path(str(url.database)), sql)
-    return _ask_server(url, sql)
+        return _ask_sqlite(Path(str(url.database)), sql, seconds)
+    return _ask_server(url, sql, seconds)
 
 
-def _ask_sqlite(path: Path, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
+def _ask_sqlite(
+    path: Path, sql: str, seconds: float
+) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
     try:
         connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
     except sqlite3.Error as error:
         raise DatabaseError(f"{path}: {error}") from error
+    for category, limit in (
+        (sqlite3.SQLITE_LIMIT_LENGTH, LONGEST_VALUE),
+        (sqlite3.SQLITE_LIMIT_SQL_LENGTH, LONGEST_SQL),
+        (sqlite3.SQLITE_LIMIT_COLUMN, MOST_COLUMNS),
+        (sqlite3.SQLITE_LIMIT_ATTACHED, 0),
+        (sqlite3.SQLITE_LIMIT_WORKER_THREADS, 0),
+    ):
+        connection.setlimit(category, limit)
     connection.execute("PRAGMA query_only = ON")
+    connection.execute("PRAGMA trusted_schema = OFF")
     connection.set_authorizer(may_read)
+    end = time.monotonic() + seconds
+    connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS)
     try:
         cursor = connection.execute(sql)
-    except (sqlite3.Error, sqlite3.Warning) as error:
-        if "file is not a database" in str(error) or "malformed" in str(error):
-            raise DatabaseError(f"{path}: {error}") from error
-        raise ConfigError(_explain(str(error))) from error
+    except (sqlite3.Error, sqlite3.Warning, UnicodeEncodeError, ValueError) as error:
+        connection.close()
+        raise _own_words(path, error, seconds) from error
     if cursor.description is None:
+        connection.close()
         raise ConfigError("query: not a question; write a SELECT")
-    return [column[0] for column in cursor.description], iter(cursor)
+    return [column[0] for column in cursor.description], _rows(connection, cursor, path, seconds)
+
+
+def _rows(
+    connection: sqlite3.Connection, cursor: sqlite3.Cursor, path: Path, seconds: float
+) -> Iterator[tuple[Any, ...]]:
+    """The rows as they are found; what goes wrong in the middle is said in our own words."""
+    with closing(connection):
+        try:
+            yield from cursor
+        except sqlite3.Error as error:
+            raise _own_words(path, error, seconds) from error
+
+
+def _own_words(path: Path, error: Exception, seconds: float) -> ConfigError | DatabaseError:
+    message = " ".join(str(error).split())
+    if "file is not a database" in message or "malformed" in message:
+        return DatabaseError(f"{path}: {message}")
+    if "interrupted" in message:
+        return _given_up(seconds)
+    return ConfigError(_explain(message))
 
 
 def may_read(action: int, _first: str | None, second: str | None, *_: str | None) -> int:
@@ -58,7 +108,9 @@ def may_read(action: int, _first: str | None, second: str | None, *_: str | None
     return sqlite3.SQLITE_OK if action in ALLOWED else sqlite3.SQLITE_DENY
 
 
-def _ask_server(url: URL, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
+def _ask_server(
+    url: URL, sql: str, seconds: float
+) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
     """The answer of a PostgreSQL server, a part at a time.
 
     The question becomes DECLARE ... CURSOR FOR, in the protocol that takes one statement only, in a
@@ -69,20 +121,42 @@ def _ask_server(url: URL, sql: str) -> tuple[Sequence[str], Iterator[tuple[Any, 
         connection = engine.connect()
     except DBAPIError as error:
         raise DatabaseError(f"{url.render_as_string()}: {_one_line(error.orig)}") from error
-    reading = connection.execution_options(
-        postgresql_readonly=True, stream_results=True, max_row_buffer=SERVER_ROWS
-    )
+    end = time.monotonic() + seconds
     try:
+        reading = connection.execution_options(postgresql_readonly=True)
+        reading.exec_driver_sql(f"SET LOCAL statement_timeout = {max(1, round(seconds * 1000))}")
+        reading = reading.execution_options(stream_results=True, max_row_buffer=SERVER_ROWS)
         result = reading.exec_driver_sql(sql)
     except DBAPIError as error:
-        raise ConfigError(_explain(_one_line(error.orig))) from error
-    return list(result.keys()), _rows(reading, result)
+        connection.close()
+        raise _servers_words(error, seconds) from error
+    return list(result.keys()), _server_rows(reading, result, end, seconds)
 
 
-def _rows(connection: Connection, result: CursorResult[Any]) -> Iterator[tuple[Any, ...]]:
+def _server_rows(
+    connection: Connection, result: CursorResult[Any], end: float, seconds: float
+) -> Iterator[tuple[Any, ...]]:
+    """The rows as they come; the server's clock starts anew with each part, so ours runs, too."""
     with connection:
-        for row in result:
-            yield tuple(row)
+        try:
+            for row in result:
+                if time.monotonic() > end:
+                    raise _given_up(seconds)
+                yield tuple(row)
+        except DBAPIError as error:
+            raise _servers_words(error, seconds) from error
+
+
+def _servers_words(error: DBAPIError, seconds: float) -> ConfigError:
+    if getattr(error.orig, "sqlstate", None) == _TIMED_OUT:
+        return _given_up(seconds)
+    return ConfigError(_explain(_one_line(error.orig)))
+
+
+def _given_up(seconds: float) -> ConfigError:
+    return ConfigError(
+        f"query: given up after {seconds:g} seconds; ask for less, or allow more with --seconds"
+    )
 
 
 def _one_line(error: BaseException | None) -> str:
@@ -92,6 +166,6 @@ def _one_line(error: BaseException | None) -> str:
 def _explain(message: str) -> str:
     if "not authorized" in message or "readonly" in message or "prohibited" in message:
         return "query: only SELECT is allowed, the connection is read-only"
-    if "one statement" in message:
+    if "one statement" in message or "multiple commands" in message:
         return "query: one statement at a time"
     return f"query: {message}"

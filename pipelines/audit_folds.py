@@ -1,7 +1,8 @@
 """Held-out folds of X_l: small workspaces inside the workspace, each with its own database.
 
-The teacher of a fold learns from the other folds; the fold itself is its val split. What a fold has
-done it keeps, so an audit that was killed continues.
+The teacher of a fold learns from the other folds; the fold itself is its val split, and made of
+whole sequences where the data set knows them. What a fold has done it keeps, so an audit that was
+killed continues.
 """
 
 from collections.abc import Iterator, Sequence
@@ -9,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from curate.datasets.base import Sequences
+from curate.datasets.base import sequences_of
 from curate.errors import ConfigError
+from curate.firewall.sequences import group_by_sequence
 from pipelines.config import Config, read_config, write_config
 from pipelines.setup import initialise
 from pipelines.workspace import CONFIG_NAME, Workspace
@@ -20,7 +22,7 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
     """The workspace of every fold, made where it does not exist yet.
 
     Raises:
-        ConfigError: there are fewer labeled frames than folds.
+        ConfigError: there are fewer labeled frames, or sequences of them, than folds.
     """
     labeled = sorted(workspace.frames("labeled"))
     if not 2 <= folds <= len(labeled):
@@ -48,20 +50,21 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
 def _dealt(
     workspace: Workspace, labeled: Sequence[str], folds: int, generator: np.random.Generator
 ) -> list[list[str]]:
-    """The labeled frames in folds of about the same size; a sequence is never in two of them."""
-    if not isinstance(workspace.dataset, Sequences):
-        shuffled = generator.permutation(labeled).tolist()
-        return [sorted(shuffled[fold::folds]) for fold in range(folds)]
-    sequences = workspace.dataset.sequences().values()
-    own = [frames for frames in (sorted(set(labeled) & set(one)) for one in sequences) if frames]
-    if len(own) < folds:
-        raise ConfigError(
-            f"--folds {folds}: the labeled frames are of {len(own)} sequences, which are not cut; "
-            "ask for fewer folds, or label frames of more sequences"
-        )
+    """The labeled frames in folds of about the same size; no sequence is in two of them.
+
+    Where frames were split singly all the same, too few sequences are cut here, too.
+    """
+    groups = group_by_sequence(sequences_of(workspace.dataset, labeled), labeled)
+    if len(groups) < folds:
+        if workspace.config.dataset.split_by == "sequence":
+            raise ConfigError(
+                f"--folds {folds}: the labeled frames are of {len(groups)} sequences, which are "
+                "not cut; ask for fewer folds, or label frames of more sequences"
+            )
+        groups = {frame: [frame] for frame in labeled}
     dealt: list[list[str]] = [[] for _ in range(folds)]
-    for place in generator.permutation(len(own)):
-        min(dealt, key=len).extend(own[place])
+    for name in generator.permutation(sorted(groups)).tolist():
+        min(dealt, key=len).extend(groups[name])
     return [sorted(fold) for fold in dealt]
 
 

@@ -10,6 +10,7 @@ from curate.errors import CurateError
 from pipelines.commands import (
     audit,
     bench,
+    check,
     demo,
     diff,
     doctor,
@@ -66,6 +67,7 @@ for command in (
     serve,
     evaluate,
     audit,
+    check,
     bench,
 ):
     command.register(app)
@@ -89,7 +91,8 @@ def main() -> None:
     try:
         app()
     except CurateError as error:
-        sys.stderr.write(f"error: {error}\n")
+        # One line, whatever a foreign file has put into it.
+        sys.stderr.write(f"error: {' '.join(str(error).splitlines())}\n")
         sys.exit(error.exit_code)
     except BrokenPipeError:
         sys.exit(0)

@@ -53,6 +53,8 @@ class DatasetSection(Section):
     categories: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_each_once)] = (
         CATEGORIES
     )
+    split_by: Literal["sequence", "frame"] = "sequence"  # frame: neighbours on both sides
+    follow_links: bool = False  # true: links may lead out of root
     options: Options = {}
 
 
@@ -177,13 +179,15 @@ def read_config(path: Path) -> Config:
         ConfigError: the file is not TOML, or some settings are wrong; all of them are named.
     """
     try:
-        return make_config(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file; `curate init` makes a workspace") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from error
+    except (RecursionError, ValueError) as error:  # ValueError: also of absurdly long numbers
+        words = " ".join(str(error).split())[:200]
+        raise ConfigError(f"{path}: not TOML: {words}") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    return make_config(document, str(path))
 
 
 def make_config(document: Mapping[str, Any], source: str) -> Config:

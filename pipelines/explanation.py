@@ -117,9 +117,8 @@ def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
     config = _stored_config(workspace, label["round"])
     age = _age(workspace, config, label) if label["lambda_u"] is not None else None
     evidence = _evidence(config, label, views)
-    recomputed = _weight(
-        label, evidence, age, alone=not views and not _self_paced(config, label["policy"])
-    )
+    alone = not views and not _self_paced(config, label["policy"])
+    recomputed = _weight(label, evidence, age, alone=alone)
     lines = _lines(config, label, views, age, evidence, recomputed)
     return Explanation(label, views, age, evidence, recomputed, tuple(lines))
 

@@ -41,6 +41,7 @@ _DECIDE: tuple[Stage, ...] = (
         settings=export.settings,
         run=export.run,
         file=export.file,
+        guard=export.guard,
     ),
     RoundStage(
         "train-round",
@@ -50,6 +51,7 @@ _DECIDE: tuple[Stage, ...] = (
         settings=train_round.settings,
         run=train_round.run,
         file=train_round.file,
+        guard=export.guard,
     ),
 )
 ROUND = (*_DETECT, *map(score.stage, PRIORS.classes), *_DECIDE)

@@ -133,8 +133,11 @@ def run_round(
 
     Raises:
         DatabaseError: another process works on the round, or on the same policy in it.
+        LeakageError: what guards the stage does not hold.
     """
     with workspace.database.claiming_round(context.number, policy, stage.name):
+        if stage.guard:
+            stage.guard(workspace, context, policy)
         frames = plan.frames_to_weigh(workspace, context, policy)
         return run_once(
             workspace,

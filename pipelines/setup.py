@@ -1,20 +1,27 @@
 """Setting a workspace up: which frames are labeled, and their ground truth."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from sqlalchemy import func, select
 
-from curate.datasets.base import Dataset, Sequences
+from curate.datasets.base import Dataset, sequences_of
+from curate.datasets.containment import check_frame_id
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
+from curate.exporters.base import named
+from curate.firewall.sequences import choose_sequences, group_by_sequence, straddling
 from curate.segmenters.classes import CLASS_MAPS, class_map
 from db import bulk
 from pipelines import registry
 from pipelines.config import Config
+from pipelines.firewall.record import split_rows
 from pipelines.workspace import SPLITS, Workspace, open_dataset
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,7 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
     """
     _refuse_absent(config)
     dataset = open_dataset(config)
-    split = choose_split(dataset, labeled, val, config.run.seed)
+    split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
     truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
     workspace = Workspace.create(root, config)
     stored = Split(*(tuple(workspace.frames(name)) for name in ("labeled", "unlabeled", "val")))
@@ -61,7 +68,9 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
         raise WorkspaceError(
             f"{workspace.root}: exists with another split of the frames; choose another folder"
         )
-    _store(workspace, dataset, split, truth)
+    lists = {"labeled": labeled, "val": val}
+    files = {name: Path(wish) for name, wish in lists.items() if wish and Path(wish).is_file()}
+    _store(workspace, dataset, split, truth, files)
     return workspace
 
 
@@ -96,14 +105,32 @@ def _refuse_undeclared_classes(config: Config) -> None:
         )
 
 
-def choose_split(dataset: Dataset, labeled: str, val: str, seed: int) -> Split:
-    """Which frames are labeled, unlabeled and val."""
+def choose_split(
+    dataset: Dataset, labeled: str, val: str, seed: int, split_by: str = "sequence"
+) -> Split:
+    """Which frames are labeled, unlabeled and val.
+
+    Where the data set knows sequences, a sequence goes into one split as a whole; `split_by`
+    "frame" draws frames all the same.
+
+    Raises:
+        LeakageError: given lists put a sequence into two splits.
+    """
     lists = dataset.splits()
     frames = lists.get("train") or dataset.frame_ids()
     if not frames:
         raise DataError("the data set holds no frames; --root should hold velodyne/ or training/")
+    known = sequences_of(dataset, {*frames, *lists.get("val", ())})
+    sequences = known if split_by == "sequence" else {}
+    if known and not sequences:
+        _log.warning(
+            "splitting by frame: near-duplicate frames of one sequence will be in several splits, "
+            "and figures on val frames will look better than they are"
+        )
     generator = np.random.default_rng(seed)
-    held_out = _choose(dataset, frames, val, generator, "val") if val else lists.get("val", ())
+    held_out: Sequence[str] = lists.get("val", ())
+    if val:
+        held_out = _choose(dataset, frames, val, generator, "val", sequences)
     bare = [frame for frame in held_out if not dataset.files(frame).label]
     if bare:
         raise ConfigError(
@@ -111,30 +138,38 @@ def choose_split(dataset: Dataset, labeled: str, val: str, seed: int) -> Split:
             "frames that have one"
         )
     pool = [frame for frame in frames if frame not in set(held_out)]
-    chosen = _choose(dataset, pool, labeled, generator, "labeled")
+    chosen = _choose(dataset, pool, labeled, generator, "labeled", sequences)
     rest = sorted(set(pool) - set(chosen))
-    split = Split(tuple(sorted(chosen)), tuple(rest), tuple(sorted(held_out)))
-    if isinstance(dataset, Sequences):
-        _refuse_cut(dataset, split)
-    return split
+    found = Split(tuple(sorted(chosen)), tuple(rest), tuple(sorted(held_out)))
+    for frame in (*found.labeled, *found.unlabeled, *found.val):
+        check_frame_id(frame)
+    _refuse_straddling(sequences, found)
+    return found
 
 
-def _refuse_cut(dataset: Sequences, split: Split) -> None:
-    """LeakageError where neighbouring frames are on two sides: they show the same objects."""
-    homes = {frame: name for name in SPLITS for frame in getattr(split, name)}
-    for sequence, frames in dataset.sequences().items():
-        sides = sorted({homes[frame] for frame in frames if frame in homes})
-        if len(sides) > 1:
-            raise LeakageError(
-                f"frames of {sequence} would be both {' and '.join(sides)}: neighbouring frames "
-                "show the same objects; list whole sequences (a list may hold their names)"
-            )
+def _refuse_straddling(sequences: Mapping[str, str], split: Split) -> None:
+    """LeakageError where a sequence is in two splits."""
+    shared = straddling(sequences, {name: getattr(split, name) for name in SPLITS})
+    for (one, other), names in shared.items():
+        raise LeakageError(
+            f"{len(names)} sequences ({named(names)}) have frames in both {one} and {other}, which "
+            "are near-duplicates of each other: give whole sequences (a list may hold their "
+            "names), or split by frame all the same with --split-by frame"
+        )
 
 
 def _choose(
-    dataset: Dataset, pool: Sequence[str], wish: str, generator: np.random.Generator, split: str
+    dataset: Dataset,
+    pool: Sequence[str],
+    wish: str,
+    generator: np.random.Generator,
+    split: str,
+    sequences: Mapping[str, str],
 ) -> list[str]:
-    """Frames by share or by list; only frames with a label file can be chosen."""
+    """Frames by share or by list, in whole sequences where there are any.
+
+    Only frames with a label file can be chosen.
+    """
     if Path(wish).is_file():
         return _listed(dataset, pool, Path(wish), split)
     try:
@@ -152,36 +187,27 @@ def _choose(
             f"--{split} {wish} asks for {count} frames, but only {len(with_label)} of {len(pool)} "
             "have a label file; give a smaller share (0 for none)"
         )
-    if isinstance(dataset, Sequences):
-        return _whole_sequences(dataset, with_label, count, generator)
+    if sequences:
+        groups = group_by_sequence(sequences, pool)
+        whole = {name for name, frames in groups.items() if set(frames) <= set(with_label)}
+        of = [frame for name in sorted(whole) for frame in groups[name]]
+        if not of:
+            raise ConfigError(
+                f"--{split} {wish}: no sequence has a label file for each of its frames; give a "
+                f"list of frames, or split by frame with --split-by frame"
+            )
+        return choose_sequences(sequences, of, count, generator)
     return list(generator.permutation(with_label)[:count].tolist())
 
 
-def _whole_sequences(
-    dataset: Sequences, frames: Sequence[str], count: int, generator: np.random.Generator
-) -> list[str]:
-    """Drawn sequences with about `count` of the frames; at least one."""
-    wanted = set(frames)
-    sequences = [wanted.intersection(own) for own in dataset.sequences().values()]
-    sequences = [own for own in sequences if own]
-    chosen: list[str] = []
-    for place in generator.permutation(len(sequences)):
-        more = sorted(sequences[place])
-        # One that would overshoot further than what is missing now is passed over.
-        if not chosen or len(chosen) + len(more) - count <= count - len(chosen):
-            chosen += more
-    return chosen
-
-
 def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
-    """The frames that a file names, each once."""
+    """The frames that a file names, each once; a sequence of the pool stands for its frames."""
     try:
         names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"--{split} {path}: no list of frame ids: {error}") from error
-    if isinstance(dataset, Sequences):
-        sequences = dataset.sequences()
-        names = [frame for name in names for frame in sequences.get(name, (name,))]
+    groups = group_by_sequence(sequences_of(dataset, pool), pool)
+    names = [frame for name in names for frame in groups.get(name, (name,))]
     unknown = sorted(set(names) - set(pool))
     if unknown:
         raise ConfigError(f"--{split} {path}: frame {unknown[0]} is not among the training frames")
@@ -192,16 +218,20 @@ def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> li
 
 
 def _store(
-    workspace: Workspace, dataset: Dataset, split: Split, truth: dict[str, Annotations]
+    workspace: Workspace,
+    dataset: Dataset,
+    split: Split,
+    truth: dict[str, Annotations],
+    files: Mapping[str, Path],
 ) -> None:
     root = workspace.config.dataset.root
     kind = workspace.config.dataset.kind
     rows = []
-    for name in ("labeled", "unlabeled", "val"):
+    for name in SPLITS:
         for frame in getattr(split, name):
-            files = dataset.files(frame)
-            label = None if name == "unlabeled" else files.label
-            paths = (files.points, files.image, files.calibration, label)
+            found = dataset.files(frame)
+            label = None if name == "unlabeled" else found.label
+            paths = (found.points, found.image, found.calibration, label)
             relative = [str(p.relative_to(root)) if p else None for p in paths]
             rows.append((kind, frame, name, *relative))
     table = bulk.table("frame")
@@ -209,6 +239,8 @@ def _store(
         if connection.execute(select(func.count()).select_from(table)).scalar_one():
             raise WorkspaceError(f"{workspace.root}: another command has just set it up")
         bulk.insert(connection, "frame", rows)
+        chosen = {name: getattr(split, name) for name in SPLITS}
+        bulk.insert(connection, "split_list", split_rows(chosen, dataset.splits(), files))
         query = select(table.c.frame, table.c.id, table.c.split)
         keys = {frame: (key, of) for frame, key, of in bulk.select(connection, query)}
         truth_rows = [

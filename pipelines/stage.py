@@ -131,6 +131,7 @@ class RoundStage:
         settings: what its result depends on beside what it reads; the last argument is the policy.
         run: does it.
         file: what it leaves on disk, if anything.
+        guard: what must hold at every start, even where the stage is up to date; raises.
     """
 
     name: str
@@ -140,6 +141,7 @@ class RoundStage:
     settings: Callable[[Workspace, RoundContext, str], Settings]
     run: Callable[[Workspace, RoundJob, Progress], Product]
     file: Callable[[Workspace, RoundContext, str], Path] | None = None
+    guard: Callable[[Workspace, RoundContext, str], None] | None = None
 
 
 Stage = FrameStage | RoundStage

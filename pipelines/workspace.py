@@ -135,7 +135,10 @@ def open_dataset(config: Config) -> Dataset:
     """The data set that a configuration names."""
     section = config.dataset
     dataset: Dataset = registry.DATASETS.build(
-        section.kind, section.root, offered={}, options=section.options
+        section.kind,
+        section.root,
+        offered={"follow_links": lambda: section.follow_links},
+        options=section.options,
     )
     return dataset
 

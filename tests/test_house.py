@@ -65,7 +65,11 @@ def test_only_the_label_file_format_speaks_sql_in_curate() -> None:
         if {"sqlite3", "sqlalchemy"} & {name.split(".")[0] for name in imports(path)}
         and path.relative_to(ROOT).parts[0] == "curate"
     }
-    assert users <= {"curate/exporters/sqlite.py", "curate/training/labels.py"}
+    assert users <= {
+        "curate/exporters/label_file.py",
+        "curate/exporters/sqlite.py",
+        "curate/training/labels.py",
+    }
 
 
 def test_every_module_says_what_it_is_for() -> None:
@@ -74,21 +78,70 @@ def test_every_module_says_what_it_is_for() -> None:
     assert silent == []
 
 
-def test_nothing_unpickles_files() -> None:
-    """Workers read their parent's bytes; a foreign pickle's reader runs nothing."""
+# What runs code that a file names, unpacks archives, or lets a shell read a text.
+RUNS_FOREIGN_CODE = {
+    "eval", "exec", "compile", "__import__", "os.system", "os.popen",
+    "pickle.load", "pickle.loads", "pickle.Unpickler", "torch.load", "yaml.load", "marshal.load",
+    "marshal.loads", "shelve.open", "joblib.load", "dill.load", "dill.loads", "runpy.run_path",
+    "shutil.unpack_archive", "zipfile.ZipFile", "tarfile.open", "np.load", "numpy.load",
+    "pd.read_pickle", "connection.load_extension", "connection.enable_load_extension",
+}  # fmt: skip
+FOREIGN_MODULES = {"marshal", "shelve", "dill", "joblib", "yaml", "zipfile", "tarfile", "xml"}
+
+
+def foreign_calls(tree: ast.AST) -> Iterator[str]:
+    """The calls in a module that could run what a file says, unless told not to."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        said = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+        name = ast.unparse(node.func)
+        harmless = said.get("weights_only") == "True" or said.get("allow_pickle") == "False"
+        shell = said.get("shell", "False") != "False"
+        if (name in RUNS_FOREIGN_CODE and not harmless) or shell:
+            yield name
+        if said.get("allow_pickle", "False") != "False":
+            yield name
+
+
+def test_nothing_runs_what_a_file_says() -> None:
+    """The process executor reads its parent's bytes; a foreign pickle's reader runs nothing."""
     calls = {
-        (str(path.relative_to(ROOT)), ast.unparse(node.func))
+        (str(path.relative_to(ROOT)), call)
         for path in HOUSE
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Call)
-        and ast.unparse(node.func) in {"pickle.load", "pickle.loads", "eval", "exec", "torch.load"}
-        and not any(keyword.arg == "weights_only" for keyword in node.keywords)
+        for call in foreign_calls(ast.parse(path.read_text()))
     }
     assert calls == {
         (f"pipelines/executors/{name}.py", "pickle.loads") for name in ("process", "ray")
     }
     readers = {str(path.relative_to(ROOT)) for path in HOUSE if "Unpickler" in path.read_text()}
     assert readers == {"curate/detectors/recorded/plain_pickle.py"}
+    strangers = {
+        (path.name, name)
+        for path in HOUSE
+        for name in imports(path)
+        if name.split(".")[0] in FOREIGN_MODULES
+    }
+    assert strangers == set()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "eval(text)",
+        "torch.load(path)",
+        "torch.load(path, weights_only=False)",
+        "np.load(path)",
+        "np.load(path, allow_pickle=True)",
+        "yaml.load(text)",
+        "subprocess.run(text, shell=True)",
+        "read(path, allow_pickle=wish)",
+    ],
+)
+def test_the_search_finds_what_it_is_for(line: str) -> None:
+    """Or it would say nothing."""
+    assert list(foreign_calls(ast.parse(line)))
+    assert not list(foreign_calls(ast.parse("torch.load(path, weights_only=True); f.load(x)")))
 
 
 def test_every_dependency_is_pinned() -> None:

@@ -1,6 +1,6 @@
 """What every data set offers."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Protocol, runtime_checkable
 
 from curate.detections import Annotations
@@ -38,9 +38,17 @@ class Dataset(Protocol):
 
 
 @runtime_checkable
-class Sequences(Protocol):
-    """A data set whose frames follow each other: neighbours must not be on two sides of a split."""
+class Sequenced(Protocol):
+    """A data set that knows which frames were recorded one after the other."""
 
-    def sequences(self) -> Mapping[str, tuple[str, ...]]:
-        """The frames of each drive or scene, by its name; every frame is in one."""
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The sequence (drive, scene, clip) of a frame; None where it is not known."""
         ...
+
+
+def sequences_of(dataset: Dataset, frames: Iterable[str]) -> Mapping[str, str]:
+    """The sequence of each frame that the data set knows one of."""
+    if not isinstance(dataset, Sequenced):
+        return {}
+    found = {frame: dataset.sequence_of(frame) for frame in frames}
+    return {frame: sequence for frame, sequence in found.items() if sequence is not None}

@@ -1,12 +1,26 @@
 """Point clouds from files of several formats: x, y, z in metres and intensity in [0, 1]."""
 
+import tokenize
 from pathlib import Path
 
 import numpy as np
 
-from curate.datasets.kitti import read_bytes
+from curate.datasets.cloud_formats import read_pcd, read_ply
+from curate.datasets.kitti import read_bytes, refuse_far_points
 from curate.errors import DataError
 
+# What a damaged header makes numpy raise.
+_NPY_DAMAGES = (
+    EOFError,
+    MemoryError,
+    OSError,
+    OverflowError,
+    RecursionError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    tokenize.TokenError,
+)
 CLOUD_SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 
 
@@ -27,12 +41,15 @@ def read_cloud(path: Path, columns: int = 4, intensity_scale: float = 1.0) -> np
     elif suffix == ".npy":
         table = _read_npy(path, columns)
     elif suffix in CLOUD_SUFFIXES:
-        table = _read_with_open3d(path)
+        read = read_pcd if suffix == ".pcd" else read_ply
+        table = read(path, read_bytes(path, "point"))
     else:
         raise DataError(f"{path}: no point file; known are {', '.join(CLOUD_SUFFIXES)}")
     points = np.zeros((len(table), 4), dtype=np.float32)
-    points[:, : min(table.shape[1], 4)] = table[:, :4]
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is left out
+        points[:, : min(table.shape[1], 4)] = table[:, :4]
     points = points[np.isfinite(points).all(axis=1)]
+    refuse_far_points(path, points)
     points[:, 3] = np.clip(points[:, 3] / intensity_scale, 0, 1)
     return points
 
@@ -47,29 +64,17 @@ def _read_bin(path: Path, columns: int) -> np.ndarray:
 
 
 def _read_npy(path: Path, columns: int) -> np.ndarray:
-    read_bytes(path, "point")
     try:
-        table = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        words = " ".join(str(error).split())
+        # Mapped, not read: a header that claims more than the file holds costs no memory, and
+        # neither pickles nor archives are taken for arrays.
+        table = np.lib.format.open_memmap(path, mode="r")
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such point file") from None
+    except _NPY_DAMAGES as error:
+        words = " ".join(str(error).split())[:200]
         raise DataError(f"{path}: no readable .npy array: {words}") from None
     if table.ndim != 2 or table.shape[1] != columns or table.dtype.kind not in "fiu":
         raise DataError(
             f"{path}: {table.dtype} {list(table.shape)}, expected [n, {columns}]; set columns"
         )
-    return np.asarray(table)
-
-
-def _read_with_open3d(path: Path) -> np.ndarray:
-    from curate.datasets.open3d_loader import load
-
-    read_bytes(path, "point")
-    open3d = load()
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        cloud = open3d.t.io.read_point_cloud(str(path))
-    if "positions" not in cloud.point:
-        raise DataError(f"{path}: no readable {path.suffix} point cloud, or one without points")
-    places = cloud.point["positions"].numpy()
-    if "intensity" not in cloud.point:
-        return np.asarray(places)
-    return np.column_stack([places, cloud.point["intensity"].numpy().reshape(-1)])
+    return np.array(table)

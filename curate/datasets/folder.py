@@ -5,6 +5,7 @@ images = "camera"             # folder of FRAME.png or .jpg; where there are non
 # image_size = [1242, 375]    # width and height of what the camera of the calibration sees
 labels = "label_2"            # optional: KITTI label files of the labeled frames
 splits = "lists"              # optional: folder of train.txt, val.txt
+sequence_separator = "_"      # optional: frames are named SEQUENCE_NUMBER, split at the last of it
 columns = 4                   # of .bin and .npy files
 intensity_scale = 255.0       # what full intensity is in the files
 
@@ -22,10 +23,10 @@ from typing import Any
 import numpy as np
 
 from curate.datasets.clouds import CLOUD_SUFFIXES, read_cloud
+from curate.datasets.containment import check_frame_id, refuse_escape
 from curate.datasets.images import read_sized_image
 from curate.datasets.kitti import (
     IMAGE_SUFFIXES,
-    check_frame_id,
     read_bytes,
     read_calibration,
     read_frame_lists,
@@ -37,7 +38,8 @@ from curate.errors import DataError
 from curate.frames import Calibration, Frame, FrameFiles
 
 DESCRIPTION = "dataset.toml"
-_TEXTS = ("points", "images", "labels", "splits")
+_FOLDERS = ("points", "images", "labels", "splits")
+_TEXTS = (*_FOLDERS, "sequence_separator")
 _KEYS = (*_TEXTS, "image_size", "columns", "intensity_scale", "calibration")
 
 
@@ -46,6 +48,7 @@ class FolderDataset:
 
     Args:
         root: the folder that holds dataset.toml.
+        follow_links: whether links and names in dataset.toml may lead out of it.
 
     Raises:
         DataError: the description is missing or malformed, or names neither images nor their size
@@ -54,10 +57,13 @@ class FolderDataset:
 
     name = "folder"
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
         self.root = Path(root)
+        self.follow_links = follow_links
         self._path = self.root / DESCRIPTION
         self._told = _read_description(self._path)
+        named = [self._told[key] for key in (*_FOLDERS, "calibration") if key in self._told]
+        self._refuse_escape(*(self.root / name for name in named if isinstance(name, str)))
 
     def frame_ids(self) -> tuple[str, ...]:
         """All frames with a point file, in sorted order."""
@@ -72,8 +78,11 @@ class FolderDataset:
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """The lists of the folder `splits`, by file name."""
-        folder = self._told.get("splits")
-        return {} if folder is None else read_frame_lists(self.root / folder)
+        if "splits" not in self._told:
+            return {}
+        return read_frame_lists(
+            self.root / self._told["splits"], None if self.follow_links else self.root
+        )
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie, or an image would; the calibration is that of all frames.
@@ -88,12 +97,21 @@ class FolderDataset:
         images = [folder / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
         calibration = self._told["calibration"]
         label = self._label(frame_id)
-        return FrameFiles(
+        found = FrameFiles(
             points=self._points[frame_id],
             image=next((image for image in images if image.exists()), images[0]),
             calibration=self.root / calibration if isinstance(calibration, str) else self._path,
             label=label if label is not None and label.exists() else None,
         )
+        self._refuse_escape(*found.paths())
+        return found
+
+    def sequence_of(self, frame_id: str) -> str | None:
+        """What stands before the last separator of the frame's name, where there is one."""
+        separator = self._told.get("sequence_separator", "")
+        if not separator or separator not in frame_id:
+            return None
+        return frame_id.rpartition(separator)[0]
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
         """The frame's calibration, its points unless unwanted, and its image where asked for.
@@ -146,6 +164,10 @@ class FolderDataset:
             raise DataError(f"{self._path}: calibration.lidar_to_camera cannot be inverted")
         return Calibration(projection, extrinsic)
 
+    def _refuse_escape(self, *paths: Path) -> None:
+        if not self.follow_links:
+            refuse_escape(self.root, *paths)
+
     def _label(self, frame_id: str) -> Path | None:
         if "labels" not in self._told:
             return None
@@ -156,8 +178,8 @@ def _read_description(path: Path) -> Mapping[str, Any]:
     """What dataset.toml says; DataError where it cannot be."""
     try:
         told = tomllib.loads(read_bytes(path, "description").decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not TOML: {error}") from None
+    except (RecursionError, ValueError) as error:  # ValueError: also of absurdly long numbers
+        raise DataError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
     unknown = sorted(set(told) - set(_KEYS))
     if unknown:
         raise DataError(f"{path}: unknown key {unknown[0]}; known are {', '.join(_KEYS)}")

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from curate.atomic import replace_file
+from curate.datasets.containment import check_frame_id, refuse_escape
 from curate.datasets.images import read_sized_image
 from curate.datasets.kitti_labels import read_objects, to_annotations
 from curate.detections import Annotations
@@ -25,6 +26,12 @@ _log = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 POINT_BYTES = 16  # x, y, z, intensity, float32 each
+# No LiDAR sees farther; maps over the points would fill the memory.
+FARTHEST_METRES = 2000.0
+# KITTI's own development kit says which drive each frame of training/ was taken from.
+_MAPPINGS = ("mapping", "devkit_object/mapping", "devkit/mapping")
+# Focal lengths are thousands of pixels, P2's last column a million at most.
+_LARGEST_ENTRY = 1e9
 CALIBRATION_SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
@@ -33,6 +40,7 @@ class KittiDataset:
 
     Args:
         root: the folder that holds training/, or velodyne/ itself.
+        follow_links: whether links may lead out of it.
 
     Raises:
         DataError: neither is there.
@@ -40,8 +48,9 @@ class KittiDataset:
 
     name = "kitti"
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
         self.root = Path(root)
+        self.follow_links = follow_links
         homes = [self.root / "training", self.root]
         home = next((home for home in homes if (home / "velodyne").is_dir()), None)
         if home is None:
@@ -73,23 +82,42 @@ class KittiDataset:
         }
         if self._home != self.root and "test" in lists:
             _log.info("%s: left out, it names frames of testing/", lists.pop("test"))
+        if not self.follow_links:
+            refuse_escape(self.root, *lists.values())
         return {name: read_frame_list(path) for name, path in lists.items()}
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie; `label` is None where there is no label file.
 
         Raises:
-            DataError: the name would lead out of the data set.
+            DataError: the name or a link would lead out of the data set.
         """
         check_frame_id(frame_id)
         images = [self._home / "image_2" / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
         label = self._home / "label_2" / f"{frame_id}.txt"
-        return FrameFiles(
+        found = FrameFiles(
             points=self._home / "velodyne" / f"{frame_id}.bin",
             image=next((image for image in images if image.exists()), images[0]),
             calibration=self._home / "calib" / f"{frame_id}.txt",
             label=label if label.exists() else None,
         )
+        if not self.follow_links:
+            refuse_escape(self.root, *found.paths())
+        return found
+
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The drive of a frame, where the mapping of KITTI's development kit lies in the root.
+
+        Raises:
+            DataError: the mapping is malformed.
+        """
+        return self._drives.get(frame_id)
+
+    @cached_property
+    def _drives(self) -> Mapping[str, str]:
+        homes = (self.root / folder for folder in _MAPPINGS)
+        home = next((home for home in homes if (home / "train_mapping.txt").is_file()), None)
+        return read_drives(home) if home else {}
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
         """The frame's calibration, its points unless unwanted, and its image where asked for.
@@ -135,7 +163,19 @@ def read_points(path: Path) -> np.ndarray:
             f"{path}: {len(bad)} of {len(points)} points are NaN or infinite, "
             f"the first is point {bad[0]}; remove them from the file"
         )
+    refuse_far_points(path, points)
     return points
+
+
+def refuse_far_points(path: Path, points: np.ndarray) -> None:
+    """DataError where a finite point of (n, >=3) is farther than any LiDAR sees."""
+    far = np.abs(points[:, :3]).max(initial=0)
+    if far > FARTHEST_METRES:
+        k = int(np.abs(points[:, :3]).max(axis=1).argmax())
+        raise DataError(
+            f"{path}: point {k} is {far:.4g} m away; points are in metres from the LiDAR, remove "
+            f"those beyond {FARTHEST_METRES:g} m"
+        )
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -190,7 +230,31 @@ def parse_matrix(entries: str, shape: tuple[int, int], place: str) -> np.ndarray
         raise DataError(f"{place}: {len(numbers)} numbers, expected {shape[0]} x {shape[1]}")
     if not np.isfinite(numbers).all():
         raise DataError(f"{place}: holds NaN or infinite numbers")
+    if np.abs(numbers).max() > _LARGEST_ENTRY:
+        raise DataError(f"{place}: holds numbers beyond {_LARGEST_ENTRY:g}")
     return numbers.reshape(shape)
+
+
+def read_drives(folder: Path) -> Mapping[str, str]:
+    """The drive of each frame of KITTI's training/ from train_mapping.txt and train_rand.txt.
+
+    The first has a line "date drive frame" per frame, the second for each frame the number of its
+    line, from 1.
+
+    Raises:
+        DataError: a file is missing or malformed.
+    """
+    path = folder / "train_rand.txt"
+    lines = read_bytes(folder / "train_mapping.txt", "mapping").decode("utf-8", "replace")
+    drives = [line.split()[1] for line in lines.splitlines() if len(line.split()) == 3]
+    try:
+        text = read_bytes(path, "mapping").decode("utf-8", "replace")
+        numbers = [int(number) for number in text.replace(",", " ").split()]
+    except ValueError as error:
+        raise DataError(f"{path}: {error}; it holds only numbers of lines") from None
+    if not all(1 <= number <= len(drives) for number in numbers):
+        raise DataError(f"{path}: names a line that train_mapping.txt does not have")
+    return {f"{i:06d}": drives[number - 1] for i, number in enumerate(numbers)}
 
 
 def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
@@ -203,13 +267,19 @@ def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
                 yield folder / entry.name
 
 
-def read_frame_lists(folder: Path) -> Mapping[str, tuple[str, ...]]:
+def read_frame_lists(folder: Path, within: Path | None) -> Mapping[str, tuple[str, ...]]:
     """The frame lists of a folder by file name; none where it is not there.
 
+    Args:
+        folder: of the lists.
+        within: the root that links must not lead out of; None where they may.
+
     Raises:
-        DataError: a list names something that is no frame id.
+        DataError: a list names something that is no frame id, or lies elsewhere.
     """
     paths = sorted(visible_files(folder, "*.txt"))
+    if within is not None:
+        refuse_escape(within, *paths)
     return {path.stem: read_frame_list(path) for path in paths}
 
 
@@ -225,12 +295,6 @@ def read_frame_list(path: Path) -> tuple[str, ...]:
                 raise DataError(f"{path}:{number}: {error}") from None
             names.append(line.strip())
     return tuple(names)
-
-
-def check_frame_id(frame_id: str) -> None:
-    """DataError where the id could lead out of the data set's folders."""
-    if not frame_id or frame_id.startswith(".") or {"/", "\\", "\0"} & set(frame_id):
-        raise DataError(f"{frame_id!r} is no frame id: it must be a plain file name such as 000008")
 
 
 def read_bytes(path: Path, kind: str) -> bytes:

@@ -31,6 +31,8 @@ KITTI_CATEGORIES = frozenset(
 """Every category that KITTI's own label files name."""
 
 LABEL_FIELDS, RESULT_FIELDS = 15, 16
+# Of a field; KITTI's own placeholders reach -1000.
+_LARGEST = 1e6
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ def read_objects(
         raise _first_fault(path, lines, fields, known) from None
     if (
         any(len(row) != fields for row in rows)
-        or not np.isfinite(values).all()
+        or not (np.abs(values) <= _LARGEST).all()
         or (known is not None and not frozenset(known).issuperset(categories))
         or _has_negative_side(categories, values[:, 7:10])
     ):
@@ -302,14 +304,23 @@ def _fault(row: Sequence[str], fields: int, known: Collection[str] | None) -> st
         kind = "a result line ends with a score and" if fields == RESULT_FIELDS else "a label line"
         return f"{len(row)} fields, but {kind} has {fields}"
     if known is not None and row[0] not in known:
-        return f"unknown category {row[0]!r}; known are {', '.join(sorted(known))}"
-    for field in row[1:]:
-        try:
-            finite = np.isfinite(float(field))
-        except ValueError:
-            return f"{field!r} is not a number"
-        if not finite:
-            return f"{field!r} is not a finite number"
+        return f"unknown category {row[0][:40]!r}; known are {', '.join(sorted(known))}"
+    wrong = next(filter(None, map(_wrong_number, row[1:])), None)
+    if wrong:
+        return wrong
     if row[0] != DONT_CARE and min(map(float, row[8:11])) < 0:
         return f"negative height, width or length ({' '.join(row[8:11])}) of a {row[0]}"
+    return None
+
+
+def _wrong_number(field: str) -> str | None:
+    """What is wrong with a field that should be a number, if anything."""
+    try:
+        number = float(field)
+    except ValueError:
+        return f"{field[:40]!r} is not a number"
+    if not np.isfinite(number):
+        return f"{field[:40]!r} is not a finite number"
+    if abs(number) > _LARGEST:
+        return f"{field[:40]!r} is beyond {_LARGEST:g}, which nothing in a label can be"
     return None

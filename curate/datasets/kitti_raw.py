@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.containment import check_frame_id, refuse_escape
 from curate.datasets.images import read_sized_image
 from curate.datasets.kitti import (
-    check_frame_id,
     parse_matrix,
     read_bytes,
     read_frame_lists,
@@ -37,6 +37,7 @@ class KittiRawDataset:
 
     Args:
         root: a date folder with drives, or a folder of dates.
+        follow_links: whether links may lead out of it.
 
     Raises:
         DataError: there is no drive.
@@ -44,8 +45,9 @@ class KittiRawDataset:
 
     name = "kitti-raw"
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
         self.root = Path(root)
+        self.follow_links = follow_links
         found = (path.parent.parent for at in _DRIVES for path in self.root.glob(f"{at}/{_POINTS}"))
         self._drives = {path.name: path for path in sorted(found)}
         if not self._drives:
@@ -71,7 +73,11 @@ class KittiRawDataset:
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """The lists of ROOT/ImageSets, by file name."""
-        return read_frame_lists(self.root / "ImageSets")
+        return read_frame_lists(self.root / "ImageSets", None if self.follow_links else self.root)
+
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The drive of a frame."""
+        return self._homes[frame_id][0].name if frame_id in self._homes else None
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie; the calibration is the drive's.
@@ -84,12 +90,15 @@ class KittiRawDataset:
             raise DataError(f"{self.root}: no frame {frame_id}; frames are named DRIVE_NUMBER")
         home, number = self._homes[frame_id]
         label = home / "label_2" / f"{number}.txt"
-        return FrameFiles(
+        found = FrameFiles(
             points=home / _POINTS / f"{number}.bin",
             image=home / _IMAGES / f"{number}.png",
             calibration=home.parent / _TO_CAMERA,
             label=label if label.exists() else None,
         )
+        if not self.follow_links:
+            refuse_escape(self.root, *found.paths(), home.parent / _CAMERAS)
+        return found
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
         """The frame's calibration, its points unless unwanted, and its image where asked for.

@@ -25,7 +25,8 @@ from curate.exporters.base import (
 
 FORMAT_VERSION = 1
 
-_TABLES = """
+# `label_file` reads no file whose tables are others.
+TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
 CREATE TABLE frame (
     frame TEXT PRIMARY KEY,
@@ -166,7 +167,7 @@ def _fill(
     rows: tuple[Iterable[tuple], Iterable[tuple], Iterable[tuple]],
 ) -> None:
     # The file is thrown away unless it gets finished: no journal is needed to undo a half.
-    connection.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;" + _TABLES)
+    connection.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;" + TABLES)
     connection.execute("BEGIN")
     columns = (FRAME_COLUMNS, GROUND_TRUTH_COLUMNS, WEIGHTED_LABEL_COLUMNS)
     last: list[tuple] = [()]

@@ -7,10 +7,8 @@ Needs the exported file and the frames it names, nothing else of this project's 
         loss = sum(sample.weights * my_loss(sample.points, sample.boxes, sample.categories))
 """
 
-import json
 import sqlite3
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +19,8 @@ from torch.utils.data import Dataset
 
 from curate.detections import as_categories
 from curate.errors import DataError
-from curate.exporters.sqlite import FORMAT_VERSION, refuse_leakage
+from curate.exporters.label_file import open_label_file, read_categories, read_meta
+from curate.exporters.sqlite import refuse_leakage
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.projection import in_view
@@ -83,34 +82,24 @@ class WeightedLabels(Dataset[Sample]):
         read: Callable[[str], Frame] | None = None,
         root: Path | None = None,
     ) -> None:
-        if not path.is_file():
-            raise DataError(f"{path}: no such label file; export the labels first")
-        try:
-            with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as rows:
-                self._load(rows, path)
-        except sqlite3.DatabaseError as error:
-            raise DataError(f"{path}: not a label file: {error}; export it again") from None
+        with open_label_file(path) as rows:
+            self._load(rows, path)
         self._read = read or _kitti_reader(root or Path(self.meta["root"]))
 
     def _load(self, rows: sqlite3.Connection, path: Path) -> None:
-        self.meta = dict(rows.execute("SELECT key, value FROM meta"))
-        version = self.meta.get("format_version")
-        if version != str(FORMAT_VERSION):
-            raise DataError(
-                f"{path}: label format {version}, this version reads {FORMAT_VERSION}; export again"
-            )
+        self.meta = read_meta(rows, path)
         refuse_leakage(rows, path)
-        self.categories: tuple[str, ...] = tuple(json.loads(self.meta["categories"]))
+        self.categories = read_categories(self.meta, path)
         frames = rows.execute("SELECT frame, split FROM frame ORDER BY frame").fetchall()
         self.frame_ids: tuple[str, ...] = tuple(frame for frame, _ in frames)
         self.labeled = np.array([split == "labeled" for _, split in frames], dtype=bool)
         self._boxes = dict.fromkeys(self.frame_ids, _NO_BOXES)
-        for table, weight in (("ground_truth", "1.0"), ("weighted_labels", "weight")):
+        for table, weight in (("ground_truth", "1.0"), ("label", "weight")):
             query = (
                 "SELECT frame, category, x, y, z, length, width, height, yaw, "  # noqa: S608
                 f"{weight} FROM {table} ORDER BY frame, k"
             )
-            self._boxes.update(_group(rows.execute(query).fetchall(), self.categories))
+            self._boxes.update(_group(path, rows.execute(query).fetchall(), self.categories))
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -133,9 +122,13 @@ _NO_BOXES = (np.zeros((0, 7)), as_categories([]), np.zeros(0))
 
 
 def _group(
-    rows: list[tuple], known: tuple[str, ...]
+    path: Path, rows: list[tuple], known: tuple[str, ...]
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Boxes, categories and weights of each frame; unknown categories are left out."""
+    """Boxes, categories and weights of each frame; unknown categories are left out.
+
+    Raises:
+        DataError: a box is not finite, or a weight not in [0, 1].
+    """
     by_frame: dict[str, list[tuple]] = {}
     for frame, category, *numbers in rows:
         neighbour = NEIGHBOURS.get(category) if category not in known else None
@@ -145,10 +138,24 @@ def _group(
             by_frame.setdefault(frame, []).append((category, *numbers))
     grouped = {}
     for frame, entries in by_frame.items():
-        numbers_of = np.array([entry[1:] for entry in entries], dtype=np.float64)
+        numbers_of = _numbers(path, frame, [entry[1:] for entry in entries])
         names = as_categories([entry[0] for entry in entries])
         grouped[frame] = (numbers_of[:, :7], names, numbers_of[:, 7])
     return grouped
+
+
+def _numbers(path: Path, frame: str, entries: list[tuple]) -> np.ndarray:
+    """(m, 8) boxes and weights; a damaged file may hold anything in their place."""
+    try:
+        numbers = np.array(entries, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.full((len(entries), 8), np.nan)
+    if not np.isfinite(numbers).all() or not ((numbers[:, 7] >= 0) & (numbers[:, 7] <= 1)).all():
+        raise DataError(
+            f"{path}: frame {frame!r} has a box that is not finite or a weight that is not in "
+            "[0, 1]; export it again"
+        )
+    return numbers
 
 
 def _kitti_reader(root: Path) -> Callable[[str], Frame]:

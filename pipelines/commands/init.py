@@ -22,6 +22,12 @@ def init(
     val: Annotated[
         str, typer.Option(help="Likewise for validation; default: the data set's own val list.")
     ] = "",
+    split_by: Annotated[
+        str, typer.Option(help="sequence, where the data set knows them; or frame, see check.")
+    ] = "sequence",
+    follow_links: Annotated[
+        bool, typer.Option("--follow-links", help="Links may lead out of the root.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the split and of every later draw.")] = 0,
     detector: Annotated[
         str, typer.Option(help="pillars, onnx, recorded or module:Class.")
@@ -65,6 +71,8 @@ def init(
         "dataset": {
             "kind": dataset,
             "root": root.resolve(),
+            "split_by": split_by,
+            "follow_links": follow_links,
             "options": dict(map(_option, dataset_option or ())),
         },
         "detector": {"name": detector, "path": detector_path and detector_path.resolve()},

@@ -73,6 +73,16 @@ def print_json(value: Any) -> None:
     typer.echo(json.dumps(_plain(value), indent=1, default=str, allow_nan=False))
 
 
+def print_json_rows(rows: Iterable[Any]) -> None:
+    """Prints values as the list that `print_json` would print, each as it comes."""
+    before = "["
+    for row in rows:
+        text = json.dumps(_plain(row), indent=1, default=str, allow_nan=False)
+        typer.echo(before + "\n " + text.replace("\n", "\n "), nl=False)
+        before = ","
+    typer.echo("[]" if before == "[" else "\n]")
+
+
 def _plain(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return _plain(asdict(value))

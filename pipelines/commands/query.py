@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pipelines.commands.options import JsonOption, WorkspaceOption, print_json, print_table
+from pipelines.commands.options import JsonOption, WorkspaceOption, print_json_rows, print_table
 
 if TYPE_CHECKING:
     from sqlalchemy import URL
@@ -30,6 +30,9 @@ def query(
     limit: Annotated[
         int, typer.Option(min=1, help="Rows of the table; csv and json print all.")
     ] = 50,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, help="After which the question is given up.")
+    ] = 60.0,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -55,7 +58,7 @@ def query(
         limit = len(named_queries())
     else:
         sql = find_query(named).sql if named is not None else sql or ""
-        columns, rows = ask(_database(file, workspace), sql)
+        columns, rows = ask(_database(file, workspace), sql, seconds)
     _print(columns, rows, form, limit)
 
 
@@ -82,9 +85,11 @@ def _print(columns: Sequence[str], rows: Iterator[tuple[Any, ...]], form: str, l
     import sys
 
     if form == "json":
-        print_json([dict(zip(columns, row, strict=True)) for row in rows])
+        print_json_rows(dict(zip(columns, row, strict=True)) for row in rows)
     elif form == "csv":
-        csv.writer(sys.stdout).writerows([columns, *rows])
+        writer = csv.writer(sys.stdout)
+        writer.writerow(columns)
+        writer.writerows(rows)
     else:
         shown = [row for row, _ in zip(rows, range(limit), strict=False)]
         print_table(columns, shown)

@@ -17,10 +17,11 @@ from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
+from pipelines.firewall.rules import enforce
 from pipelines.progress import Progress
 from pipelines.review.human_labels import fingerprint
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
-from pipelines.workspace import Workspace
+from pipelines.workspace import Workspace, sha256
 
 CURRENT = "labels.sqlite"
 _CHUNK = 10_000
@@ -37,16 +38,37 @@ def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
     return workspace.root / "exports" / f"round-{context.number:02d}-{policy}.sqlite"
 
 
+def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
+    """LeakageError where ground truth would reach what it must not, see `firewall`."""
+    enforce(workspace, context.number, file(workspace, context, policy))
+
+
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     """Writes the round's file; `labels.sqlite` becomes a copy where the policy is the trainer's."""
     path = file(workspace, job.context, job.policy)
     unlabeled = open_policy(workspace.config, job.policy).uses_unlabeled
     labels = write_label_file(workspace, path, job.context.number, job.policy if unlabeled else "")
+    written = [path]
     if job.policy == workspace.config.run.method:
+        written.append(path.with_name(CURRENT))
         partial = path.with_suffix(".partial")
         shutil.copyfile(path, partial)
-        partial.replace(path.with_name(CURRENT))
-    return Product(f"{labels} labels in {workspace.relative(path)}", lambda _connection: None)
+        partial.replace(written[-1])
+
+    def write(connection: Connection) -> None:
+        for each in written:
+            register_label_file(connection, workspace, each, job.context.number, job.policy)
+
+    return Product(f"{labels} labels in {workspace.relative(path)}", write)
+
+
+def register_label_file(
+    connection: Connection, workspace: Workspace, path: Path, round_number: int, policy: str
+) -> None:
+    """Stores the hash of a label file in place of an earlier one's."""
+    table, name = bulk.table("label_file"), workspace.relative(path)
+    connection.execute(table.delete().where(table.c.path == name))
+    bulk.insert(connection, "label_file", [(name, round_number, policy, sha256(path))])
 
 
 def write_label_file(workspace: Workspace, path: Path, round_number: int, policy: str) -> int:
@@ -65,7 +87,9 @@ def export_as(
 
     Raises:
         WorkspaceError: the policy has weighted nothing in that round.
+        LeakageError: ground truth would reach what it must not.
     """
+    enforce(workspace, round_number)
     labels = label_set(workspace, round_number, policy)
     if not len(labels.labels):
         raise WorkspaceError(

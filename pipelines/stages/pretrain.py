@@ -5,12 +5,13 @@ from sqlalchemy import Connection
 from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError, WorkspaceError
 from pipelines import plan
+from pipelines.firewall.rules import enforce
 from pipelines.methods import METHODS
 from pipelines.progress import Progress
 from pipelines.rounds import is_trainable, register_checkpoint
 from pipelines.runner import Report, run_once
 from pipelines.stage import Product
-from pipelines.stages.export import write_label_file
+from pipelines.stages.export import register_label_file, write_label_file
 from pipelines.stages.train_round import train_with_progress, training_settings
 from pipelines.workspace import Workspace
 
@@ -21,6 +22,7 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
     Raises:
         ConfigError: curate cannot train the configured detector.
         WorkspaceError: there are no labeled frames.
+        LeakageError: ground truth would reach what it must not, see `firewall`.
     """
     config = workspace.config
     if not is_trainable(workspace):
@@ -54,9 +56,9 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
         FORMAT_VERSION,
     ]
     path = workspace.root / "checkpoints" / "round-00.safetensors"
+    labels = workspace.root / "exports" / "labeled.sqlite"
 
     def make() -> Product:
-        labels = workspace.root / "exports" / "labeled.sqlite"
         write_label_file(workspace, labels, 0, "")
         report = train_with_progress(
             labels=labels,
@@ -77,6 +79,8 @@ def pretrain(workspace: Workspace, progress: Progress) -> Report:
 
     def write(connection: Connection) -> None:
         register_checkpoint(connection, workspace, 0, "", path)
+        register_label_file(connection, workspace, labels, 0, "")
 
     with workspace.database.claiming_round(0, None, "pretrain"):
+        enforce(workspace, file=labels)
         return run_once(workspace, plan.Once(0, "pretrain", ""), plan.digest(key), path, make)

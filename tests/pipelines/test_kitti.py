@@ -32,7 +32,7 @@ def test_real_frames_get_weights_that_a_query_lists(
     work = tmp_path / "work"
     (tmp_path / "labeled.txt").write_text("000000\n000004\n")
     code, out, err = curate(
-        "init", work, "--dataset", "kitti", "--root", real_frames,
+        "init", work, "--dataset", "kitti", "--root", real_frames, "--follow-links",
         "--labeled", tmp_path / "labeled.txt",
         "--detector", "recorded", "--detector-path", kitti_root / "recorded" / "pointgnn_T0.csv",
         "--segmenter", "onnx", "--segmenter-classes", "voc", "--segmenter-path",

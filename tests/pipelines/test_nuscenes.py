@@ -70,10 +70,15 @@ def test_a_share_takes_whole_scenes(root: Path, tmp_path: Path) -> None:
 
 
 def test_a_list_that_cuts_a_scene_is_refused(root: Path, tmp_path: Path) -> None:
-    """Neighbours show the same objects."""
-    (tmp_path / "labeled.txt").write_text(sample_token("scene-0001", 1))
-    with pytest.raises(LeakageError, match="scene-0001 would be both labeled and unlabeled"):
-        choose_split(NuScenesDataset(root), str(tmp_path / "labeled.txt"), "", 0)
+    """Neighbours show the same objects; who wants it all the same can say so."""
+    chosen = sample_token("scene-0001", 1)
+    (tmp_path / "labeled.txt").write_text(chosen)
+    arguments = (NuScenesDataset(root), str(tmp_path / "labeled.txt"), "", 0)
+    with pytest.raises(LeakageError, match=r"scene-0001\) have frames in both labeled and unlab"):
+        choose_split(*arguments)
+    assert choose_split(*arguments, "frame").labeled == (chosen,)
+    (tmp_path / "labeled.txt").write_text(f"scene-0002\n{chosen}")
+    assert set(choose_split(*arguments, "frame").labeled) == tokens("scene-0002") | {chosen}
 
 
 def test_recorded_results_become_weights_and_results(

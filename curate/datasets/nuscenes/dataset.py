@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from curate.datasets.clouds import read_cloud
+from curate.datasets.containment import check_frame_id, refuse_escape
 from curate.datasets.images import read_image
-from curate.datasets.kitti import check_frame_id
 from curate.datasets.nuscenes.annotations import AnnotationTable
 from curate.datasets.nuscenes.keyframes import TO_SENSOR_AXES, Keyframe, read_keyframes
 from curate.datasets.nuscenes.names import CATEGORIES
@@ -30,7 +30,7 @@ _COLUMNS, _FULL_INTENSITY = 5, 255.0
 
 
 class NuScenesDataset:
-    """A `Dataset` and `Sequences` of nuScenes' key frames; those whose files are not there are out.
+    """A `Dataset` and `Sequenced` of nuScenes' key frames; those whose files are not there are out.
 
     Args:
         root: the folder with samples/ and v1.0-*/.
@@ -38,6 +38,7 @@ class NuScenesDataset:
         camera: channel of the camera.
         rename: categories by name of the detection task's class, in place of `names.CATEGORIES`.
         minimum_points: annotated objects with fewer LiDAR points (num_lidar_pts) are left out.
+        follow_links: whether links and names in the tables may lead out of the root.
 
     Raises:
         DataError: there are no tables.
@@ -54,8 +55,10 @@ class NuScenesDataset:
         camera: str = "CAM_FRONT",
         rename: Mapping[str, str] | None = None,
         minimum_points: int = 1,
+        follow_links: bool = False,
     ) -> None:
         self.root = Path(root)
+        self.follow_links = follow_links
         self.version = _version(self.root, version)
         self.camera = camera
         self._tables = self.root / self.version
@@ -93,36 +96,36 @@ class NuScenesDataset:
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """The official train and val of v1.0-trainval and v1.0-mini, by scene; else none."""
-        scenes = self.sequences()
+        scenes = {self._keyframes[token].scene for token in self._present}
         held_out = validation_scenes(self.version, scenes)
         if not held_out:
             return {}
         lists: dict[str, list[str]] = {"train": [], "val": []}
-        for scene, tokens in scenes.items():
-            lists["val" if scene in held_out else "train"] += tokens
-        return {name: tuple(sorted(tokens)) for name, tokens in lists.items()}
-
-    def sequences(self) -> Mapping[str, tuple[str, ...]]:
-        """The frames of each scene, by its name; a scene is 20 seconds of one drive."""
-        scenes: dict[str, list[str]] = {}
         for token in self._present:
-            scenes.setdefault(self._keyframes[token].scene, []).append(token)
-        return {scene: tuple(tokens) for scene, tokens in sorted(scenes.items())}
+            lists["val" if self.sequence_of(token) in held_out else "train"].append(token)
+        return {name: tuple(tokens) for name, tokens in lists.items()}
+
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The scene of a frame: 20 seconds of one drive."""
+        return self._keyframes[frame_id].scene if frame_id in self._keyframes else None
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie; calibration and labels are tables of all frames.
 
         Raises:
-            DataError: there is no such frame.
+            DataError: there is no such frame, or its files lie elsewhere.
         """
         frame = self._frame(frame_id)
         labels = self._annotated.path
-        return FrameFiles(
+        found = FrameFiles(
             points=self.root / frame.points,
             image=self.root / frame.image,
             calibration=self._tables / "calibrated_sensor.json",
             label=labels if labels.exists() else None,
         )
+        if not self.follow_links:
+            refuse_escape(self.root, *found.paths())
+        return found
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
         """The frame's calibration, its points unless unwanted, and its image where asked for.

@@ -13,6 +13,9 @@ from curate.errors import DataError
 from curate.frames import Calibration
 from curate.geometry.similarity import wrap_angle
 
+# Metres or radians: boxes are in the LiDAR frame, not on a map.
+LARGEST = 1e6
+
 
 class Placed(Protocol):
     """Boxes in another frame of reference, waiting for the calibration of their frame."""
@@ -58,8 +61,9 @@ def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections
     try:
         boxes = np.array(boxes, dtype=np.float64)
         scores = np.array(scores, dtype=np.float64).reshape(-1)
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{place}: boxes and scores must be numbers: {error}") from None
+    except (OverflowError, TypeError, ValueError) as error:
+        words = " ".join(str(error).split())[:200]
+        raise DataError(f"{place}: boxes and scores must be numbers: {words}") from None
     categories = as_categories(names)
     if boxes.size == 0:
         boxes = boxes.reshape(0, 7)
@@ -71,6 +75,7 @@ def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections
     boxes = boxes[:, :7]
     faults = {
         "a number is NaN or infinite": ~np.isfinite(np.column_stack([boxes, scores])).all(axis=1),
+        f"a number is beyond {LARGEST:g}": (np.abs(boxes) > LARGEST).any(axis=1),
         "length, width or height is not positive": (boxes[:, 3:6] <= 0).any(axis=1),
         "the score is not in [0, 1]": (scores < 0) | (scores > 1),
     }

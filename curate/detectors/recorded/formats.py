@@ -76,7 +76,8 @@ def _tell_list(path: Path, entries: Sequence[Any]) -> str:
         return "mmdetection3d"
     if isinstance(first, Mapping) and "boxes_lidar" in first:
         return "openpcdet"
-    keys = ", ".join(map(str, first)) if isinstance(first, Mapping) else type(first).__name__
+    names = " ".join(", ".join(map(str, first)).split())[:80] if isinstance(first, Mapping) else ""
+    keys = names or type(first).__name__
     raise DataError(f"{path}: entries of no known format ({keys}); expected {_EXPECTED}")
 
 
@@ -98,8 +99,9 @@ def _read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {error}") from None
+    except (OSError, RecursionError, ValueError) as error:
+        words = " ".join(str(error).split())[:200]
+        raise DataError(f"{path}: cannot be read as JSON: {words}") from None
 
 
 def refuse_unknown_kind(kind: str) -> None:

@@ -66,7 +66,7 @@ def _detections(place: str, entry: Any, classes: Sequence[str]) -> Detections:
         raise DataError(f"{place}: no {', '.join(missing)}")
     if inner.get("box_type_3d", "LiDAR") != "LiDAR":
         raise DataError(f"{place}: boxes are of type {inner['box_type_3d']}, not LiDAR")
-    labels = np.asarray(inner["labels_3d"]).reshape(-1)
+    labels = _labels(place, inner["labels_3d"])
     if len(labels) and (labels.dtype.kind not in "iu" or not 0 <= labels.min() <= labels.max()):
         raise DataError(f"{place}: labels_3d are not the numbers of classes: {labels[:5].tolist()}")
     if len(labels) and labels.max() >= len(classes):
@@ -77,6 +77,14 @@ def _detections(place: str, entry: Any, classes: Sequence[str]) -> Detections:
     found = as_detections(place, inner[box_key], inner["scores_3d"], names)
     found.boxes[:, 2] += found.boxes[:, 5] / 2
     return found
+
+
+def _labels(place: str, told: Any) -> np.ndarray:
+    """(n,) labels of any type."""
+    try:
+        return np.asarray(told).reshape(-1)
+    except (OverflowError, ValueError):
+        raise DataError(f"{place}: labels_3d is no list of numbers") from None
 
 
 def _frames(path: Path, entries: Sequence[Any], frame_list: Path | None) -> list[str]:

@@ -22,6 +22,7 @@ from typing import BinaryIO
 import numpy as np
 
 from curate.detections import Detections, as_categories
+from curate.detectors.recorded.answers import LARGEST
 from curate.errors import DataError
 from curate.geometry.similarity import Similarity, wrap_angle
 
@@ -204,7 +205,7 @@ def _parse_numbers(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[in
         try:
             numbers[index] = [float(field) for field in row[2:]]
         except ValueError as error:
-            raise DataError(f"{path}:{line}: {error}") from None
+            raise DataError(f"{path}:{line}: {str(error)[:120]}") from None
     return numbers
 
 
@@ -214,6 +215,7 @@ def _refuse_impossible(path: Path, lines: Sequence[int], numbers: np.ndarray) ->
     identity = (flip_y == 0) & (rotation_rad == 0) & (scale == 1)
     faults = {
         "a number is NaN or infinite": ~np.isfinite(numbers).all(axis=1),
+        f"a number is beyond {LARGEST:g}": (np.abs(numbers) > LARGEST).any(axis=1),
         "view is not 0, 1, 2, ...": (view < 0) | (view != np.floor(view)),
         "flip_y is neither 0 nor 1": (flip_y != 0) & (flip_y != 1),
         "scale is not positive": scale <= 0,

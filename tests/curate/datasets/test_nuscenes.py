@@ -17,6 +17,7 @@ from nuscenes_scenes import (
     write_nuscenes,
 )
 
+from curate.datasets.base import sequences_of
 from curate.datasets.nuscenes import NuScenesDataset
 from curate.errors import ConfigError, DataError
 from curate.geometry.points_in_boxes import count_points_in_boxes
@@ -129,7 +130,9 @@ def test_scenes_are_whole_on_each_side(kept):
     tokens = {scene: {sample_token(scene, step) for step in range(2)} for scene in SCENES}
     assert set(splits["train"]) == tokens["scene-0061"]
     assert set(splits["val"]) == tokens["scene-0103"]
-    assert {scene: set(own) for scene, own in dataset.sequences().items()} == tokens
+    for scene, own in tokens.items():
+        assert set(sequences_of(dataset, own).values()) == {scene}
+    assert dataset.sequence_of("stranger") is None
 
 
 def test_another_version_has_no_lists(tmp_path):

@@ -116,5 +116,5 @@ def test_files_that_are_no_label_files(tmp_path, make_labels):
         WeightedLabels(tmp_path / "empty.sqlite")
     path = make_labels()
     change(path, "UPDATE meta SET value = '7' WHERE key = 'format_version'")
-    with pytest.raises(DataError, match="label format 7"):
+    with pytest.raises(DataError, match="label format '7'"):
         WeightedLabels(path)

@@ -1,0 +1,125 @@
+"""Reading an exported label file that anyone may have written or changed.
+
+A SQLite file is more than rows: a table may be a view that never ends, or a column an expression
+that fills the memory. Only the very tables that `curate.exporters.sqlite` makes are read, so what
+is read is bounded by the size of the file.
+"""
+
+import json
+import re
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from curate.errors import DataError
+from curate.exporters.sqlite import FORMAT_VERSION, TABLES
+
+_KEYS = ("categories", "round", "policy", "root")
+# No cell of a label file is longer; SQLite's own limit is a gigabyte.
+_LONGEST_CELL = 1 << 24
+
+
+@dataclass(frozen=True)
+class LabelFileFrames:
+    """Which frames a label file speaks of.
+
+    Attributes:
+        splits: the split that the file gives each frame.
+        truth: the frames that have rows of ground truth.
+        objects: rows of ground truth.
+        labels: rows of labels.
+    """
+
+    splits: Mapping[str, str]
+    truth: frozenset[str]
+    objects: int
+    labels: int
+
+
+@contextmanager
+def open_label_file(path: Path) -> Iterator[sqlite3.Connection]:
+    """A connection that can only read the file, whose tables are what an export makes.
+
+    Raises:
+        DataError: the file is missing or damaged, or of another version or kind.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such label file; export the labels first")
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as rows:
+            rows.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_CELL)
+            rows.execute("PRAGMA trusted_schema = OFF")
+            rows.execute("PRAGMA cell_size_check = ON")
+            _refuse_foreign_tables(rows, path)
+            yield rows
+    except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
+        words = " ".join(str(error).split())
+        raise DataError(f"{path}: not a label file: {words}; export it again") from None
+
+
+def read_meta(rows: sqlite3.Connection, path: Path) -> Mapping[str, str]:
+    """What the file says about itself.
+
+    Raises:
+        DataError: it is of another version, or says too little.
+    """
+    meta = dict(rows.execute("SELECT key, value FROM meta"))
+    version = meta.get("format_version")
+    if version != str(FORMAT_VERSION):
+        raise DataError(
+            f"{path}: label format {version!r}, this version reads {FORMAT_VERSION}; export again"
+        )
+    missing = [key for key in _KEYS if key not in meta]
+    if missing:
+        raise DataError(f"{path}: meta names no {', '.join(missing)}; export it again")
+    return meta
+
+
+def read_categories(meta: Mapping[str, str], path: Path) -> tuple[str, ...]:
+    """The categories to learn; DataError where they are no list of names."""
+    try:
+        names = json.loads(meta["categories"])
+    except (ValueError, RecursionError):
+        names = None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise DataError(f"{path}: meta.categories is no list of names; export it again")
+    return tuple(names)
+
+
+def read_frames(path: Path) -> LabelFileFrames:
+    """Which frames a label file speaks of.
+
+    Raises:
+        DataError: the file is missing or damaged, or of another version or kind.
+    """
+    with open_label_file(path) as rows:
+        read_meta(rows, path)
+        splits = dict(rows.execute("SELECT frame, split FROM frame"))
+        truth = dict(rows.execute("SELECT frame, count(*) FROM ground_truth GROUP BY frame"))
+        [labels] = rows.execute("SELECT count(*) FROM label").fetchone()
+    return LabelFileFrames(splits, frozenset(truth), sum(truth.values()), labels)
+
+
+def _refuse_foreign_tables(rows: sqlite3.Connection, path: Path) -> None:
+    """DataError where a table is not the one that an export makes."""
+    found = dict(rows.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+    for name, statement in _statements().items():
+        if name not in found:
+            raise DataError(f"{path}: not a label file: no table {name}; export it again")
+        if _bare(str(found[name])) != statement:
+            raise DataError(
+                f"{path}: table {name} is not the one that an export makes; export it again"
+            )
+
+
+def _statements() -> Mapping[str, str]:
+    """The bare CREATE TABLE statement of each table."""
+    parts = [part.strip() for part in _bare(TABLES).split(";") if part.strip()]
+    return {part.split()[2]: part for part in parts}
+
+
+def _bare(statement: str) -> str:
+    """An SQL statement without comments, its spaces made one."""
+    return " ".join(re.sub(r"--[^\n]*", " ", statement).split())

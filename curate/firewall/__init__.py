@@ -1,0 +1,1 @@
+"""The leakage firewall: what may be on both sides of a split, and what may not."""

@@ -1,0 +1,118 @@
+"""The same recording under two names: files of equal size and content in different splits.
+
+Files are told apart by size, then by the hash of their first bytes, and only where both are equal
+by all of their content. Hashes of heads are kept between runs, by path, size and time of change.
+"""
+
+import hashlib
+import json
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from curate.atomic import replace_file
+
+_log = logging.getLogger(__name__)
+
+HEAD_BYTES = 1 << 16
+# A smaller file is an empty sweep or a blank image, and alike without being the same recording.
+SMALLEST_BYTES = 256
+
+
+@dataclass(frozen=True)
+class SplitFile:
+    """A file of a frame.
+
+    Attributes:
+        split: that the frame belongs to.
+        frame: its name.
+        path: of the file.
+    """
+
+    split: str
+    frame: str
+    path: Path
+
+
+class HeadHashes:
+    """Hashes of the first bytes of files, kept in a JSON file; a damaged one is made anew.
+
+    Args:
+        path: of the JSON file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._known: dict[str, list[int | str]] = _read_known(path)
+        self._changed = False
+
+    def of(self, path: Path, size: int, changed_ns: int) -> str:
+        """The hash of the first bytes of a file, read only where it has changed."""
+        known = self._known.get(str(path))
+        if isinstance(known, list) and known[:2] == [size, changed_ns] and len(known) == 3:
+            return str(known[2])
+        with path.open("rb") as file:
+            head = hashlib.sha256(file.read(HEAD_BYTES)).hexdigest()
+        self._known[str(path)] = [size, changed_ns, head]
+        self._changed = True
+        return head
+
+    def save(self) -> None:
+        """Keeps what was learned."""
+        if self._changed:
+            replace_file(self._path, json.dumps(self._known).encode())
+
+
+def find_duplicates(
+    files: Iterable[SplitFile], heads: HeadHashes
+) -> list[tuple[SplitFile, SplitFile]]:
+    """Pairs of files of different splits that hold the same, one pair per content and split.
+
+    Files that are not there, or too small to tell anything, are left out.
+    """
+    by_size: dict[int, list[tuple[SplitFile, int]]] = {}
+    for file in files:
+        try:
+            found = file.path.stat()
+        except OSError:
+            continue
+        if found.st_size >= SMALLEST_BYTES:
+            by_size.setdefault(found.st_size, []).append((file, found.st_mtime_ns))
+    pairs: list[tuple[SplitFile, SplitFile]] = []
+    for size, group in by_size.items():
+        if len({file.split for file, _ in group}) > 1:
+            by_head: dict[str, list[SplitFile]] = {}
+            for file, changed_ns in group:
+                by_head.setdefault(heads.of(file.path, size, changed_ns), []).append(file)
+            for alike in by_head.values():
+                pairs += _pairs(alike)
+    heads.save()
+    return pairs
+
+
+def _pairs(alike: list[SplitFile]) -> list[tuple[SplitFile, SplitFile]]:
+    """Of files with equal heads, those that are equal to the end, across splits."""
+    if len({file.split for file in alike}) < 2:
+        return []
+    first: dict[str, dict[str, SplitFile]] = {}
+    for file in alike:
+        with file.path.open("rb") as content:
+            digest = hashlib.file_digest(content, "sha256").hexdigest()
+        first.setdefault(digest, {}).setdefault(file.split, file)
+    return [
+        (files[0], other)
+        for files in (list(of_content.values()) for of_content in first.values())
+        for other in files[1:]
+    ]
+
+
+def _read_known(path: Path) -> dict[str, list[int | str]]:
+    try:
+        known = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, RecursionError):
+        _log.warning("%s is damaged; hashing anew", path)
+        return {}
+    return dict(known) if isinstance(known, Mapping) else {}

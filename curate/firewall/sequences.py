@@ -1,0 +1,66 @@
+"""Sequences: neighbours within a drive look almost the same, so a drive belongs to one split."""
+
+from collections.abc import Iterable, Mapping
+from itertools import combinations
+
+import numpy as np
+
+from curate.errors import ConfigError
+
+
+def straddling(
+    sequences: Mapping[str, str], splits: Mapping[str, Iterable[str]]
+) -> Mapping[tuple[str, str], list[str]]:
+    """The sequences that two splits share, for each pair of splits that shares some.
+
+    Args:
+        sequences: the sequence of each frame; frames without one are not in it.
+        splits: the frames of each split.
+    """
+    held = {
+        name: {sequences[frame] for frame in frames if frame in sequences}
+        for name, frames in splits.items()
+    }
+    shared = {pair: sorted(held[pair[0]] & held[pair[1]]) for pair in combinations(held, 2)}
+    return {pair: names for pair, names in shared.items() if names}
+
+
+def choose_sequences(
+    sequences: Mapping[str, str],
+    pool: Iterable[str],
+    count: int,
+    generator: np.random.Generator,
+) -> list[str]:
+    """Whole sequences in random order, so many that their frames come nearest to a count.
+
+    Args:
+        sequences: the sequence of each frame; a frame without one stands for itself.
+        pool: the frames to choose from.
+        count: how many of them are wanted, at least one.
+        generator: draws the order.
+
+    Raises:
+        ConfigError: any choice would be all or nothing.
+    """
+    groups = group_by_sequence(sequences, pool)
+    if len(groups) == 1 and 0 < count < len(next(iter(groups.values()))):
+        raise ConfigError(
+            f"all {len(next(iter(groups.values())))} frames are of sequence {next(iter(groups))}; "
+            "a share of it would put near-duplicate frames on both sides: record more sequences, "
+            "or split by frame all the same with --split-by frame"
+        )
+    chosen: list[str] = []
+    for name in generator.permutation(sorted(groups)).tolist():
+        if abs(len(chosen) + len(groups[name]) - count) < abs(len(chosen) - count):
+            chosen += groups[name]
+    return chosen or min(groups.values(), key=lambda group: (len(group), group))
+
+
+def group_by_sequence(
+    sequences: Mapping[str, str], frames: Iterable[str]
+) -> Mapping[str, list[str]]:
+    """The frames of each sequence; a frame without one stands for itself."""
+    groups: dict[str, list[str]] = {}
+    for frame in frames:
+        groups.setdefault(sequences.get(frame, frame), []).append(frame)
+    return groups

@@ -1,0 +1,38 @@
+"""curate check: the leakage firewall by itself."""
+
+import typer
+
+from pipelines.commands.options import JsonOption, WorkspaceOption
+
+
+def check(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> None:
+    """Look whether any ground truth could reach what it must not; nothing is changed.
+
+    The same rules are looked at before every export and training, there on a sample of frames.
+    A broken rule ends in exit code 5.
+
+    Example: curate check
+    """
+    from curate.errors import LeakageError
+    from pipelines.commands.options import open_workspace, print_json
+    from pipelines.firewall.rules import check as check_all
+
+    findings = []
+    for finding in check_all(open_workspace(workspace)):
+        findings.append(finding)
+        if not as_json:
+            typer.echo(f"{'pass' if finding.held else 'FAIL'}  {finding.rule:<36} {finding.told}")
+    if as_json:
+        print_json(findings)
+    broken = [finding for finding in findings if not finding.held]
+    if broken:
+        first = broken[0]
+        raise LeakageError(
+            f"{len(broken)} of {len(findings)} rules are broken; {first.rule}: {first.told}; "
+            f"{first.remedy or 'see above'}"
+        )
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command."""
+    app.command()(check)

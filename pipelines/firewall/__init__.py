@@ -1,0 +1,1 @@
+"""The leakage firewall: rules that hold before anything is exported or trained on."""

@@ -1,0 +1,58 @@
+"""All rules, by themselves or before a command."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from curate.errors import DataError
+from curate.exporters.label_file import LabelFileFrames, read_frames
+from pipelines.firewall.files import duplicates, label_files, object_bank
+from pipelines.firewall.finding import Finding, refuse
+from pipelines.firewall.splits import recorded_splits, sequences_apart, unchanged_lists
+from pipelines.firewall.truth import copied_truth, predicted_rounds, stored_truth
+from pipelines.workspace import Workspace
+
+
+def check(workspace: Workspace) -> Iterator[Finding]:
+    """Every rule, one after the other, on everything that the workspace holds."""
+    yield from _of_the_database(workspace)
+    yield copied_truth(workspace, predicted_rounds(workspace), thorough=True)
+    files: dict[Path, LabelFileFrames] = {}
+    for path in sorted((workspace.root / "exports").glob("*.sqlite")):
+        try:
+            files[path] = read_frames(path)
+        except DataError as error:
+            yield Finding("label files can be read", False, str(error))
+    yield label_files(workspace, files)
+    yield object_bank(workspace, files)
+    yield duplicates(workspace)
+
+
+def enforce(workspace: Workspace, round_number: int = 0, file: Path | None = None) -> None:
+    """Looks at the rules before a command exports or trains.
+
+    Predictions are compared with label files in a sample of frames, files are not looked at for
+    duplicates: that is left to `check`.
+
+    Args:
+        workspace: see `Workspace`.
+        round_number: whose predictions are exported or learned from; 0 for none.
+        file: the label file that is written or read; one that is not there yet is no matter.
+
+    Raises:
+        LeakageError: a rule is broken; the message names the frames and the remedy.
+        DataError: the label file is damaged.
+    """
+    for finding in _of_the_database(workspace):
+        refuse(finding)
+    if round_number:
+        refuse(copied_truth(workspace, [round_number], thorough=False))
+    files: Mapping[Path, LabelFileFrames] = {}
+    if file is not None and file.exists():
+        files = {file: read_frames(file)}
+    refuse(label_files(workspace, files))
+    refuse(object_bank(workspace, files))
+
+
+def _of_the_database(workspace: Workspace) -> Iterator[Finding]:
+    for rule in (recorded_splits, unchanged_lists, sequences_apart, stored_truth):
+        yield rule(workspace)

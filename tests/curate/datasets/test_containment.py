@@ -1,0 +1,93 @@
+"""Paths of a data set stay inside it."""
+
+from pathlib import Path
+
+import pytest
+from dataset_layouts import write_toy_folder, write_toy_raw
+from hypothesis import given
+from hypothesis import strategies as st
+from toys import write_toy_kitti
+
+from curate.datasets.containment import check_frame_id
+from curate.datasets.folder import FolderDataset
+from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti_raw import KittiRawDataset
+from curate.errors import DataError
+
+LAYOUTS = {
+    "kitti": (lambda root: write_toy_kitti(root, 4), KittiDataset),
+    "raw": (write_toy_raw, KittiRawDataset),
+    "folder": (write_toy_folder, FolderDataset),
+}
+
+
+@given(st.text(max_size=20))
+def test_a_frame_id_is_a_plain_name(name: str) -> None:
+    """What is accepted names a file in a folder, and prints on one line."""
+    try:
+        check_frame_id(name)
+    except DataError as error:
+        message = str(error)
+    else:
+        message = name
+        assert Path("/folder", f"{name}.bin").parent == Path("/folder")
+    assert len(message.splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["../000001", "/etc/passwd", "..", "a/b", "a\\b", "a\0b", "a\nb"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_no_name_leads_out(tmp_path: Path, layout: str, name: str) -> None:
+    """Neither asked for nor in a list."""
+    write, kind = LAYOUTS[layout]
+    write(tmp_path)
+    with pytest.raises(DataError, match="no frame id"):
+        kind(tmp_path).files(name)
+
+
+@pytest.mark.parametrize("line", ["../../secret", "/etc/passwd", "a\\b", "\0"])
+def test_a_list_of_frames_names_frames(tmp_path: Path, line: str) -> None:
+    """A split list with a path in it is refused by its line."""
+    write_toy_kitti(tmp_path, 4)
+    (tmp_path / "ImageSets" / "train.txt").write_text(f"000000\n{line}\n")
+    with pytest.raises(DataError, match=r"train\.txt:2: .* no frame id"):
+        KittiDataset(tmp_path).splits()
+
+
+@pytest.mark.parametrize("part", ["points", "image", "label"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_link_that_leads_out_is_not_followed(tmp_path: Path, layout: str, part: str) -> None:
+    """Of a file or of its folder, unless that was wished; links within the data set are."""
+    write, kind = LAYOUTS[layout]
+    write(tmp_path / "data")
+    name = kind(tmp_path / "data").frame_ids()[0]
+    path = getattr(kind(tmp_path / "data").files(name), part)
+    inside = path.with_name(f"other-{path.name}")
+    path.rename(inside)
+    path.symlink_to(inside)
+    kind(tmp_path / "data").read(name)
+    path.unlink()
+    outside = tmp_path / path.name
+    inside.rename(outside)
+    path.symlink_to(outside)
+    with pytest.raises(DataError, match="leads out of the data set") as caught:
+        kind(tmp_path / "data").files(name)
+    assert "--follow-links" in str(caught.value)
+    assert getattr(kind(tmp_path / "data", follow_links=True).files(name), part) == path
+    path.unlink()
+    outside.rename(path)
+    folder = path.parent
+    folder.rename(tmp_path / "folder")
+    folder.symlink_to(tmp_path / "folder")
+    with pytest.raises(DataError, match="leads out of the data set"):
+        kind(tmp_path / "data").files(name)
+
+
+@pytest.mark.parametrize("key", ["points", "images", "labels", "splits", "calibration"])
+def test_a_description_that_leads_out_is_refused(tmp_path: Path, key: str) -> None:
+    """By dots or from the root of the disk."""
+    for where in ("../outside", "/etc"):
+        told = {"points": "lidar", "images": "camera", "calibration": "calib.txt", key: where}
+        lines = [f'{name} = "{value}"' for name, value in told.items()]
+        (tmp_path / "dataset.toml").write_text("\n".join(lines))
+        with pytest.raises(DataError, match="leads out of the data set"):
+            FolderDataset(tmp_path)

@@ -1,0 +1,318 @@
+"""Everything that reads foreign files: a valid file for each, and how it is read."""
+
+import io
+import json
+import pickle
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from dataset_layouts import write_cloud
+from exported import toy_labels
+from toys import IMAGE_SIZE, toy_calibration
+
+from curate.datasets.clouds import read_cloud
+from curate.datasets.containment import check_frame_id
+from curate.datasets.folder import FolderDataset
+from curate.datasets.images import read_image, read_image_size
+from curate.datasets.kitti import (
+    read_calibration,
+    read_drives,
+    read_frame_list,
+    read_points,
+    write_calibration,
+)
+from curate.datasets.kitti_labels import read_objects, to_annotations, to_detections
+from curate.datasets.kitti_raw import read_raw_calibration
+from curate.detectors.recorded.answers import Reading
+from curate.detectors.recorded.formats import read_answers
+from curate.detectors.recorded.table import read_record
+from curate.errors import CurateError
+from curate.exporters.sqlite import SqliteExporter
+from curate.frames import Frame
+
+LABELS = (
+    b"Car 0.00 0 1.55 614.24 181.78 727.31 284.77 1.57 1.73 4.15 1.00 1.75 13.22 1.62\n"
+    b"DontCare -1 -1 -10 5.00 229.89 214.12 367.61 -1 -1 -1 -1000 -1000 -1000 -10\n"
+)
+DESCRIPTION = """points = "lidar"
+images = "camera"
+columns = 4
+intensity_scale = 255.0
+sequence_separator = "_"
+[calibration]
+projection = [[60.0, 0, 60, 0], [0, 60, 20, 0], [0, 0, 1, 0]]
+lidar_to_camera = [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]
+"""
+COLUMNS = "frame,view,flip_y,rotation_rad,scale,category,score,x,y,z,length,width,height,yaw"
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Attributes:
+        name: of the file that it reads.
+        write: makes a valid one in a folder that is otherwise empty, with what belongs to it.
+        read: reads it; raises nothing but `CurateError`.
+    """
+
+    name: str
+    write: Callable[[Path], None]
+    read: Callable[[Path], object]
+
+    def attempt(self, path: Path) -> CurateError | None:
+        """Reads the file; the error where it is refused, which must be one line."""
+        try:
+            self.read(path)
+        except CurateError as error:
+            refused = error
+        else:
+            return None
+        assert len(str(refused).splitlines()) == 1, repr(str(refused))
+        return refused
+
+
+def toy_frame() -> Frame:
+    """A frame with a hundred points."""
+    points = np.random.default_rng(0).uniform([5, -5, -2, 0], [30, 5, 1, 1], (100, 4))
+    image = np.zeros((IMAGE_SIZE[1], IMAGE_SIZE[0], 3), dtype=np.uint8)
+    return Frame("000000", points.astype(np.float32), toy_calibration(), IMAGE_SIZE, image)
+
+
+def _bytes(content: bytes) -> Callable[[Path], None]:
+    return lambda path: path.write_bytes(content) and None
+
+
+def _cloud(path: Path) -> None:
+    write_cloud(path, toy_frame().points)
+
+
+def _ply_of_bytes(path: Path) -> None:
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex 100\n{names}end_header\n"
+    path.write_bytes(head.encode() + toy_frame().points.tobytes())
+
+
+def _pcd_of_text(path: Path) -> None:
+    rows = "\n".join(" ".join(map(str, row)) for row in toy_frame().points.tolist())
+    path.write_text(
+        "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+        f"WIDTH 100\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 100\nDATA ascii\n{rows}\n"
+    )
+
+
+def _image(path: Path) -> None:
+    import cv2
+
+    pixels = np.random.default_rng(0).integers(0, 255, (12, 20, 3), dtype=np.uint8)
+    cv2.imwrite(str(path), pixels)
+
+
+def _read_image(path: Path) -> None:
+    read_image_size(path)
+    read_image(path)
+
+
+def _map(path: Path) -> None:
+    import cv2
+
+    cv2.imwrite(str(path), np.ones((IMAGE_SIZE[1], IMAGE_SIZE[0]), dtype=np.uint8))
+
+
+def _read_map(path: Path) -> None:
+    from curate.segmenters.saved import SavedSegmenter
+
+    SavedSegmenter(path.parent, {"Car": (1,)}).segment(toy_frame())
+
+
+def _read_labels(path: Path) -> None:
+    to_annotations(read_objects(path), toy_calibration())
+
+
+def _read_results(path: Path) -> None:
+    to_detections(read_objects(path, scored=True, known=None), toy_calibration())
+
+
+def _raw_calibration(path: Path) -> None:
+    (path.parent / "calib_cam_to_cam.txt").write_text(
+        "R_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_02: 60 0 60 0 0 60 20 0 0 0 1 0\n"
+    )
+    path.write_text("calib_time: 15-Mar-2012 11:37:16\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 0\n")
+
+
+def _drives(path: Path) -> None:
+    (path.parent / "train_mapping.txt").write_text(
+        "2011_09_26 2011_09_26_drive_0005_sync 0000000109\n"
+        "2011_09_26 2011_09_26_drive_0009_sync 0000000130\n"
+    )
+    path.write_text("2,1")
+
+
+def _description(path: Path) -> None:
+    (path.parent / "lidar").mkdir()
+    (path.parent / "camera").mkdir()
+    _cloud(path.parent / "lidar" / "a_0.bin")
+    _image(path.parent / "camera" / "a_0.png")
+    path.write_text(DESCRIPTION)
+
+
+def _read_folder(path: Path) -> None:
+    dataset = FolderDataset(path.parent)
+    dataset.splits()
+    for name in dataset.frame_ids():
+        dataset.sequence_of(name)
+        dataset.read(name)
+
+
+def _config(path: Path) -> None:
+    from pipelines.config import Config, write_config
+
+    write_config(path, Config.model_validate({"dataset": {"root": "data"}}))
+
+
+def _read_config(path: Path) -> None:
+    from pipelines.workspace import Workspace
+
+    read = Workspace.open(path.parent)
+    read.database.close()
+
+
+def _entries() -> list[dict]:
+    return [
+        {
+            "frame_id": f"00000{i}",
+            "name": np.array(["Car", "Pedestrian"]),
+            "score": np.array([0.9, 0.5], dtype=np.float32),
+            "boxes_lidar": np.full((2, 7), 1.5, dtype=np.float32),
+        }
+        for i in range(2)
+    ]
+
+
+def _pickled(protocol: int) -> Callable[[Path], None]:
+    return lambda path: path.write_bytes(pickle.dumps(_entries(), protocol=protocol)) and None
+
+
+def _json(path: Path) -> None:
+    entry = {"boxes_3d": [[1.0, 2, 0, 4, 2, 1.5, 0]], "scores_3d": [0.5], "labels_3d": [0]}
+    path.write_text(json.dumps([{"frame_id": f"00000{i}", **entry} for i in range(2)]))
+
+
+def _read_list(path: Path) -> None:
+    answers = read_answers(path, "list", Reading(("Car",)))
+    for name in answers:
+        answers[name]
+
+
+def _safetensors(path: Path) -> None:
+    from safetensors.numpy import save
+
+    metadata = {"format": "curate-pillars", "format_version": "2", "preset": "small"}
+    tensors = {"stem.weight": np.zeros((4, 4), np.float32), "head.bias": np.zeros(3, np.float32)}
+    path.write_bytes(save(tensors, {**metadata, "categories": '["Car"]'}))
+
+
+def _read_checkpoint(path: Path) -> None:
+    from curate.detectors.pillars.checkpoint import load_checkpoint, write_graph
+    from curate.detectors.pillars.network import network_of
+    from curate.errors import ModelError
+
+    checkpoint = load_checkpoint(path)
+    try:
+        write_graph(path, checkpoint, "")
+    except ModelError:
+        network_of(checkpoint)
+
+
+def _onnx(path: Path) -> None:
+    from tiny_onnx import tiny_detector
+
+    tiny_detector(path)
+
+
+def _read_onnx(path: Path) -> None:
+    from curate.detectors.onnx import OnnxDetector
+
+    OnnxDetector(path, classes=("Car", "Pedestrian", "Cyclist")).predict(toy_frame())
+
+
+def _segmenter(path: Path) -> None:
+    import onnx
+    from onnx import TensorProto, helper
+
+    graph = helper.make_graph(
+        [helper.make_node("ArgMax", ["image"], ["classes"], axis=1, keepdims=0)],
+        "tiny",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, (1, 3, 16, 24))],
+        [helper.make_tensor_value_info("classes", TensorProto.INT64, (1, 16, 24))],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    onnx.save(model, str(path))
+
+
+def _read_segmenter(path: Path) -> None:
+    from curate.segmenters.onnx import OnnxSegmenter
+
+    OnnxSegmenter(path, {"Car": (1,)}).segment(toy_frame())
+
+
+def _label_file(path: Path) -> None:
+    SqliteExporter().write(path, toy_labels())
+
+
+def _read_label_file(path: Path) -> None:
+    from curate.training.labels import WeightedLabels
+
+    for sample in WeightedLabels(path, read=_safe_frame):
+        assert sample.weights.shape == (len(sample.boxes),)
+
+
+def _safe_frame(name: str) -> Frame:
+    check_frame_id(name)
+    return toy_frame()
+
+
+def _npy(path: Path) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, toy_frame().points)
+    path.write_bytes(buffer.getvalue())
+
+
+TARGETS: Mapping[str, Target] = {
+    "velodyne": Target("a.bin", _cloud, read_points),
+    "calibration": Target(
+        "a.txt", lambda path: write_calibration(path, toy_calibration()), read_calibration
+    ),
+    "raw calibration": Target(
+        "calib_velo_to_cam.txt", _raw_calibration, lambda path: read_raw_calibration(path.parent)
+    ),
+    "drives": Target("train_rand.txt", _drives, lambda path: read_drives(path.parent)),
+    "frame list": Target("train.txt", _bytes(b"000000\n000001\n"), read_frame_list),
+    "labels": Target("000000.txt", _bytes(LABELS), _read_labels),
+    "results": Target("000000.txt", _bytes(LABELS.replace(b"\n", b" 0.5\n")), _read_results),
+    "png": Target("a.png", _image, _read_image),
+    "jpg": Target("a.jpg", _image, _read_image),
+    "saved map": Target("000000.png", _map, _read_map),
+    "bin": Target("a.bin", _cloud, read_cloud),
+    "npy": Target("a.npy", _npy, read_cloud),
+    "pcd": Target("a.pcd", _cloud, read_cloud),
+    "pcd text": Target("a.pcd", _pcd_of_text, read_cloud),
+    "ply": Target("a.ply", _ply_of_bytes, read_cloud),
+    "ply text": Target("a.ply", _cloud, read_cloud),
+    "description": Target("dataset.toml", _description, _read_folder),
+    "configuration": Target("curate.toml", _config, _read_config),
+    "csv record": Target(
+        "a.csv",
+        _bytes(f"{COLUMNS}\n000000,0,0,0.0,1.0,Car,0.9,1,2,3,4,2,1.5,0.5\n".encode()),
+        read_record,
+    ),
+    "pickle 2": Target("a.pkl", _pickled(2), _read_list),
+    "pickle 5": Target("a.pkl", _pickled(5), _read_list),
+    "json": Target("a.json", _json, _read_list),
+    "checkpoint": Target("a.safetensors", _safetensors, _read_checkpoint),
+    "onnx detector": Target("a.onnx", _onnx, _read_onnx),
+    "onnx segmenter": Target("a.onnx", _segmenter, _read_segmenter),
+    "label file": Target("labels.sqlite", _label_file, _read_label_file),
+}

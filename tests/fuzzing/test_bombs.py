@@ -1,0 +1,51 @@
+"""Memory stays bounded whatever a file claims."""
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+from fuzzing.bombs import BOMBS
+from fuzzing.targets import TARGETS
+
+# Above what Python with its libraries takes by itself.
+MOST_BYTES = 300 << 20
+TESTS = Path(__file__).parent.parent
+
+
+def test_every_bomb_is_refused_and_none_fills_the_memory(tmp_path: Path) -> None:
+    """All in one process, whose greatest size tells."""
+    ended = subprocess.run(
+        [sys.executable, "-m", "fuzzing.test_bombs", tmp_path],
+        capture_output=True,
+        text=True,
+        cwd=TESTS,
+        env={"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "PATH": "", "OMP_NUM_THREADS": "1"},
+        check=False,
+        timeout=300,
+    )
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    grown = dict(line.rsplit(": ", 1) for line in ended.stdout.splitlines())
+    assert set(grown) == set(BOMBS)
+    assert {name: int(size) for name, size in grown.items() if int(size) > MOST_BYTES} == {}
+
+
+def explode(folder: Path) -> None:
+    """Reads every bomb, and prints by how much the greatest size of this process grew."""
+    for name, (kind, write) in BOMBS.items():
+        target = TARGETS[kind]
+        # A valid file first, so that only the bomb counts and not the libraries.
+        home = folder / name.replace(" ", "-")
+        for use in (target.write, write):
+            home.mkdir()
+            use(home / target.name)
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            refused = target.attempt(home / target.name)
+            home.rename(folder / f"{home.name}-{use is write}")
+        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        assert refused is not None, name
+        sys.stdout.write(f"{name}: {grown * 1024}\n")
+
+
+if __name__ == "__main__":
+    explode(Path(sys.argv[1]))

@@ -1,0 +1,67 @@
+"""No file, however damaged, does more than be refused in one line."""
+
+import random
+import warnings
+from pathlib import Path
+
+import pytest
+from fuzzing.mutations import mutated
+from fuzzing.targets import TARGETS, Target
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+# Few for each reader in the normal run; `make prove` tries many, `make fuzz` goes on.
+EXAMPLES, MANY = 60, 2_000
+# Readers in C that take long for a file, and were tried more often by hand.
+COSTLY = {"onnx detector": 15, "onnx segmenter": 15, "checkpoint": 15, "configuration": 20}
+
+
+def prepared(target: Target, folder: Path) -> tuple[Path, bytes]:
+    """A valid file of a reader and its content."""
+    path = folder / target.name
+    target.write(path)
+    return path, path.read_bytes()
+
+
+def try_damaged(target: Target, path: Path, content: bytes) -> None:
+    """Reads damaged content; numbers that overflow on the way are faults too."""
+    path.write_bytes(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        target.attempt(path)
+
+
+@pytest.mark.parametrize("name", sorted(set(TARGETS) - {"checkpoint"}))
+def test_a_valid_file_is_read(tmp_path: Path, name: str) -> None:
+    """Or else nothing below would say anything."""
+    path, _ = prepared(TARGETS[name], tmp_path)
+    assert TARGETS[name].attempt(path) is None
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_damaged_file_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, name) -> None:
+    """A result, or a CurateError of one line."""
+    target = TARGETS[name]
+    path, content = prepared(target, tmp_path_factory.mktemp("damaged"))
+
+    @settings(
+        max_examples=COSTLY.get(name, EXAMPLES),
+        deadline=None,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.randoms(use_true_random=False))
+    def damage(chance: random.Random) -> None:
+        try_damaged(target, path, mutated(content, chance.randint))
+
+    damage()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TARGETS)
+def test_many_damaged_files_are_read_or_refused(tmp_path: Path, name: str) -> None:
+    """The same, longer."""
+    target = TARGETS[name]
+    path, content = prepared(target, tmp_path)
+    for seed in range(MANY):
+        try_damaged(target, path, mutated(content, random.Random(seed).randint))  # noqa: S311

@@ -1,0 +1,287 @@
+"""Every kind of leak, done for real, is caught before it reaches a training."""
+
+import csv
+import json
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from pipelines_cli import Curate, in_process
+from toys import toy_document, write_toy_kitti
+
+from curate.datasets.kitti import KittiDataset
+from curate.errors import DataError, LeakageError
+from pipelines.config import make_config
+from pipelines.progress import Silent
+from pipelines.schedule import run_all
+from pipelines.setup import initialise
+
+# So that a training takes no time: it is a program that writes a file.
+TRAINER = 'python3 -c \'import os; open(os.environ["CURATE_OUTPUT"], "w").write("student")\''
+
+
+@pytest.fixture
+def curate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Curate:
+    """The command line."""
+    return in_process(monkeypatch, capsys)
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with toy frames and a workspace over them that can be copied to another place."""
+    home = tmp_path_factory.mktemp("leaks")
+    write_toy_kitti(home / "kitti", frames=12, val=4)
+    (home / "detector.txt").touch()
+    document = toy_document(home / "kitti", home / "detector.txt")
+    workspace = initialise(home / "work", make_config(document, "test"), "0.25", "")
+    for report in run_all(workspace, None, Silent(), train=False):
+        assert report.failed == 0
+    workspace.database.close()
+    settings = home / "work" / "curate.toml"
+    settings.write_text(settings.read_text().replace(str(home), ".."))
+    return home
+
+
+@pytest.fixture
+def work(exported: Path, tmp_path: Path) -> Path:
+    """A workspace of 2 labeled, 6 unlabeled and 4 val frames, exported once."""
+    shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "work"
+
+
+@pytest.fixture
+def toy_kitti(exported: Path, tmp_path: Path) -> Path:
+    """The frames of the workspace."""
+    shutil.copytree(exported / "kitti", tmp_path / "kitti", dirs_exist_ok=True)
+    return tmp_path / "kitti"
+
+
+def change(path: Path, *statements: str) -> None:
+    """Changes a database as someone with the sqlite3 shell would."""
+    with closing(sqlite3.connect(path)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+        connection.commit()
+
+
+def frames(work: Path, split: str) -> list[str]:
+    """The frames of a split."""
+    with closing(sqlite3.connect(work / "curate.db")) as connection:
+        query = "SELECT frame FROM frame WHERE split = ? ORDER BY frame"
+        return [row[0] for row in connection.execute(query, (split,))]
+
+
+def assert_caught(curate: Curate, work: Path, *words: str, started: bool = True) -> None:
+    """`check` says so, and unless only it looks, neither export nor training starts."""
+    code, out, err = curate("check", "-w", work)
+    assert code == LeakageError.exit_code, out
+    assert "FAIL" in out
+    assert err.count("\n") == 1
+    assert all(word in err for word in words), err
+    for command in (
+        ["export"],
+        ["export", "--format", "csv"],
+        ["train-round", "--command", TRAINER],
+    ):
+        code, _, err = curate(*command, "-w", work)
+        if started:
+            assert code == LeakageError.exit_code, (command, err)
+            assert err.count("\n") == 1
+            assert all(word in err for word in words), err
+    assert started is False or not list((work / "checkpoints").iterdir())
+
+
+def test_a_clean_workspace_passes(curate: Curate, work: Path) -> None:
+    """Every rule with its numbers; then it trains."""
+    code, out, err = curate("check", "-w", work)
+    assert (code, err) == (0, "")
+    assert "FAIL" not in out
+    assert "2 labeled, 6 unlabeled, 4 val" in out
+    assert "6 objects of X_l, 12 of val, 0 of X_u" in out
+    assert "18 predictions compared" in out
+    code, out, _ = curate("check", "--json", "-w", work)
+    assert code == 0
+    assert all(finding["held"] for finding in json.loads(out))
+    code, _, err = curate("train-round", "--command", TRAINER, "-w", work)
+    assert code == 0, err
+
+
+def test_a_changed_list_of_the_data_set(curate: Curate, work: Path, toy_kitti: Path) -> None:
+    """A val frame that moves into train.txt is named."""
+    val = toy_kitti / "ImageSets" / "val.txt"
+    names = val.read_text().split()
+    val.write_text("\n".join(names[1:]) + "\n")
+    with (toy_kitti / "ImageSets" / "train.txt").open("a") as file:
+        file.write(f"{names[0]}\n")
+    assert_caught(curate, work, "1 added (000008)", "1 removed (000008)", "curate init")
+
+
+def test_a_changed_list_that_init_was_given(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """The file of labeled frames grows; one that is gone is no matter, its frames are recorded."""
+    (tmp_path / "detector.txt").touch()
+    listed = tmp_path / "ids.txt"
+    listed.write_text("000001\n000003\n")
+    curate(
+        "init", tmp_path / "work", "--root", toy_kitti, "--labeled", listed,
+        "--detector", "toys:ToyDetector", "--detector-path", tmp_path / "detector.txt",
+    )  # fmt: skip
+    listed.write_text("000001\n000003\n000004\n")
+    code, _, err = curate("check", "-w", tmp_path / "work")
+    assert code == LeakageError.exit_code
+    assert "ids.txt: 1 added (000004)" in err
+    listed.unlink()
+    assert curate("check", "-w", tmp_path / "work")[0] == 0
+
+
+def test_a_changed_split_in_the_database(curate: Curate, work: Path) -> None:
+    """A val frame declared unlabeled, or a frame that was removed."""
+    moved = frames(work, "val")[0]
+    change(
+        work / "curate.db",
+        "PRAGMA foreign_keys = OFF",
+        f"DELETE FROM ground_truth WHERE frame_id = (SELECT id FROM frame WHERE frame = '{moved}')",
+        f"UPDATE frame SET split = 'unlabeled', label_path = NULL WHERE frame = '{moved}'",
+    )
+    assert_caught(curate, work, f"val: 1 removed ({moved})", f"unlabeled: 1 added ({moved})")
+
+
+def test_a_tampered_record_of_the_splits(curate: Curate, work: Path) -> None:
+    """Nor can the record be made to fit."""
+    change(
+        work / "curate.db", "UPDATE split_list SET names = names || '999999\n' WHERE name = 'val'"
+    )
+    assert_caught(curate, work, "does not fit its hash")
+    change(work / "curate.db", "DELETE FROM split_list")
+    assert_caught(curate, work, "the record is gone")
+
+
+def test_ground_truth_of_an_unlabeled_frame_in_the_database(curate: Curate, work: Path) -> None:
+    """With trigger and foreign keys out of the way."""
+    leaked = frames(work, "unlabeled")[2]
+    change(
+        work / "curate.db",
+        "PRAGMA foreign_keys = OFF",
+        "DROP TRIGGER ground_truth_never_unlabeled",
+        f"UPDATE ground_truth SET frame_id = (SELECT id FROM frame WHERE frame = '{leaked}') "
+        "WHERE split = 'labeled'"
+        " AND frame_id = (SELECT min(frame_id) FROM ground_truth WHERE split = 'labeled')",
+    )
+    assert_caught(curate, work, "3 rows of ground_truth", leaked)
+
+
+@pytest.mark.parametrize("split", ["val", "unlabeled"])
+def test_a_frame_smuggled_into_the_label_file(curate: Curate, work: Path, split: str) -> None:
+    """As a labeled frame, with its ground truth: object bank and trainer would take both."""
+    leaked = frames(work, split)[0]
+    change(
+        work / "exports" / "round-01-pspsl.sqlite",
+        f"DELETE FROM label WHERE frame = '{leaked}'",
+        f"INSERT OR REPLACE INTO frame VALUES ('{leaked}', 'labeled', 'p', 'i', 'c')",
+        "INSERT INTO ground_truth (frame, k, category, x, y, z, length, width, height, yaw, "
+        f"truncated, occluded) VALUES ('{leaked}', 0, 'Car', 9, 0, 0, 4, 2, 1.5, 0, 0, 0)",
+    )
+    code, out, err = curate("check", "-w", work)
+    assert code == LeakageError.exit_code
+    assert leaked in err
+    assert "the object bank is of X_l" in out
+    assert f"objects of frames outside X_l: {leaked}" in out
+    for command in (["export"], ["train-round", "--command", TRAINER]):
+        code, _, err = curate(*command, "-w", work)
+        assert code == LeakageError.exit_code
+        assert leaked in err
+    (work / "exports" / "round-01-pspsl.sqlite").unlink()
+    assert curate("export", "-w", work)[0] == 0
+    assert curate("check", "-w", work)[0] == 0
+
+
+def test_labels_changed_after_the_export(curate: Curate, work: Path) -> None:
+    """A box and a weight overwritten: only the hash can tell."""
+    change(work / "exports" / "round-01-pspsl.sqlite", "UPDATE label SET weight = 1, x = x + 0.25")
+    code, _, err = curate("train-round", "--command", TRAINER, "-w", work)
+    assert code == LeakageError.exit_code
+    assert "round-01-pspsl.sqlite was changed after it was exported" in err
+    assert curate("check", "-w", work)[0] == LeakageError.exit_code
+
+
+def test_a_damaged_label_file(curate: Curate, work: Path) -> None:
+    """Half a file is no leak, but nothing to train on."""
+    path = work / "exports" / "round-01-pspsl.sqlite"
+    path.write_bytes(path.read_bytes()[:5000])
+    code, _, err = curate("train-round", "--command", TRAINER, "-w", work)
+    assert code == DataError.exit_code, err
+    assert curate("check", "-w", work)[0] == LeakageError.exit_code
+
+
+@pytest.mark.parametrize("score", [1.0, 0.7])
+def test_label_files_that_pass_for_detections(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, score: float
+) -> None:
+    """A record that was written from label files of X_u."""
+    dataset = KittiDataset(toy_kitti)
+    record = tmp_path / "detections.csv"
+    columns = "frame view flip_y rotation_rad scale category score x y z length width height yaw"
+    with record.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns.split())
+        for frame in dataset.frame_ids():
+            truth = dataset.annotations(frame)
+            for box, category in zip(truth.boxes.tolist(), truth.categories, strict=True):
+                rounded = [round(number, 5) for number in box]
+                writer.writerow([frame, 0, 0, 0, 1, category, score, *rounded])
+    work = tmp_path / "work"
+    code, _, err = curate(
+        "init", work, "--root", toy_kitti, "--labeled", "0.25",
+        "--detector", "recorded", "--detector-path", record,
+    )  # fmt: skip
+    assert code == 0, err
+    assert curate("predict", "-w", work)[0] == 0
+    assert_caught(curate, work, "18 predictions are equal to label files")
+
+
+def test_an_object_bank_of_unlabeled_frames(curate: Curate, work: Path) -> None:
+    """Exported for another trainer, and filled up with objects of X_u."""
+    code, _, err = curate("export", "--format", "openpcdet", "-w", work)
+    assert code == 0, err
+    assert curate("check", "-w", work)[0] == 0
+    bank = work / "exports" / "openpcdet" / "gt_database"
+    leaked = frames(work, "unlabeled")[1]
+    (bank / f"{leaked}_Person_sitting_0.bin").write_bytes(bytes(64))
+    assert_caught(curate, work, f"outside X_l: {leaked}", started=False)
+
+
+def test_the_same_recording_under_two_names(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """A labeled frame's points are those of a val frame, and an image is used twice."""
+    home = toy_kitti / "training"
+    shutil.copy(home / "velodyne" / "000002.bin", home / "velodyne" / "000009.bin")
+    shutil.copy(home / "image_2" / "000003.png", home / "image_2" / "000010.png")
+    (tmp_path / "detector.txt").touch()
+    work = tmp_path / "work"
+    curate(
+        "init", work, "--root", toy_kitti, "--labeled", "0.25",
+        "--detector", "toys:ToyDetector", "--detector-path", tmp_path / "detector.txt",
+    )  # fmt: skip
+    for _ in range(2):  # the second time from remembered hashes
+        code, _, err = curate("check", "-w", work)
+        assert code == LeakageError.exit_code
+        assert "2 pairs are the same" in err
+        assert "000002 and val 000009 (points)" in err
+        assert "000003 and val 000010 (image)" in err
+    write_toy_kitti(toy_kitti, frames=12, val=4)
+    assert curate("check", "-w", work)[0] == 0
+
+
+def test_pretraining_looks_too(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
+    """The first teacher learns from X_l as init chose it, or not at all."""
+    work = tmp_path / "work"
+    assert curate("init", work, "--root", toy_kitti, "--labeled", "0.25")[0] == 0
+    (toy_kitti / "ImageSets" / "val.txt").write_text("000011\n")
+    for command in ("pretrain", "run"):
+        code, _, err = curate(command, "-w", work)
+        assert code == LeakageError.exit_code, err
+        assert "the data set's val: 3 removed" in err
