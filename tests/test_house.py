@@ -112,7 +112,9 @@ def test_nothing_runs_what_a_file_says() -> None:
         for call in foreign_calls(ast.parse(path.read_text()))
     }
     assert calls == {
-        (f"pipelines/executors/{name}.py", "pickle.loads") for name in ("process", "ray")
+        ("pipelines/executors/process.py", "pickle.loads"),
+        ("pipelines/executors/ray.py", "pickle.loads"),
+        ("curate/review/editors/cvat.py", "zipfile.ZipFile"),
     }
     readers = {str(path.relative_to(ROOT)) for path in HOUSE if "Unpickler" in path.read_text()}
     assert readers == {"curate/detectors/recorded/plain_pickle.py"}
@@ -122,7 +124,8 @@ def test_nothing_runs_what_a_file_says() -> None:
         for name in imports(path)
         if name.split(".")[0] in FOREIGN_MODULES
     }
-    assert strangers == set()
+    # CVAT's answers are archives; they are read in memory, of a bounded size, never unpacked.
+    assert strangers == {("cvat.py", "zipfile")}
 
 
 @pytest.mark.parametrize(
