@@ -27,7 +27,7 @@ def labels(tmp_path: Path) -> Path:
               (("velodyne", "bin"), ("image_2", "png"), ("calib", "txt")))
         for name in ("000000", "000001")
     ]  # fmt: skip
-    evidence = (0.9, 0.1, 9, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "pspsl")
+    evidence = (0.9, 0.1, 9, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "detector", "pspsl")
     path = tmp_path / "labels.sqlite"
     write_labels(
         path,

@@ -45,6 +45,7 @@ _COLUMNS: Mapping[str, tuple[str, str, str]] = {
     "rho_anno": ("float64?", "1", "Eq. 9"),
     "rho_det": ("float64?", "1", "rho_diff * rho_anno"),
     "lambda_u": ("float64?", "1", "age parameter, Eq. 4"),
+    "provenance": ("name", "", "detector, or human where a person decided"),
     "policy": ("name", "", "that weighted the label"),
     "weight": ("float64", "1", "v in [0, 1]; 0 is an ignore region"),
 }  # fmt: skip

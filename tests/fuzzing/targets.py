@@ -27,7 +27,7 @@ from curate.datasets.kitti_labels import read_objects, to_annotations, to_detect
 from curate.datasets.kitti_raw import read_raw_calibration
 from curate.detectors.recorded.answers import Reading
 from curate.detectors.recorded.formats import read_answers
-from curate.detectors.recorded.table import read_record
+from curate.detectors.recorded.table import TableRecord
 from curate.errors import CurateError
 from curate.exporters.sqlite import SqliteExporter
 from curate.frames import Frame
@@ -206,6 +206,12 @@ def _read_list(path: Path) -> None:
         answers[name]
 
 
+def _read_table(path: Path) -> None:
+    record = TableRecord.read(path)
+    for name in record.frame_ids():
+        record.answer(name)
+
+
 def _safetensors(path: Path) -> None:
     from safetensors.numpy import save
 
@@ -306,7 +312,7 @@ TARGETS: Mapping[str, Target] = {
     "csv record": Target(
         "a.csv",
         _bytes(f"{COLUMNS}\n000000,0,0,0.0,1.0,Car,0.9,1,2,3,4,2,1.5,0.5\n".encode()),
-        read_record,
+        _read_table,
     ),
     "pickle 2": Target("a.pkl", _pickled(2), _read_list),
     "pickle 5": Target("a.pkl", _pickled(5), _read_list),

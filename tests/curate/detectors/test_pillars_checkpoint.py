@@ -13,7 +13,7 @@ from curate.detectors.pillars.network import PillarNetwork, checkpoint_of, netwo
 from curate.detectors.pillars.presets import PRESETS
 from curate.errors import ModelError
 
-META = {"format": "curate-pillars", "format_version": "2", "preset": "small"}
+META = {"format": "curate-pillars", "format_version": "3", "preset": "small"}
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_a_missing_checkpoint_says_what_to_do(tmp_path):
         ({**META, "format_version": "9", "categories": "[]"}, "checkpoint format 9"),
         (
             {**META, "format_version": "1", "categories": '["Car"]'},
-            "checkpoint format 1, this version reads 2; train again",
+            "checkpoint format 1, this version reads 3; train again",
         ),
         ({**META, "preset": "huge", "categories": '["Car"]'}, "damaged metadata"),
         ({**META, "categories": "Car"}, "damaged metadata"),

@@ -87,7 +87,7 @@ def test_a_reader_walks_from_a_question_to_a_picture(browser: Any, pages: Pages)
     viewer = Viewer(browser, 1280)
     page = viewer.open(pages.url)
     page.get_by_role("link", name="kept").first.click()
-    assert page.locator("tbody tr").count() > 0
+    page.locator("tbody tr").first.wait_for()
     page.goto(pages.url + "/labels/weighted_labels")
     page.locator("td.col-k a").first.click()
     page.wait_for_load_state("load")

@@ -10,7 +10,7 @@ from serving import Pages
 
 from db.models import Base
 from pipelines.asking import ask
-from pipelines.frame_boxes import newest_round
+from pipelines.frame_boxes import chosen_round
 from pipelines.named_queries import named_queries
 from pipelines.pictures import frame_picture
 
@@ -64,7 +64,7 @@ def test_a_picture_is_the_one_of_curate_view(pages: Pages) -> None:
     answer = pages.get("/-/picture", frame="000003")
     assert (answer.status, answer.headers["content-type"]) == (200, "image/jpeg")
     shown = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    drawn = frame_picture(pages.workspace, "000003", newest_round(pages.workspace), "pspsl")
+    drawn = frame_picture(pages.workspace, "000003", chosen_round(pages.workspace, None), "pspsl")
     assert shown.shape == drawn.shape
     assert np.abs(shown.astype(int) - drawn).mean() < 6
     assert list((pages.workspace.root / "pictures").iterdir()) == []
