@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pipelines_cli import Curate
 
@@ -21,7 +22,7 @@ def results(tmp_path: Path, toy_kitti: Path) -> Path:
     for name in dataset.frame_ids():
         frame, truth = dataset.read(name), dataset.annotations(name)
         # A centimetre off: a detector that repeats the labels to the digit has seen them.
-        beside = truth.boxes + [0.01, 0, 0, 0, 0, 0, 0]
+        beside = np.add(truth.boxes, [0.01, 0, 0, 0, 0, 0, 0])
         found = Detections(beside, truth.alpha + 0.9, truth.categories)
         objects = from_detections(found, frame.calibration, frame.image_size)
         write_objects(folder / f"{name}.txt", objects)

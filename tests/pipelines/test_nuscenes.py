@@ -41,7 +41,7 @@ def write_results(path: Path, similarity: Similarity = AS_IT_IS) -> Path:
     for number, scene in enumerate(SCENES):
         for step in range(STEPS):
             # A centimetre off: who repeats the labels to the digit has seen them.
-            boxes = drawn_boxes(number, step)[:2] + [0.01, 0, 0, 0, 0, 0, 0]
+            boxes = np.add(drawn_boxes(number, step)[:2], [0.01, 0, 0, 0, 0, 0, 0])
             boxes = similarity.apply_to_boxes(boxes)
             placed = into_map(boxes, vehicle_pose(number, step))
             names = (("car", 0.8), ("pedestrian", 0.6))
