@@ -33,7 +33,7 @@ _VIEWS = {
                h.x, h.y, h.z, h.length, h.width, h.height, h.yaw,
                1.0, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, 'human', t.variant, 1.0
         FROM human_label AS h
-        JOIN frame AS f ON f.id = h.frame_id
+        JOIN frame AS f ON f.id = +h.frame_id
         JOIN task AS t ON t.stage = 'solve' AND t.frame_id IS NULL AND t.round >= h.from_round
         LEFT JOIN human_match AS m
             ON m.round = t.round AND m.frame_id = h.frame_id AND m.n = h.n AND m.leads = 1

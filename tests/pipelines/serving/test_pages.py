@@ -50,7 +50,8 @@ def test_a_named_query_answers_as_curate_query_does(pages: Pages, name: str) -> 
 def test_a_label_leads_to_its_frame(pages: Pages) -> None:
     """From its row, with round and policy; the number of the label to its explanation."""
     text = pages.get("/labels/weighted_labels").text
-    link = "/-/frame?frame=000002&amp;round=1&amp;policy=pspsl"
+    name = next(iter(pages.workspace.frames("unlabeled")))
+    link = f"/-/frame?frame={name}&amp;round=1&amp;policy=pspsl"
     assert link in text
     assert f"{link}&amp;k=0" in text
     assert "/-/frame?id=" in pages.get("/workspace/weight").text
