@@ -13,7 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, one_line
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelFileDescription, LabelSet, Row
 from curate.parquet import load_parquet
 
@@ -150,9 +150,8 @@ def _batch(arrow: Any, schema: Any, rows: tuple[Row, ...]) -> Any:
         try:
             columns.append(arrow.array(values, field.type))
         except (arrow.ArrowException, OverflowError) as error:
-            words = " ".join(str(error).split())
             raise DataError(
-                f"column {field.name}: not all of it is {field.type}: {words}"
+                f"column {field.name}: not all of it is {field.type}: {one_line(error)}"
             ) from None
     return arrow.record_batch(columns, schema)
 

@@ -11,8 +11,9 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from curate.errors import ConfigError, CurateError
+from curate.errors import ConfigError, CurateError, one_line
 from pipelines.executors.base import (
+    IN_HAND,
     FrameFunction,
     FrameJob,
     JobQueue,
@@ -21,8 +22,6 @@ from pipelines.executors.base import (
     open_function,
 )
 
-# Jobs in the hands of an actor: one that it works on, and one so that it need not wait.
-IN_HAND = 2
 PULSE_S = 5.0
 
 
@@ -111,12 +110,12 @@ class RayExecutor:
         try:
             answer = self._ray.get(actor.head())
         except self._ray.exceptions.RayTaskError as error:
-            raise CurateError(f"a Ray actor failed: {_one_line(error)}") from error
+            raise CurateError(f"a Ray actor failed: {one_line(error, 200)}") from error
         except self._ray.exceptions.RayError as error:
             jobs, opened = list(actor.jobs), actor.opened
             self._dismiss(actor)
             yield from queue.bury(
-                jobs, f"{type(error).__name__}: {_one_line(error)}", opened=opened
+                jobs, f"{type(error).__name__}: {one_line(error, 200)}", opened=opened
             )
             return
         if isinstance(answer, CurateError):
@@ -227,8 +226,4 @@ def _join(ray: Any, address: str | None, workers: int) -> None:
         ray.init(**where, logging_level="ERROR", log_to_driver=False)
     except Exception as error:  # Ray raises many kinds, none of which says more than its words
         done = f"joined at {joins}" if joins else "started on this machine"
-        raise CurateError(f"no Ray cluster could be {done}: {_one_line(error)}") from error
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+        raise CurateError(f"no Ray cluster could be {done}: {one_line(error, 200)}") from error
