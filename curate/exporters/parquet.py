@@ -9,10 +9,10 @@ Rows are streamed in row groups, so that millions of labels need no more memory 
 import json
 import os
 from collections.abc import Iterable, Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
+from curate.batches import batched
 from curate.errors import ConfigError, DataError, one_line
 from curate.exporters.base import LabelFileDescription, LabelSet, Row
 from curate.exporters.columns import WEIGHTED_LABELS
@@ -99,10 +99,9 @@ def _metadata(about: LabelFileDescription) -> dict[str, str]:
     return {f"curate.{key}": value for key, value in told.items()}
 
 
-def _groups(rows: Iterable[Row], size: int) -> Iterator[tuple[Row, ...]]:
+def _groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
     """The rows in groups, each checked; DataError at a weight that cannot be."""
-    walk = iter(rows)
-    while group := tuple(islice(walk, size)):
+    for group in batched(rows, size):
         for row in group:
             if not 0 <= row[-1] <= 1:
                 raise DataError(
@@ -111,7 +110,7 @@ def _groups(rows: Iterable[Row], size: int) -> Iterator[tuple[Row, ...]]:
         yield group
 
 
-def _batch(arrow: Any, schema: Any, rows: tuple[Row, ...]) -> Any:
+def _batch(arrow: Any, schema: Any, rows: list[Row]) -> Any:
     """A record batch of the rows."""
     columns = []
     for field, values in zip(schema, zip(*rows, strict=True), strict=True):

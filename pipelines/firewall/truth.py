@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from sqlalchemy import func, select
 
+from curate.batches import batched
 from curate.errors import DataError
 from curate.exporters.base import named
 from curate.firewall.copied_truth import copied_boxes
@@ -59,9 +60,8 @@ def copied_truth(
     copies: dict[str, int] = {}
     for number in rounds:
         chosen = frames if thorough else _suspects(workspace, number, frames)
-        names = list(chosen)
-        for start in range(0, len(names), _BATCH):
-            batch = {chosen[name]: name for name in names[start : start + _BATCH]}
+        for names in batched(chosen, _BATCH):
+            batch = {chosen[name]: name for name in names}
             for key, found in workspace.predictions(number, list(batch)).items():
                 compared += len(found)
                 copied = int(_repeated(workspace, batch[key], found.boxes).sum())
