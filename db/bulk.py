@@ -1,7 +1,8 @@
 """The one bulk reader and writer: tuples in, tuples out, no objects in between."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain, repeat
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,14 @@ from db.models import Base
 
 Row = tuple[Any, ...]
 BLOCK_ROWS = 50_000
+FETCHED_ROWS = 1000  # from SQLite at a time: more do not stay in the processor's cache
 
 # Building an index anew costs a sixth of a row's way in and out of it, measured at 10 million rows.
 _REBUILT_FROM = 100_000
 _REBUILT_SHARE = 1 / 5
+_BULK_CACHE_KIB = 64 * 1024
+# Of one INSERT; every SQLite takes so many variables.
+_MOST_ROWS, _MOST_VARIABLES = 50, 999
 
 
 def table(name: str) -> Table:
@@ -38,15 +43,82 @@ def insert(connection: Connection, name: str, rows: Iterable[Row]) -> None:
     if not rows:
         return
     names = columns(name)
-    quoted = ", ".join(f'"{column}"' for column in names)
     if connection.dialect.name == "postgresql":
-        cursor = connection.connection.cursor()
-        with cursor.copy(f'COPY "{name}" ({quoted}) FROM STDIN') as copy:
-            for row in rows:
-                copy.write_row(row)
+        _copy(connection, name, names, rows)
         return
-    marks = ", ".join("?" * len(names))
-    connection.exec_driver_sql(f'INSERT INTO "{name}" ({quoted}) VALUES ({marks})', rows)  # noqa: S608
+    marks = f"({', '.join('?' * len(names))})"
+    for start, end, count in _statements(len(rows), _rows_per_statement(len(names))):
+        parts = (rows[i : i + count] for i in range(start, end, count))
+        connection.exec_driver_sql(
+            _insertion(name, names, [marks] * count),
+            [tuple(chain.from_iterable(part)) for part in parts],
+        )
+
+
+def insert_columns(connection: Connection, name: str, values: Mapping[str, Any]) -> None:
+    """Inserts rows that are given as columns: no tuple is made of them where it can be spared.
+
+    Args:
+        connection: to the database.
+        name: of the table.
+        values: a list per column, all of one length; what is no list is the value of every row.
+    """
+    fixed = {column: value for column, value in values.items() if not isinstance(value, list)}
+    varying = {column: value for column, value in values.items() if column not in fixed}
+    length, width = len(next(iter(varying.values()))), len(varying)
+    if connection.dialect.name == "postgresql":
+        each = [repeat(v, length) if c in fixed else v for c, v in values.items()]
+        _copy(connection, name, tuple(values), zip(*each, strict=True))
+        return
+    # The values of all columns, row by row.
+    flat: list[Any] = [None] * (length * width)
+    for place, column in enumerate(varying.values()):
+        flat[place::width] = column
+    names, head = (*fixed, *varying), tuple(fixed.values())
+    for start, end, count in _statements(length, _rows_per_statement(width, len(head))):
+        marks = [_numbered(len(head), width, row) for row in range(count)]
+        step = count * width
+        parts = (flat[i : i + step] for i in range(start * width, end * width, step))
+        connection.exec_driver_sql(
+            _insertion(name, names, marks), [(*head, *part) for part in parts]
+        )
+
+
+def _copy(
+    connection: Connection, name: str, names: Sequence[str], rows: Iterable[Sequence[Any]]
+) -> None:
+    """COPY into a server's table."""
+    quoted = ", ".join(f'"{column}"' for column in names)
+    cursor = connection.connection.cursor()
+    with cursor.copy(f'COPY "{name}" ({quoted}) FROM STDIN') as copy:
+        for row in rows:
+            copy.write_row(row)
+
+
+def _insertion(name: str, names: Sequence[str], rows: Sequence[str]) -> str:
+    """An INSERT of several rows of marks, which costs SQLite half as much as one of each."""
+    quoted = ", ".join(f'"{column}"' for column in names)
+    return f'INSERT INTO "{name}" ({quoted}) VALUES {", ".join(rows)}'  # noqa: S608
+
+
+def _numbered(constants: int, width: int, row: int) -> str:
+    """The marks of a row: the values that all rows share, then its own."""
+    first = constants + row * width + 1
+    places = (*range(1, constants + 1), *range(first, first + width))
+    return f"({', '.join(f'?{place}' for place in places)})"
+
+
+def _rows_per_statement(width: int, constants: int = 0) -> int:
+    return min(_MOST_ROWS, (_MOST_VARIABLES - constants) // width)
+
+
+def _statements(length: int, step: int) -> Iterator[tuple[int, int, int]]:
+    """First row, end and rows per statement: of the full statements, and of the rest."""
+    whole = length - length % step
+    if whole:
+        yield 0, whole, step
+    if whole < length:
+        yield whole, length, length - whole
 
 
 def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
@@ -55,22 +127,38 @@ def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
     return [tuple(row) for row in cursor]
 
 
-def stream(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[Any]]:
-    """The values of a query's only column in blocks, as many as a block holds at a time."""
-    result = connection.execution_options(yield_per=BLOCK_ROWS).execute(statement)
-    yield from result.scalars().partitions()
+def blocks(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[Row]]:
+    """The rows of a query, some at a time.
+
+    For numbers and text only: SQLite's come as its driver makes them, without an object of
+    SQLAlchemy per row, which takes as long as the row itself.
+    """
+    if connection.dialect.name == "sqlite":
+        result = connection.execute(statement)
+        cursor = result.cursor
+        while cursor is not None and (rows := cursor.fetchmany(FETCHED_ROWS)):
+            yield rows
+        result.close()
+    else:
+        options = {"yield_per": BLOCK_ROWS}
+        yield from connection.execute(statement, execution_options=options).partitions()
 
 
 def numbers(connection: Connection, statement: Select[Any]) -> np.ndarray:
     """(n,) float64 the only column of a query; NaN for null."""
-    blocks = stream(connection, statement)
-    found = [np.array(values, dtype=np.float64) for values in blocks]
+    found = [
+        np.array([value for (value,) in rows], dtype=np.float64)
+        for rows in blocks(connection, statement)
+    ]
     return np.concatenate([np.zeros(0), *found])
 
 
 def integers(connection: Connection, statement: Select[Any]) -> np.ndarray:
     """(n,) int64 the only column of a query, without nulls."""
-    found = [np.array(values, dtype=np.int64) for values in stream(connection, statement)]
+    found = [
+        np.fromiter((value for (value,) in rows), np.int64, len(rows))
+        for rows in blocks(connection, statement)
+    ]
     return np.concatenate([np.zeros(0, dtype=np.int64), *found])
 
 
@@ -85,12 +173,29 @@ def replacing(connection: Connection, name: str, count: int) -> Iterator[None]:
     if worthwhile:
         stored = connection.execute(query_of(func.count()).select_from(table(name))).scalar_one()
         worthwhile = count >= stored * _REBUILT_SHARE
-    indices = sorted(table(name).indexes, key=lambda each: str(each.name)) if worthwhile else []
+    if not worthwhile:
+        yield
+        return
+    indices = sorted(table(name).indexes, key=lambda each: str(each.name))
     for index in indices:
         connection.execute(DropIndex(index))
-    yield
-    for index in indices:
-        connection.execute(CreateIndex(index))
+    with _roomy(connection):
+        yield
+        for index in indices:
+            connection.execute(CreateIndex(index))
+
+
+@contextmanager
+def _roomy(connection: Connection) -> Iterator[None]:
+    """Within it SQLite has room for the pages in work, and sorts an index on a second core."""
+    usual = connection.exec_driver_sql("PRAGMA cache_size").scalar_one()
+    connection.exec_driver_sql(f"PRAGMA cache_size = -{_BULK_CACHE_KIB}")
+    connection.exec_driver_sql("PRAGMA threads = 1")
+    try:
+        yield
+    finally:
+        connection.exec_driver_sql(f"PRAGMA cache_size = {usual}")
+        connection.exec_driver_sql("PRAGMA threads = 0")
 
 
 def refresh_statistics(connection: Connection) -> None:

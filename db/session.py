@@ -59,9 +59,16 @@ class Database:
             yield connection
 
     @contextmanager
-    def writing(self) -> Iterator[Connection]:
-        """One transaction: all of it is kept, or nothing."""
-        writer = self.engine.execution_options(sqlite_begin="IMMEDIATE")
+    def writing(self, *, keys_known: bool = False) -> Iterator[Connection]:
+        """One transaction: all of it is kept, or nothing.
+
+        Args:
+            keys_known: that the rows which others refer to were read under a claim, so SQLite need
+                not look each of them up, nor delete what refers to deleted rows.
+        """
+        writer = self.engine.execution_options(
+            sqlite_begin="IMMEDIATE", sqlite_foreign_keys=not keys_known
+        )
         with self._own_words(), writer.begin() as connection:
             yield connection
 
@@ -201,14 +208,16 @@ def _set_pragmas(connection: Any, _record: Any) -> None:
     cursor.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
     cursor.execute("PRAGMA journal_mode = WAL")
     cursor.execute("PRAGMA synchronous = NORMAL")
-    cursor.execute("PRAGMA foreign_keys = ON")
     cursor.close()
 
 
 def _begin(connection: Connection) -> None:
     # Taking the write lock at once lets a second writer wait instead of failing half way.
-    mode = connection.get_execution_options().get("sqlite_begin", "DEFERRED")
-    connection.exec_driver_sql(f"BEGIN {mode}")
+    options = connection.get_execution_options()
+    # Within a transaction this one has no effect.
+    checked = "ON" if options.get("sqlite_foreign_keys", True) else "OFF"
+    connection.exec_driver_sql(f"PRAGMA foreign_keys = {checked}")
+    connection.exec_driver_sql(f"BEGIN {options.get('sqlite_begin', 'DEFERRED')}")
 
 
 _REMEDIES = {

@@ -1,7 +1,7 @@
 """What is known of the labels of a round, read from the database in columns.
 
-Every table of evidence is scanned once in the order of its key and one column at a time: a join of
-them costs a seek per label and table, and rows of many columns cost an object per value at once.
+Every table of evidence is scanned in the order of its key, and one column at a time: a join of them
+costs a seek per label and table, and rows of many columns cost an object per value at once.
 """
 
 from collections.abc import Collection, Sequence
@@ -87,15 +87,15 @@ class _Scan:
     def __init__(self, connection: Connection, round_number: int, frames: Sequence[int]) -> None:
         self._connection = connection
         self._round = round_number
-        self._all = self._read_keys("prediction")
+        self._all, self._category, self._category_names = self._read_predictions()
         wanted = np.isin(self._all >> _K_BITS, np.asarray(frames, dtype=np.int64))
         self._wanted = slice(None) if wanted.all() else np.flatnonzero(wanted)
 
     def keys(self) -> LabelKeys:
         """Keys and categories."""
         own = self._all[self._wanted]
-        category, names = self._categories()
-        return LabelKeys(own >> _K_BITS, own & ((1 << _K_BITS) - 1), category, names)
+        category = self._category[self._wanted]
+        return LabelKeys(own >> _K_BITS, own & ((1 << _K_BITS) - 1), category, self._category_names)
 
     def numbers(self, table: str, column: str) -> np.ndarray:
         """(n,) float64; NaN for null, and where the table has no row of a label."""
@@ -115,16 +115,20 @@ class _Scan:
         """(n,) the value in place of a column that nobody asks for; it takes no memory."""
         return np.broadcast_to(np.array(value), self._all[self._wanted].shape)
 
-    def _categories(self) -> tuple[np.ndarray, tuple[str, ...]]:
-        """(n,) int64 number of each label's category, and the categories by their number."""
+    def _read_predictions(self) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+        """(n,) int64 keys as of `_read_keys`, (n,) int64 number of each category, their names."""
         numbering: dict[str, int] = {}
-        blocks = [np.zeros(0, dtype=np.int64)]
-        query = self._ordered("prediction", bulk.table("prediction").c.category)
-        for names in bulk.stream(self._connection, query):
-            for name in set(names):
+        keys, categories = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+        columns = bulk.table("prediction").c
+        query = self._ordered("prediction", columns.frame_id, columns.k, columns.category)
+        for rows in bulk.blocks(self._connection, query):
+            frame = np.array([row[0] for row in rows], dtype=np.int64)
+            keys.append((frame << _K_BITS) + np.array([row[1] for row in rows], dtype=np.int64))
+            names = [row[2] for row in rows]
+            for name in dict.fromkeys(names):
                 numbering.setdefault(name, len(numbering))
-            blocks.append(np.fromiter(map(numbering.__getitem__, names), np.int64, len(names)))
-        return np.concatenate(blocks)[self._wanted], tuple(numbering)
+            categories.append(np.array([numbering[name] for name in names], dtype=np.int64))
+        return np.concatenate(keys), np.concatenate(categories), tuple(numbering)
 
     def _read_keys(self, table: str) -> np.ndarray:
         """(n,) int64 frame and k of each row in one ascending number."""
@@ -132,10 +136,12 @@ class _Scan:
         key = cast(columns.frame_id, BigInteger) * (1 << _K_BITS) + columns.k
         return bulk.integers(self._connection, self._ordered(table, key))
 
-    def _ordered(self, table: str, column: ColumnElement[Any]) -> Select[Any]:
+    def _ordered(self, table: str, *chosen: ColumnElement[Any]) -> Select[Any]:
         columns = bulk.table(table).c
         return (
-            select(column).where(columns.round == self._round).order_by(columns.frame_id, columns.k)
+            select(*chosen)
+            .where(columns.round == self._round)
+            .order_by(columns.frame_id, columns.k)
         )
 
 

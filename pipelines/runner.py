@@ -162,7 +162,7 @@ def run_once(
         return Report(what.stage, what.round, kept=1, summary="up to date")
     product = make()
     seconds = time.perf_counter() - start
-    with workspace.database.writing() as connection:
+    with workspace.database.writing(keys_known=product.keys_known) as connection:
         product.write(connection)
         connection.execute(bulk.table("task").delete().where(*what.conditions()))
         row = (what.round, what.stage, what.variant, None, fingerprint, "done", None, seconds)

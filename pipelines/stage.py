@@ -73,10 +73,12 @@ class Product:
     Attributes:
         summary: what it did, in a few words.
         write: stores its rows, in the transaction that also records the stage as done.
+        keys_known: see `db.session.Database.writing`.
     """
 
     summary: str
     write: Callable[[Connection], None]
+    keys_known: bool = False
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,6 @@ def solved(workspace: Workspace, policy: str = "pspsl", rounds: int = 3) -> Work
     frames = list(workspace.frames("unlabeled").values())
     context = RoundContext(1, rounds, 0, Teacher(workspace.root, ""))
     product = solve.run(workspace, RoundJob(context, policy, frames), Silent())
-    with workspace.database.writing() as connection:
+    with workspace.database.writing(keys_known=product.keys_known) as connection:
         product.write(connection)
     return workspace

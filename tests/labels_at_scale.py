@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from sqlalchemy import text
 from sqlalchemy.schema import CreateIndex, DropIndex
 
 from db import bulk
@@ -12,6 +13,7 @@ from pipelines.workspace import Workspace
 
 EACH = 50  # labels per frame
 BATCH_FRAMES = 2000
+DRAWN_FRAMES = 20_000  # others are copies of them, with slightly different numbers
 CATEGORIES = ("Car", "Pedestrian", "Cyclist")
 SHARES = (0.7, 0.2, 0.1)
 
@@ -30,11 +32,16 @@ def filled_workspace(root: Path, frames: int, database: str | None = None) -> Wo
         for index in indices:
             connection.execute(DropIndex(index))
     generator = np.random.default_rng(0)
-    for first in range(1, frames + 1, BATCH_FRAMES):
-        keys = _keys(first, min(first + BATCH_FRAMES, frames + 1))
+    drawn = min(frames, DRAWN_FRAMES)
+    for first in range(1, drawn + 1, BATCH_FRAMES):
+        keys = _keys(first, min(first + BATCH_FRAMES, drawn + 1))
         with workspace.database.writing() as connection:
             for table, rows in _evidence(generator, keys):
                 bulk.insert(connection, table, rows)
+    for first in range(drawn, frames, drawn):
+        with workspace.database.writing() as connection:
+            for statement in _copies(first, min(drawn, frames - first)):
+                connection.execute(text(statement))
     with workspace.database.writing() as connection:
         for index in indices:
             connection.execute(CreateIndex(index))
@@ -66,6 +73,19 @@ def _evidence(
     yield "consistency", _joined(keys, matched, [1] * count, counts)
     yield "point_prior", _joined(keys, [5] * count, [10.0] * count, rho[0])
     yield "semantic_prior", _joined(keys, [5] * count, [10] * count, rho[1])
+
+
+def _copies(first: int, count: int) -> Iterator[str]:
+    """Statements that repeat the first frames behind others; no weight comes twice."""
+    shrunk = {name: f"{name} * {1 - 1e-9 * first!r}" for name in ("loss", "rho_diff", "score")}
+    for name in ("prediction", "consistency", "point_prior", "semantic_prior"):
+        chosen = {column: column for column in bulk.columns(name)}
+        chosen |= {column: shrunk[column] for column in shrunk if column in chosen}
+        chosen["frame_id"] = f"frame_id + {first}"
+        yield (
+            f"INSERT INTO {name} ({', '.join(chosen)}) SELECT {', '.join(chosen.values())} "
+            f"FROM {name} WHERE round = 1 AND frame_id <= {count} ORDER BY frame_id, k"
+        )
 
 
 def _joined(keys: list[bulk.Row], *columns: list) -> list[bulk.Row]:

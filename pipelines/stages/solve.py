@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import repeat
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection
@@ -58,8 +58,8 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
                 table = bulk.table(name)
                 mine = (table.c.round == context.number, table.c.policy == policy)
                 connection.execute(table.delete().where(*mine))
-            for rows in _rows(context.number, keys, policy, weights, evidence):
-                bulk.insert(connection, "weight", rows)
+            for columns in _columns(context.number, keys, policy, weights, evidence):
+                bulk.insert_columns(connection, "weight", columns)
         bulk.insert(connection, "label_count", counts)
         refresh_matches(connection, context.number)
         bulk.refresh_statistics(connection)
@@ -67,7 +67,9 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     trusted, total = int((weights.v > 0).sum()), float(weights.v.sum())
     summary = f"{len(keys)} labels, {trusted} with weight > 0, their weights sum to {total:.1f}"
     dropped = int(weights.dropped.sum())
-    return Product(f"{summary}, {dropped} dropped" if dropped else summary, write)
+    summary = f"{summary}, {dropped} dropped" if dropped else summary
+    # No other process changes predictions of a round that is being solved, see `db.claims`.
+    return Product(summary, write, keys_known=True)
 
 
 def remembers(policy: Policy) -> bool:
@@ -82,10 +84,10 @@ def _memory_fingerprint(workspace: Workspace, context: RoundContext, policy: str
     return solved_fingerprint(workspace, context.number - 1, policy)
 
 
-def _rows(
+def _columns(
     round_number: int, keys: LabelKeys, policy: str, weights: Weights, evidence: Evidence
-) -> Iterator[list[bulk.Row]]:
-    """The rows of `weight`, a block at a time."""
+) -> Iterator[dict[str, Any]]:
+    """The columns of `weight`, a block at a time."""
     columns = (keys.frame_id, keys.k, weights.lambda_u, evidence.rho_det, weights.v)
     for start in range(0, len(keys), bulk.BLOCK_ROWS):
         block = slice(start, start + bulk.BLOCK_ROWS)
@@ -93,7 +95,10 @@ def _rows(
         frame_id, k, age, rho, v = (column[block][kept].tolist() for column in columns)
         # NaN differs from itself; the database knows null.
         ages = [None if each != each else each for each in age]  # noqa: PLR0124
-        yield list(zip(repeat(round_number), frame_id, k, repeat(policy), ages, rho, v))
+        yield {
+            "round": round_number, "frame_id": frame_id, "k": k, "policy": policy,
+            "lambda_u": ages, "rho_det": rho, "v": v,
+        }  # fmt: skip
 
 
 def _counts(round_number: int, policy: str, keys: LabelKeys, weights: Weights) -> list[bulk.Row]:

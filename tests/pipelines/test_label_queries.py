@@ -17,17 +17,32 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     return solved(filled_workspace(tmp_path_factory.mktemp("filled"), frames=40))
 
 
+def _plan(workspace: Workspace, question: str) -> list[tuple[int, str]]:
+    """The steps of SQLite's plan, each with the number of the step that it belongs to."""
+    with workspace.database.reading() as connection:
+        rows = connection.execute(text(f"EXPLAIN QUERY PLAN {question}"))
+        return [(row[1], row[3]) for row in rows]
+
+
 @pytest.mark.parametrize("question", [TRUSTED, HEAVIEST, FRAME, FRAME_OF_ROUND, COUNTS])
 def test_no_table_is_read_from_end_to_end(workspace: Workspace, question: str) -> None:
-    """SQLite seeks in every table of predictions, evidence and weights.
+    """SQLite seeks in every table of frames, predictions, evidence and weights.
 
-    Where frames are few, it may ask a Bloom filter of them before it seeks one. Only what people
-    decided, which is never much, is read as a whole.
+    Only what people decided and the rounds, which are never many, are read as a whole; no index
+    and no filter is made for the question alone.
     """
-    with workspace.database.reading() as connection:
-        plan = [row[3] for row in connection.execute(text(f"EXPLAIN QUERY PLAN {question}"))]
-    scanned = {step.split()[1] for step in plan if step.startswith("SCAN")}
-    assert scanned <= {"weighted_labels", "h", "t"}, plan
+    steps = [step for _, step in _plan(workspace, question)]
+    assert {step.split()[1] for step in steps if step.startswith("SCAN")} <= {"h", "m", "r"}, steps
+    assert not [step for step in steps if "AUTOMATIC" in step or "BLOOM" in step], steps
+
+
+@pytest.mark.parametrize("columns", ["*", "frame, k, weight"])
+def test_the_heaviest_labels_come_by_their_index(workspace: Workspace, columns: str) -> None:
+    """The weights of the policy come in its order; only what people decided is sorted."""
+    plan = _plan(workspace, HEAVIEST.replace("*", columns) + " LIMIT 5")
+    index = "ix_weight_policy_v (round=? AND policy=? AND v>?)"
+    (part,) = [part for part, step in plan if step.startswith("SEARCH w") and index in step]
+    assert [step for of, step in plan if of == part and "TEMP B-TREE" in step] == [], plan
 
 
 def test_counts_are_those_of_the_labels(workspace: Workspace) -> None:
