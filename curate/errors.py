@@ -73,3 +73,18 @@ class TrainerFailed(CurateError):  # noqa: N818 - it reports another program's f
     """The user's trainer ended with an error, or without a checkpoint."""
 
     exit_code = 10
+
+
+def one_line(error: BaseException, longest: int | None = None) -> str:
+    """What another library's error says, as one line for a message of ours.
+
+    Args:
+        error: may say nothing; then the line is empty.
+        longest: letters to keep; all of them without.
+    """
+    return " ".join(str(error).split())[:longest]
+
+
+def first_line(error: BaseException) -> str:
+    """What another library's error says first, for one whose message is a page."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

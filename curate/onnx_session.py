@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from curate.errors import ModelError
+from curate.errors import ModelError, first_line
 
 
 def open_session(model: Path, threads: int, section: str) -> Any:
@@ -51,8 +51,3 @@ def runtime_errors() -> tuple[type[Exception], ...]:
         state.NotImplemented,
         state.RuntimeException,
     )
-
-
-def first_line(error: Exception) -> str:
-    """What an error says first."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import URL, Connection, CursorResult, NullPool, create_engine
 from sqlalchemy.exc import DBAPIError
 
-from curate.errors import ConfigError, DatabaseError
+from curate.errors import ConfigError, DatabaseError, one_line
 
 # What SQLite may do for a question: read tables and call functions, nothing else. ATTACH would read
 # other files, PRAGMA could switch the protection off.
@@ -93,7 +93,7 @@ def _rows(
 
 
 def _own_words(path: Path, error: Exception, seconds: float) -> ConfigError | DatabaseError:
-    message = " ".join(str(error).split())
+    message = one_line(error)
     if "file is not a database" in message or "malformed" in message:
         return DatabaseError(f"{path}: {message}")
     if "interrupted" in message:

@@ -17,7 +17,7 @@ from pydantic import (
 
 from curate.atomic import replace_file
 from curate.detections import CATEGORIES
-from curate.errors import ConfigError
+from curate.errors import ConfigError, one_line
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -183,8 +183,7 @@ def read_config(path: Path) -> Config:
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file; `curate init` makes a workspace") from error
     except (RecursionError, ValueError) as error:  # ValueError: also of absurdly long numbers
-        words = " ".join(str(error).split())[:200]
-        raise ConfigError(f"{path}: not TOML: {words}") from error
+        raise ConfigError(f"{path}: not TOML: {one_line(error, 200)}") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     return make_config(document, str(path))

@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
-from typing import TypeVar
 
 from sqlalchemy import Connection, select
 
+from curate.batches import batched
 from db import bulk
 from pipelines import plan, registry
 from pipelines.executors.base import Executor, FrameJob, Outcome
@@ -26,8 +26,6 @@ from pipelines.workspace import Workspace
 READ_AHEAD = 256  # frames whose earlier rows are read at once
 FLUSH_FRAMES = 64
 FLUSH_S = 1.0
-
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -207,7 +205,7 @@ def _jobs(
     Frames that an earlier stage found empty are no jobs; `skip` is told of them.
     """
     reads = "prediction" in stage.reads
-    for batch in _batched(frames, READ_AHEAD):
+    for batch in batched(frames, READ_AHEAD):
         if empty := [key for key, _, is_empty in batch if is_empty]:
             skip(empty)
         keys = [key for key, _, is_empty in batch if not is_empty]
@@ -216,12 +214,6 @@ def _jobs(
         for key, name, is_empty in batch:
             if not is_empty:
                 yield FrameJob(key, name, found.get(key), measured.get(key))
-
-
-def _batched(items: Iterable[Item], size: int) -> Iterator[Sequence[Item]]:
-    waiting = iter(items)
-    while batch := list(islice(waiting, size)):
-        yield batch
 
 
 class _Writer:

@@ -235,9 +235,7 @@ def _store(
             bulk.insert(connection, "frame", rows)
         chosen = {name: getattr(split, name) for name in SPLITS}
         bulk.insert(connection, "split_list", split_rows(chosen, dataset.splits(), files))
-        query = select(table.c.frame, table.c.id, table.c.split).where(
-            table.c.split != "unlabeled"
-        )
+        query = select(table.c.frame, table.c.id, table.c.split).where(table.c.split != "unlabeled")
         keys = {frame: (key, of) for frame, key, of in bulk.select(connection, query)}
         truth_rows = [
             row for frame, found in truth.items() for row in _truth_rows(*keys[frame], found)

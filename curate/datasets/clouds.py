@@ -7,7 +7,7 @@ import numpy as np
 
 from curate.datasets.cloud_formats import read_pcd, read_ply
 from curate.datasets.kitti import read_bytes, refuse_far_points
-from curate.errors import DataError
+from curate.errors import DataError, one_line
 
 # What a damaged header makes numpy raise.
 _NPY_DAMAGES = (
@@ -71,8 +71,7 @@ def _read_npy(path: Path, columns: int) -> np.ndarray:
     except FileNotFoundError:
         raise DataError(f"{path}: no such point file") from None
     except _NPY_DAMAGES as error:
-        words = " ".join(str(error).split())[:200]
-        raise DataError(f"{path}: no readable .npy array: {words}") from None
+        raise DataError(f"{path}: no readable .npy array: {one_line(error, 200)}") from None
     if table.ndim != 2 or table.shape[1] != columns or table.dtype.kind not in "fiu":
         raise DataError(
             f"{path}: {table.dtype} {list(table.shape)}, expected [n, {columns}]; set columns"

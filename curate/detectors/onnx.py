@@ -15,10 +15,10 @@ import numpy as np
 
 from curate.detections import Detections, as_categories
 from curate.detectors.conventions import BoxConvention
-from curate.errors import ConfigError, ModelError
+from curate.errors import ConfigError, ModelError, first_line
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
-from curate.onnx_session import first_line, open_session, runtime_errors
+from curate.onnx_session import open_session, runtime_errors
 
 _KEYS = ("boxes", "scores", "labels")
 

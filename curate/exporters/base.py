@@ -1,21 +1,16 @@
 """What every exporter offers: the labels of a round as files for trainers."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from curate.errors import DataError, LeakageError
+from curate.exporters.columns import WEIGHTED_LABELS
 from curate.frames import Frame
 
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
-WEIGHTED_LABEL_COLUMNS = (
-    "round", "frame", "k", "category", *BOX_COLUMNS,
-    "score", "loss", "points", "points_threshold", "rho_diff", "mask_pixels", "box_pixels",
-    "rho_anno", "rho_det", "lambda_u", "provenance", "policy", "weight",
-)  # fmt: skip
-PROVENANCES = ("detector", "human")
-"""Whose a label is: a prediction that a policy weighs, or what a person decided in a review."""
+WEIGHTED_LABEL_COLUMNS = tuple(WEIGHTED_LABELS)
 GROUND_TRUTH_COLUMNS = ("frame", "k", "category", *BOX_COLUMNS, "truncated", "occluded")
 FRAME_COLUMNS = ("frame", "split", "points", "image", "calibration")
 
@@ -72,6 +67,7 @@ class LabelSet:
         labels: rows of `WEIGHTED_LABEL_COLUMNS`, of unlabeled frames, by frame and k.
         read: calibration and image size of a frame, for formats in the camera's frame.
         read_points: the same with the frame's points, for formats that carry objects' points.
+        categories: those that ground truth or labels have; not all need be ones to be learned.
 
     Raises:
         LeakageError: ground truth of a frame that is not labeled, or a frame of another split.
@@ -84,9 +80,10 @@ class LabelSet:
     labels: Rows
     read: Callable[[str], Frame]
     read_points: Callable[[str], Frame]
+    categories: frozenset[str] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Checks the splits."""
+        """Checks the splits and finds the categories in one walk through the labels."""
         splits = {str(row[0]): str(row[1]) for row in self.frames}
         others = {name for name, split in splits.items() if split not in ("labeled", "unlabeled")}
         leaked = {row[0] for row in self.ground_truth if splits.get(row[0]) != "labeled"}
@@ -96,25 +93,17 @@ class LabelSet:
                 f"the labeled split: {named(others or leaked)}; export labeled and unlabeled "
                 "frames only, with ground truth of labeled ones"
             )
-        position = WEIGHTED_LABEL_COLUMNS.index("frame")
-        strays = {row[position] for row in self.labels}
-        strays = {name for name in strays if splits.get(name) != "unlabeled"}
+        frame, category = map(WEIGHTED_LABEL_COLUMNS.index, ("frame", "category"))
+        found = {(row[frame], row[category]) for row in self.labels}
+        strays = {name for name, _ in found if splits.get(name) != "unlabeled"}
         if strays:
             raise DataError(
                 f"labels to export belong to frames outside the unlabeled split: {named(strays)}; "
                 "export labels of unlabeled frames only"
             )
-
-    @property
-    def categories(self) -> frozenset[str]:
-        """The categories that ground truth or labels have; not all need be ones to be learned."""
-        of_truth, of_labels = (
-            columns.index("category") for columns in (GROUND_TRUTH_COLUMNS, WEIGHTED_LABEL_COLUMNS)
-        )
-        return frozenset(
-            {str(row[of_truth]) for row in self.ground_truth}
-            | {str(row[of_labels]) for row in self.labels}
-        )
+        of_truth = GROUND_TRUTH_COLUMNS.index("category")
+        categories = {row[of_truth] for row in self.ground_truth} | {name for _, name in found}
+        object.__setattr__(self, "categories", frozenset(map(str, categories)))
 
 
 class Exporter(Protocol):

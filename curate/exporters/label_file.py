@@ -13,7 +13,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from curate.errors import DataError
+from curate.errors import DataError, one_line
 from curate.exporters.sqlite import FORMAT_VERSION, TABLES
 
 _KEYS = ("categories", "round", "policy", "root")
@@ -55,8 +55,7 @@ def open_label_file(path: Path) -> Iterator[sqlite3.Connection]:
             _refuse_foreign_tables(rows, path)
             yield rows
     except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
-        words = " ".join(str(error).split())
-        raise DataError(f"{path}: not a label file: {words}; export it again") from None
+        raise DataError(f"{path}: not a label file: {one_line(error)}; export it again") from None
 
 
 def read_meta(rows: sqlite3.Connection, path: Path) -> Mapping[str, str]:

@@ -8,47 +8,20 @@ Rows are streamed in row groups, so that millions of labels need no more memory 
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from itertools import islice
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
-from curate.errors import ConfigError, DataError
-from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelFileDescription, LabelSet, Row
+from curate.batches import batched
+from curate.errors import ConfigError, DataError, one_line
+from curate.exporters.base import LabelFileDescription, LabelSet, Row
+from curate.exporters.columns import WEIGHTED_LABELS
 from curate.parquet import load_parquet
 
 FORMAT = "curate weighted labels, Parquet"
 FORMAT_VERSION = "1"
 FRAME_OF_REFERENCE = "LiDAR: x forward, y left, z up; x, y, z is the centre of the box"
 ROWS_PER_GROUP = 65_536
-
-# Type, unit and meaning of each column; those with a "?" may be null.
-_COLUMNS: Mapping[str, tuple[str, str, str]] = {
-    "round": ("int32", "", "round that made the label"),
-    "frame": ("name", "", "frame id"),
-    "k": ("int32", "", "number of the label within its frame, by falling score"),
-    "category": ("name", "", "of the object"),
-    "x": ("float64", "m", "box centre, forward"),
-    "y": ("float64", "m", "box centre, left"),
-    "z": ("float64", "m", "box centre, up"),
-    "length": ("float64", "m", "along the heading"),
-    "width": ("float64", "m", "across the heading"),
-    "height": ("float64", "m", "upward"),
-    "yaw": ("float64", "rad", "counter-clockwise from x, in (-pi, pi]"),
-    "score": ("float64", "1", "of the detector, in [0, 1]"),
-    "loss": ("float64?", "1", "consistency loss L; null without a matched reprediction"),
-    "points": ("int32?", "1", "LiDAR points in the box"),
-    "points_threshold": ("float64?", "1", "m_th of the category"),
-    "rho_diff": ("float64?", "1", "Eq. 8"),
-    "mask_pixels": ("int64?", "px", "S, pixels of the category in the rectangle"),
-    "box_pixels": ("int64?", "px", "A, pixels of the rectangle"),
-    "rho_anno": ("float64?", "1", "Eq. 9"),
-    "rho_det": ("float64?", "1", "rho_diff * rho_anno"),
-    "lambda_u": ("float64?", "1", "age parameter, Eq. 4"),
-    "provenance": ("name", "", "detector, or human where a person decided"),
-    "policy": ("name", "", "that weighted the label"),
-    "weight": ("float64", "1", "v in [0, 1]; 0 is an ignore region"),
-}  # fmt: skip
 
 
 class ParquetExporter:
@@ -103,11 +76,9 @@ def label_schema(about: LabelFileDescription) -> Any:
         "name": arrow.dictionary(arrow.int32(), arrow.string()),
     }
     fields = []
-    for name in WEIGHTED_LABEL_COLUMNS:
-        kind, unit, meaning = _COLUMNS[name]
-        told = {"meaning": meaning} | ({"unit": unit} if unit else {})
-        optional = kind.endswith("?")
-        fields.append(arrow.field(name, types[kind.rstrip("?")], optional, told))
+    for name, column in WEIGHTED_LABELS.items():
+        told = {"meaning": column.meaning} | ({"unit": column.unit} if column.unit else {})
+        fields.append(arrow.field(name, types[column.kind], column.optional, told))
     return arrow.schema(fields, _metadata(about))
 
 
@@ -128,10 +99,9 @@ def _metadata(about: LabelFileDescription) -> dict[str, str]:
     return {f"curate.{key}": value for key, value in told.items()}
 
 
-def _groups(rows: Iterable[Row], size: int) -> Iterator[tuple[Row, ...]]:
+def _groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
     """The rows in groups, each checked; DataError at a weight that cannot be."""
-    walk = iter(rows)
-    while group := tuple(islice(walk, size)):
+    for group in batched(rows, size):
         for row in group:
             if not 0 <= row[-1] <= 1:
                 raise DataError(
@@ -140,7 +110,7 @@ def _groups(rows: Iterable[Row], size: int) -> Iterator[tuple[Row, ...]]:
         yield group
 
 
-def _batch(arrow: Any, schema: Any, rows: tuple[Row, ...]) -> Any:
+def _batch(arrow: Any, schema: Any, rows: list[Row]) -> Any:
     """A record batch of the rows."""
     columns = []
     for field, values in zip(schema, zip(*rows, strict=True), strict=True):
@@ -150,9 +120,8 @@ def _batch(arrow: Any, schema: Any, rows: tuple[Row, ...]) -> Any:
         try:
             columns.append(arrow.array(values, field.type))
         except (arrow.ArrowException, OverflowError) as error:
-            words = " ".join(str(error).split())
             raise DataError(
-                f"column {field.name}: not all of it is {field.type}: {words}"
+                f"column {field.name}: not all of it is {field.type}: {one_line(error)}"
             ) from None
     return arrow.record_batch(columns, schema)
 

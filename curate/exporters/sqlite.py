@@ -72,7 +72,7 @@ CREATE TABLE label (
     lambda_u REAL,              -- age parameter, Eq. 4
     provenance TEXT NOT NULL CHECK (provenance IN ('detector', 'human')),
     policy TEXT NOT NULL,
-    weight REAL NOT NULL CHECK (weight BETWEEN 0 AND 1),  -- v; 0 is an ignore region
+    weight REAL NOT NULL CHECK (weight BETWEEN 0 AND 1),  -- v; 0: no object to learn
     split TEXT GENERATED ALWAYS AS ('unlabeled') VIRTUAL,
     FOREIGN KEY (frame, split) REFERENCES frame (frame, split)
 ) STRICT;

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from curate.atomic import replace_file
-from curate.errors import DataError
+from curate.errors import DataError, one_line
 
 MANIFEST = "review.json"
 FORMAT = "curate review 1"
@@ -130,8 +130,7 @@ def read_json(path: Path, remedy: str = "") -> Any:
     except FileNotFoundError:
         raise DataError(f"{path}: no such file{remedy}") from None
     except (OSError, ValueError, RecursionError) as error:
-        words = " ".join(str(error).split())
-        raise DataError(f"{path}: is no readable JSON: {words}") from None
+        raise DataError(f"{path}: is no readable JSON: {one_line(error)}") from None
 
 
 def _sheet(document: Mapping[str, Any]) -> Sheet:

@@ -22,9 +22,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from curate.errors import ConfigError, ModelError
+from curate.errors import ConfigError, ModelError, first_line
 from curate.frames import Frame
-from curate.onnx_session import first_line, open_session, runtime_errors
+from curate.onnx_session import open_session, runtime_errors
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes
 

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from curate.errors import ConfigError
+from curate.errors import ConfigError, one_line
 from curate.frames import Calibration, Frame
 from curate.viewing.palette import GROUND_TRUTH, height_shades, weight_colours
 from curate.viewing.tags import ShownLabels, ShownRepredictions
@@ -138,8 +138,9 @@ def _open(stream: Any, path: Path) -> None:
     try:
         stream.save(path, default_blueprint=_blueprint())
     except (OSError, RuntimeError) as error:
-        words = " ".join(str(error).split())
-        raise ConfigError(f"{path.parent}: no recording can be written there: {words}") from error
+        raise ConfigError(
+            f"{path.parent}: no recording can be written there: {one_line(error)}"
+        ) from error
     if not path.exists():
         raise ConfigError("rerun is switched off: unset the environment variable RERUN")
 

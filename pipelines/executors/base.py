@@ -10,12 +10,15 @@ from typing import Any, Protocol
 import numpy as np
 
 from curate.detections import Detections
-from curate.errors import CurateError, ModelError
+from curate.errors import CurateError, ModelError, one_line
 
 logger = logging.getLogger(__name__)
 
 # A frame whose worker died is tried so often in all; the next death may well be its own doing.
 TRIES = 2
+# Jobs in the hands of a worker: one that it works on, and one so that it need not wait while the
+# runner writes.
+IN_HAND = 2
 # So many more workers than there are may die in a row while they load their models.
 SPARE_OPENINGS = 2
 
@@ -148,7 +151,7 @@ def open_function(function: FrameFunction) -> None:
     except Exception as fault:  # a user's model may raise anything
         logger.debug("cannot load", exc_info=True)
         raise ModelError(
-            f"the models cannot be loaded: {type(fault).__name__}: {_one_line(fault)}"
+            f"the models cannot be loaded: {type(fault).__name__}: {one_line(fault, 500)}"
         ) from fault
 
 
@@ -162,9 +165,5 @@ def attempt(function: FrameFunction, job: FrameJob) -> Outcome:
     except Exception as fault:
         # A user's model may raise anything; it costs this frame, never the run.
         logger.debug("frame %s failed", job.frame, exc_info=True)
-        rows, error = {}, f"frame {job.frame}: {type(fault).__name__}: {_one_line(fault)}"
+        rows, error = {}, f"frame {job.frame}: {type(fault).__name__}: {one_line(fault, 500)}"
     return Outcome(job, rows, error, time.perf_counter() - start)
-
-
-def _one_line(fault: Exception) -> str:
-    return " ".join(str(fault).split())[:500]

@@ -18,6 +18,7 @@ from typing import Any
 
 from curate.errors import CurateError
 from pipelines.executors.base import (
+    IN_HAND,
     FrameFunction,
     FrameJob,
     JobQueue,
@@ -26,9 +27,6 @@ from pipelines.executors.base import (
     open_function,
 )
 
-# Jobs in the hands of a worker: one that it works on, and one so that it need not wait while the
-# parent writes.
-IN_HAND = 2
 # How often a look is taken at workers that say nothing: a process that a dead one has forked may
 # hold its pipe open.
 PULSE_S = 5.0

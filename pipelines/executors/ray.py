@@ -12,8 +12,9 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from curate.errors import ConfigError, CurateError
+from curate.errors import ConfigError, CurateError, one_line
 from pipelines.executors.base import (
+    IN_HAND,
     FrameFunction,
     FrameJob,
     JobQueue,
@@ -22,8 +23,6 @@ from pipelines.executors.base import (
     open_function,
 )
 
-# Jobs in the hands of an actor: one that it works on, and one so that it need not wait.
-IN_HAND = 2
 PULSE_S = 5.0
 # Frames and rows are small; by default Ray takes a third of the memory of a machine.
 OBJECT_STORE_BYTES = 256 * 1024**2
@@ -235,15 +234,11 @@ def _join(ray: Any, address: str | None, workers: int) -> None:
         ray.init(**where, logging_level="ERROR", log_to_driver=False)
     except Exception as error:  # Ray raises many kinds, none of which says more than its words
         done = f"joined at {joins}" if joins else "started on this machine"
-        raise CurateError(f"no Ray cluster could be {done}: {_one_line(error)}") from error
+        raise CurateError(f"no Ray cluster could be {done}: {one_line(error, 200)}") from error
 
 
 def _reason(error: Any) -> str:
     """What was raised in an actor, without Ray's account of how it got here."""
     cause = getattr(error, "cause", None)
     found = cause if isinstance(cause, Exception) else error
-    return f"{type(found).__name__}: {_one_line(found)}"
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+    return f"{type(found).__name__}: {one_line(found, 200)}"

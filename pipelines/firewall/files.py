@@ -10,16 +10,19 @@ from curate.exporters.label_file import LabelFileFrames
 from curate.firewall.duplicates import HeadHashes, SplitFile, find_duplicates
 from db import bulk
 from pipelines.firewall.finding import Finding
-from pipelines.workspace import SPLITS, Workspace, sha256
+from pipelines.firewall.record import SplitRecord
+from pipelines.workspace import Workspace, sha256
 
 _HASHES = "reports/.file-heads.json"
 _AGAIN = "delete it and run `curate export` again"
 
 
-def label_files(workspace: Workspace, files: Mapping[Path, LabelFileFrames]) -> Finding:
+def label_files(
+    workspace: Workspace, record: SplitRecord, files: Mapping[Path, LabelFileFrames]
+) -> Finding:
     """The files that trainers read hold X_l and X_u as the workspace does, and were not changed."""
     rule = "label files speak of X_l and X_u"
-    own = {name: split for split in SPLITS for name in workspace.frames(split)}
+    own = record.split_of
     digests = _written(workspace)
     labels = objects = 0
     for path, found in files.items():
@@ -33,7 +36,7 @@ def label_files(workspace: Workspace, files: Mapping[Path, LabelFileFrames]) -> 
     return Finding(rule, True, told)
 
 
-def _fault(found: LabelFileFrames, own: dict[str, str]) -> str:
+def _fault(found: LabelFileFrames, own: Mapping[str, str]) -> str:
     """What a label file says of frames that the workspace knows better; empty where nothing."""
     held_out = [name for name in found.splits if own.get(name) == "val"]
     strangers = [name for name in found.splits if name not in own]
@@ -57,10 +60,12 @@ def _written(workspace: Workspace) -> dict[str, str]:
         return dict(bulk.select(connection, select(table.c.path, table.c.sha256)))
 
 
-def object_bank(workspace: Workspace, files: Mapping[Path, LabelFileFrames]) -> Finding:
+def object_bank(
+    workspace: Workspace, record: SplitRecord, files: Mapping[Path, LabelFileFrames]
+) -> Finding:
     """The bank is cut from the ground truth of label files, or was exported as a folder."""
     rule = "the object bank is of X_l"
-    strangers = {name: split for split in SPLITS[1:] for name in workspace.frames(split)}
+    strangers = {name for name, split in record.split_of.items() if split != "labeled"}
     truth = {name for found in files.values() for name in found.truth}
     banks = list((workspace.root / "exports").glob("*/gt_database"))
     cut = {path.stem for bank in banks for path in bank.glob("*.bin")}
@@ -77,15 +82,14 @@ def _prefixes(stem: str) -> Iterator[str]:
     return (stem[:i] for i, letter in enumerate(stem) if letter == "_")
 
 
-def duplicates(workspace: Workspace) -> Finding:
+def duplicates(workspace: Workspace, record: SplitRecord) -> Finding:
     """No point file or image of one split is that of another under another name."""
     rule = "no recording is in two splits"
     told, count = [], 0
     for kind in ("points", "image"):
         files = [
             SplitFile(split, name, getattr(workspace.dataset.files(name), kind))
-            for split in SPLITS
-            for name in workspace.frames(split)
+            for name, split in record.split_of.items()
         ]
         heads = HeadHashes(workspace.root / _HASHES)
         count += len(files)

@@ -1,6 +1,7 @@
 """The lists of frames as `curate init` found and chose them, and whether they are still so."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import select
@@ -33,56 +34,91 @@ def split_rows(
     return [_row(source, name, path, SplitList.of(names)) for source, name, path, names in rows]
 
 
-def recorded_lists(workspace: Workspace) -> Mapping[tuple[str, str], tuple[str | None, SplitList]]:
-    """The path and the list of each source and name."""
-    table = bulk.table("split_list")
-    query = select(table.c.source, table.c.name, table.c.path, table.c.sha256, table.c.names)
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, query)
-    return {
-        (source, name): (path, SplitList.from_text(names)) for source, name, path, _, names in rows
-    }
+@dataclass(frozen=True)
+class RecordedList:
+    """A list of frames as init recorded it.
+
+    Attributes:
+        source: "chosen" for a split of the workspace, "dataset" for a list of the data set, "file"
+            for one that init was given.
+        name: of the split or list.
+        path: of the file.
+        sha256: what the frames hashed to.
+        frames: see `SplitList`.
+    """
+
+    source: str
+    name: str
+    path: Path | None
+    sha256: str
+    frames: SplitList
 
 
-def damaged_records(workspace: Workspace) -> list[str]:
-    """The recorded lists that do not fit their own hash."""
-    table = bulk.table("split_list")
-    query = select(table.c.source, table.c.name, table.c.sha256, table.c.names)
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, query)
-    return [
-        f"{source} {name}"
-        for source, name, digest, names in rows
-        if SplitList.from_text(names).sha256 != digest
-    ]
+@dataclass(frozen=True)
+class SplitRecord:
+    """The splits as they are, and the lists as init recorded them.
+
+    Attributes:
+        splits: names and keys of the frames of each split.
+        lists: what init recorded.
+    """
+
+    splits: Mapping[str, Mapping[str, int]]
+    lists: Sequence[RecordedList]
+
+    @classmethod
+    def read(cls, workspace: Workspace) -> "SplitRecord":
+        """Both from the database."""
+        table = bulk.table("split_list")
+        columns = (table.c[name] for name in ("source", "name", "path", "sha256", "names"))
+        with workspace.database.reading() as connection:
+            rows = bulk.select(connection, select(*columns))
+        lists = [
+            RecordedList(source, name, path and Path(path), digest, SplitList.from_text(names))
+            for source, name, path, digest, names in rows
+        ]
+        return cls({split: workspace.frames(split) for split in SPLITS}, lists)
+
+    @property
+    def split_of(self) -> Mapping[str, str]:
+        """The split of each frame."""
+        return {name: split for split, names in self.splits.items() for name in names}
+
+    @property
+    def damaged(self) -> Sequence[str]:
+        """The recorded lists that do not fit their own hash."""
+        return [
+            f"{found.source} {found.name}"
+            for found in self.lists
+            if found.frames.sha256 != found.sha256
+        ]
+
+    @property
+    def changed(self) -> Mapping[str, str]:
+        """What changed in each split since init; nothing where all is as it was."""
+        return _told(
+            (found.name, found.frames, self.splits.get(found.name, ()))
+            for found in self.lists
+            if found.source == "chosen"
+        )
 
 
-def changed_splits(workspace: Workspace) -> Mapping[str, str]:
-    """What changed in each split of the database since init; nothing where all is as it was."""
-    known = recorded_lists(workspace)
-    found = {}
-    for name in SPLITS:
-        if ("chosen", name) in known:
-            told = changes(known["chosen", name][1], SplitList.of(workspace.frames(name)))
-            if told:
-                found[name] = told
-    return found
-
-
-def changed_lists(workspace: Workspace) -> Mapping[str, str]:
+def changed_lists(workspace: Workspace, record: SplitRecord) -> Mapping[str, str]:
     """What changed in each list outside the workspace; a file that is gone has not changed."""
     own = workspace.dataset.splits()
-    found = {}
-    for (source, name), (path, before) in recorded_lists(workspace).items():
-        if source == "dataset":
-            told, what = changes(before, SplitList.of(own.get(name, ()))), f"the data set's {name}"
-        elif source == "file" and path is not None and Path(path).is_file():
-            told, what = changes(before, SplitList.of(_read(Path(path)))), path
-        else:
-            continue
-        if told:
-            found[what] = told
-    return found
+    return _told(
+        (f"the data set's {found.name}", found.frames, own.get(found.name, ()))
+        if found.path is None
+        else (str(found.path), found.frames, _read(found.path))
+        for found in record.lists
+        if found.source == "dataset" or (found.path is not None and found.path.is_file())
+    )
+
+
+def _told(lists: Iterable[tuple[str, SplitList, Iterable[str]]]) -> Mapping[str, str]:
+    """What changed in the lists that did change, by name."""
+    told = {name: changes(before, SplitList.of(now)) for name, before, now in lists}
+    return {name: what for name, what in told.items() if what}
 
 
 def _row(source: str, name: str, path: str | None, names: SplitList) -> bulk.Row:

@@ -7,6 +7,7 @@ from curate.errors import DataError
 from curate.exporters.label_file import LabelFileFrames, read_frames
 from pipelines.firewall.files import duplicates, label_files, object_bank
 from pipelines.firewall.finding import Finding, refuse
+from pipelines.firewall.record import SplitRecord
 from pipelines.firewall.splits import recorded_splits, sequences_apart, unchanged_lists
 from pipelines.firewall.truth import copied_truth, predicted_rounds, stored_truth
 from pipelines.workspace import Workspace
@@ -14,17 +15,18 @@ from pipelines.workspace import Workspace
 
 def check(workspace: Workspace) -> Iterator[Finding]:
     """Every rule, one after the other, on everything that the workspace holds."""
-    yield from _of_the_database(workspace)
-    yield copied_truth(workspace, predicted_rounds(workspace), thorough=True)
+    record = SplitRecord.read(workspace)
+    yield from _of_the_database(workspace, record)
+    yield copied_truth(workspace, record, predicted_rounds(workspace), thorough=True)
     files: dict[Path, LabelFileFrames] = {}
     for path in sorted((workspace.root / "exports").glob("*.sqlite")):
         try:
             files[path] = read_frames(path)
         except DataError as error:
             yield Finding("label files can be read", False, str(error))
-    yield label_files(workspace, files)
-    yield object_bank(workspace, files)
-    yield duplicates(workspace)
+    yield label_files(workspace, record, files)
+    yield object_bank(workspace, record, files)
+    yield duplicates(workspace, record)
 
 
 def enforce(workspace: Workspace, round_number: int = 0, file: Path | None = None) -> None:
@@ -42,17 +44,20 @@ def enforce(workspace: Workspace, round_number: int = 0, file: Path | None = Non
         LeakageError: a rule is broken; the message names the frames and the remedy.
         DataError: the label file is damaged.
     """
-    for finding in _of_the_database(workspace):
+    record = SplitRecord.read(workspace)
+    for finding in _of_the_database(workspace, record):
         refuse(finding)
     if round_number:
-        refuse(copied_truth(workspace, [round_number], thorough=False))
+        refuse(copied_truth(workspace, record, [round_number], thorough=False))
     files: Mapping[Path, LabelFileFrames] = {}
     if file is not None and file.exists():
         files = {file: read_frames(file)}
-    refuse(label_files(workspace, files))
-    refuse(object_bank(workspace, files))
+    refuse(label_files(workspace, record, files))
+    refuse(object_bank(workspace, record, files))
 
 
-def _of_the_database(workspace: Workspace) -> Iterator[Finding]:
-    for rule in (recorded_splits, unchanged_lists, sequences_apart, stored_truth):
-        yield rule(workspace)
+def _of_the_database(workspace: Workspace, record: SplitRecord) -> Iterator[Finding]:
+    yield recorded_splits(record)
+    yield unchanged_lists(workspace, record)
+    yield sequences_apart(workspace, record)
+    yield stored_truth(workspace)

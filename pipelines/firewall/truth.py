@@ -5,11 +5,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from sqlalchemy import func, select
 
+from curate.batches import batched
 from curate.errors import DataError
 from curate.exporters.base import named
 from curate.firewall.copied_truth import copied_boxes
 from db import bulk
 from pipelines.firewall.finding import Finding
+from pipelines.firewall.record import SplitRecord
 from pipelines.workspace import Workspace
 
 # Before a command, so many frames are compared with label files besides those with a score of 1.
@@ -47,18 +49,19 @@ def stored_truth(workspace: Workspace) -> Finding:
     return Finding(rule, True, told)
 
 
-def copied_truth(workspace: Workspace, rounds: Sequence[int], *, thorough: bool) -> Finding:
+def copied_truth(
+    workspace: Workspace, record: SplitRecord, rounds: Sequence[int], *, thorough: bool
+) -> Finding:
     """Predictions of X_u are compared with label files of X_u, of which nothing is kept."""
     rule = "no prediction repeats a label of X_u"
     files = workspace.dataset.files
-    frames = {name: key for name, key in workspace.frames("unlabeled").items() if files(name).label}
+    frames = {name: key for name, key in record.splits["unlabeled"].items() if files(name).label}
     compared = 0
     copies: dict[str, int] = {}
     for number in rounds:
         chosen = frames if thorough else _suspects(workspace, number, frames)
-        names = list(chosen)
-        for start in range(0, len(names), _BATCH):
-            batch = {chosen[name]: name for name in names[start : start + _BATCH]}
+        for names in batched(chosen, _BATCH):
+            batch = {chosen[name]: name for name in names}
             for key, found in workspace.predictions(number, list(batch)).items():
                 compared += len(found)
                 copied = int(_repeated(workspace, batch[key], found.boxes).sum())

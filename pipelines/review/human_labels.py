@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from sqlalchemy import Connection, select
 
+from curate.batches import batched
 from curate.detections import as_categories
 from curate.review.human_labels import REJECTED, HumanLabels, speak_for
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.workspace import Workspace
+
+# Frames that one statement names; SQLite takes some thousands of parameters.
+_ASKED_AT_ONCE = 400
 
 SEEN_COLUMNS = tuple(f"seen_{name}" for name in BOX_COLUMNS)
 FIRST_K = 1_000_000
@@ -77,11 +81,11 @@ def refresh_matches(
     gone = match.delete().where(match.c.round == round_number)
     if frame_ids is None:
         connection.execute(gone)
-    for batch in _batched(sorted(frame_ids or ())):
+    for batch in batched(sorted(frame_ids or ()), _ASKED_AT_ONCE):
         connection.execute(gone.where(match.c.frame_id.in_(batch)))
     labels = read_human_labels(connection, frame_ids, until_round=round_number)
     rows: list[bulk.Row] = []
-    for batch in _batched(list(labels)):
+    for batch in batched(labels, _ASKED_AT_ONCE):
         predictions = _predictions(connection, round_number, batch)
         for frame_id, predicted in predictions.items():
             rows += _match_rows(round_number, frame_id, predicted, labels[frame_id])
@@ -161,8 +165,3 @@ def _match_rows(
         n = int(stored.n[spoken.label[place]])
         what = (predicted[place][0], n, float(spoken.iou[place]), int(spoken.leads[place]))
         yield (round_number, frame_id, *what)
-
-
-def _batched(items: Sequence[int], size: int = 400) -> Iterable[Sequence[int]]:
-    for start in range(0, len(items), size):
-        yield items[start : start + size]

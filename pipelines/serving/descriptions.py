@@ -3,35 +3,12 @@
 import inspect
 from typing import Any
 
+from curate.exporters.columns import WEIGHTED_LABELS
 from db.models import Base
 from pipelines.named_queries import named_queries
 
-_BOX = "of the box, metres, LiDAR frame"
-_WEIGHTED_LABELS = {
-    "round": "number of the round",
-    "frame": "unlabeled frame; leads to its picture",
-    "k": "number of the label in its frame; leads to why it has its weight",
-    "category": "what the detector takes it for",
-    "x": "centre, metres forward of the LiDAR",
-    "y": "centre, metres to its left",
-    "z": "centre, metres above it",
-    "length": _BOX,
-    "width": _BOX,
-    "height": _BOX,
-    "yaw": "radians, counter-clockwise from x",
-    "score": "s, the detector's own",
-    "loss": "consistency loss L; null: no reprediction matched, no evidence",
-    "points": "m, LiDAR points in the box",
-    "points_threshold": "m_th, what labeled boxes of the category hold",
-    "rho_diff": "point prior, Eq. 8: min(m, m_th) / m_th",
-    "mask_pixels": "S, pixels of the category in the projected box",
-    "box_pixels": "A, pixels of the projected box; 0: outside the image",
-    "rho_anno": "semantic prior, Eq. 9, from s, S and A",
-    "rho_det": "product of the priors",
-    "lambda_u": "age parameter, Eq. 4: losses above it weigh nothing",
-    "policy": "whose weight",
-    "weight": "v, reliability, 0 to 1; 0: ignore this region",
-}
+# What a page adds to the meaning of a column.
+_LEADS_TO = {"frame": "its picture", "k": "why it has its weight"}
 _VIEWS = {
     "weighted_labels": "Every label of an unlabeled frame with its evidence, a row per policy.",
     "evaluation": (
@@ -55,7 +32,7 @@ def working_database() -> dict[str, Any]:
     tables["frame"]["label_column"] = "frame"
     for name, told in _VIEWS.items():
         tables[name] = {"description": told}
-    tables["weighted_labels"]["columns"] = dict(_WEIGHTED_LABELS)
+    tables["weighted_labels"]["columns"] = _weighted_labels()
     return {
         "description": "Predictions, their evidence, their weights, and what was done",
         "tables": tables,
@@ -68,11 +45,21 @@ def exported_file() -> dict[str, Any]:
     tables: dict[str, Any] = {name: {"description": told} for name, told in _EXPORTED.items()}
     tables["weighted_labels"] = {"description": _VIEWS["weighted_labels"]}
     for name in ("label", "weighted_labels"):
-        tables[name]["columns"] = dict(_WEIGHTED_LABELS)
+        tables[name]["columns"] = _weighted_labels()
     return {
         "description": "The exported weighted labels that a training reads",
         "tables": tables,
         "queries": _questions(exported=True),
+    }
+
+
+def _weighted_labels() -> dict[str, str]:
+    """The columns of the weighted labels, with their units."""
+    return {
+        name: column.meaning
+        + (f" [{column.unit}]" if column.unit not in ("", "1") else "")
+        + (f"; leads to {_LEADS_TO[name]}" if name in _LEADS_TO else "")
+        for name, column in WEIGHTED_LABELS.items()
     }
 
 

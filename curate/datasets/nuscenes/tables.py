@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from curate.errors import DataError
+from curate.errors import DataError, one_line
 from curate.geometry.poses import pose_matrix
 
 Record = Mapping[str, Any]
@@ -39,8 +39,7 @@ def read_table(path: Path) -> dict[str, Record]:
     except OSError as error:
         raise _unreadable(path, error) from None
     except (ValueError, TypeError, KeyError) as error:
-        words = " ".join(str(error).split())
-        raise DataError(f"{path}: no table of records with a token: {words}") from None
+        raise DataError(f"{path}: no table of records with a token: {one_line(error)}") from None
 
 
 def scan_table(path: Path) -> Iterator[tuple[int, bytes]]:

@@ -16,7 +16,7 @@ from safetensors.numpy import save
 
 from curate.atomic import replace_file
 from curate.detectors.pillars.presets import PRESETS, Preset
-from curate.errors import ModelError
+from curate.errors import ModelError, first_line
 
 FORMAT = "curate-pillars"
 # Version 2 added the estimate of the IoU, version 3 measures heights from the ground.
@@ -83,7 +83,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     except FileNotFoundError:
         raise ModelError(f"{path}: no such checkpoint; train one first") from None
     except (SafetensorError, OSError) as error:
-        raise ModelError(f"{path}: not a readable safetensors file: {_line(error)}") from None
+        raise ModelError(f"{path}: not a readable safetensors file: {first_line(error)}") from None
     kind, version = metadata.get("format"), metadata.get("format_version")
     if kind != FORMAT:
         raise ModelError(f"{path}: not a checkpoint of the pillars detector (format {kind!r})")
@@ -95,7 +95,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         preset = PRESETS[metadata["preset"]]
         categories = tuple(str(name) for name in json.loads(metadata["categories"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise ModelError(f"{path}: damaged metadata: {_line(error)}; train again") from None
+        raise ModelError(f"{path}: damaged metadata: {first_line(error)}; train again") from None
     return Checkpoint(preset, categories, weights)
 
 
@@ -130,14 +130,9 @@ def write_graph(path: Path, checkpoint: Checkpoint, digest: str) -> None:
     try:
         model = build_graph(checkpoint.weights, checkpoint.preset, len(checkpoint.categories))
     except (KeyError, ValueError) as error:
-        raise ModelError(f"{path}: damaged checkpoint: {_line(error)}; train again") from None
+        raise ModelError(f"{path}: damaged checkpoint: {first_line(error)}; train again") from None
     model.metadata_props.add(key=GRAPH_DIGEST, value=digest)
     try:
         replace_file(graph_path(path), model.SerializeToString())
     except OSError as error:
         raise ModelError(f"{graph_path(path)}: cannot be written: {error.strerror}") from None
-
-
-def _line(error: Exception) -> str:
-    """The first line of a library's message."""
-    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -9,7 +9,7 @@ import numpy as np
 
 from curate.datasets.kitti_labels import KittiObjects
 from curate.detections import Detections, as_categories
-from curate.errors import DataError
+from curate.errors import DataError, one_line
 from curate.frames import Calibration
 from curate.geometry.similarity import wrap_angle
 
@@ -62,8 +62,9 @@ def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections
         boxes = np.array(boxes, dtype=np.float64)
         scores = np.array(scores, dtype=np.float64).reshape(-1)
     except (OverflowError, TypeError, ValueError) as error:
-        words = " ".join(str(error).split())[:200]
-        raise DataError(f"{place}: boxes and scores must be numbers: {words}") from None
+        raise DataError(
+            f"{place}: boxes and scores must be numbers: {one_line(error, 200)}"
+        ) from None
     categories = as_categories(names)
     if boxes.size == 0:
         boxes = boxes.reshape(0, 7)

@@ -11,7 +11,7 @@ from curate.detectors.recorded.mmdetection3d import holds_boxes, read_mmdetectio
 from curate.detectors.recorded.nuscenes import holds_results, read_nuscenes
 from curate.detectors.recorded.openpcdet import read_openpcdet
 from curate.detectors.recorded.plain_pickle import read_plain_pickle
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, one_line
 
 _LISTS: Mapping[str, Callable[[Path, Sequence[Any], Reading], Answers]] = {
     "openpcdet": read_openpcdet,
@@ -100,8 +100,7 @@ def _read_json(path: Path) -> Any:
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
     except (OSError, RecursionError, ValueError) as error:
-        words = " ".join(str(error).split())[:200]
-        raise DataError(f"{path}: cannot be read as JSON: {words}") from None
+        raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None
 
 
 def refuse_unknown_kind(kind: str) -> None:

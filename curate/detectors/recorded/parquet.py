@@ -19,7 +19,7 @@ import numpy as np
 
 from curate.detections import Detections
 from curate.detectors.recorded.answers import as_detections
-from curate.errors import DataError
+from curate.errors import DataError, one_line
 from curate.exporters.base import BOX_COLUMNS
 from curate.geometry.similarity import Similarity
 from curate.parquet import load_parquet
@@ -120,7 +120,7 @@ def _open(path: Path) -> Any:
     except FileNotFoundError:
         raise DataError(f"{path}: no such file of recorded detections") from None
     except (arrow.ArrowException, OSError) as error:
-        raise DataError(f"{path}: no readable Parquet: {_words(error)}") from None
+        raise DataError(f"{path}: no readable Parquet: {one_line(error)}") from None
 
 
 def _refuse_types(path: Path, schema: Any, names: Sequence[str]) -> None:
@@ -161,7 +161,7 @@ def _read(path: Path, file: Any, number: int, columns: Sequence[str]) -> Mapping
         table = file.read_row_group(number, columns=list(columns), use_threads=False)
         return {name: _values(path, number, arrow, name, table.column(name)) for name in columns}
     except (arrow.ArrowException, OSError) as error:
-        raise DataError(f"{path}: row group {number} is damaged: {_words(error)}") from None
+        raise DataError(f"{path}: row group {number} is damaged: {one_line(error)}") from None
 
 
 def _values(path: Path, number: int, arrow: Any, name: str, column: Any) -> np.ndarray:
@@ -193,7 +193,3 @@ def _refuse_views(place: str, told: np.ndarray) -> None:
     for fault, rows in faults.items():
         if rows.any():
             raise DataError(f"{place}: box {int(np.argmax(rows))}: {fault}")
-
-
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from curate.errors import DataError
+from curate.errors import DataError, one_line
 
 # Kinds of numpy's types that hold plain values; objects come only as elements that are plain.
 _KINDS = "biufcSUO"
@@ -67,7 +67,7 @@ def read_plain_pickle(path: Path) -> Any:
             "are read: save tensors and boxes as arrays (boxes.tensor.numpy())"
         ) from None
     except _DAMAGES as error:
-        words = " ".join(str(error).split())[:200] or type(error).__name__
+        words = one_line(error, 200) or type(error).__name__
         raise DataError(f"{path}: no pickle, or a damaged one: {words}") from None
     return held
 

@@ -15,12 +15,12 @@ import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
+from curate.batches import batched
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded.answers import LARGEST
 from curate.errors import DataError
@@ -141,8 +141,7 @@ class _Rows:
 
     def blocks(self, order: Sequence[int]) -> Iterator[_Block]:
         """All rows, some at a time; DataError for one with a wrong number of fields."""
-        placed = self._placed(order)
-        while block := list(islice(placed, BLOCK_ROWS)):
+        for block in batched(self._placed(order), BLOCK_ROWS):
             yield _Block([row for row, _ in block], np.array([place for _, place in block]))
 
     def _placed(self, order: Sequence[int]) -> Iterator[tuple[list[str], tuple[int, int, int]]]:
