@@ -225,6 +225,7 @@ def _join(ray: Any, address: str | None, workers: int) -> None:
         {"address": joins}
         if joins
         else {
+            "address": "local",  # not the one that somebody else has started on this machine
             "num_cpus": max(workers, os.cpu_count() or 1),
             "object_store_memory": OBJECT_STORE_BYTES,
             "include_dashboard": False,
