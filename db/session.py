@@ -1,9 +1,7 @@
 """Opening a database: pragmas, migrations, and errors in our own words."""
 
-import logging
-import sqlite3
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +13,10 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, 
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError
+from db.backups import back_up
 from db.claims import claimed, round_resources
 from db.lock_holders import holders
 from db.views import create_views, drop_views
-
-_log = logging.getLogger(__name__)
 
 # A writer that finds another one waits this long before it gives up.
 BUSY_TIMEOUT_MS = 30_000
@@ -33,17 +30,18 @@ class Database:
     Args:
         url: an SQLAlchemy URL, e.g. "sqlite:////data/run/curate.db", or
             "postgresql://user@host/curate", which psycopg 3 answers.
+        backups: folder for a copy of a server's database before its schema is migrated.
 
     Raises:
         ConfigError: the URL is none, or its driver is not installed.
         DatabaseError: it cannot be opened, is damaged, or a newer curate has written it.
     """
 
-    def __init__(self, url: str | URL) -> None:
+    def __init__(self, url: str | URL, backups: Path | None = None) -> None:
         self.url = parse_url(url) if isinstance(url, str) else url
         self.engine = _engine(self.url)
         with self._own_words():
-            self._migrate()
+            self._migrate(backups)
 
     @property
     def name(self) -> str:
@@ -89,7 +87,7 @@ class Database:
         """Gives every connection back."""
         self.engine.dispose()
 
-    def _migrate(self) -> None:
+    def _migrate(self, backups: Path | None) -> None:
         config = Config()
         config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
         script = ScriptDirectory.from_config(config)
@@ -101,8 +99,8 @@ class Database:
             raise DatabaseError(
                 f"{self.name}: written by a newer curate (schema {current}); update curate"
             )
-        if current is not None and self.engine.dialect.name == "sqlite":
-            _back_up(Path(str(self.url.database)), current)
+        if current is not None:
+            back_up(self.url, current, backups)
         with self.writing() as connection:
             if self.engine.dialect.name == "postgresql":
                 connection.execute(text(f"SELECT pg_advisory_xact_lock({_MIGRATION_LOCK})"))
@@ -138,29 +136,6 @@ class Database:
                     "writing: wait for it or end it, then run the command again"
                 )
         return next((each for sign, each in _REMEDIES[backend].items() if sign in message), "")
-
-
-def _back_up(path: Path, revision: str) -> None:
-    """Copies a database as it is before it is migrated.
-
-    Raises:
-        DatabaseError: there is no room for it, or its folder cannot be written.
-    """
-    backup = path.with_name(f"{path.name}.schema-{revision}.backup")
-    partial = backup.with_suffix(".partial")
-    try:
-        with closing(sqlite3.connect(path)) as old, closing(sqlite3.connect(partial)) as copy:
-            old.backup(copy)
-        partial.replace(backup)
-    except (sqlite3.Error, OSError) as error:
-        partial.unlink(missing_ok=True)
-        raise DatabaseError(
-            f"{path}: cannot be copied before its schema is migrated: {error}; make room for "
-            f"{backup.name} and run the command again"
-        ) from error
-    _log.warning(
-        "%s: schema %s is migrated; the old database is kept as %s", path, revision, backup
-    )
 
 
 def parse_url(address: str) -> URL:

@@ -1,13 +1,14 @@
 """Setting a workspace up: which frames are labeled, and their ground truth."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from sqlalchemy import func, select
 
+from curate.batches import batched
 from curate.datasets.base import Dataset, sequences_of
 from curate.datasets.containment import check_frame_id
 from curate.detections import Annotations
@@ -22,6 +23,8 @@ from pipelines.firewall.record import split_rows
 from pipelines.workspace import SPLITS, Workspace, open_dataset
 
 _log = logging.getLogger(__name__)
+
+FRAMES_AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
@@ -224,29 +227,32 @@ def _store(
     truth: dict[str, Annotations],
     files: Mapping[str, Path],
 ) -> None:
-    root = workspace.config.dataset.root
-    kind = workspace.config.dataset.kind
-    rows = []
+    table = bulk.table("frame")
+    with workspace.database.writing() as connection:
+        if connection.execute(select(func.count()).select_from(table)).scalar_one():
+            raise WorkspaceError(f"{workspace.root}: another command has just set it up")
+        for rows in batched(_frame_rows(workspace, dataset, split), FRAMES_AT_ONCE):
+            bulk.insert(connection, "frame", rows)
+        chosen = {name: getattr(split, name) for name in SPLITS}
+        bulk.insert(connection, "split_list", split_rows(chosen, dataset.splits(), files))
+        query = select(table.c.frame, table.c.id, table.c.split).where(table.c.split != "unlabeled")
+        keys = {frame: (key, of) for frame, key, of in bulk.select(connection, query)}
+        truth_rows = [
+            row for frame, found in truth.items() for row in _truth_rows(*keys[frame], found)
+        ]
+        bulk.insert(connection, "ground_truth", truth_rows)
+
+
+def _frame_rows(workspace: Workspace, dataset: Dataset, split: Split) -> Iterator[bulk.Row]:
+    """The rows of `frame`, one at a time; not even the path of a label is kept for X_u."""
+    root, kind = workspace.config.dataset.root, workspace.config.dataset.kind
     for name in SPLITS:
         for frame in getattr(split, name):
             found = dataset.files(frame)
             label = None if name == "unlabeled" else found.label
             paths = (found.points, found.image, found.calibration, label)
             relative = [str(p.relative_to(root)) if p else None for p in paths]
-            rows.append((kind, frame, name, *relative))
-    table = bulk.table("frame")
-    with workspace.database.writing() as connection:
-        if connection.execute(select(func.count()).select_from(table)).scalar_one():
-            raise WorkspaceError(f"{workspace.root}: another command has just set it up")
-        bulk.insert(connection, "frame", rows)
-        chosen = {name: getattr(split, name) for name in SPLITS}
-        bulk.insert(connection, "split_list", split_rows(chosen, dataset.splits(), files))
-        query = select(table.c.frame, table.c.id, table.c.split)
-        keys = {frame: (key, of) for frame, key, of in bulk.select(connection, query)}
-        truth_rows = [
-            row for frame, found in truth.items() for row in _truth_rows(*keys[frame], found)
-        ]
-        bulk.insert(connection, "ground_truth", truth_rows)
+            yield (kind, frame, name, *relative)
 
 
 def _truth_rows(frame_id: int, split: str, found: Annotations) -> list[bulk.Row]:

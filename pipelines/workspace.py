@@ -49,7 +49,7 @@ class Workspace:
         if not (root / CONFIG_NAME).is_file():
             raise WorkspaceError(f"{root}: no workspace here; make one with `curate init {root}`")
         config = _anchored(root, read_config(root / CONFIG_NAME))
-        return cls(root, config, Database(_url(root, config)))
+        return cls(root, config, Database(_url(root, config), root))
 
     @classmethod
     def create(cls, root: Path, config: Config) -> "Workspace":
@@ -66,7 +66,7 @@ class Workspace:
             (root / folder).mkdir(parents=True, exist_ok=True)
         if not path.exists():
             write_config(path, config)
-        return cls(root, config, Database(_url(root, config)))
+        return cls(root, config, Database(_url(root, config), root))
 
     def with_settings(self, section: str, **changes: Any) -> "Workspace":
         """The same workspace with other settings in a section, for this command only.

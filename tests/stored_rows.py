@@ -7,7 +7,7 @@ from db.models import Base
 from pipelines.workspace import Workspace
 
 # Keys that the database draws, and times: two equal runs differ in them.
-CHANCE = {"id", "seconds", "created_at"}
+CHANCE = {"id", "seconds", "created_at", "imported_at", "decided_at"}
 # What was asked for, not what came out: it names executor and paths.
 SETTINGS = {"config"}
 

@@ -49,7 +49,12 @@ def in_view(
     """
     width, height = image_size
     columns = np.asarray(points)
-    seen, doubtful = _in_view(columns, calibration.lidar_to_image, float(width), float(height))
+    matrix = calibration.lidar_to_image
+    # One margin for all points, that of the farthest: to be in doubt too often costs no exactness.
+    reach = max(1.0, -columns.min(initial=0), columns.max(initial=0))
+    margin = np.abs(matrix).sum() * _UNDECIDED * reach * max(width, height)
+    seen, undecided = _in_view(columns, matrix, float(width), float(height), margin)
+    doubtful = np.flatnonzero(undecided)
     if len(doubtful):
         pixels, depth = project_points(columns[doubtful], calibration)
         inside = (pixels >= 0) & (pixels < np.asarray(image_size))
@@ -59,26 +64,33 @@ def in_view(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _in_view(
-    points: np.ndarray, matrix: np.ndarray, width: float, height: float
+    points: np.ndarray, matrix: np.ndarray, width: float, height: float, margin: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The kernel of `in_view`: (n,) bool, and the indices of points that it leaves undecided."""
-    seen = np.zeros(len(points), np.bool_)
-    doubtful = [0 for _ in range(0)]  # typed by its elements
-    size = np.abs(matrix).sum() * _UNDECIDED
+    """The kernel of `in_view`: (n,) bool, and (n,) whether it leaves a point undecided.
+
+    It has no branches: which points are seen is too irregular to be foretold.
+    """
+    seen = np.empty(len(points), np.bool_)
+    doubtful = np.empty(len(points), np.bool_)
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
-        margin = size * max(abs(x), abs(y), abs(z), 1.0) * max(width, height)
-        if depth < -margin:
-            continue
         u = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
         v = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
-        nearest = min(depth, u, v, width * depth - u, height * depth - v)
-        if nearest > margin:
-            seen[i] = True
-        elif not nearest < -margin:  # NaN too
-            doubtful.append(i)
-    return seen, np.array(doubtful, dtype=np.int64)
+        depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+        right, below = width * depth - u, height * depth - v
+        inside = (
+            (depth > margin) & (u > margin) & (v > margin) & (right > margin) & (below > margin)
+        )
+        outside = (
+            (depth < -margin)
+            | (u < -margin)
+            | (v < -margin)
+            | (right < -margin)
+            | (below < -margin)
+        )
+        seen[i] = inside
+        doubtful[i] = not (inside | outside)  # NaN too
+    return seen, doubtful
 
 
 def image_rectangles(

@@ -1,14 +1,15 @@
 """Several machines: a pool of Ray actors, each of which holds its own model.
 
 The runner stays the only writer; what travels is a frame's name with what is known of it, and its
-rows. The data set must lie at the same path on every node.
+rows. Every node needs the same curate, and the data set at the same path.
 """
 
 import os
 import pickle
+import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from curate.errors import ConfigError, CurateError, one_line
@@ -23,6 +24,8 @@ from pipelines.executors.base import (
 )
 
 PULSE_S = 5.0
+# Frames and rows are small; by default Ray takes a third of the memory of a machine.
+OBJECT_STORE_BYTES = 256 * 1024**2
 
 
 class RayExecutor:
@@ -71,15 +74,16 @@ class RayExecutor:
         """
         queue = JobQueue(jobs, self.workers)
         packed = pickle.dumps(function)
-        started = time.monotonic()
+        placed_at = time.monotonic()
         try:
             while self._hand_out(packed, queue):
                 heads = {actor.head(): actor for actor in self._crew if actor.answers}
                 ready, _ = self._ray.wait(list(heads), num_returns=1, timeout=PULSE_S)
                 for ref in ready:
                     yield from self._collect(heads[ref], queue)
-                if not any(actor.placed for actor in self._crew):
-                    self._refuse_to_wait_for_ever(started)
+                if any(actor.placed for actor in self._crew):
+                    placed_at = time.monotonic()
+                self._refuse_to_wait_for_ever(placed_at)
         finally:
             for actor in [actor for actor in self._crew if actor.answers]:
                 self._dismiss(actor)
@@ -95,7 +99,7 @@ class RayExecutor:
         """Gives every actor that has loaded its models work; False where all is done."""
         while (job := queue.take()) is not None:
             while len(self._crew) < self.workers:
-                self._crew.append(_Actor(self._holder.remote()))
+                self._crew.append(_Actor(self._holder.remote(sys.path)))
             for actor in self._crew:
                 actor.open(packed)
             able = [actor for actor in self._crew if actor.opened and len(actor.jobs) < IN_HAND]
@@ -110,13 +114,11 @@ class RayExecutor:
         try:
             answer = self._ray.get(actor.head())
         except self._ray.exceptions.RayTaskError as error:
-            raise CurateError(f"a Ray actor failed: {one_line(error, 200)}") from error
+            raise CurateError(f"a Ray actor failed: {_reason(error)}") from error
         except self._ray.exceptions.RayError as error:
             jobs, opened = list(actor.jobs), actor.opened
             self._dismiss(actor)
-            yield from queue.bury(
-                jobs, f"{type(error).__name__}: {one_line(error, 200)}", opened=opened
-            )
+            yield from queue.bury(jobs, _reason(error), opened=opened)
             return
         if isinstance(answer, CurateError):
             raise answer
@@ -133,8 +135,8 @@ class RayExecutor:
         self._crew.remove(actor)
         self._ray.kill(actor.handle)
 
-    def _refuse_to_wait_for_ever(self, started: float) -> None:
-        if time.monotonic() - started > self.start_timeout_s:
+    def _refuse_to_wait_for_ever(self, placed_at: float) -> None:
+        if time.monotonic() - placed_at > self.start_timeout_s:
             offered = self._ray.cluster_resources()
             raise CurateError(
                 f"the Ray cluster has placed no actor in {self.start_timeout_s:.0f} s; each needs "
@@ -146,7 +148,9 @@ class RayExecutor:
 class Holder:
     """What runs in an actor: the function of the stage at hand, with its models."""
 
-    def __init__(self) -> None:
+    def __init__(self, search_path: Sequence[str]) -> None:
+        # A detector that the driver finds beside itself must be found on another node as well.
+        sys.path += [path for path in search_path if path not in sys.path]
         self._function: FrameFunction | None = None
 
     def place(self) -> None:
@@ -220,10 +224,22 @@ def _join(ray: Any, address: str | None, workers: int) -> None:
     where: dict[str, Any] = (
         {"address": joins}
         if joins
-        else {"num_cpus": max(workers, os.cpu_count() or 1), "include_dashboard": False}
+        else {
+            "address": "local",  # not the one that somebody else has started on this machine
+            "num_cpus": max(workers, os.cpu_count() or 1),
+            "object_store_memory": OBJECT_STORE_BYTES,
+            "include_dashboard": False,
+        }
     )
     try:
         ray.init(**where, logging_level="ERROR", log_to_driver=False)
     except Exception as error:  # Ray raises many kinds, none of which says more than its words
         done = f"joined at {joins}" if joins else "started on this machine"
         raise CurateError(f"no Ray cluster could be {done}: {one_line(error, 200)}") from error
+
+
+def _reason(error: Any) -> str:
+    """What was raised in an actor, without Ray's account of how it got here."""
+    cause = getattr(error, "cause", None)
+    found = cause if isinstance(cause, Exception) else error
+    return f"{type(found).__name__}: {one_line(found, 200)}"

@@ -1,6 +1,9 @@
 """The database: its schema, its refusals, and its errors in our own words."""
 
+import os
+import shutil
 import sqlite3
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -91,6 +94,68 @@ def test_an_older_database_is_kept_before_it_is_migrated(
         assert old.execute("SELECT version_num FROM alembic_version").fetchone() == ("0001",)
         tables = {row[0] for row in old.execute("SELECT name FROM sqlite_master")}
     assert "audit" not in tables
+
+
+@pytest.fixture
+def older_server_database(new_url: Callable[[], str | None]) -> Database:
+    """A PostgreSQL database of the first schema, with one frame."""
+    url = new_url()
+    if url is None:
+        pytest.skip("SQLite files are copied, see above")
+    database = Database(url)
+    _frame(database, "val")
+    config = Config()
+    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
+    with database.writing() as connection:
+        config.attributes["connection"] = connection
+        drop_views(connection)
+        command.downgrade(config, "0001")
+    database.close()
+    return database
+
+
+@pytest.mark.skipif(shutil.which("pg_dump") is None, reason="pg_dump is not installed")
+def test_an_older_server_database_is_dumped_before_it_is_migrated(
+    older_server_database: Database, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Into the folder of the workspace; pg_restore reads it."""
+    Database(older_server_database.url, tmp_path).close()
+    backup = tmp_path / "curate.schema-0001.dump"
+    assert str(backup) in caplog.text
+    assert list(tmp_path.iterdir()) == [backup]
+    listed = subprocess.run(
+        ["pg_restore", "--file=-", backup], check=True, capture_output=True, text=True
+    ).stdout
+    assert "COPY public.frame" in listed
+    assert "audit" not in listed
+
+
+def test_a_server_database_that_cannot_be_dumped_is_not_migrated(
+    older_server_database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """pg_dump fails: one line with its reason, and the schema stays as it was."""
+    refusing = tmp_path / "pg_dump"
+    refusing.write_text("#!/bin/sh\necho server version mismatch >&2\nexit 1\n")
+    refusing.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    with pytest.raises(DatabaseError, match=r"cannot be copied.*version mismatch"):
+        Database(older_server_database.url, tmp_path)
+    with older_server_database.engine.connect() as connection:
+        found = connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalar_one()
+    assert found == "0001"
+
+
+def test_a_server_without_pg_dump_is_migrated_with_a_warning(
+    older_server_database: Database,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The migration is one transaction of its own."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    Database(older_server_database.url, tmp_path).close()
+    assert "without a copy" in caplog.text
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_weighted_labels_has_exactly_the_columns_of_the_format(database: Database) -> None:

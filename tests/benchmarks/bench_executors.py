@@ -1,0 +1,85 @@
+"""Executors and workers in frames per second, by the clock: predict with curate's own network."""
+
+import shutil
+import time
+
+import pytest
+from benchmarks.measuring import measure
+
+from curate.datasets.synthetic import simulate
+from curate.detections import CATEGORIES
+from pipelines.config import make_config
+from pipelines.progress import Silent
+from pipelines.round import stage
+from pipelines.rounds import open_round
+from pipelines.runner import open_executor, run_frames
+from pipelines.setup import initialise
+from pipelines.workspace import Workspace
+
+pytestmark = pytest.mark.benchmark(timer=time.perf_counter)
+
+FRAMES = 48
+ROUNDS = 3
+GROUP = f"Predict for {FRAMES - 1} simulated frames by the clock, workers with their models loaded"
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    """A function that gives a fresh workspace; its network has not learned anything."""
+    import torch
+
+    from curate.detectors.pillars.checkpoint import save_checkpoint
+    from curate.detectors.pillars.network import PillarNetwork, checkpoint_of
+    from curate.detectors.pillars.presets import PRESETS
+
+    home = tmp_path_factory.mktemp("executors")
+    simulate(home / "data", FRAMES, 0, val_frames=0, workers=1)
+    torch.manual_seed(0)
+    network = PillarNetwork(PRESETS["small"], len(CATEGORIES)).eval()
+    save_checkpoint(home / "small.safetensors", checkpoint_of(network, CATEGORIES))
+    document = {
+        "dataset": {"root": home / "data"},
+        "detector": {
+            "name": "curate.detectors.pillars:PillarDetector",
+            "path": home / "small.safetensors",
+        },
+    }
+    workspace = initialise(home / "work", make_config(document, "benchmark"), str(1 / FRAMES), "")
+    workspace.database.close()
+
+    def copy():
+        place = home / f"copy-{len(list(home.iterdir()))}"
+        shutil.copytree(home / "work", place)
+        return Workspace.open(place)
+
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("executor", "workers"), [("serial", 1), ("process", 1), ("process", 2), ("ray", 1), ("ray", 2)]
+)
+def bench_predict(benchmark, prepared, executor, workers):
+    """Planned, worked on and stored, as `curate predict` does it."""
+    if executor == "ray":
+        pytest.importorskip("ray", reason="Ray is not installed: pip install '.[ray]'")
+    settings = {"executor": executor, "workers": workers}
+    with open_executor(prepared().with_settings("run", **settings)) as work:
+
+        def predict(workspace):
+            report = run_frames(
+                workspace, open_round(workspace, 1), stage("predict"), work, Silent()
+            )
+            assert report.done + report.empty == FRAMES - 1, report.errors
+
+        predict(prepared())  # starts the workers, which load their models
+        measure(
+            benchmark,
+            predict,
+            group=GROUP,
+            name=f"{executor}, {workers} worker{'s' * (workers > 1)}",
+            amount=FRAMES - 1,
+            unit="frames",
+            setup=lambda: ((prepared(),), {}),
+            rounds=ROUNDS,
+            figure="rate",
+        )
