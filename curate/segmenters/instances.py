@@ -14,7 +14,7 @@ import numpy as np
 from curate.errors import ConfigError, DataError
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
-from curate.segmenters.classes import checked_classes
+from curate.segmenters.classes import checked_classes, free_id
 from curate.segmenters.masks import decode_mask
 
 Objects = Sequence[Mapping[str, Any]]
@@ -55,7 +55,8 @@ class InstanceSegmenter:
         """
         width, height = frame.image_size
         wanted = {one for ids in self.classes.values() for one in ids}
-        class_ids = np.zeros((height, width), dtype=np.uint8)
+        nothing = free_id(self.classes)
+        class_ids = np.full((height, width), nothing, dtype=np.uint8)
         place, objects = self._objects(frame.frame_id)
         scored = [(_score(place, number, one), number) for number, one in enumerate(objects)]
         for score, number in sorted(scored, key=lambda pair: pair[0]):
@@ -69,7 +70,7 @@ class InstanceSegmenter:
                 raise DataError(f"{place}: object {number} has no {error.args[0]}") from None
             except DataError as error:
                 raise DataError(f"{place}: object {number}: {error}") from None
-            class_ids[mask] = category if category in wanted else 0
+            class_ids[mask] = category if category in wanted else nothing
         return SemanticMap(class_ids, self.classes)
 
     def _objects(self, frame_id: str) -> tuple[str, Objects]:
