@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, one_line
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes, free_id
@@ -70,6 +70,8 @@ class InstanceSegmenter:
                 raise DataError(f"{place}: object {number} has no {error.args[0]}") from None
             except DataError as error:
                 raise DataError(f"{place}: object {number}: {error}") from None
+            if not isinstance(category, int):
+                raise DataError(f"{place}: object {number}: the category_id is no whole number")
             class_ids[mask] = category if category in wanted else nothing
         return SemanticMap(class_ids, self.classes)
 
@@ -99,8 +101,10 @@ def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
             key = one["image_id"]
             frames.setdefault(names[key] if names else key, []).append(one)
     except (KeyError, TypeError) as error:
-        words = f"no {error.args[0]}" if isinstance(error, KeyError) else str(error)
-        raise DataError(f"{path}: not COCO's format of images and masks: {words}") from None
+        words = f"no {error.args[0]!s:.80}" if isinstance(error, KeyError) else str(error)
+        raise DataError(
+            f"{path}: not COCO's format of images and masks: {' '.join(words.split())}"
+        ) from None
     return frames
 
 
@@ -114,8 +118,8 @@ def _listed(path: Path, held: Any) -> list[Mapping[str, Any]]:
 
 def _score(place: str, number: int, one: Mapping[str, Any]) -> float:
     score = one.get("score", 1.0)
-    if not isinstance(score, int | float):
-        raise DataError(f"{place}: object {number}: the score is {score!r}")
+    if not isinstance(score, int | float) or not 0 <= score <= 1:
+        raise DataError(f"{place}: object {number}: the score is no number from 0 to 1")
     return float(score)
 
 
@@ -124,5 +128,5 @@ def _read(path: Path) -> Any:
         return json.loads(path.read_bytes())
     except FileNotFoundError:
         raise DataError(f"{path}: no such file of instance masks") from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {error}") from None
+    except (OSError, RecursionError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None

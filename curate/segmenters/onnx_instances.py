@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from curate.errors import ConfigError, ModelError
+from curate.errors import ConfigError, ModelError, first_line
 from curate.frames import Frame
-from curate.onnx_session import first_line, open_session, runtime_errors
+from curate.onnx_session import open_session, runtime_errors
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes, free_id
 from curate.segmenters.onnx_answers import KINDS, Instance
