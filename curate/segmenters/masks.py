@@ -33,8 +33,11 @@ def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
     if isinstance(segmentation, dict):
         own = segmentation.get("size")
         if own != [height, width]:
-            whole = isinstance(own, list) and len(own) == 2 and all(isinstance(n, int) for n in own)
-            shown = f"{own[1]:.6g} x {own[0]:.6g} pixels" if whole else "without a size"
+            match own:
+                case [int(rows), int(columns)]:
+                    shown = f"{columns:.6g} x {rows:.6g} pixels"
+                case _:
+                    shown = "without a size"
             raise DataError(f"the mask is {shown}, the image {width} x {height}")
         counts = segmentation.get("counts")
         return runs_to_mask(decompress(counts) if isinstance(counts, str) else counts, size)

@@ -1,4 +1,4 @@
-"""Valid files of nuScenes, Parquet, masks and instance models for the fuzzing, and their readers."""
+"""Valid files of nuScenes, Parquet, masks and instance models for fuzzing, and their readers."""
 
 import json
 from collections.abc import Callable

@@ -82,7 +82,8 @@ def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str
     Raises:
         DataError: a result lacks a key or cannot be, or the file shows one of the usual mistakes.
     """
-    found, names = {}, {}
+    found: dict[str, MapBoxes] = {}
+    names: dict[str, str] = {}
     long = wide = 0
     for token, boxes in results:
         one = _frame(path, token, boxes, names)
