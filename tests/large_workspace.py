@@ -17,10 +17,7 @@ PER_FRAME = 50
 
 # Numbers from 0 to 1 that look random and are the same on every machine.
 _DRAW = "(((f.id * 7919 + n.k * 104729 + {round} * 15485863 + {salt} * 32452843) % 9973) / 9973.0)"
-_ROWS = (
-    "FROM frame AS f CROSS JOIN n WHERE f.split = 'unlabeled' AND f.id % {share} = 0 "
-    "ORDER BY f.id, n.k"
-)
+_ROWS = "FROM frame AS f CROSS JOIN n WHERE f.id > 1000 AND f.id % {share} = 0 ORDER BY f.id, n.k"
 _NUMBERS = (
     f"WITH RECURSIVE n(k) AS (SELECT 0 UNION ALL SELECT k + 1 FROM n WHERE k + 1 < {PER_FRAME}) "
 )
