@@ -32,6 +32,8 @@ _UPRIGHT = 0.7
 _UNIT_SLACK = 0.01
 # No LiDAR sees so far, metres; vehicles are hundreds of metres from their map's origin.
 _FARTHEST = 200.0
+# Metres; further products of numbers stay finite.
+_LARGEST = 1e7
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,7 @@ def _row(place: str, token: str, box: Any) -> list[float]:
         numbers.append(float(box["detection_score"]))
     except (OverflowError, TypeError, ValueError):
         numbers = []
-    if lengths != [3, 3, 4] or not np.isfinite(numbers).all() or len(numbers) != _NUMBERS:
+    if lengths != [3, 3, 4] or not (np.abs(numbers) <= _LARGEST).all() or len(numbers) != _NUMBERS:
         raise DataError(
             f"{place}: translation, size, rotation and detection_score are not 3, 3, 4 and 1 "
             "finite numbers"
