@@ -52,6 +52,6 @@ $(READY): pyproject.toml constraints.txt
 	@command -v nvidia-smi >/dev/null 2>&1 \
 		|| $(BIN)/pip install -q -c constraints.txt torch==2.13.0+cpu 2>/dev/null \
 		|| echo "The index offers no CPU build of torch; installing the general one."
-	$(BIN)/pip install -q -c constraints.txt -e '.[test,lint,postgres,serve,browser]'
+	$(BIN)/pip install -q -c constraints.txt -e '.[test,lint,postgres,serve,browser,nuscenes]'
 	@$(BIN)/python -c 'from curate.datasets.open3d_loader import load; load()'
 	@touch $@

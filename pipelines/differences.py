@@ -1,12 +1,12 @@
 """What became of a policy's labels from one round to another."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from curate.label_changes import LabelChanges, compare_labels
-from pipelines.label_columns import LabelColumns, as_rounds, read_columns
+from pipelines.label_columns import LabelColumns, as_rounds, read_blocks
 from pipelines.workspace import Workspace
 
 COLUMNS = (
@@ -75,37 +75,62 @@ def compare_rounds(
     Raises:
         WorkspaceError: the policy has weighted nothing in one of the rounds.
     """
-    before, after = (read_columns(workspace, number, policy) for number in rounds)
-    return difference_of(before, after, rounds, policy, listed)
+    found = Comparison(listed)
+    for before, after in read_blocks(workspace, rounds, policy):
+        found.add(before, after)
+    return found.finish(rounds, policy)
 
 
-def difference_of(
-    before: LabelColumns, after: LabelColumns, rounds: tuple[int, int], policy: str, listed: int
-) -> Difference:
-    """The difference of labels that are read already; see `compare_rounds`."""
-    changes = compare_labels(*as_rounds(before, after))
-    names = tuple(dict.fromkeys((*before.category_names, *after.category_names)))
-    rows = [_row(changes, name, number) for number, name in enumerate(names)]
-    rows.append(_row(changes, "all", None))
-    return Difference(rounds, policy, tuple(rows), tuple(_listed(changes, before, after, listed)))
+@dataclass
+class Comparison:
+    """Two rounds compared a block of frames at a time.
+
+    Attributes:
+        listed: how many changed labels are kept.
+        sums: the numbers of `COLUMNS` of each category.
+        labels: those whose weight changed most so far, the largest change first.
+    """
+
+    listed: int
+    sums: dict[str, np.ndarray] = field(default_factory=dict)
+    labels: list[ChangedLabel] = field(default_factory=list)
+
+    def add(self, before: LabelColumns, after: LabelColumns) -> None:
+        """The labels of the same frames in both rounds more."""
+        changes = compare_labels(*as_rounds(before, after))
+        names = tuple(dict.fromkeys((*before.category_names, *after.category_names)))
+        for number, name in enumerate(names):
+            self.sums[name] = self.sums.get(name, 0) + _sums(changes, number)
+        found = [*self.labels, *_listed(changes, before, after, self.listed)]
+        found.sort(key=lambda each: -abs(each.weight_after - each.weight_before))
+        self.labels = found[: self.listed]
+
+    def finish(self, rounds: tuple[int, int], policy: str) -> Difference:
+        """The difference, with the sums over all categories."""
+        everything = np.sum([*self.sums.values()], axis=0)
+        rows = tuple(_row(name, sums) for name, sums in (self.sums | {"all": everything}).items())
+        return Difference(rounds, policy, rows, tuple(self.labels))
 
 
-def _row(changes: LabelChanges, name: str, category: int | None) -> dict[str, Any]:
-    """A row of `COLUMNS`."""
-    before, after = (
-        np.full(len(side), True) if category is None else side.categories == category
-        for side in (changes.before, changes.after)
-    )
+def _row(name: str, sums: np.ndarray) -> dict[str, Any]:
+    """A row of `COLUMNS`: counts, then two sums of weights."""
+    counts, weights = map(int, sums[:-2]), map(float, sums[-2:])
+    return dict(zip(COLUMNS, (name, *counts, *weights), strict=True))
+
+
+def _sums(changes: LabelChanges, category: int) -> np.ndarray:
+    """(10,) float64 what `COLUMNS` say of a category."""
+    before, after = (side.categories == category for side in (changes.before, changes.after))
     paired = before[changes.pairs[:, 0]]
     change = changes.weight_change[paired]
     values = (
-        *(name, int(before.sum()), int(after.sum()), int(paired.sum())),
-        *(int(after[changes.gained].sum()), int(before[changes.lost].sum())),
-        int((changes.iou[paired] < MOVED_BELOW).sum()),
-        *(int((change >= CHANGED_BY).sum()), int((change <= -CHANGED_BY).sum())),
-        *(float(changes.before.weights[before].sum()), float(changes.after.weights[after].sum())),
+        *(before.sum(), after.sum(), paired.sum()),
+        *(after[changes.gained].sum(), before[changes.lost].sum()),
+        (changes.iou[paired] < MOVED_BELOW).sum(),
+        *((change >= CHANGED_BY).sum(), (change <= -CHANGED_BY).sum()),
+        *(changes.before.weights[before].sum(), changes.after.weights[after].sum()),
     )
-    return dict(zip(COLUMNS, values, strict=True))
+    return np.array(values, dtype=np.float64)
 
 
 def _listed(

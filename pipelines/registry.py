@@ -99,6 +99,7 @@ SEGMENTERS = Registry(
     "segmenter",
     {
         "onnx": "curate.segmenters.onnx:OnnxSegmenter",
+        "onnx-instances": "curate.segmenters.onnx_instances:OnnxInstanceSegmenter",
         "saved": "curate.segmenters.saved:SavedSegmenter",
         "instances": "curate.segmenters.instances:InstanceSegmenter",
         "degraded": "curate.segmenters.degraded:DegradedSegmenter",

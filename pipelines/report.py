@@ -11,11 +11,13 @@ from curate.viewing.close_up import LabelShown, draw_close_up
 from curate.viewing.page import Figure, Section, render_page
 from curate.viewing.svg import share_curve
 from db import bulk
-from pipelines.differences import COLUMNS, Difference, difference_of
+from pipelines.differences import COLUMNS, ChangedLabel, Comparison, Difference
 from pipelines.frame_boxes import chosen_round
-from pipelines.label_columns import LabelColumns, read_columns
+from pipelines.label_columns import read_blocks, read_frame_columns
+from pipelines.label_ranking import RankedLabel, Ranking
 from pipelines.report_figures import beside_others, by_category, distributions, summary
 from pipelines.review.human_labels import counts
+from pipelines.round_totals import RoundTotals, extent
 from pipelines.workspace import Workspace
 
 _PICTURES = 6
@@ -34,17 +36,30 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
     """
     number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
-    labels = read_columns(workspace, number, policy)
-    score = labels.numbers["score"]
-    raised = np.where(score < 0.5, labels.weights, 0.0)
+    totals = RoundTotals(extent(workspace, number, policy))
+    doubted, kept = Ranking(_PICTURES), Ranking(_PICTURES)
+    comparison = Comparison(_PICTURES)
+    before = _round_before(workspace, number, policy)
+    rounds = (number,) if before is None else (number, before)
+    for labels, *former in read_blocks(workspace, rounds, policy):
+        score = labels.numbers["score"]
+        totals.add(labels)
+        doubted.add(labels, score - labels.weights)
+        kept.add(labels, np.where(score < 0.5, labels.weights, 0.0))
+        for each in former:
+            comparison.add(each, labels)
     sections = [
-        summary(workspace, labels, number),
-        distributions(labels),
-        by_category(labels),
+        summary(workspace, totals, number),
+        distributions(totals),
+        by_category(totals, workspace.config.dataset.categories),
         *beside_others(workspace, number, policy),
-        *_changes(workspace, labels, number, policy),
-        _shown(workspace, labels, "Most doubted: high score, low weight", score - labels.weights),
-        _shown(workspace, labels, "Kept against a low score: below 0.5, greatest weight", raised),
+        *(
+            []
+            if before is None
+            else _changes(workspace, comparison.finish((before, number), policy))
+        ),
+        _shown(workspace, "Most doubted: high score, low weight", doubted),
+        _shown(workspace, "Kept against a low score: below 0.5, greatest weight", kept),
         *_reliability(workspace, number, policy),
     ]
     title = f"Round {number}, weights by {policy}"
@@ -58,58 +73,52 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
     return path
 
 
-def _changes(
-    workspace: Workspace, labels: LabelColumns, number: int, policy: str
-) -> Iterator[Section]:
-    """What changed since the round before, where the policy weighted that."""
+def _round_before(workspace: Workspace, number: int, policy: str) -> int | None:
+    """The round before, where the policy weighted that."""
     weight = bulk.table("weight")
     query = select(weight.c.k).where(weight.c.round == number - 1, weight.c.policy == policy)
     with workspace.database.reading() as connection:
-        if not bulk.select(connection, query.limit(1)):
-            return
-    before = read_columns(workspace, number - 1, policy)
-    found = difference_of(before, labels, (number - 1, number), policy, _PICTURES)
+        return number - 1 if bulk.select(connection, query.limit(1)) else None
+
+
+def _changes(workspace: Workspace, found: Difference) -> Iterator[Section]:
+    """What changed since the round before."""
     note = (
         "Matched one to one by BEV IoU; moved: an IoU below 0.7; heavier, lighter: by 0.05 or more."
     )
     names = [name.replace("_", " ") for name in COLUMNS]
     rows = [tuple(row.values()) for row in found.categories]
-    title = f"Since round {number - 1}"
-    yield Section(title, note, names, rows, list(_changed(workspace, before, labels, found)))
+    figures = [_changed(workspace, found, each) for each in found.labels]
+    yield Section(f"Since round {found.rounds[0]}", note, names, rows, figures)
 
 
-def _changed(
-    workspace: Workspace, before: LabelColumns, after: LabelColumns, found: Difference
-) -> Iterator[Figure]:
-    """The most changed labels, with their former boxes in dashes."""
-    for each in found.labels:
-        box = _box(after, each.frame, each.k_after)
-        former = _box(before, each.frame, each.k_before)
-        shown = former if box is None else box
-        if shown is None:
-            continue
-        label = LabelShown(shown, each.weight_after, former if box is not None else None)
-        caption = (
-            f"{each.change}: {each.category} in frame {each.frame}, weight "
-            f"{each.weight_before:.2f} to {each.weight_after:.2f}"
-        )
-        yield _close_up(workspace, each.frame, label, caption)
+def _changed(workspace: Workspace, found: Difference, each: ChangedLabel) -> Figure:
+    """One of the most changed labels, with its former box in dashes."""
+    boxes = [
+        _box(workspace, number, found.policy, each.frame, k)
+        for number, k in zip(found.rounds, (each.k_before, each.k_after), strict=True)
+        if k is not None
+    ]
+    label = LabelShown(boxes[-1], each.weight_after, boxes[0] if len(boxes) == 2 else None)
+    caption = (
+        f"{each.change}: {each.category} in frame {each.frame}, weight "
+        f"{each.weight_before:.2f} to {each.weight_after:.2f}"
+    )
+    return _close_up(workspace, each.frame, label, caption)
 
 
-def _shown(workspace: Workspace, labels: LabelColumns, title: str, rank: np.ndarray) -> Section:
-    """Pictures of the labels with the highest (n,) rank; those without any are not worth one."""
-    first = np.argsort(-rank, kind="stable")[:_PICTURES]
-    figures = []
-    for i in first[rank[first] > 0].tolist():
-        frame = labels.frame_names[labels.frames[i]]
-        label = LabelShown(labels.boxes[i], float(labels.weights[i]))
-        figures.append(_close_up(workspace, frame, label, _told(labels, i, frame)))
+def _shown(workspace: Workspace, title: str, ranking: Ranking) -> Section:
+    """Pictures of the labels of a ranking."""
+    figures = [
+        _close_up(workspace, each.frame, LabelShown(each.box, each.numbers["weight"]), _told(each))
+        for each in ranking.labels
+    ]
     return Section(title, "" if figures else "There is none.", figures=figures)
 
 
-def _told(labels: LabelColumns, i: int, frame: str) -> str:
+def _told(label: RankedLabel) -> str:
     """What a label is, its numbers, and what took its weight away."""
-    own = {name: float(values[i]) for name, values in labels.numbers.items()}
+    own = label.numbers
     shown = {"score": "score", "weight": "weight", "loss": "L", "points": "points",
              "rho_diff": "rho_diff", "rho_anno": "rho_anno"}  # fmt: skip
     numbers = ", ".join(
@@ -122,8 +131,7 @@ def _told(labels: LabelColumns, i: int, frame: str) -> str:
         "no LiDAR point inside": own["points"] == 0,
     }
     found = [reason for reason, holds in reasons.items() if holds and own["weight"] <= 0]
-    category = labels.category_names[labels.categories[i]]
-    return f"{category} {labels.k[i]} in frame {frame}: {numbers}" + "".join(
+    return f"{label.category} {label.k} in frame {label.frame}: {numbers}" + "".join(
         f"; {reason}" for reason in found
     )
 
@@ -163,12 +171,10 @@ def _curve(rows: Sequence[Sequence[float]]) -> str:
     return share_curve(table[:, 0], table[:, 1], table[:, 2], "mean weight of the bin")
 
 
-def _box(labels: LabelColumns, frame: str, k: int | None) -> np.ndarray | None:
-    """(7,) box of a label; None for no label."""
-    if k is None:
-        return None
-    place = labels.frame_names.index(frame)
-    box: np.ndarray = labels.boxes[(labels.frames == place) & (labels.k == k)][0]
+def _box(workspace: Workspace, number: int, policy: str, frame: str, k: int) -> np.ndarray:
+    """(7,) box of a label."""
+    labels = read_frame_columns(workspace, number, policy, frame)
+    box: np.ndarray = labels.boxes[labels.k == k][0]
     return box
 
 

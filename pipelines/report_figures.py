@@ -1,7 +1,6 @@
 """The figures of a report: what a round's losses, priors and weights are, all labels together."""
 
 from collections.abc import Iterator
-from itertools import pairwise
 
 import numpy as np
 from sqlalchemy import case, func, select
@@ -9,11 +8,9 @@ from sqlalchemy import case, func, select
 from curate.viewing.page import ALL, Figure, Section
 from curate.viewing.svg import Mark, histogram
 from db import bulk
-from pipelines.label_columns import LabelColumns
+from pipelines.round_totals import BANDS, SHARES, SHOWN_AGES, RoundTotals, Sums
 from pipelines.workspace import Workspace
 
-_LOSS_BINS, _BINS = 40, 25
-_BANDS = (0.0, 20.0, 40.0, 60.0, np.inf)
 _TOLD = {
     "weight": "the weight v",
     "score": "the detector's score s",
@@ -23,75 +20,66 @@ _TOLD = {
 }
 
 
-def summary(workspace: Workspace, labels: LabelColumns, number: int) -> Section:
+def summary(workspace: Workspace, totals: RoundTotals, number: int) -> Section:
     """The round in a few numbers."""
-    weights, n = labels.weights, len(labels)
-    matched = int((~np.isnan(labels.numbers["loss"])).sum())
-    kept, trusted = int((weights > 0).sum()), int((weights > 0.5).sum())
+    n, kept, trusted = totals.everything.labels, totals.everything.kept, totals.trusted
     facts = [
         ("labels", f"{n:,}"),
-        ("unlabeled frames", f"{len(labels.frame_names):,}"),
+        ("unlabeled frames", f"{totals.frames:,}"),
         ("weight above 0", f"{kept:,} ({kept / n:.1%})"),
         ("weight above 0.5", f"{trusted:,} ({trusted / n:.1%})"),
-        ("sum of weights", f"{weights.sum():,.1f}"),
-        ("matched again", f"{matched:,} ({matched / n:.1%})"),
+        ("sum of weights", f"{totals.everything.weight:,.1f}"),
+        ("matched again", f"{totals.matched:,} ({totals.matched / n:.1%})"),
     ]
-    ages = labels.numbers["lambda_u"][~np.isnan(labels.numbers["lambda_u"])]
-    if len(ages):
-        low, high = float(ages.min()), float(ages.max())
+    if len(totals.ages):
+        low, high = float(totals.ages[0]), float(totals.ages[-1])
         facts.append(("lambda", f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"))
     facts.append(("age e/E", _age(workspace, number)))
     note = (
-        f"{n:,} labels in {len(labels.frame_names):,} unlabeled frames, {kept:,} with a weight "
+        f"{n:,} labels in {totals.frames:,} unlabeled frames, {kept:,} with a weight "
         "above 0; the others mark regions to ignore."
     )
     return Section("The round", note, facts=facts)
 
 
-def distributions(labels: LabelColumns) -> Section:
+def distributions(totals: RoundTotals) -> Section:
     """Histograms of losses, priors and weights."""
-    loss, age = labels.numbers["loss"], labels.numbers["lambda_u"]
-    matched, ages = loss[~np.isnan(loss)], np.unique(age[~np.isnan(age)])
-    marks = [Mark(float(value), f"λ {value:.3g}") for value in ages[:4]]
+    n, loss = totals.everything.labels, totals.histograms["loss"]
+    marks = [Mark(float(value), f"λ {value:.3g}") for value in totals.ages[:SHOWN_AGES]]
     figures = []
-    if len(matched):
-        reach = max(float(matched.max()), float(ages[0]) if len(ages) else 0.0, 1e-9) * 1.02
-        counts, edges = np.histogram(matched, _LOSS_BINS, (0, reach))
+    if totals.matched:
         unmatched = (
-            f"the loss of {len(matched):,} labels; {len(loss) - len(matched):,} without a matched "
+            f"the loss of {totals.matched:,} labels; {n - totals.matched:,} without a matched "
             "reprediction left out"
         )
-        figures.append(Figure(histogram(counts, edges, "consistency loss L", marks), unmatched))
-    for name, told in _TOLD.items():
-        values = labels.numbers[name]
-        above = values[values > 0]
-        if len(above) == 0:
+        chart = histogram(loss.counts, loss.edges, "consistency loss L", marks)
+        figures.append(Figure(chart, unmatched))
+    for name in SHARES:
+        found = totals.histograms[name]
+        if not found.above:
             continue
-        zeros = int((values == 0).sum())
         # Most weights are 0: in the same chart they would flatten all others.
-        left_out = f"; {zeros:,} labels with 0 left out" if zeros else ""
-        chart = histogram(*np.histogram(above, _BINS, (0, 1)), name)
-        figures.append(Figure(chart, f"{told} of {len(above):,} labels{left_out}"))
+        left_out = f"; {found.zeros:,} labels with 0 left out" if found.zeros else ""
+        chart = histogram(found.counts, found.edges, name)
+        figures.append(Figure(chart, f"{_TOLD[name]} of {found.above:,} labels{left_out}"))
     return Section("Losses, priors and weights", figures=figures)
 
 
-def by_category(labels: LabelColumns) -> Section:
-    """A row per category and distance, and the sums."""
-    distance = np.hypot(labels.boxes[:, 0], labels.boxes[:, 1])
-    band = np.digitize(distance, _BANDS[1:])
-    everything = np.full(len(labels), True)
+def by_category(totals: RoundTotals, categories: tuple[str, ...]) -> Section:
+    """A row per category and distance, and the sums.
+
+    Args:
+        totals: see `RoundTotals`.
+        categories: those that come first.
+    """
     rows = []
-    for c, category in enumerate(labels.category_names):
-        own = labels.categories == c
-        if not own.any():
-            continue
-        rows.append((category, ALL, *_sums(labels, own)))
-        for b, (near, far) in enumerate(pairwise(_BANDS)):
-            here = own & (band == b)
-            if here.any():
-                place = f"{near:.0f}-{far:.0f} m" if np.isfinite(far) else f"from {near:.0f} m"
-                rows.append((category, place, *_sums(labels, here)))
-    rows.append((ALL, "", *_sums(labels, everything)))
+    for category in dict.fromkeys((*categories, *(name for name, _ in totals.cells))):
+        own = {band: totals.cells.get((category, band)) for band in range(len(BANDS) - 1)}
+        found = {band: sums for band, sums in own.items() if sums is not None}
+        if found:
+            rows.append((category, ALL, *_cells(_together(list(found.values())))))
+        rows += [(category, _place(band), *_cells(sums)) for band, sums in found.items()]
+    rows.append((ALL, "", *_cells(totals.everything)))
     columns = (
         "category", "distance", "labels", "weight > 0", "share kept", "sum of weights",
         "mean weight", "mean score",
@@ -121,12 +109,24 @@ def beside_others(workspace: Workspace, number: int, policy: str) -> Iterator[Se
         yield Section("Beside other policies", note, columns, rows)
 
 
-def _sums(labels: LabelColumns, here: np.ndarray) -> tuple[int, int, float, float, float, float]:
+def _together(parts: list[Sums]) -> Sums:
+    return Sums(
+        sum(part.labels for part in parts),
+        sum(part.kept for part in parts),
+        sum(part.weight for part in parts),
+        sum(part.score for part in parts),
+    )
+
+
+def _place(band: int) -> str:
+    near, far = BANDS[band], BANDS[band + 1]
+    return f"{near:.0f}-{far:.0f} m" if np.isfinite(far) else f"from {near:.0f} m"
+
+
+def _cells(sums: Sums) -> tuple[int, int, float, float, float, float]:
     """Labels, kept ones, their share, and the sum and means of weight and score."""
-    weights = labels.weights[here]
-    count, kept = int(here.sum()), int((weights > 0).sum())
-    score = float(labels.numbers["score"][here].mean())
-    return count, kept, kept / count, float(weights.sum()), float(weights.mean()), score
+    n = sums.labels
+    return n, sums.kept, sums.kept / n, sums.weight, sums.weight / n, sums.score / n
 
 
 def _age(workspace: Workspace, number: int) -> str:

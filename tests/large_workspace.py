@@ -17,15 +17,17 @@ PER_FRAME = 50
 
 # Numbers from 0 to 1 that look random and are the same on every machine.
 _DRAW = "(((f.id * 7919 + n.k * 104729 + {round} * 15485863 + {salt} * 32452843) % 9973) / 9973.0)"
-_ROWS = (
-    "FROM frame AS f CROSS JOIN n WHERE f.split = 'unlabeled' AND f.id % {share} = 0 "
-    "ORDER BY f.id, n.k"
-)
+_ROWS = "FROM frame AS f CROSS JOIN n WHERE f.id > 1000 AND f.id % {share} = 0 ORDER BY f.id, n.k"
 _NUMBERS = (
     f"WITH RECURSIVE n(k) AS (SELECT 0 UNION ALL SELECT k + 1 FROM n WHERE k + 1 < {PER_FRAME}) "
 )
 
 
+# An index by value that exists while millions of rows come makes each of them a seek.
+_INDICES = (
+    "SELECT name, sql FROM sqlite_master WHERE type = 'index' AND sql IS NOT NULL "
+    "AND tbl_name IN ('prediction', 'weight') ORDER BY name"
+)
 # Columns and values per table; u0 to u3 are the draws of a label, place is that of all rounds.
 _VALUES = {
     "prediction": (
@@ -69,12 +71,20 @@ def large_workspace(folder: Path, labels: tuple[int, ...]) -> Workspace:
     workspace = initialise(folder / "work", make_config(document, "test"), "0.25", "")
     workspace.database.close()
     with closing(sqlite3.connect(workspace.root / "curate.db")) as connection:
-        connection.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF; BEGIN")
+        connection.executescript(
+            "PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF; PRAGMA cache_size = -200000;BEGIN"
+        )
+        indices = connection.execute(_INDICES).fetchall()
+        for name, _ in indices:
+            connection.execute(f"DROP INDEX {name}")
         frames = max(labels) // PER_FRAME
         _add_frames(connection, frames)
         for number, count in enumerate(labels, start=1):
             _add_round(connection, number, len(labels), max(frames * PER_FRAME // count, 1))
-        connection.commit()
+        for _, made in indices:
+            connection.execute(made)
+        # As solve leaves the statistics; without them the planner walks through all weights.
+        connection.executescript("PRAGMA analysis_limit = 400; ANALYZE")
     return workspace
 
 

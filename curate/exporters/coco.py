@@ -92,7 +92,8 @@ def _annotations(
             "category_id": ids[str(found.categories[k])],
             "bbox": [*seen[k, :2].tolist(), *sizes[k].tolist()],
             "area": float(sizes[k].prod()),
-            "iscrowd": int(weight == 0),
+            # Its readers never match what has no area, so nobody should be asked to find it.
+            "iscrowd": int(weight == 0 or not sizes[k].all()),
             "weight": weight,
             "box_3d": found.boxes[k].tolist(),
             "frame": objects.frame_id,

@@ -2,7 +2,8 @@
 
 A cyclist is rider and bicycle together; a pedestrian is a person on foot. Where a class set has one
 class for all people, it counts for both. The numbers are those of each data set's own definition:
-Pascal VOC's, Cityscapes' train ids, and COCO's category ids with 0 as background.
+Pascal VOC's, Cityscapes' train ids, COCO's category ids with 0 as background, and COCO's 80 classes
+counted from 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,7 @@ CLASS_MAPS: Mapping[str, ClassMap] = MappingProxyType(
         "cityscapes": {"Car": (13,), "Pedestrian": (11,), "Cyclist": (12, 18)},
         "cityscapes-label-ids": {"Car": (26,), "Pedestrian": (24,), "Cyclist": (25, 33)},
         "coco": {"Car": (3,), "Pedestrian": (1,), "Cyclist": (1, 2)},
+        "coco-from-0": {"Car": (2,), "Pedestrian": (0,), "Cyclist": (0, 1)},
         "simulated": {"Car": (1,), "Pedestrian": (2,), "Cyclist": (3,)},
     }
 )
@@ -57,6 +59,12 @@ def checked_classes(classes: Mapping[str, Sequence[int]]) -> ClassMap:
             if not isinstance(one, int) or not 0 <= one <= 255:
                 raise ConfigError(f"segmenter class {one!r} of {category}: an id is 0 to 255")
     return {category: tuple(ids) for category, ids in classes.items()}
+
+
+def free_id(classes: ClassMap) -> int:
+    """A class id for the pixels of nothing: 0, unless that counts for a category."""
+    wanted = {one for ids in classes.values() for one in ids}
+    return next((one for one in range(256) if one not in wanted), 0)
 
 
 def foreign_ids(class_ids: np.ndarray, classes: ClassMap) -> str | None:

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, one_line
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
-from curate.segmenters.classes import checked_classes
+from curate.segmenters.classes import checked_classes, free_id
 from curate.segmenters.masks import decode_mask
 
 Objects = Sequence[Mapping[str, Any]]
@@ -55,7 +55,8 @@ class InstanceSegmenter:
         """
         width, height = frame.image_size
         wanted = {one for ids in self.classes.values() for one in ids}
-        class_ids = np.zeros((height, width), dtype=np.uint8)
+        nothing = free_id(self.classes)
+        class_ids = np.full((height, width), nothing, dtype=np.uint8)
         place, objects = self._objects(frame.frame_id)
         scored = [(_score(place, number, one), number) for number, one in enumerate(objects)]
         for score, number in sorted(scored, key=lambda pair: pair[0]):
@@ -69,7 +70,9 @@ class InstanceSegmenter:
                 raise DataError(f"{place}: object {number} has no {error.args[0]}") from None
             except DataError as error:
                 raise DataError(f"{place}: object {number}: {error}") from None
-            class_ids[mask] = category if category in wanted else 0
+            if not isinstance(category, int):
+                raise DataError(f"{place}: object {number}: the category_id is no whole number")
+            class_ids[mask] = category if category in wanted else nothing
         return SemanticMap(class_ids, self.classes)
 
     def _objects(self, frame_id: str) -> tuple[str, Objects]:
@@ -98,8 +101,10 @@ def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
             key = one["image_id"]
             frames.setdefault(names[key] if names else key, []).append(one)
     except (KeyError, TypeError) as error:
-        words = f"no {error.args[0]}" if isinstance(error, KeyError) else str(error)
-        raise DataError(f"{path}: not COCO's format of images and masks: {words}") from None
+        words = f"no {error.args[0]!s:.80}" if isinstance(error, KeyError) else str(error)
+        raise DataError(
+            f"{path}: not COCO's format of images and masks: {' '.join(words.split())}"
+        ) from None
     return frames
 
 
@@ -113,8 +118,8 @@ def _listed(path: Path, held: Any) -> list[Mapping[str, Any]]:
 
 def _score(place: str, number: int, one: Mapping[str, Any]) -> float:
     score = one.get("score", 1.0)
-    if not isinstance(score, int | float):
-        raise DataError(f"{place}: object {number}: the score is {score!r}")
+    if not isinstance(score, int | float) or not 0 <= score <= 1:
+        raise DataError(f"{place}: object {number}: the score is no number from 0 to 1")
     return float(score)
 
 
@@ -123,5 +128,5 @@ def _read(path: Path) -> Any:
         return json.loads(path.read_bytes())
     except FileNotFoundError:
         raise DataError(f"{path}: no such file of instance masks") from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {error}") from None
+    except (OSError, RecursionError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None

@@ -11,6 +11,9 @@ import numpy as np
 
 from curate.errors import DataError
 
+# Pixels from the image's corner; no annotator goes so far.
+_FARTHEST = 1e7
+
 
 def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
     """The pixels of an object.
@@ -30,8 +33,12 @@ def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
     if isinstance(segmentation, dict):
         own = segmentation.get("size")
         if own != [height, width]:
-            shown = f"{own[1]} x {own[0]}" if isinstance(own, list) and len(own) == 2 else own
-            raise DataError(f"the mask is {shown} pixels, the image {width} x {height}")
+            match own:
+                case [int(rows), int(columns)]:
+                    shown = f"{columns:.6g} x {rows:.6g} pixels"
+                case _:
+                    shown = "without a size"
+            raise DataError(f"the mask is {shown}, the image {width} x {height}")
         counts = segmentation.get("counts")
         return runs_to_mask(decompress(counts) if isinstance(counts, str) else counts, size)
     if not isinstance(segmentation, list):
@@ -124,8 +131,9 @@ def _corners(polygon: Sequence[float] | Any) -> np.ndarray:
     """(n, 2) x, y."""
     try:
         corners = np.asarray(polygon, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         corners = np.zeros(0)
-    if corners.ndim != 1 or len(corners) < 6 or len(corners) % 2 or not np.isfinite(corners).all():
+    near = (np.abs(corners) < _FARTHEST).all()
+    if corners.ndim != 1 or len(corners) < 6 or len(corners) % 2 or not near:
         raise DataError("a polygon is a list of at least three corners, x0, y0, x1, y1, ...")
     return corners.reshape(-1, 2)

@@ -27,18 +27,11 @@ from curate.frames import Frame
 from curate.onnx_session import open_session, runtime_errors
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes
+from curate.segmenters.onnx_images import SCALINGS, image_input
 
-# Mean and standard deviation of ImageNet's RGB, with which most published models were trained.
-_IMAGENET = (np.array([0.485, 0.456, 0.406]) * 255, np.array([0.229, 0.224, 0.225]) * 255)
-_SCALINGS = {
-    "imagenet": _IMAGENET,
-    "unit": (np.zeros(3), np.full(3, 255.0)),
-    "none": (np.zeros(3), np.ones(3)),
-}
 # A whole image may be squeezed by this factor before it is cut into crops.
 _SQUEEZE_LIMIT = 1.5
 
-_EXPECTED = "expected one image [1, height, width, 3] or [1, 3, height, width], uint8 or float32"
 _ANSWER = "expected class ids [1, h, w], or scores [1, classes, h, w] or [1, h, w, classes]"
 
 
@@ -71,8 +64,8 @@ class OnnxSegmenter:
         scaling: str = "imagenet",
         threads: int = 1,
     ) -> None:
-        if scaling not in _SCALINGS:
-            raise ConfigError(f"segmenter scaling {scaling!r}: use one of {', '.join(_SCALINGS)}")
+        if scaling not in SCALINGS:
+            raise ConfigError(f"segmenter scaling {scaling!r}: use one of {', '.join(SCALINGS)}")
         if tiles < 1:
             raise ConfigError(f"segmenter tiles {tiles}: at least 1")
         self.model = Path(model)
@@ -80,7 +73,8 @@ class OnnxSegmenter:
         self.tiles = tiles
         self.scaling = scaling
         self._session = open_session(self.model, threads, "segmenter")
-        self._input = _describe_input(self._session, self.model)
+        self._input = image_input(self._session, self.model)
+        _refuse_output(self._session, self.model)
 
     def segment(self, frame: Frame) -> SemanticMap:
         """The frame's semantic map.
@@ -129,14 +123,8 @@ class OnnxSegmenter:
         shrinks = target[0] < width or target[1] < height
         kind = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         pixels = cv2.resize(image, target, interpolation=kind)
-        if self._input.is_float:
-            mean, deviation = _SCALINGS[self.scaling]
-            pixels = ((pixels - mean) / deviation).astype(np.float32)
-        if self._input.channels_first:
-            pixels = pixels.transpose(2, 0, 1)
-        blob = np.ascontiguousarray(pixels[None])
         try:
-            answer = self._session.run(None, {self._input.name: blob})[0]
+            answer = self._session.run(None, self._input.feed(pixels, self.scaling))[0]
         except runtime_errors() as error:
             raise ModelError(f"{self.model}: {first_line(error)}") from error
         class_ids = _class_ids(answer, target, self.model)
@@ -153,17 +141,6 @@ class Crop:
     own_right: int
 
 
-@dataclass(frozen=True)
-class _Input:
-    """What the model wants; height and width are None where they are free."""
-
-    name: str
-    is_float: bool
-    channels_first: bool
-    height: int | None
-    width: int | None
-
-
 def cut_along(width: int, crop_width: int, count: int) -> list[Crop]:
     """`count` crops spread evenly over an image's width, each owning the columns nearest to it."""
     lefts = np.round(np.linspace(0, width - crop_width, count)).astype(int)
@@ -175,26 +152,11 @@ def cut_along(width: int, crop_width: int, count: int) -> list[Crop]:
     ]
 
 
-def _describe_input(session: Any, model: Path) -> _Input:
-    """The model's input; ModelError where it is not one image or the output is no map."""
-    inputs, output = session.get_inputs(), session.get_outputs()[0]
-    found = ", ".join(f"{one.name} {one.type}{one.shape}" for one in inputs)
-    fault = ModelError(f"{model}: takes {found}; {_EXPECTED}")
-    if len(inputs) != 1 or len(inputs[0].shape) != 4:
-        raise fault
-    one = inputs[0]
-    sizes = [size if isinstance(size, int) else None for size in one.shape]
-    channels_first = sizes[3] != 3
-    if (
-        sizes[0] not in {1, None}
-        or sizes[1 if channels_first else 3] != 3
-        or one.type not in {"tensor(uint8)", "tensor(float)"}
-    ):
-        raise fault
+def _refuse_output(session: Any, model: Path) -> None:
+    """ModelError where a model says that its answer is no map."""
+    output = session.get_outputs()[0]
     if output.shape and len(output.shape) not in {3, 4}:
         raise ModelError(f"{model}: answers {output.name} {output.shape}; {_ANSWER}")
-    height, width = sizes[2:] if channels_first else sizes[1:3]
-    return _Input(one.name, one.type == "tensor(float)", channels_first, height, width)
 
 
 def _class_ids(answer: np.ndarray, size: tuple[int, int], model: Path) -> np.ndarray:

@@ -36,7 +36,7 @@ def histogram(counts: np.ndarray, edges: np.ndarray, axis: str, marks: Sequence[
     span = float(edges[-1] - edges[0]) or 1.0
     across = _LEFT + (edges - edges[0]) / span * (_WIDTH - _LEFT - _RIGHT)
     parts = [_frame(axis, f"{axis}: histogram of {int(counts.sum())} labels")]
-    parts += [_tick_y(share, f"{share * most:,.0f}") for share in (0.0, 0.5, 1.0)]
+    parts += [_tick_y(share, _count(share * most)) for share in (0.0, 0.5, 1.0)]
     parts += [
         _tick_x(across[0] + share * (across[-1] - across[0]), f"{edges[0] + share * span:.3g}")
         for share in (0.0, 0.5, 1.0)
@@ -81,6 +81,11 @@ def _frame(axis: str, told: str) -> str:
         f'<text class="axis" x="{middle:.0f}" y="{_HEIGHT - 6}" text-anchor="middle">'
         f"{escape(axis)}</text>"
     )
+
+
+def _count(value: float) -> str:
+    """A count that has room beside an axis."""
+    return f"{value:,.0f}" if value < 1e6 else f"{value / 1e6:,.3g} M"
 
 
 def _down(share: float) -> float:

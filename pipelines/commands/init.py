@@ -45,7 +45,9 @@ def init(
     ] = None,
     segmenter_classes: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Whose class numbers: voc, coco, cityscapes, cityscapes-label-ids."),
+        typer.Option(
+            help="Whose class numbers: voc, coco, coco-from-0, cityscapes, cityscapes-label-ids."
+        ),
     ] = None,
     settings: Annotated[
         Optional[list[str]],  # noqa: UP045

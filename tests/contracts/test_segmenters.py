@@ -43,9 +43,39 @@ def write_instances(folder: Path, frames: Sequence[Frame]) -> Path:
     return path
 
 
+def write_instance_model(folder: Path, frames: Sequence[Frame]) -> Path:
+    """A model that sees a rectangle per class whatever the image."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    found = {
+        "boxes": np.float32([[30 * one, 5, 30 * one + 20, 35] for one in (1, 2, 3)]),
+        "labels": np.array([1, 2, 3]),
+        "scores": np.float32([0.9, 0.8, 0.7]),
+        "masks": np.ones((3, 1, 28, 28), np.float32),
+    }
+    nodes = [
+        helper.make_node("Constant", [], [name], value=numpy_helper.from_array(values))
+        for name, values in found.items()
+    ]
+    outputs = [
+        helper.make_tensor_value_info(
+            name, TensorProto.INT64 if name == "labels" else TensorProto.FLOAT, values.shape
+        )
+        for name, values in found.items()
+    ]
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, None, None])
+    graph = helper.make_graph(nodes, "toy", [image], outputs)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    path = folder / "instances.onnx"
+    onnx.save(model, path)
+    return path
+
+
 # Gives the file or folder from which the segmenter is made, fit for some frames.
 SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
     "onnx": lambda folder, frames: SHIPPED_SEGMENTER,
+    "onnx-instances": write_instance_model,
     "saved": write_maps,
     "degraded": write_maps,
     "instances": write_instances,

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from dataset_layouts import write_cloud
 from exported import toy_labels
+from fuzzing.foreign_formats import FORMATS
 from toys import IMAGE_SIZE, toy_calibration
 
 from curate.datasets.clouds import read_cloud
@@ -321,4 +322,4 @@ TARGETS: Mapping[str, Target] = {
     "onnx detector": Target("a.onnx", _onnx, _read_onnx),
     "onnx segmenter": Target("a.onnx", _segmenter, _read_segmenter),
     "label file": Target("labels.sqlite", _label_file, _read_label_file),
-}
+} | {name: Target(*of) for name, of in FORMATS.items()}

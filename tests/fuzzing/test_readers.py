@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 # Few for each reader in the normal run; `make prove` tries many, `make fuzz` goes on.
 EXAMPLES, MANY = 60, 2_000
 # Readers in C that take long for a file, and were tried more often by hand.
-COSTLY = {"onnx detector": 15, "onnx segmenter": 15, "checkpoint": 15, "configuration": 20}
+COSTLY = {
+    "onnx detector": 15,
+    "onnx segmenter": 15,
+    "onnx instances": 15,
+    "checkpoint": 15,
+    "configuration": 20,
+}
 
 
 def prepared(target: Target, folder: Path) -> tuple[Path, bytes]:

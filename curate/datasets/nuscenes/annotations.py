@@ -13,12 +13,13 @@ import numpy as np
 from curate.datasets.nuscenes.names import category_of
 from curate.datasets.nuscenes.tables import (
     Record,
-    field,
+    count,
     numbers,
     parse_record,
     quaternion,
     read_table,
     scan_table,
+    text,
 )
 from curate.detections import Annotations, as_categories
 from curate.errors import DataError
@@ -85,26 +86,29 @@ class AnnotationTable:
     def _places(self) -> Mapping[str, list[tuple[int, int]]]:
         """Where the records of each sample are in the file: first byte and length."""
         places: dict[str, list[tuple[int, int]]] = {}
-        for start, text in scan_table(self.path):
-            sample = _SAMPLE.search(text)
+        for start, content in scan_table(self.path):
+            sample = _SAMPLE.search(content)
             if sample is None:
                 raise DataError(f"{self.path}: the record at byte {start} has no sample_token")
-            places.setdefault(sample.group(1).decode(), []).append((start, len(text)))
+            token = sample.group(1).decode(errors="replace")
+            places.setdefault(token, []).append((start, len(content)))
         return places
 
     def _counted(self, record: Record) -> bool:
-        return int(field(self.path, record, "num_lidar_pts")) >= self.minimum_points
+        return count(self.path, record, "num_lidar_pts") >= self.minimum_points
 
     def _boxes(self, records: list[Record], calibration: Calibration) -> np.ndarray:
         centres = [numbers(self.path, one, "translation", (3,)) for one in records]
-        sizes = [numbers(self.path, one, "size", (3,)) for one in records]
+        sizes = np.reshape([numbers(self.path, one, "size", (3,)) for one in records], (-1, 3))
+        if (sizes <= 0).any():
+            raise DataError(f"{self.path}: a size of {sizes.min():g} m; they are above 0")
         turns = [quaternion(self.path, one) for one in records]
-        lengths_first = np.reshape(sizes, (-1, 3))[:, [1, 0, 2]]
+        lengths_first = sizes[:, [1, 0, 2]]
         places = np.reshape(centres, (-1, 3)), lengths_first, np.reshape(turns, (-1, 4))
         return boxes_in_frame(*places, calibration.pose_in_map())
 
     def _category(self, record: Record) -> str:
-        token = str(field(self.path, record, "instance_token"))
+        token = text(self.path, record, "instance_token")
         if token not in self._names:
             raise DataError(f"{self.tables / 'instance.json'}: no instance {token} with a category")
         return category_of(self._names[token], self.rename)
@@ -112,16 +116,13 @@ class AnnotationTable:
     @cached_property
     def _names(self) -> Mapping[str, str]:
         """General class of each instance."""
-        names = {
-            token: str(one.get("name"))
-            for token, one in read_table(self.tables / "category.json").items()
+        path = self.tables / "category.json"
+        names = {token: text(path, one, "name") for token, one in read_table(path).items()}
+        path = self.tables / "instance.json"
+        kinds = {
+            token: text(path, one, "category_token") for token, one in read_table(path).items()
         }
-        instances = read_table(self.tables / "instance.json")
-        return {
-            token: names[one["category_token"]]
-            for token, one in instances.items()
-            if one.get("category_token") in names
-        }
+        return {token: names[kind] for token, kind in kinds.items() if kind in names}
 
 
 def _truncation(

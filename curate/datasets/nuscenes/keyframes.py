@@ -13,14 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.images import MOST_PIXELS
 from curate.datasets.nuscenes.tables import (
     Record,
-    field,
+    count,
     numbers,
     parse_record,
     pose,
     read_table,
     scan_table,
+    text,
 )
 from curate.errors import ConfigError, DataError
 from curate.frames import Calibration
@@ -74,15 +76,18 @@ def read_keyframes(tables: Path, camera: str) -> dict[str, Keyframe]:
         ConfigError: there is no such camera.
     """
     sensors = _sensors(tables, camera)
-    scenes = {token: str(one["name"]) for token, one in read_table(tables / "scene.json").items()}
-    samples = read_table(tables / "sample.json")
+    path = tables / "scene.json"
+    scenes = {token: text(path, one, "name") for token, one in read_table(path).items()}
+    path = tables / "sample.json"
+    of_sample = {token: text(path, one, "scene_token") for token, one in read_table(path).items()}
     pairs = _sensor_data(tables / "sample_data.json", sensors)
     both = {token: pair for token, pair in sorted(pairs.items()) if len(pair) == 2}
-    needed = {str(one["ego_pose_token"]) for pair in both.values() for one in pair.values()}
+    path = tables / "sample_data.json"
+    needed = {text(path, one, "ego_pose_token") for pair in both.values() for one in pair.values()}
     vehicle = _vehicle_poses(tables / "ego_pose.json", needed)
     frames = {}
     for token, pair in both.items():
-        scene = scenes.get(samples.get(token, {}).get("scene_token", ""))
+        scene = scenes.get(of_sample.get(token, ""))
         if scene is None:
             raise DataError(f"{tables / 'sample.json'}: no sample {token}, or none with a scene")
         frames[token] = _keyframe(tables, scene, pair[LIDAR], pair[camera], sensors, vehicle)
@@ -91,15 +96,15 @@ def read_keyframes(tables: Path, camera: str) -> dict[str, Keyframe]:
 
 def _sensors(tables: Path, camera: str) -> dict[str, _Sensor]:
     """The LiDAR and the camera as mounted on each vehicle, by token of calibrated_sensor."""
-    kinds = read_table(tables / "sensor.json")
-    channels = {token: str(one.get("channel")) for token, one in kinds.items()}
+    path = tables / "sensor.json"
+    channels = {token: text(path, one, "channel") for token, one in read_table(path).items()}
     cameras = sorted(name for name in channels.values() if name.startswith("CAM"))
     if camera not in cameras:
         raise ConfigError(f"dataset.options.camera '{camera}': use one of {', '.join(cameras)}")
     path = tables / "calibrated_sensor.json"
     found = {}
     for token, record in read_table(path).items():
-        channel = channels.get(field(path, record, "sensor_token"), "")
+        channel = channels.get(text(path, record, "sensor_token"), "")
         if channel in (LIDAR, camera):
             found[token] = _Sensor(channel, pose(path, record), record)
     return found
@@ -108,13 +113,13 @@ def _sensors(tables: Path, camera: str) -> dict[str, _Sensor]:
 def _sensor_data(path: Path, sensors: Mapping[str, _Sensor]) -> dict[str, dict[str, Record]]:
     """The records of key frames of these sensors, by sample token and channel."""
     found: dict[str, dict[str, Record]] = {}
-    for _, text in scan_table(path):
-        if not _KEY.search(text):
+    for _, content in scan_table(path):
+        if not _KEY.search(content):
             continue
-        record = parse_record(path, text)
-        sensor = sensors.get(field(path, record, "calibrated_sensor_token"))
+        record = parse_record(path, content)
+        sensor = sensors.get(text(path, record, "calibrated_sensor_token"))
         if sensor is not None:
-            sample = str(field(path, record, "sample_token"))
+            sample = text(path, record, "sample_token")
             found.setdefault(sample, {})[sensor.channel] = record
     return found
 
@@ -122,10 +127,11 @@ def _sensor_data(path: Path, sensors: Mapping[str, _Sensor]) -> dict[str, dict[s
 def _vehicle_poses(path: Path, needed: set[str]) -> dict[str, np.ndarray]:
     """(4, 4) vehicle to map, by token of ego_pose."""
     found = {}
-    for _, text in scan_table(path):
-        token = _TOKEN.search(text)
-        if token and token.group(1).decode() in needed:
-            found[token.group(1).decode()] = pose(path, parse_record(path, text))
+    for _, content in scan_table(path):
+        match = _TOKEN.search(content)
+        token = match.group(1).decode(errors="replace") if match else ""
+        if token in needed:
+            found[token] = pose(path, parse_record(path, content))
     missing = sorted(needed - set(found))
     if missing:
         raise DataError(f"{path}: no record {missing[0]}, which sample_data.json refers to")
@@ -148,12 +154,20 @@ def _keyframe(
     path = tables / "sample_data.json"
     return Keyframe(
         scene,
-        str(field(path, sweep, "filename")),
-        str(field(path, image, "filename")),
-        (int(field(path, image, "width")), int(field(path, image, "height"))),
+        text(path, sweep, "filename"),
+        text(path, image, "filename"),
+        _image_size(path, image),
         Calibration(
             projection=np.column_stack([intrinsic, np.zeros(3)]),
             lidar_to_camera=invert_pose(camera_to_map) @ lidar_to_map,
             lidar_to_map=lidar_to_map,
         ),
     )
+
+
+def _image_size(path: Path, record: Record) -> tuple[int, int]:
+    """(width, height) in pixels; DataError for none."""
+    size = count(path, record, "width"), count(path, record, "height")
+    if 0 in size or size[0] * size[1] > MOST_PIXELS:
+        raise DataError(f"{path}: an image of {size[0]} x {size[1]} pixels")
+    return size

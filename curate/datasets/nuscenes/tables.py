@@ -25,6 +25,8 @@ _PIECE_BYTES = 8 << 20
 _RECORD = re.compile(rb"\{[^{}]*\}")
 # How far the length of a quaternion may be from one; they are written with many digits.
 _UNIT_SLACK = 0.01
+# Metres and pixels; letters of tokens and of file names.
+_LARGEST, _LONGEST = 1e7, 200
 
 
 def read_table(path: Path) -> dict[str, Record]:
@@ -35,11 +37,13 @@ def read_table(path: Path) -> dict[str, Record]:
     """
     try:
         records = json.loads(path.read_bytes())
-        return {record["token"]: record for record in records}
     except OSError as error:
         raise _unreadable(path, error) from None
-    except (ValueError, TypeError, KeyError) as error:
-        raise DataError(f"{path}: no table of records with a token: {one_line(error)}") from None
+    except (RecursionError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None
+    if not isinstance(records, list) or not all(isinstance(one, dict) for one in records):
+        raise DataError(f"{path}: no table of records with a token")
+    return {text(path, record, "token"): record for record in records}
 
 
 def scan_table(path: Path) -> Iterator[tuple[int, bytes]]:
@@ -63,31 +67,52 @@ def scan_table(path: Path) -> Iterator[tuple[int, bytes]]:
         raise DataError(f"{path}: no table, or one that ends within a record; fetch it again")
 
 
-def parse_record(path: Path, text: bytes) -> Record:
+def parse_record(path: Path, content: bytes) -> Record:
     """A record of a large table from its text; DataError where it is none."""
     try:
-        record: Record = json.loads(text)
-    except ValueError as error:
-        raise DataError(f"{path}: a damaged record: {error}") from None
+        record: Record = json.loads(content)
+    except (RecursionError, ValueError) as error:
+        raise DataError(f"{path}: a damaged record: {one_line(error, 200)}") from None
     return record
 
 
 def field(path: Path, record: Record, name: str) -> Any:
     """A value of a record; DataError where there is none."""
     if name not in record:
-        raise DataError(f"{path}: record {record.get('token', '?')} has no {name}")
+        raise DataError(f"{path}: record {_named(record)} has no {name}")
     return record[name]
 
 
+def text(path: Path, record: Record, name: str) -> str:
+    """A token or a name of a record; DataError where it is none that a message can repeat."""
+    found = field(path, record, name)
+    if not isinstance(found, str) or not found.isprintable() or len(found) > _LONGEST:
+        raise DataError(
+            f"{path}: record {_named(record)}: {name} is no text of up to {_LONGEST} letters"
+        )
+    return found
+
+
+def count(path: Path, record: Record, name: str) -> int:
+    """A whole number of a record, from 0 on; DataError where it is none."""
+    found = field(path, record, name)
+    if not isinstance(found, int) or not 0 <= found <= _LARGEST:
+        raise DataError(f"{path}: record {_named(record)}: {name} is no whole number from 0 on")
+    return found
+
+
 def numbers(path: Path, record: Record, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Numbers of a record; DataError where they are not finite or of another shape."""
+    """Numbers of a record; DataError where they are absurd or of another shape."""
     try:
         found = np.array(field(path, record, name), dtype=np.float64)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         found = np.full(shape, np.nan)
-    if found.shape != shape or not np.isfinite(found).all():
+    if found.shape != shape or not (np.abs(found) <= _LARGEST).all():
         wanted = " x ".join(map(str, shape))
-        raise DataError(f"{path}: record {record['token']}: {name} is not {wanted} finite numbers")
+        raise DataError(
+            f"{path}: record {_named(record)}: {name} is not {wanted} finite numbers up to "
+            f"{_LARGEST:g}"
+        )
     return found
 
 
@@ -97,7 +122,7 @@ def quaternion(path: Path, record: Record) -> np.ndarray:
     length = float(np.linalg.norm(rotation))
     if abs(length - 1) > _UNIT_SLACK:
         raise DataError(
-            f"{path}: record {record['token']}: rotation {rotation.tolist()} is no unit quaternion "
+            f"{path}: record {_named(record)}: rotation {rotation.tolist()} is no unit quaternion "
             f"(w, x, y, z), its length is {length:.3f}"
         )
     return rotation / length
@@ -106,6 +131,12 @@ def quaternion(path: Path, record: Record) -> np.ndarray:
 def pose(path: Path, record: Record) -> np.ndarray:
     """(4, 4) pose of a record of ego_pose or calibrated_sensor."""
     return pose_matrix(numbers(path, record, "translation", (3,)), quaternion(path, record))
+
+
+def _named(record: Record) -> str:
+    """The token of a record as a message may repeat it."""
+    token = record.get("token")
+    return token[:80] if isinstance(token, str) and token.isprintable() else "without a token"
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:

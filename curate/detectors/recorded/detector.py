@@ -133,8 +133,8 @@ class RecordedDetector:
         if not views and not self._record.has_views:
             _warn_once(
                 f"{self.path}: no second pass over augmented copies, so no label has a consistency "
-                "loss, and methods that need one weigh every label 0: name passes in "
-                "detector.options, or set solve.self_paced = false"
+                "loss, and methods that need one weigh every label 0 unless solve.self_paced = "
+                "false; passes in detector.options bring one"
             )
         return [
             (similarity, self._detections(frame_id, answer, self._calibration))

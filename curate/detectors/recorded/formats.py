@@ -1,17 +1,17 @@
 """Which format a record is in, by its suffix and contents, and its reader."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from curate.detectors.recorded.answers import Answers, Reading
+from curate.detectors.recorded.json_files import holds_object, read_json, stream_results
 from curate.detectors.recorded.kitti_results import KittiResults
 from curate.detectors.recorded.mmdetection3d import holds_boxes, read_mmdetection3d
-from curate.detectors.recorded.nuscenes import holds_results, read_nuscenes
+from curate.detectors.recorded.nuscenes import read_nuscenes
 from curate.detectors.recorded.openpcdet import read_openpcdet
 from curate.detectors.recorded.plain_pickle import read_plain_pickle
-from curate.errors import ConfigError, DataError, one_line
+from curate.errors import ConfigError, DataError
 
 _LISTS: Mapping[str, Callable[[Path, Sequence[Any], Reading], Answers]] = {
     "openpcdet": read_openpcdet,
@@ -55,9 +55,9 @@ def read_answers(path: Path, kind: str, reading: Reading) -> Answers:
     """
     if kind == "kitti":
         return KittiResults(path)
+    if kind in ("list", "nuscenes") and path.suffix.lower() == ".json" and holds_object(path):
+        return read_nuscenes(path, stream_results(path))
     held = _read(path)
-    if holds_results(held) and kind in ("list", "nuscenes"):
-        return read_nuscenes(path, held)
     if kind == "nuscenes":
         raise DataError(f"{path}: no nuScenes results: an object with meta and results")
     if not isinstance(held, list | tuple):
@@ -86,21 +86,12 @@ def _read(path: Path) -> Any:
     if path.is_dir():
         entries = []
         for file in sorted(path.glob("*.json")):
-            entry = _read_json(file)
+            entry = read_json(file)
             if not isinstance(entry, dict):
                 raise DataError(f"{file}: holds no results of a frame")
             entries.append({"frame_id": file.stem, **entry})
         return entries
-    return _read_json(path) if path.suffix.lower() == ".json" else read_plain_pickle(path)
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
-    except (OSError, RecursionError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None
+    return read_json(path) if path.suffix.lower() == ".json" else read_plain_pickle(path)
 
 
 def refuse_unknown_kind(kind: str) -> None:

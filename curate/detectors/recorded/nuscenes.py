@@ -7,7 +7,7 @@ left out. The well-known mistakes are refused by name: sizes in another order, a
 begins with x, boxes in the LiDAR's frame of reference.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,8 @@ _UPRIGHT = 0.7
 _UNIT_SLACK = 0.01
 # No LiDAR sees so far, metres; vehicles are hundreds of metres from their map's origin.
 _FARTHEST = 200.0
+# Metres; further products of numbers stay finite.
+_LARGEST = 1e7
 
 
 @dataclass(frozen=True)
@@ -72,41 +74,41 @@ class MapBoxes:
         return as_detections(self.place, boxes, self.numbers[:, 10], as_categories(names))
 
 
-def read_nuscenes(path: Path, held: Mapping[str, Any]) -> Mapping[str, MapBoxes]:
-    """The results of each frame.
+def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str, MapBoxes]:
+    """The results of each frame; in memory are eleven numbers and a name per box.
 
     Args:
         path: the file, for messages.
-        held: what it holds, with `results`.
+        results: sample token and list of boxes of each frame, which are let go one by one.
 
     Raises:
         DataError: a result lacks a key or cannot be, or the file shows one of the usual mistakes.
     """
-    results = held["results"]
-    if not isinstance(results, Mapping):
-        raise DataError(f"{path}: results is no object of sample tokens but {type(results)}")
-    found = {str(token): _frame(path, str(token), boxes) for token, boxes in results.items()}
-    filled = [one for one in found.values() if len(one.names)]
-    if filled:
-        numbers = np.concatenate([one.numbers for one in filled])
-        names = np.array([name for one in filled for name in one.names])
-        _refuse_swapped_sizes(path, numbers[:, 3:6], names)
-    for one in filled:
+    found: dict[str, MapBoxes] = {}
+    names: dict[str, str] = {}
+    long = wide = 0
+    for token, boxes in results:
+        one = _frame(path, token, boxes, names)
         _refuse_rotations(one)
+        own = one.numbers[np.isin(one.names, _LONG), 3:5]
+        long += len(own)
+        wide += int(np.sum(own[:, 0] > own[:, 1]))
+        found[token] = one
+    if long >= _FEWEST_LONG and wide > _MOST_WIDE * long:
+        raise DataError(
+            f"{path}: {wide} of {long} boxes of {', '.join(_LONG)} would be wider than long: "
+            "nuScenes' size is width, length, height; swap the first two"
+        )
     return found
 
 
-def holds_results(held: Any) -> bool:
-    """Whether the content of a JSON file looks like nuScenes' results."""
-    return isinstance(held, Mapping) and "results" in held
-
-
-def _frame(path: Path, token: str, boxes: Any) -> MapBoxes:
-    place = f"{path}: results of {token}"
+def _frame(path: Path, token: str, boxes: Any, known: dict[str, str]) -> MapBoxes:
+    """The boxes of a frame; a name that many of them have is kept once, in `known`."""
+    place = f"{path}: results of {_words(token)}"
     if not isinstance(boxes, list):
         raise DataError(f"{place}: expected a list of boxes, not {type(boxes).__name__}")
     rows = [_row(f"{place}: box {k}", token, box) for k, box in enumerate(boxes)]
-    names = [str(box["detection_name"]) for box in boxes]
+    names = [known.setdefault(box["detection_name"], box["detection_name"]) for box in boxes]
     return MapBoxes(place, np.array(rows, dtype=np.float64).reshape(-1, _NUMBERS), names)
 
 
@@ -116,15 +118,18 @@ def _row(place: str, token: str, box: Any) -> list[float]:
     if missing:
         raise DataError(f"{place}: no {', '.join(missing)}; expected {', '.join(_KEYS)}")
     if box.get("sample_token", token) != token:
-        raise DataError(f"{place}: its sample_token is {box['sample_token']}, another frame's")
+        other = _words(box["sample_token"])
+        raise DataError(f"{place}: its sample_token is {other}, another frame's")
+    if not isinstance(box["detection_name"], str):
+        raise DataError(f"{place}: its detection_name is no text")
     parts = [box[key] for key in ("translation", "size", "rotation")]
     lengths = [len(part) if isinstance(part, list) else 0 for part in parts]
     try:
         numbers = [float(number) for part in parts for number in part]
         numbers.append(float(box["detection_score"]))
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         numbers = []
-    if lengths != [3, 3, 4] or not np.isfinite(numbers).all() or len(numbers) != _NUMBERS:
+    if lengths != [3, 3, 4] or not (np.abs(numbers) <= _LARGEST).all() or len(numbers) != _NUMBERS:
         raise DataError(
             f"{place}: translation, size, rotation and detection_score are not 3, 3, 4 and 1 "
             "finite numbers"
@@ -132,15 +137,9 @@ def _row(place: str, token: str, box: Any) -> list[float]:
     return numbers
 
 
-def _refuse_swapped_sizes(path: Path, sizes: np.ndarray, names: np.ndarray) -> None:
-    """DataError where cars and the like are wider than long throughout."""
-    own = sizes[np.isin(names, _LONG)]
-    wide = int(np.sum(own[:, 0] > own[:, 1]))
-    if len(own) >= _FEWEST_LONG and wide > _MOST_WIDE * len(own):
-        raise DataError(
-            f"{path}: {wide} of {len(own)} boxes of {', '.join(_LONG)} would be wider than long: "
-            "nuScenes' size is width, length, height; swap the first two"
-        )
+def _words(text: Any) -> str:
+    """A foreign text as a message may repeat it."""
+    return " ".join(text.split())[:80] if isinstance(text, str) else f"a {type(text).__name__}"
 
 
 def _refuse_rotations(found: MapBoxes) -> None:

@@ -119,7 +119,7 @@ def _open(path: Path) -> Any:
         return parquet.ParquetFile(path)
     except FileNotFoundError:
         raise DataError(f"{path}: no such file of recorded detections") from None
-    except (arrow.ArrowException, OSError) as error:
+    except (arrow.ArrowException, OSError, UnicodeError) as error:
         raise DataError(f"{path}: no readable Parquet: {one_line(error)}") from None
 
 
@@ -160,7 +160,7 @@ def _read(path: Path, file: Any, number: int, columns: Sequence[str]) -> Mapping
     try:
         table = file.read_row_group(number, columns=list(columns), use_threads=False)
         return {name: _values(path, number, arrow, name, table.column(name)) for name in columns}
-    except (arrow.ArrowException, OSError) as error:
+    except (arrow.ArrowException, OSError, UnicodeError) as error:
         raise DataError(f"{path}: row group {number} is damaged: {one_line(error)}") from None
 
 

@@ -34,6 +34,8 @@ ANNOTATIONS = "annotations.zip"
 _MEMBER = "annotations/default.json"
 _LARGEST_BYTES = 2**28
 _UPRIGHT_RADIANS = 0.01
+# Datumaro's number of that kind; without it, it takes every item for an image and refuses.
+_POINT_CLOUD = 6
 
 
 class CvatEditor:
@@ -93,6 +95,7 @@ def _document(sheet: Sheet) -> dict[str, Any]:
     labels = [{"name": name, "parent": "", "attributes": []} for name in sheet.categories]
     return {
         "info": {},
+        "media_type": _POINT_CLOUD,
         "categories": {"label": {"labels": labels, "attributes": ["occluded"]}},
         "items": [_item(sheet, i, shown) for i, shown in enumerate(sheet.frames)],
     }

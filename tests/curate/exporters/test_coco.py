@@ -48,6 +48,6 @@ def test_weights_and_scores_come_back_and_weight_0_is_a_crowd(document):
     labels = of_image(document, "000001")
     assert [each["weight"] for each in labels] == list(WEIGHTS)
     assert [each["score"] for each in labels] == list(SCORES)
-    assert [each["iscrowd"] for each in labels] == [0, 1, 0]
+    assert [each["iscrowd"] for each in labels] == [0, 1, 1]
     assert labels[2]["bbox"] == [0, 0, 0, 0]
     assert np.all([each["area"] > 0 for each in labels[:2]])

@@ -84,7 +84,7 @@ def test_neighbours_share_no_pixel_and_polygons_unite() -> None:
     ("segmentation", "message"),
     [
         ({"size": [6, 8], "counts": [48]}, "the mask is 8 x 6 pixels, the image 9 x 6"),
-        ({"counts": [54]}, "the mask is None pixels"),
+        ({"counts": [54]}, "the mask is without a size"),
         ({"size": [6, 9], "counts": [50]}, "the run lengths are 50, not 54 pixels"),
         ({"size": [6, 9], "counts": [60, -6]}, "no whole numbers"),
         ({"size": [6, 9], "counts": None}, "no whole numbers"),

@@ -3,6 +3,7 @@
 import json
 import logging
 import pickle
+import sys
 
 import numpy as np
 import pytest
@@ -326,6 +327,8 @@ BOX = nuscenes()["000001"][0]
     [
         ([BOX | {"size": BOX["size"][:2]}], "box 0: translation, size, rotation and"),
         ([BOX | {"translation": [1, "far", 2]}], "box 0: translation, size, rotation and"),
+        ([BOX | {"detection_name": [1]}], "box 0: its detection_name is no text"),
+        ([BOX | {"translation": [10**400, 0, 0]}], "box 0: translation|integer overflow"),
         ([BOX | {"detection_score": None}], "box 0: translation, size, rotation and"),
         ([{"translation": [0, 0, 0]}], "box 0: no size, rotation, detection_name"),
         ([BOX | {"sample_token": "other"}], "box 0: its sample_token is other, another"),
@@ -361,6 +364,48 @@ def test_nuscenes_results_need_poses(tmp_path):
     bare = Frame("000001", np.zeros((0, 4), np.float32), toy_calibration(), (120, 40))
     with pytest.raises(ConfigError, match="need the vehicle's poses"):
         record.predict(bare)
+
+
+@pytest.fixture(params=["ijson", "json"])
+def json_reader(request, monkeypatch):
+    """With ijson, where it is installed, and without."""
+    if request.param == "ijson":
+        pytest.importorskip("ijson")
+    else:
+        monkeypatch.setitem(sys.modules, "ijson", None)
+
+
+@pytest.mark.usefixtures("json_reader")
+def test_results_are_read_a_frame_at_a_time_or_whole(tmp_path):
+    """With the same answers; a key in the meta that is called results is not it."""
+    path = write_nuscenes(tmp_path / "a.json")
+    held = json.loads(path.read_text())
+    path.write_text(json.dumps({"meta": {"results": {"a": 1}}, **held, "more": [{}]}))
+    record = RecordedDetector(path)
+    assert record.frame_ids() == tuple(sorted(nuscenes()))
+    path.write_text(json.dumps({"meta": {}, "results": {}}))
+    assert RecordedDetector(path).frame_ids() == ()
+
+
+@pytest.mark.usefixtures("json_reader")
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"results": {"000001": [', "cannot be read as JSON"),
+        ('{"results": {"000001": []}} {}', "cannot be read as JSON"),
+        ('{"results": {"000001": [1e}}', "cannot be read as JSON"),
+        ('{"results": {"a\\nb": {}}}', "results of a b: expected a list of boxes"),
+        ('{"results": 3}', "results is no object of sample tokens but a int"),
+        ('{"results": null}', "results is no object of sample tokens but a NoneType"),
+        ('{"meta": {}}', "holds a dict, not a list of frames, and no nuScenes results"),
+    ],
+)
+def test_damaged_results_are_refused_in_one_line(tmp_path, text, message):
+    """By whichever reader."""
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(DataError, match=message) as caught:
+        RecordedDetector(tmp_path / "a.json")
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_what_is_no_nuscenes_result_is_said(tmp_path):

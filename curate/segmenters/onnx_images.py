@@ -1,0 +1,81 @@
+"""The image that an ONNX model takes: its type, the order of its axes, its size, its scaling."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curate.errors import ModelError
+
+# Mean and standard deviation of ImageNet's RGB, with which most published models were trained.
+_IMAGENET = (np.array([0.485, 0.456, 0.406]) * 255, np.array([0.229, 0.224, 0.225]) * 255)
+SCALINGS = {
+    "imagenet": _IMAGENET,
+    "unit": (np.zeros(3), np.full(3, 255.0)),
+    "none": (np.zeros(3), np.ones(3)),
+}
+"""What a float model wants, as mean and deviation of pixels from 0 to 255."""
+
+_EXPECTED = "expected one image [1, height, width, 3] or [1, 3, height, width], uint8 or float32"
+
+
+@dataclass(frozen=True)
+class ImageInput:
+    """What a model wants.
+
+    Attributes:
+        name: of the input.
+        is_float: float32, not uint8.
+        channels_first: of the order of its axes.
+        batched: whether there is an axis of images, of which one is given.
+        height: None where it is free.
+        width: likewise.
+    """
+
+    name: str
+    is_float: bool
+    channels_first: bool
+    batched: bool
+    height: int | None
+    width: int | None
+
+    def feed(self, pixels: np.ndarray, scaling: str) -> dict[str, np.ndarray]:
+        """What the session takes for (height, width, 3) uint8 RGB pixels of the model's size."""
+        if self.is_float:
+            mean, deviation = SCALINGS[scaling]
+            pixels = ((pixels - mean) / deviation).astype(np.float32)
+        if self.channels_first:
+            pixels = pixels.transpose(2, 0, 1)
+        return {self.name: np.ascontiguousarray(pixels[None] if self.batched else pixels)}
+
+
+def image_input(session: Any, model: Path, *, single: bool = False) -> ImageInput:
+    """The input of a model that takes one image.
+
+    Args:
+        session: of ONNX Runtime.
+        model: for messages.
+        single: whether an image without an axis of images is taken too, [3, height, width].
+
+    Raises:
+        ModelError: it takes something else.
+    """
+    inputs = session.get_inputs()
+    found = ", ".join(f"{one.name} {one.type}{one.shape}" for one in inputs)
+    fault = ModelError(f"{model}: takes {found}; {_EXPECTED}")
+    if len(inputs) != 1 or len(inputs[0].shape) not in ({3, 4} if single else {4}):
+        raise fault
+    one = inputs[0]
+    sizes = [size if isinstance(size, int) else None for size in one.shape]
+    batched = len(sizes) == 4
+    batch, first, second, last = sizes if batched else (1, *sizes)
+    channels_first = last != 3
+    if (
+        batch not in {1, None}
+        or (first if channels_first else last) != 3
+        or one.type not in {"tensor(uint8)", "tensor(float)"}
+    ):
+        raise fault
+    height, width = (second, last) if channels_first else (first, second)
+    return ImageInput(one.name, one.type == "tensor(float)", channels_first, batched, height, width)
