@@ -19,21 +19,47 @@ def check_frame_id(frame_id: str) -> None:
         )
 
 
-def refuse_escape(root: Path, *paths: Path) -> None:
-    """DataError where a path leads out of a folder, by a link or by its name.
+class Boundary:
+    """The folder of a data set, which no path of it leads out of.
+
+    Where folders really lie is looked up once each: who can exchange them meanwhile can exchange
+    the files as well.
 
     Args:
         root: the folder.
-        paths: files or folders, which need not be there.
+        follow_links: whether links and names may lead out of it after all.
     """
-    home = os.path.realpath(root)
-    for path in paths:
-        try:
-            real = os.path.realpath(path)
-        except ValueError:  # a zero byte
-            raise DataError(f"{str(path)!r} is no path") from None
-        if real != home and not real.startswith(home.rstrip(os.sep) + os.sep):
-            raise DataError(
-                f"{path}: leads out of the data set, to {real}; if you made that link yourself, "
-                "set dataset.follow_links = true (curate init --follow-links)"
-            )
+
+    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
+        self._root = os.fspath(root)
+        self._open = follow_links
+        self._folders: dict[str, str] = {}
+
+    def check(self, *paths: Path) -> None:
+        """DataError where a path leads out, by a link or by its name; it need not be there."""
+        if self._open:
+            return
+        home = self._real_folder(self._root)
+        for path in paths:
+            try:
+                real = self._real(path)
+            except ValueError:  # a zero byte
+                raise DataError(f"{str(path)!r} is no path") from None
+            if real != home and not real.startswith(home.rstrip(os.sep) + os.sep):
+                raise DataError(
+                    f"{path}: leads out of the data set, to {real}; if you made that link "
+                    "yourself, set dataset.follow_links = true (curate init --follow-links)"
+                )
+
+    def _real(self, path: Path) -> str:
+        """`os.path.realpath`, which would ask the system about every folder on the way."""
+        folder, name = os.path.split(path)
+        plain = name not in ("", os.curdir, os.pardir) and "\0" not in name
+        if plain and not path.is_symlink():
+            return f"{self._real_folder(folder).rstrip(os.sep)}{os.sep}{name}"
+        return os.path.realpath(path)
+
+    def _real_folder(self, folder: str) -> str:
+        if folder not in self._folders:
+            self._folders[folder] = os.path.realpath(folder)
+        return self._folders[folder]

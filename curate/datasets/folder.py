@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from curate.datasets.clouds import CLOUD_SUFFIXES, read_cloud
-from curate.datasets.containment import check_frame_id, refuse_escape
+from curate.datasets.containment import Boundary, check_frame_id
 from curate.datasets.images import read_sized_image
 from curate.datasets.kitti import (
     IMAGE_SUFFIXES,
@@ -59,11 +59,11 @@ class FolderDataset:
 
     def __init__(self, root: Path, *, follow_links: bool = False) -> None:
         self.root = Path(root)
-        self.follow_links = follow_links
+        self._boundary = Boundary(self.root, follow_links=follow_links)
         self._path = self.root / DESCRIPTION
         self._told = _read_description(self._path)
         named = [self._told[key] for key in (*_FOLDERS, "calibration") if key in self._told]
-        self._refuse_escape(*(self.root / name for name in named if isinstance(name, str)))
+        self._boundary.check(*(self.root / name for name in named if isinstance(name, str)))
 
     def frame_ids(self) -> tuple[str, ...]:
         """All frames with a point file, in sorted order."""
@@ -80,9 +80,7 @@ class FolderDataset:
         """The lists of the folder `splits`, by file name."""
         if "splits" not in self._told:
             return {}
-        return read_frame_lists(
-            self.root / self._told["splits"], None if self.follow_links else self.root
-        )
+        return read_frame_lists(self.root / self._told["splits"], self._boundary)
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie, or an image would; the calibration is that of all frames.
@@ -103,7 +101,7 @@ class FolderDataset:
             calibration=self.root / calibration if isinstance(calibration, str) else self._path,
             label=label if label is not None and label.exists() else None,
         )
-        self._refuse_escape(*found.paths())
+        self._boundary.check(*found.paths())
         return found
 
     def sequence_of(self, frame_id: str) -> str | None:
@@ -163,10 +161,6 @@ class FolderDataset:
         if abs(np.linalg.det(extrinsic)) < 1e-6:
             raise DataError(f"{self._path}: calibration.lidar_to_camera cannot be inverted")
         return Calibration(projection, extrinsic)
-
-    def _refuse_escape(self, *paths: Path) -> None:
-        if not self.follow_links:
-            refuse_escape(self.root, *paths)
 
     def _label(self, frame_id: str) -> Path | None:
         if "labels" not in self._told:

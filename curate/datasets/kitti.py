@@ -5,9 +5,11 @@ object development kit. Two layouts are read: ROOT/training/{velodyne,image_2,ca
 flat ROOT/{velodyne,image_2,calib,label_2}; label_2 and ROOT/ImageSets/*.txt are optional.
 """
 
+import io
 import logging
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from curate.atomic import replace_file
-from curate.datasets.containment import check_frame_id, refuse_escape
+from curate.datasets.containment import Boundary, check_frame_id
 from curate.datasets.images import read_sized_image
 from curate.datasets.kitti_labels import read_objects, to_annotations
 from curate.detections import Annotations
@@ -50,7 +52,7 @@ class KittiDataset:
 
     def __init__(self, root: Path, *, follow_links: bool = False) -> None:
         self.root = Path(root)
-        self.follow_links = follow_links
+        self._boundary = Boundary(self.root, follow_links=follow_links)
         homes = [self.root / "training", self.root]
         home = next((home for home in homes if (home / "velodyne").is_dir()), None)
         if home is None:
@@ -59,6 +61,7 @@ class KittiDataset:
                 "name the root of a data set in KITTI's layout"
             )
         self._home = home
+        self._folders = [home / name for name in ("velodyne", "image_2", "calib", "label_2")]
 
     def frame_ids(self) -> tuple[str, ...]:
         """All frames with a velodyne file, in sorted order."""
@@ -82,8 +85,7 @@ class KittiDataset:
         }
         if self._home != self.root and "test" in lists:
             _log.info("%s: left out, it names frames of testing/", lists.pop("test"))
-        if not self.follow_links:
-            refuse_escape(self.root, *lists.values())
+        self._boundary.check(*lists.values())
         return {name: read_frame_list(path) for name, path in lists.items()}
 
     def files(self, frame_id: str) -> FrameFiles:
@@ -93,16 +95,16 @@ class KittiDataset:
             DataError: the name or a link would lead out of the data set.
         """
         check_frame_id(frame_id)
-        images = [self._home / "image_2" / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
-        label = self._home / "label_2" / f"{frame_id}.txt"
+        velodyne, pictures, calib, labels = self._folders
+        images = [pictures / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
+        label = labels / f"{frame_id}.txt"
         found = FrameFiles(
-            points=self._home / "velodyne" / f"{frame_id}.bin",
+            points=velodyne / f"{frame_id}.bin",
             image=next((image for image in images if image.exists()), images[0]),
-            calibration=self._home / "calib" / f"{frame_id}.txt",
+            calibration=calib / f"{frame_id}.txt",
             label=label if label.exists() else None,
         )
-        if not self.follow_links:
-            refuse_escape(self.root, *found.paths())
+        self._boundary.check(*found.paths())
         return found
 
     def sequence_of(self, frame_id: str) -> str | None:
@@ -149,13 +151,14 @@ def read_points(path: Path) -> np.ndarray:
     Raises:
         DataError: the file is missing or truncated, or holds NaN or infinite numbers.
     """
-    content = read_bytes(path, "velodyne")
-    if len(content) % POINT_BYTES:
-        raise DataError(
-            f"{path}: {len(content)} bytes are no multiple of {POINT_BYTES} "
-            "(x, y, z, intensity as float32); the file is truncated, fetch it again"
-        )
-    points = np.frombuffer(bytearray(content), dtype="<f4").reshape(-1, 4)
+    with opened(path, "velodyne") as file:
+        size = os.fstat(file.fileno()).st_size
+        points = np.empty((size // POINT_BYTES, 4), dtype="<f4")
+        if size % POINT_BYTES or file.readinto(points.reshape(-1).view(np.uint8).data) != size:
+            raise DataError(
+                f"{path}: {size} bytes are no multiple of {POINT_BYTES} "
+                "(x, y, z, intensity as float32); the file is truncated, fetch it again"
+            )
     # NaN and infinite numbers show in the extremes, and all columns at once are read fastest.
     low, high = points.min(initial=0), points.max(initial=0)
     if low >= -FARTHEST_METRES and high <= FARTHEST_METRES:
@@ -271,19 +274,18 @@ def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
                 yield folder / entry.name
 
 
-def read_frame_lists(folder: Path, within: Path | None) -> Mapping[str, tuple[str, ...]]:
+def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str, ...]]:
     """The frame lists of a folder by file name; none where it is not there.
 
     Args:
         folder: of the lists.
-        within: the root that links must not lead out of; None where they may.
+        boundary: that links must not lead out of.
 
     Raises:
         DataError: a list names something that is no frame id, or lies elsewhere.
     """
     paths = sorted(visible_files(folder, "*.txt"))
-    if within is not None:
-        refuse_escape(within, *paths)
+    boundary.check(*paths)
     return {path.stem: read_frame_list(path) for path in paths}
 
 
@@ -303,8 +305,16 @@ def read_frame_list(path: Path) -> tuple[str, ...]:
 
 def read_bytes(path: Path, kind: str) -> bytes:
     """The content of a file; DataError with its kind where it is missing."""
+    with opened(path, kind) as file:
+        return file.read()
+
+
+@contextmanager
+def opened(path: Path, kind: str) -> Iterator[io.FileIO]:
+    """A file that is read at once, so without a buffer; DataError with its kind where missing."""
     try:
-        return path.read_bytes()
+        with path.open("rb", buffering=0) as file:
+            yield file
     except FileNotFoundError:
         raise DataError(f"{path}: no such {kind} file") from None
     except OSError as error:

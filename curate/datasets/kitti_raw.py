@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curate.datasets.containment import check_frame_id, refuse_escape
+from curate.datasets.containment import Boundary, check_frame_id
 from curate.datasets.images import read_sized_image
 from curate.datasets.kitti import (
     parse_matrix,
@@ -47,7 +47,7 @@ class KittiRawDataset:
 
     def __init__(self, root: Path, *, follow_links: bool = False) -> None:
         self.root = Path(root)
-        self.follow_links = follow_links
+        self._boundary = Boundary(self.root, follow_links=follow_links)
         found = (path.parent.parent for at in _DRIVES for path in self.root.glob(f"{at}/{_POINTS}"))
         self._drives = {path.name: path for path in sorted(found)}
         if not self._drives:
@@ -73,7 +73,7 @@ class KittiRawDataset:
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """The lists of ROOT/ImageSets, by file name."""
-        return read_frame_lists(self.root / "ImageSets", None if self.follow_links else self.root)
+        return read_frame_lists(self.root / "ImageSets", self._boundary)
 
     def sequence_of(self, frame_id: str) -> str | None:
         """The drive of a frame."""
@@ -96,8 +96,7 @@ class KittiRawDataset:
             calibration=home.parent / _TO_CAMERA,
             label=label if label.exists() else None,
         )
-        if not self.follow_links:
-            refuse_escape(self.root, *found.paths(), home.parent / _CAMERAS)
+        self._boundary.check(*found.paths(), home.parent / _CAMERAS)
         return found
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:

@@ -53,7 +53,8 @@ def in_view(
     # One margin for all points, that of the farthest: to be in doubt too often costs no exactness.
     reach = max(1.0, -columns.min(initial=0), columns.max(initial=0))
     margin = np.abs(matrix).sum() * _UNDECIDED * reach * max(width, height)
-    seen, undecided = _in_view(columns, matrix, float(width), float(height), margin)
+    x, y, z = np.ascontiguousarray(columns[:, :3].T)  # each by itself: the kernel is vectorised
+    seen, undecided = _in_view(x, y, z, matrix, float(width), float(height), margin)
     doubtful = np.flatnonzero(undecided)
     if len(doubtful):
         pixels, depth = project_points(columns[doubtful], calibration)
@@ -64,19 +65,28 @@ def in_view(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _in_view(
-    points: np.ndarray, matrix: np.ndarray, width: float, height: float, margin: float
+    x: np.ndarray,
+    y: np.ndarray,
+    z: np.ndarray,
+    matrix: np.ndarray,
+    width: float,
+    height: float,
+    margin: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The kernel of `in_view`: (n,) bool, and (n,) whether it leaves a point undecided.
 
     It has no branches: which points are seen is too irregular to be foretold.
     """
-    seen = np.empty(len(points), np.bool_)
-    doubtful = np.empty(len(points), np.bool_)
-    for i in range(len(points)):
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        u = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
-        v = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
-        depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+    seen = np.empty(len(x), np.bool_)
+    doubtful = np.empty(len(x), np.bool_)
+    m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
+    m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
+    m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
+    for i in range(len(x)):
+        px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+        u = m00 * px + m01 * py + m02 * pz + m03
+        v = m10 * px + m11 * py + m12 * pz + m13
+        depth = m20 * px + m21 * py + m22 * pz + m23
         right, below = width * depth - u, height * depth - v
         inside = (
             (depth > margin) & (u > margin) & (v > margin) & (right > margin) & (below > margin)

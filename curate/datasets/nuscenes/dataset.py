@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from curate.datasets.clouds import read_cloud
-from curate.datasets.containment import check_frame_id, refuse_escape
+from curate.datasets.containment import Boundary, check_frame_id
 from curate.datasets.images import read_image
 from curate.datasets.nuscenes.annotations import AnnotationTable
 from curate.datasets.nuscenes.keyframes import TO_SENSOR_AXES, Keyframe, read_keyframes
@@ -58,7 +58,7 @@ class NuScenesDataset:
         follow_links: bool = False,
     ) -> None:
         self.root = Path(root)
-        self.follow_links = follow_links
+        self._boundary = Boundary(self.root, follow_links=follow_links)
         self.version = _version(self.root, version)
         self.camera = camera
         self._tables = self.root / self.version
@@ -123,8 +123,7 @@ class NuScenesDataset:
             calibration=self._tables / "calibrated_sensor.json",
             label=labels if labels.exists() else None,
         )
-        if not self.follow_links:
-            refuse_escape(self.root, *found.paths())
+        self._boundary.check(*found.paths())
         return found
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
