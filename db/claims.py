@@ -7,6 +7,7 @@ nothing stale is ever left behind.
 
 import os
 import socket
+import time
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -32,6 +33,8 @@ _POSTGRES_OWNER = text("""
           AND l.database = (SELECT oid FROM pg_database WHERE datname = current_database())
     ORDER BY a.backend_start LIMIT 1
 """)
+# Who asks whose a claim is holds its file for a moment; that moment is waited out.
+_TRIES, _PAUSE_S = 5, 0.01
 LONGEST_NAME = 63  # bytes of an application's name that PostgreSQL keeps
 
 
@@ -133,11 +136,14 @@ def _opened(path: Path) -> "TextIOWrapper":
 def _try_lock(file: "TextIOWrapper", mode: int) -> bool:
     import fcntl
 
-    try:
-        fcntl.flock(file, mode | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+    for _ in range(_TRIES):
+        try:
+            fcntl.flock(file, mode | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(_PAUSE_S)
+        else:
+            return True
+    return False
 
 
 def _file_owner(path: Path) -> str:

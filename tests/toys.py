@@ -82,10 +82,20 @@ def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: b
 
 
 def dawdle() -> None:
-    """Lets a test stop the process in the middle of its work, or hold it at a gate: a file."""
+    """Lets a test stop the process in the middle of its work, or hold it at a gate: a file.
+
+    A process that has come to the gate leaves another file beside it, by its number.
+    """
     time.sleep(float(os.environ.get("TOY_DELAY_S", "0")))
-    while "TOY_GATE" in os.environ and Path(os.environ["TOY_GATE"]).exists():
+    gate = Path(os.environ.get("TOY_GATE", "/no gate"))
+    while gate.exists():
+        arrival(gate, os.getpid()).touch()
         time.sleep(0.02)
+
+
+def arrival(gate: Path, process: int) -> Path:
+    """The file that a process leaves at a gate."""
+    return gate.with_name(f"{gate.name}-{process}")
 
 
 class ToyDetector:

@@ -68,7 +68,7 @@ def checked(found: Detections, config: Config) -> Detections:
     if wrong.any():
         raise ModelError(
             f"the detector answered a box that is not finite or has no size: "
-            f"{np.round(numbers[wrong][0], 3).tolist()} (x, y, z, l, w, h, yaw, score)"
+            f"{[round(float(number), 3) for number in numbers[wrong][0]]} (x, y, z, l, w, h, yaw, score)"
         )
     return found.select(np.argsort(-found.scores, kind="stable"))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from pipelines_cli import Curate
+from toys import arrival
 
 from curate.errors import DatabaseError
 from db import bulk
@@ -72,7 +73,8 @@ def test_stages_of_one_round_do_not_collide(
 ) -> None:
     """The second is refused in one line that names the first; a killed owner is none any more."""
     first = started(workspace, gate, "predict")
-    wait_until(lambda: f"process {first.pid} " in (owner(workspace, 1) or ""), first)
+    wait_until(arrival(gate, first.pid).exists, first)
+    assert f"process {first.pid} " in (owner(workspace, 1) or "")
     for command in (["predict"], ["repredict"], ["solve"]):
         code, _, err = curate(*command, "-w", workspace.root)
         assert code == DatabaseError.exit_code
@@ -92,7 +94,8 @@ def test_different_rounds_run_side_by_side(workspace: Workspace, gate: Path) -> 
         number: started(workspace, gate, "predict", "--round", str(number)) for number in (1, 2)
     }
     for number, process in both.items():
-        wait_until(lambda number=number: owner(workspace, number) is not None, process)
+        wait_until(arrival(gate, process.pid).exists, process)
+        assert owner(workspace, number) is not None
     assert [process.poll() for process in both.values()] == [None, None]
     gate.unlink()
     messages = [process.communicate()[1] for process in both.values()]

@@ -83,7 +83,7 @@ def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections
     for fault, rows in faults.items():
         if rows.any():
             k = int(np.argmax(rows))
-            numbers = np.round([*boxes[k], scores[k]], 3).tolist()
+            numbers = [round(float(number), 3) for number in (*boxes[k], scores[k])]
             raise DataError(f"{place}: box {k}: {fault}: {numbers} (x, y, z, l, w, h, yaw, score)")
     boxes[:, 6] = wrap_angle(boxes[:, 6])
     return Detections(boxes, scores, categories)
