@@ -66,9 +66,10 @@ def checked(found: Detections, config: Config) -> Detections:
     numbers = np.column_stack([found.boxes, found.scores])
     wrong = ~np.isfinite(numbers).all(axis=1) | (found.boxes[:, 3:6] <= 0).any(axis=1)
     if wrong.any():
+        shown = [round(float(number), 3) for number in numbers[wrong][0]]
         raise ModelError(
-            f"the detector answered a box that is not finite or has no size: "
-            f"{[round(float(number), 3) for number in numbers[wrong][0]]} (x, y, z, l, w, h, yaw, score)"
+            f"the detector answered a box that is not finite or has no size: {shown} "
+            "(x, y, z, l, w, h, yaw, score)"
         )
     return found.select(np.argsort(-found.scores, kind="stable"))
 
