@@ -10,13 +10,13 @@ def demo(
     directory: Annotated[Path, typer.Argument(help="Folder for data and workspace.")] = Path(
         "demo"
     ),
-    frames: Annotated[int, typer.Option(min=8, help="Training frames to simulate.")] = 400,
+    frames: Annotated[int, typer.Option(min=8, help="Training frames to simulate.")] = 200,
     val: Annotated[int, typer.Option(min=4, help="Validation frames to simulate.")] = 120,
     labeled: Annotated[
         float, typer.Option(help="Share of the training frames with labels.")
-    ] = 0.06,
+    ] = 0.08,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds.")] = 1,
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 600,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 400,
     seed: Annotated[int, typer.Option(min=0, help="Of simulation, split and training.")] = 0,
     workers: Annotated[
         Optional[int],  # noqa: UP045
