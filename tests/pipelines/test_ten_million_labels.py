@@ -20,14 +20,14 @@ SOLVES_S, FIRST_ROW_S = 60.0, 0.05
 
 @pytest.mark.slow
 def test_ten_million_labels(tmp_path: Path) -> None:
-    """Each solve within a minute of CPU time, each first row within 50 ms."""
+    """Each solve within a minute, each first row within 50 ms, on a machine with nothing else."""
     url = os.environ.get("CURATE_PROOF_URL")
     workspace = filled_workspace(tmp_path / "work", LABELS // EACH, url)
     figures: dict[str, float] = {}
     for name, policy, rounds in (("first", "pspsl", 3), ("age", "pspsl", 4), ("policy", "uda", 4)):
-        start = time.process_time()
+        start = time.perf_counter()
         solved(workspace, policy, rounds)
-        figures[f"solve, {name}"] = time.process_time() - start
+        figures[f"solve, {name}"] = time.perf_counter() - start
     for question in (TRUSTED, HEAVIEST, FRAME, FRAME_OF_ROUND, COUNTS):
         with workspace.database.reading() as connection:
             streaming = connection.execution_options(stream_results=True)

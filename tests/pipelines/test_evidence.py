@@ -1,0 +1,30 @@
+"""The evidence of a round, read from the database in columns."""
+
+import numpy as np
+import pytest
+
+from pipelines import evidence
+from pipelines.executors.serial import SerialExecutor
+from pipelines.progress import Silent
+from pipelines.round import stage
+from pipelines.rounds import open_round
+from pipelines.runner import run_frames
+from pipelines.workspace import Workspace
+
+
+def test_several_processes_read_what_one_reads(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of many frames the columns are read ahead; they are the same to the bit."""
+    context = open_round(workspace, 1)
+    for name in ("predict", "repredict", "points", "semantic"):
+        run_frames(workspace, context, stage(name), SerialExecutor(), Silent())
+    frames = list(workspace.frames("unlabeled").values())
+    keys, alone = evidence.read_evidence(workspace, 1, frames, boxes=True)
+    assert len(keys) > 0
+    monkeypatch.setattr(evidence, "_MANY_FRAMES", 1)
+    monkeypatch.setattr(evidence.os, "cpu_count", lambda: 2)
+    same, together = evidence.read_evidence(workspace, 1, frames, boxes=True)
+    for one, other in ((keys, same), (alone, together)):
+        for name, value in vars(one).items():
+            np.testing.assert_equal(vars(other)[name], value, err_msg=name)
