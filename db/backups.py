@@ -75,7 +75,7 @@ def _dump(url: URL, name: str, backup: Path) -> None:
             command, env=os.environ | secret, capture_output=True, text=True, check=False
         )
         if ended.returncode:
-            raise _refusal(name, " ".join(ended.stderr.split()), backup)
+            raise _refused_by_pg_dump(name, " ".join(ended.stderr.split()))
         partial.replace(backup)
     except OSError as error:
         raise _refusal(name, str(error), backup) from error
@@ -86,5 +86,20 @@ def _dump(url: URL, name: str, backup: Path) -> None:
 def _refusal(name: str, reason: str, backup: Path) -> DatabaseError:
     return DatabaseError(
         f"{name}: cannot be copied before its schema is migrated: {reason}; make room for "
-        f"{backup.name} and run the command again"
+        f"{backup.name}, let yourself write into its folder, and run the command again"
     )
+
+
+def _refused_by_pg_dump(name: str, reason: str) -> DatabaseError:
+    remedy = next((each for sign, each in _REMEDIES.items() if sign in reason), "mend that")
+    return DatabaseError(
+        f"{name}: cannot be copied before its schema is migrated: {reason}; {remedy}, and run the "
+        "command again"
+    )
+
+
+_REMEDIES = {
+    "version mismatch": "install the pg_dump of the server's version, before others in PATH",
+    "permission denied": "let the database's owner run a command once",
+    "No space left": "make room in the workspace",
+}

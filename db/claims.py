@@ -76,7 +76,8 @@ def claimed(engine: Engine, resources: Sequence[Resource], purpose: str) -> Iter
             for resource in resources:
                 _claim_session(connection, resource)
         elif engine.url.database:
-            folder = Path(f"{engine.url.database}-locks")
+            # Who opens the file by a link works on the same one.
+            folder = Path(f"{os.path.realpath(engine.url.database)}-locks")
             for resource in resources:
                 held.enter_context(_claimed_file(folder, resource, owner))
         yield

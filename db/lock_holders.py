@@ -14,6 +14,7 @@ _LOCKS = Path("/proc/locks")  # Linux
 
 def holders(database: Path) -> tuple[str, ...]:
     """The processes that write a SQLite database, as "process 123 (its command line)"."""
+    database = database.resolve()  # what SQLite keeps beside it lies beside no link
     shared = database.with_name(database.name + "-shm")
     # In the file itself any locked byte counts.
     spans = {

@@ -91,23 +91,33 @@ class Database:
         config = Config()
         config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
         script = ScriptDirectory.from_config(config)
+        head = script.get_current_head()
         with self.engine.connect() as connection:
-            current = MigrationContext.configure(connection).get_current_revision()
-        if current == script.get_current_head():
-            return
-        if current is not None and current not in {r.revision for r in script.walk_revisions()}:
-            raise DatabaseError(
-                f"{self.name}: written by a newer curate (schema {current}); update curate"
-            )
-        if current is not None:
-            back_up(self.url, current, backups)
+            if self._revision(connection, script) == head:
+                return
         with self.writing() as connection:
             if self.engine.dialect.name == "postgresql":
                 connection.execute(text(f"SELECT pg_advisory_xact_lock({_MIGRATION_LOCK})"))
+            # Whoever had the lock before may have migrated it: its copy is of the older schema,
+            # and one that is made now would take its place.
+            current = self._revision(connection, script)
+            if current == head:
+                return
+            if current is not None:
+                back_up(self.url, current, backups)
             config.attributes["connection"] = connection
             drop_views(connection)
             command.upgrade(config, "head")
             create_views(connection)
+
+    def _revision(self, connection: Connection, script: ScriptDirectory) -> str | None:
+        """Of the schema; None for an empty database, DatabaseError where it is unknown here."""
+        current = MigrationContext.configure(connection).get_current_revision()
+        if current is not None and current not in {r.revision for r in script.walk_revisions()}:
+            raise DatabaseError(
+                f"{self.name}: written by a newer curate (schema {current}); update curate"
+            )
+        return current
 
     @contextmanager
     def _own_words(self) -> Iterator[None]:
@@ -139,7 +149,7 @@ class Database:
 
 
 def parse_url(address: str) -> URL:
-    """An SQLAlchemy URL.
+    """An SQLAlchemy URL; a password in its query is moved to where it is not shown.
 
     Raises:
         ConfigError: it is none.
@@ -153,7 +163,10 @@ def parse_url(address: str) -> URL:
             "out for curate.db in the workspace"
         ) from error
     if url.drivername in {"postgres", "postgresql"}:
-        return url.set(drivername="postgresql+psycopg")
+        url = url.set(drivername="postgresql+psycopg")
+    secret = url.query.get("password")
+    if isinstance(secret, str):  # where it stands otherwise, messages leave it out
+        url = url.difference_update_query(["password"]).set(password=url.password or secret)
     return url
 
 

@@ -95,7 +95,7 @@ def _rows(
 def _own_words(path: Path, error: Exception, seconds: float) -> ConfigError | DatabaseError:
     message = one_line(error)
     if "file is not a database" in message or "malformed" in message:
-        return DatabaseError(f"{path}: {message}")
+        return DatabaseError(f"{path}: {message}; restore a backup of the file")
     if "interrupted" in message:
         return _given_up(seconds)
     return ConfigError(_explain(message))
@@ -142,6 +142,8 @@ def _server_rows(
             for row in result:
                 if time.monotonic() > end:
                     raise _given_up(seconds)
+                if any(isinstance(v, str | bytes) and len(v) > LONGEST_VALUE for v in row):
+                    raise ConfigError("query: string or blob too big")
                 yield tuple(row)
         except DBAPIError as error:
             raise _servers_words(error, seconds) from error

@@ -1,10 +1,12 @@
 """Paths of a data set stay inside it: names lead nowhere else, and neither do links, unless wished.
 
 A data set that was fetched from somewhere is foreign data. A frame name with a separator, or a link
-that its archive has brought along, would make curate read files that nobody meant to show it.
+that its archive has brought along, would make curate read files that nobody meant to show it; a
+named pipe would make it wait for ever.
 """
 
 import os
+import stat
 from pathlib import Path
 
 from curate.errors import DataError
@@ -36,13 +38,16 @@ class Boundary:
         self._folders: dict[str, str] = {}
 
     def check(self, *paths: Path) -> None:
-        """DataError where a path leads out, by a link or by its name; it need not be there."""
+        """DataError where a path leads out, by a link or by its name, or is a pipe or a device.
+
+        It need not be there.
+        """
         if self._open:
             return
         home = self._real_folder(self._root)
         for path in paths:
             try:
-                real = self._real(path)
+                real, mode = self._real(path)
             except ValueError:  # a zero byte
                 raise DataError(f"{str(path)!r} is no path") from None
             if real != home and not real.startswith(home.rstrip(os.sep) + os.sep):
@@ -50,16 +55,30 @@ class Boundary:
                     f"{path}: leads out of the data set, to {real}; if you made that link "
                     "yourself, set dataset.follow_links = true (curate init --follow-links)"
                 )
+            if mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise DataError(f"{path}: is a pipe or a device, no file; remove it")
 
-    def _real(self, path: Path) -> str:
-        """`os.path.realpath`, which would ask the system about every folder on the way."""
+    def _real(self, path: Path) -> tuple[str, int]:
+        """`os.path.realpath`, which would ask the system about every folder on the way.
+
+        With the mode of what lies there, 0 where nothing does.
+        """
         folder, name = os.path.split(path)
         plain = name not in ("", os.curdir, os.pardir) and "\0" not in name
-        if plain and not path.is_symlink():
-            return f"{self._real_folder(folder).rstrip(os.sep)}{os.sep}{name}"
-        return os.path.realpath(path)
+        mode = _mode(os.fspath(path))
+        if plain and not stat.S_ISLNK(mode):
+            return f"{self._real_folder(folder).rstrip(os.sep)}{os.sep}{name}", mode
+        real = os.path.realpath(path)
+        return real, _mode(real)
 
     def _real_folder(self, folder: str) -> str:
         if folder not in self._folders:
             self._folders[folder] = os.path.realpath(folder)
         return self._folders[folder]
+
+
+def _mode(path: str) -> int:
+    try:
+        return os.lstat(path).st_mode
+    except OSError:
+        return 0

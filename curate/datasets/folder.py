@@ -61,6 +61,7 @@ class FolderDataset:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._path = self.root / DESCRIPTION
+        self._boundary.check(self._path)
         self._told = _read_description(self._path)
         named = [self._told[key] for key in (*_FOLDERS, "calibration") if key in self._told]
         self._boundary.check(*(self.root / name for name in named if isinstance(name, str)))

@@ -32,6 +32,7 @@ POINT_BYTES = 16  # x, y, z, intensity, float32 each
 FARTHEST_METRES = 2000.0
 # KITTI's own development kit says which drive each frame of training/ was taken from.
 _MAPPINGS = ("mapping", "devkit_object/mapping", "devkit/mapping")
+_MAPPING_FILES = ("train_mapping.txt", "train_rand.txt")
 # Focal lengths are thousands of pixels, P2's last column a million at most.
 _LARGEST_ENTRY = 1e9
 CALIBRATION_SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
@@ -111,15 +112,19 @@ class KittiDataset:
         """The drive of a frame, where the mapping of KITTI's development kit lies in the root.
 
         Raises:
-            DataError: the mapping is malformed.
+            DataError: the mapping is malformed, or lies elsewhere.
         """
         return self._drives.get(frame_id)
 
     @cached_property
     def _drives(self) -> Mapping[str, str]:
         homes = (self.root / folder for folder in _MAPPINGS)
-        home = next((home for home in homes if (home / "train_mapping.txt").is_file()), None)
-        return read_drives(home) if home else {}
+        home = next((home for home in homes if (home / _MAPPING_FILES[0]).is_file()), None)
+        if home is None:
+            return {}
+        # Before they are read: messages repeat a piece of what is no number.
+        self._boundary.check(*(home / name for name in _MAPPING_FILES))
+        return read_drives(home)
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
         """The frame's calibration, its points unless unwanted, and its image where asked for.
@@ -251,8 +256,8 @@ def read_drives(folder: Path) -> Mapping[str, str]:
     Raises:
         DataError: a file is missing or malformed.
     """
-    path = folder / "train_rand.txt"
-    lines = read_bytes(folder / "train_mapping.txt", "mapping").decode("utf-8", "replace")
+    mapping, path = (folder / name for name in _MAPPING_FILES)
+    lines = read_bytes(mapping, "mapping").decode("utf-8", "replace")
     drives = [line.split()[1] for line in lines.splitlines() if len(line.split()) == 3]
     try:
         text = read_bytes(path, "mapping").decode("utf-8", "replace")

@@ -55,7 +55,9 @@ def open_label_file(path: Path) -> Iterator[sqlite3.Connection]:
             _refuse_foreign_tables(rows, path)
             yield rows
     except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not a label file: {one_line(error)}; export it again") from None
+        raise DataError(
+            f"{path}: not a label file: {one_line(error)}; delete it and export it again"
+        ) from None
 
 
 def read_meta(rows: sqlite3.Connection, path: Path) -> Mapping[str, str]:
@@ -72,7 +74,9 @@ def read_meta(rows: sqlite3.Connection, path: Path) -> Mapping[str, str]:
         )
     missing = [key for key in _KEYS if key not in meta]
     if missing:
-        raise DataError(f"{path}: meta names no {', '.join(missing)}; export it again")
+        raise DataError(
+            f"{path}: meta names no {', '.join(missing)}; delete it and export it again"
+        )
     return meta
 
 
@@ -83,7 +87,9 @@ def read_categories(meta: Mapping[str, str], path: Path) -> tuple[str, ...]:
     except (ValueError, RecursionError):
         names = None
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise DataError(f"{path}: meta.categories is no list of names; export it again")
+        raise DataError(
+            f"{path}: meta.categories is no list of names; delete it and export it again"
+        )
     return tuple(names)
 
 
@@ -106,10 +112,13 @@ def _refuse_foreign_tables(rows: sqlite3.Connection, path: Path) -> None:
     found = dict(rows.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     for name, statement in _statements().items():
         if name not in found:
-            raise DataError(f"{path}: not a label file: no table {name}; export it again")
+            raise DataError(
+                f"{path}: not a label file: no table {name}; delete it and export it again"
+            )
         if _bare(str(found[name])) != statement:
             raise DataError(
-                f"{path}: table {name} is not the one that an export makes; export it again"
+                f"{path}: table {name} is not the one that an export makes; delete it and "
+                "export it again"
             )
 
 

@@ -153,7 +153,7 @@ def _numbers(path: Path, frame: str, entries: list[tuple]) -> np.ndarray:
     if not np.isfinite(numbers).all() or not ((numbers[:, 7] >= 0) & (numbers[:, 7] <= 1)).all():
         raise DataError(
             f"{path}: frame {frame!r} has a box that is not finite or a weight that is not in "
-            "[0, 1]; export it again"
+            "[0, 1]; delete it and export it again"
         )
     return numbers
 

@@ -56,6 +56,20 @@ def test_what_does_not_collide_runs_side_by_side(
         pass
 
 
+def test_a_link_to_the_file_is_claimed_with_it(tmp_path: Path) -> None:
+    """SQLite follows it, and so do claims."""
+    database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
+    (tmp_path / "elsewhere").mkdir()
+    linked = tmp_path / "elsewhere" / "curate.db"
+    linked.symlink_to(tmp_path / "curate.db")
+    with (
+        database.claiming_round(1, None, "predict"),
+        pytest.raises(DatabaseError, match="round 1 is being worked on by predict"),
+        Database(f"sqlite:///{linked}").claiming_round(1, None, "predict"),
+    ):
+        pass
+
+
 def test_an_error_ends_the_claim(pair: tuple[Database, Database]) -> None:
     """Whatever went wrong while it was held."""
     with pytest.raises(ZeroDivisionError), pair[0].claiming_round(1, None, "predict"):

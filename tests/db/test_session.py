@@ -5,6 +5,7 @@ import shutil
 import sqlite3
 import subprocess
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -12,14 +13,14 @@ from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
-from sqlalchemy import inspect
+from sqlalchemy import Connection, inspect
 
 import db
 from curate.errors import DatabaseError, LeakageError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db import bulk
 from db.models import Base
-from db.session import Database
+from db.session import Database, parse_url
 from db.views import drop_views
 
 ENGINES = ("sqlite", "postgresql")
@@ -138,7 +139,8 @@ def test_a_server_database_that_cannot_be_dumped_is_not_migrated(
     refusing.write_text("#!/bin/sh\necho server version mismatch >&2\nexit 1\n")
     refusing.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    with pytest.raises(DatabaseError, match=r"cannot be copied.*version mismatch"):
+    remedy = r"cannot be copied.*version mismatch; install the pg_dump of the server"
+    with pytest.raises(DatabaseError, match=remedy):
         Database(older_server_database.url, tmp_path)
     with older_server_database.engine.connect() as connection:
         found = connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalar_one()
@@ -156,6 +158,43 @@ def test_a_server_without_pg_dump_is_migrated_with_a_warning(
     Database(older_server_database.url, tmp_path).close()
     assert "without a copy" in caplog.text
     assert list(tmp_path.iterdir()) == []
+
+
+def test_who_finds_a_database_migrated_meanwhile_leaves_its_copy_alone(
+    tmp_path: Path, new_url: Callable[[], str | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two processes find an older schema at once; the copy stays that of the older schema."""
+    database = Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
+    config = Config()
+    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
+    with database.writing() as connection:
+        config.attributes["connection"] = connection
+        drop_views(connection)
+        command.downgrade(config, "0001")
+    database.close()
+    writing = Database.writing
+
+    def late(self: Database, **options: bool) -> AbstractContextManager[Connection]:
+        monkeypatch.setattr(Database, "writing", writing)
+        Database(database.url, tmp_path).close()
+        return self.writing(**options)
+
+    monkeypatch.setattr(Database, "writing", late)
+    made: list[str] = []
+    monkeypatch.setattr("db.session.back_up", lambda _url, revision, _folder: made.append(revision))
+    Database(database.url, tmp_path).close()
+    assert made == ["0001"]
+
+
+def test_a_password_anywhere_in_a_url_is_not_shown() -> None:
+    """The server's library takes it from the query as well."""
+    for address in (
+        "postgresql://me:hidden@/name?host=/x",
+        "postgresql://me@/name?password=hidden",
+    ):
+        url = parse_url(address)
+        assert url.password == "hidden"  # noqa: S105
+        assert "hidden" not in url.render_as_string()
 
 
 def test_weighted_labels_has_exactly_the_columns_of_the_format(database: Database) -> None:

@@ -117,3 +117,15 @@ def test_the_exported_file_can_only_be_read(curate: Curate, weighted: Path) -> N
     code, _, err = curate("query", "DELETE FROM label", "--file", exported)
     assert code == ConfigError.exit_code
     assert "read-only" in err
+
+
+def test_a_huge_value_is_refused(curate: Curate, workspace: Workspace, engine: str) -> None:
+    """A server, too, would make a gigabyte where it is asked to."""
+    huge = {
+        "sqlite": "replace(hex(zeroblob(999999)), '0', 'long')",
+        "postgresql": "repeat('x', 5000000)",
+    }
+    sql = f"SELECT {huge[engine]} AS value"
+    code, _, err = curate("query", sql, "-w", workspace.root)
+    assert code == ConfigError.exit_code
+    assert err == "error: query: string or blob too big\n"

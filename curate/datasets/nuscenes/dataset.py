@@ -62,6 +62,7 @@ class NuScenesDataset:
         self.version = _version(self.root, version)
         self.camera = camera
         self._tables = self.root / self.version
+        self._boundary.check(*self._tables.glob("*.json"))
         names = CATEGORIES if rename is None else rename
         self._annotated = AnnotationTable(self._tables, names, minimum_points)
 

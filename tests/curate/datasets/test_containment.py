@@ -1,17 +1,20 @@
 """Paths of a data set stay inside it."""
 
+import os
 from pathlib import Path
 
 import pytest
 from dataset_layouts import write_toy_folder, write_toy_raw
 from hypothesis import given
 from hypothesis import strategies as st
+from nuscenes_scenes import write_nuscenes
 from toys import write_toy_kitti
 
 from curate.datasets.containment import check_frame_id
 from curate.datasets.folder import FolderDataset
 from curate.datasets.kitti import KittiDataset
 from curate.datasets.kitti_raw import KittiRawDataset
+from curate.datasets.nuscenes.dataset import NuScenesDataset
 from curate.errors import DataError
 
 LAYOUTS = {
@@ -91,3 +94,60 @@ def test_a_description_that_leads_out_is_refused(tmp_path: Path, key: str) -> No
         (tmp_path / "dataset.toml").write_text("\n".join(lines))
         with pytest.raises(DataError, match="leads out of the data set"):
             FolderDataset(tmp_path)
+
+
+def test_a_link_in_place_of_a_description_is_not_followed(tmp_path: Path) -> None:
+    """What a message would repeat of another file stays there."""
+    (tmp_path / "secret").write_text("password = 1\n")
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "dataset.toml").symlink_to(tmp_path / "secret")
+    with pytest.raises(DataError, match="leads out of the data set"):
+        FolderDataset(tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    "linked", ["mapping", "mapping/train_mapping.txt", "mapping/train_rand.txt"]
+)
+def test_a_mapping_that_leads_out_is_not_read(tmp_path: Path, linked: str) -> None:
+    """No word of the file that it leads to stands in the message."""
+    write_toy_kitti(tmp_path / "data", 4)
+    (tmp_path / "data" / "mapping").mkdir()
+    (tmp_path / "data" / "mapping" / "train_mapping.txt").write_text("2011_09_26 drive_1 0\n" * 4)
+    (tmp_path / "data" / "mapping" / "train_rand.txt").write_text("secret,2,3,4\n")
+    path = tmp_path / "data" / linked
+    path.rename(tmp_path / "outside")
+    path.symlink_to(tmp_path / "outside")
+    with pytest.raises(DataError, match="leads out of the data set") as caught:
+        KittiDataset(tmp_path / "data").sequence_of("000000")
+    assert "secret" not in str(caught.value)
+
+
+def test_tables_that_lead_out_are_not_read(tmp_path: Path) -> None:
+    """Of nuScenes, each file and the folder of a version."""
+    write_nuscenes(tmp_path / "data", ("scene-0061",), 1)
+    version = NuScenesDataset(tmp_path / "data").version
+    for path in (tmp_path / "data" / version / "sample_data.json", tmp_path / "data" / version):
+        path.rename(tmp_path / path.name)
+        path.symlink_to(tmp_path / path.name)
+        with pytest.raises(DataError, match="leads out of the data set"):
+            NuScenesDataset(tmp_path / "data")
+        path.unlink()
+        (tmp_path / path.name).rename(path)
+
+
+@pytest.mark.parametrize("part", ["points", "image", "calibration", "label"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_pipe_is_not_waited_for(tmp_path: Path, layout: str, part: str) -> None:
+    """Nobody would ever write into it; nor where a link within the data set leads to one."""
+    write, kind = LAYOUTS[layout]
+    write(tmp_path)
+    name = kind(tmp_path).frame_ids()[0]
+    path = getattr(kind(tmp_path).files(name), part)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(DataError, match="pipe or a device"):
+        kind(tmp_path).files(name)
+    path.rename(path.with_name("pipe"))
+    path.symlink_to(path.with_name("pipe"))
+    with pytest.raises(DataError, match="pipe or a device"):
+        kind(tmp_path).files(name)

@@ -213,7 +213,12 @@ def test_a_damaged_label_file(curate: Curate, work: Path) -> None:
     path.write_bytes(path.read_bytes()[:5000])
     code, _, err = curate("train-round", "--command", TRAINER, "-w", work)
     assert code == DataError.exit_code, err
+    # An export finds it up to date, but damaged, too.
+    assert "delete it and export it again" in err
     assert curate("check", "-w", work)[0] == LeakageError.exit_code
+    path.unlink()
+    assert curate("export", "-w", work)[0] == 0
+    assert curate("check", "-w", work)[0] == 0
 
 
 @pytest.mark.parametrize("score", [1.0, 0.7])
