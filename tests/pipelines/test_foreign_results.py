@@ -75,6 +75,10 @@ def test_the_priors_alone_weigh_where_the_setting_says_so(
     assert "no second pass over augmented copies" in out
     assert f"recomputed     {rows[0]['weight']:.4f}" in out
     assert "differ" not in out
+    assert curate("report", "-w", work)[0] == 0
+    page = (work / "reports" / "round-01-pspsl.html").read_text()
+    assert "no second pass" in page
+    assert "no reprediction matched it" not in page
 
 
 def test_a_folder_of_results_is_taught_by_a_folder_of_results(
