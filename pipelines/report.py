@@ -1,6 +1,7 @@
 """The report of a round: one HTML file with figures, changes and the labels worth a look."""
 
 from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from curate.viewing.close_up import LabelShown, draw_close_up
 from curate.viewing.page import Figure, Section, render_page
 from curate.viewing.svg import share_curve
 from db import bulk
+from db.views import WEIGHTED_LABELS
 from pipelines.differences import COLUMNS, ChangedLabel, Comparison, Difference
 from pipelines.frame_boxes import chosen_round
 from pipelines.label_columns import read_blocks, read_frame_columns
@@ -55,6 +57,7 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
         kept.add(labels, np.where(score < 0.5, labels.weights, 0.0))
         for each in former:
             comparison.add(each, labels)
+    rejected = _rejected(workspace, number, policy, doubted)
     sections = [
         summary(workspace, totals, number, repredicted=repredicted),
         distributions(totals),
@@ -66,7 +69,7 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
             else _changes(workspace, comparison.finish((before, number), policy))
         ),
         *(
-            _shown(workspace, heading, ranking, repredicted=repredicted)
+            _shown(workspace, heading, ranking, rejected, repredicted=repredicted)
             for heading, ranking in (
                 ("Most doubted: high score, low weight", doubted),
                 ("Kept against a low score: below 0.5, greatest weight", kept),
@@ -119,21 +122,44 @@ def _changed(workspace: Workspace, found: Difference, each: ChangedLabel) -> Fig
     return _close_up(workspace, each.frame, label, caption)
 
 
-def _shown(workspace: Workspace, title: str, ranking: Ranking, *, repredicted: bool) -> Section:
+def _rejected(
+    workspace: Workspace, number: int, policy: str, ranking: Ranking
+) -> AbstractSet[tuple[str, int]]:
+    """Frames and numbers of the labels that people rejected, in the frames of a ranking."""
+    labels = WEIGHTED_LABELS.c
+    query = select(labels.frame, labels.k).where(
+        labels.round == number,
+        labels.policy == policy,
+        labels.frame.in_(sorted({each.frame for each in ranking.labels})),
+        labels.provenance == "human",
+        labels.weight == 0,
+    )
+    with workspace.database.reading() as connection:
+        return {(frame, k) for frame, k in bulk.select(connection, query)}
+
+
+def _shown(
+    workspace: Workspace,
+    title: str,
+    ranking: Ranking,
+    rejected: AbstractSet[tuple[str, int]],
+    *,
+    repredicted: bool,
+) -> Section:
     """Pictures of the labels of a ranking."""
     figures = [
         _close_up(
             workspace,
             each.frame,
             LabelShown(each.box, each.numbers["weight"]),
-            _told(each, repredicted=repredicted),
+            _told(each, rejected=(each.frame, each.k) in rejected, repredicted=repredicted),
         )
         for each in ranking.labels
     ]
     return Section(title, "" if figures else "There is none.", figures=figures)
 
 
-def _told(label: RankedLabel, *, repredicted: bool) -> str:
+def _told(label: RankedLabel, *, rejected: bool, repredicted: bool) -> str:
     """What a label is, its numbers, and what took its weight away."""
     own = label.numbers
     shown = {"score": "score", "weight": "weight", "loss": "L", "points": "points",
@@ -147,6 +173,8 @@ def _told(label: RankedLabel, *, repredicted: bool) -> str:
         "no pixel of its category": own["rho_anno"] == 0,
         "no LiDAR point inside": own["points"] == 0,
     }
+    if rejected:
+        reasons = {"a person rejected it": True}
     found = [reason for reason, holds in reasons.items() if holds and own["weight"] <= 0]
     return f"{label.category} {label.k} in frame {label.frame}: {numbers}" + "".join(
         f"; {reason}" for reason in found
