@@ -8,6 +8,7 @@ CURATE_LABELS and so on. It runs in the current folder, and what it prints goes 
 
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -47,7 +48,7 @@ def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
     before = _state(draft)
     _run(arguments, values)
     _check(draft, before)
-    draft.replace(output)
+    _take_place(draft, output)
 
 
 def split_command(command: str, values: dict[str, str]) -> list[str]:
@@ -133,14 +134,27 @@ def _check(draft: Path, before: tuple[int, int] | None) -> None:
     else:
         return
     raise TrainerFailed(
-        f"{draft}: {fault}, though the trainer ended well; let it write its checkpoint, one file, "
-        "to {output} or $CURATE_OUTPUT"
+        f"{draft}: {fault}, though the trainer ended well; let it write its checkpoint, a file or "
+        "a folder as your detector reads it, to {output} or $CURATE_OUTPUT"
     )
 
 
 def _state(path: Path) -> tuple[int, int] | None:
-    """When the file was written and how long it is; None where there is no file."""
-    if not path.is_file():
+    """When the file, or the last one in the folder, was written, and how long they are.
+
+    None where there is nothing.
+    """
+    if not path.exists():
         return None
-    found = path.stat()
-    return found.st_mtime_ns, found.st_size
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    found = [file.stat() for file in files]
+    return max((each.st_mtime_ns for each in found), default=0), sum(each.st_size for each in found)
+
+
+def _take_place(draft: Path, output: Path) -> None:
+    """Moves what was written to its place; unlike a file, a folder does not replace anything."""
+    if output.is_dir():
+        shutil.rmtree(output)
+    elif draft.is_dir():
+        output.unlink(missing_ok=True)
+    draft.replace(output)

@@ -238,7 +238,7 @@ def round_state(workspace: Workspace, context: RoundContext, of: RoundStage, pol
         return "stale"
     current = round_fingerprint(workspace, context, of, policy, frames)
     file = of.file(workspace, context, policy) if of.file else None
-    return "done" if stored == [(current,)] and (file is None or file.is_file()) else "stale"
+    return "done" if stored == [(current,)] and (file is None or file.exists()) else "stale"
 
 
 def is_current(workspace: Workspace, what: Once, fingerprint: str) -> bool:

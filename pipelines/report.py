@@ -1,6 +1,7 @@
 """The report of a round: one HTML file with figures, changes and the labels worth a look."""
 
 from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,18 @@ from curate.viewing.close_up import LabelShown, draw_close_up
 from curate.viewing.page import Figure, Section, render_page
 from curate.viewing.svg import share_curve
 from db import bulk
+from db.views import WEIGHTED_LABELS
 from pipelines.differences import COLUMNS, ChangedLabel, Comparison, Difference
 from pipelines.frame_boxes import chosen_round
 from pipelines.label_columns import read_blocks, read_frame_columns
 from pipelines.label_ranking import RankedLabel, Ranking
-from pipelines.report_figures import beside_others, by_category, distributions, summary
+from pipelines.report_figures import (
+    beside_others,
+    by_category,
+    distributions,
+    is_repredicted,
+    summary,
+)
 from pipelines.review.human_labels import counts
 from pipelines.round_totals import RoundTotals, extent
 from pipelines.workspace import Workspace
@@ -37,6 +45,7 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
     number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
     totals = RoundTotals(extent(workspace, number, policy))
+    repredicted = is_repredicted(workspace, number)
     doubted, kept = Ranking(_PICTURES), Ranking(_PICTURES)
     comparison = Comparison(_PICTURES)
     before = _round_before(workspace, number, policy)
@@ -48,8 +57,9 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
         kept.add(labels, np.where(score < 0.5, labels.weights, 0.0))
         for each in former:
             comparison.add(each, labels)
+    rejected = _rejected(workspace, number, policy, doubted)
     sections = [
-        summary(workspace, totals, number),
+        summary(workspace, totals, number, repredicted=repredicted),
         distributions(totals),
         by_category(totals, workspace.config.dataset.categories),
         *beside_others(workspace, number, policy),
@@ -58,8 +68,13 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
             if before is None
             else _changes(workspace, comparison.finish((before, number), policy))
         ),
-        _shown(workspace, "Most doubted: high score, low weight", doubted),
-        _shown(workspace, "Kept against a low score: below 0.5, greatest weight", kept),
+        *(
+            _shown(workspace, heading, ranking, rejected, repredicted=repredicted)
+            for heading, ranking in (
+                ("Most doubted: high score, low weight", doubted),
+                ("Kept against a low score: below 0.5, greatest weight", kept),
+            )
+        ),
         *_reliability(workspace, number, policy),
     ]
     title = f"Round {number}, weights by {policy}"
@@ -107,16 +122,44 @@ def _changed(workspace: Workspace, found: Difference, each: ChangedLabel) -> Fig
     return _close_up(workspace, each.frame, label, caption)
 
 
-def _shown(workspace: Workspace, title: str, ranking: Ranking) -> Section:
+def _rejected(
+    workspace: Workspace, number: int, policy: str, ranking: Ranking
+) -> AbstractSet[tuple[str, int]]:
+    """Frames and numbers of the labels that people rejected, in the frames of a ranking."""
+    labels = WEIGHTED_LABELS.c
+    query = select(labels.frame, labels.k).where(
+        labels.round == number,
+        labels.policy == policy,
+        labels.frame.in_(sorted({each.frame for each in ranking.labels})),
+        labels.provenance == "human",
+        labels.weight == 0,
+    )
+    with workspace.database.reading() as connection:
+        return {(frame, k) for frame, k in bulk.select(connection, query)}
+
+
+def _shown(
+    workspace: Workspace,
+    title: str,
+    ranking: Ranking,
+    rejected: AbstractSet[tuple[str, int]],
+    *,
+    repredicted: bool,
+) -> Section:
     """Pictures of the labels of a ranking."""
     figures = [
-        _close_up(workspace, each.frame, LabelShown(each.box, each.numbers["weight"]), _told(each))
+        _close_up(
+            workspace,
+            each.frame,
+            LabelShown(each.box, each.numbers["weight"]),
+            _told(each, rejected=(each.frame, each.k) in rejected, repredicted=repredicted),
+        )
         for each in ranking.labels
     ]
     return Section(title, "" if figures else "There is none.", figures=figures)
 
 
-def _told(label: RankedLabel) -> str:
+def _told(label: RankedLabel, *, rejected: bool, repredicted: bool) -> str:
     """What a label is, its numbers, and what took its weight away."""
     own = label.numbers
     shown = {"score": "score", "weight": "weight", "loss": "L", "points": "points",
@@ -125,11 +168,13 @@ def _told(label: RankedLabel) -> str:
         f"{word} {_figure(own[name])}" for name, word in shown.items() if not np.isnan(own[name])
     )
     reasons = {
-        "no reprediction matched it": np.isnan(own["loss"]),
+        "no reprediction matched it": repredicted and np.isnan(own["loss"]),
         "its loss is above lambda": own["loss"] >= own["lambda_u"],
         "no pixel of its category": own["rho_anno"] == 0,
         "no LiDAR point inside": own["points"] == 0,
     }
+    if rejected:
+        reasons = {"a person rejected it": True}
     found = [reason for reason, holds in reasons.items() if holds and own["weight"] <= 0]
     return f"{label.category} {label.k} in frame {label.frame}: {numbers}" + "".join(
         f"; {reason}" for reason in found

@@ -20,7 +20,17 @@ _TOLD = {
 }
 
 
-def summary(workspace: Workspace, totals: RoundTotals, number: int) -> Section:
+def is_repredicted(workspace: Workspace, number: int) -> bool:
+    """Whether the round has a second pass over augmented copies."""
+    view = bulk.table("reprediction_view")
+    query = select(view.c.round).where(view.c.round == number).limit(1)
+    with workspace.database.reading() as connection:
+        return bool(bulk.select(connection, query))
+
+
+def summary(
+    workspace: Workspace, totals: RoundTotals, number: int, *, repredicted: bool
+) -> Section:
     """The round in a few numbers."""
     n, kept, trusted = totals.everything.labels, totals.everything.kept, totals.trusted
     facts = [
@@ -29,7 +39,10 @@ def summary(workspace: Workspace, totals: RoundTotals, number: int) -> Section:
         ("weight above 0", f"{kept:,} ({kept / n:.1%})"),
         ("weight above 0.5", f"{trusted:,} ({trusted / n:.1%})"),
         ("sum of weights", f"{totals.everything.weight:,.1f}"),
-        ("matched again", f"{totals.matched:,} ({totals.matched / n:.1%})"),
+        (
+            "matched again",
+            f"{totals.matched:,} ({totals.matched / n:.1%})" if repredicted else "no second pass",
+        ),
     ]
     if len(totals.ages):
         low, high = float(totals.ages[0]), float(totals.ages[-1])

@@ -125,7 +125,7 @@ def find_teacher(workspace: Workspace, number: int) -> tuple[int, Teacher]:
     if not found:
         raise WorkspaceError(f"round {number} has no teacher yet; run `{before}`")
     key, path, digest = found[0]
-    if not (workspace.root / path).is_file():
+    if not (workspace.root / path).exists():
         raise WorkspaceError(f"{workspace.root / path}: the checkpoint is gone; run `{before}`")
     return key, Teacher(workspace.root / path, digest)
 

@@ -158,7 +158,7 @@ def run_once(
     Its rows and its task are stored in one transaction.
     """
     start = time.perf_counter()
-    if plan.is_current(workspace, what, fingerprint) and (file is None or file.is_file()):
+    if plan.is_current(workspace, what, fingerprint) and (file is None or file.exists()):
         return Report(what.stage, what.round, kept=1, summary="up to date")
     product = make()
     seconds = time.perf_counter() - start

@@ -78,10 +78,18 @@ class FolderDataset:
         return {path.stem: path for path in paths}
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
-        """The lists of the folder `splits`, by file name."""
+        """The lists of the folder `splits`, by file name.
+
+        Raises:
+            DataError: the folder is named, but holds none; no frame would be kept for val.
+        """
         if "splits" not in self._told:
             return {}
-        return read_frame_lists(self.root / self._told["splits"], self._boundary)
+        folder = self.root / self._told["splits"]
+        found = read_frame_lists(folder, self._boundary)
+        if not found:
+            raise DataError(f"{self._path}: splits: {folder} holds no list such as train.txt")
+        return found
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie, or an image would; the calibration is that of all frames.

@@ -23,7 +23,7 @@ p { margin: 4px 0 12px; color: var(--faint); }
 figure { margin: 0; padding: 12px; background: var(--panel); border-radius: 6px; min-width: 0; }
 figcaption { font-size: 13px; margin-top: 6px; color: var(--faint); overflow-wrap: anywhere; }
 figure img, svg { display: block; width: 100%; height: auto; border-radius: 4px; }
-.scroll { overflow-x: auto; }
+.scroll { overflow-x: auto; } .scroll + .row { margin-top: 16px; }
 table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums; }
 th, td { padding: 3px 12px 3px 0; border-bottom: 1px solid var(--line); text-align: right; }
 th { color: var(--faint); font-weight: 500; }

@@ -35,9 +35,10 @@ def train_round(
 
     A killed training continues from its last snapshot. With --command any trainer does it: in the
     command {labels}, {output}, {teacher}, {round} and {policy} are replaced, and CURATE_LABELS,
-    CURATE_OUTPUT and so on are in its environment; no shell runs it. It writes one file, {output}.
-    docs/training.md shows how v is made to count. Once it has trained the student that teaches the
-    next round, it is written into curate.toml, so that later rounds are trained with it too.
+    CURATE_OUTPUT and so on are in its environment; no shell runs it. It writes {output}, a
+    file or a folder. docs/training.md shows how v is made to count. Once it has trained the student
+    that teaches the next round, it is written into curate.toml, so that later rounds are trained
+    with it too.
 
     Example: curate train-round --command "python train.py {labels} {output}"
     """

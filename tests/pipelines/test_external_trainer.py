@@ -165,6 +165,7 @@ def test_labels_come_in_the_format_that_is_asked_for(curate: Curate, exported: W
         ("import os; os.kill(os.getpid(), 9)", "ended with signal 9"),
         ("pass", "was not written, though the trainer ended well"),
         ("import os; open(os.environ['CURATE_OUTPUT'], 'w')", "is empty, though"),
+        ("import os; os.mkdir(os.environ['CURATE_OUTPUT'])", "is empty, though"),
     ],
 )
 def test_a_trainer_that_fails_is_one_line_and_an_exit_code(

@@ -1,6 +1,8 @@
 """A foreign detector's result files without a second pass, and what a new user does with them."""
 
 import json
+import shlex
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +75,41 @@ def test_the_priors_alone_weigh_where_the_setting_says_so(
     assert "no second pass over augmented copies" in out
     assert f"recomputed     {rows[0]['weight']:.4f}" in out
     assert "differ" not in out
+    assert curate("report", "-w", work)[0] == 0
+    page = (work / "reports" / "round-01-pspsl.html").read_text()
+    assert "no second pass" in page
+    assert "no reprediction matched it" not in page
+
+
+def test_a_folder_of_results_is_taught_by_a_folder_of_results(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path
+) -> None:
+    """The next detector's files, which the command writes; trained anew, they replace those."""
+    work = tmp_path / "work"
+    begin(curate, work, toy_kitti, results, "--set", "solve.self_paced=false")
+    assert curate("run", "-w", work)[0] == 0
+    for moved in ("surer", "surest"):
+        code = (
+            "import os, pathlib; output = pathlib.Path(os.environ['CURATE_OUTPUT']);"
+            "output.mkdir(exist_ok=True); teacher = pathlib.Path(os.environ['CURATE_TEACHER']);"
+            "[(output / path.name).write_text(path.read_text().replace('0.9', '0.95'))"
+            f" for path in teacher.iterdir()]; (output / '{moved}').write_text('yes')"
+        )
+        command = shlex.join([sys.executable, "-c", code])
+        ended, _, err = curate(
+            "train-round", "--round", 1, "--command", command, "--workspace", work
+        )
+        assert ended == 0, err
+    student = work / "checkpoints" / "round-01-pspsl"
+    assert len(list(student.glob("*.txt"))) == len(list(results.iterdir()))
+    assert [path.name for path in student.iterdir() if not path.suffix] == ["surest"]
+    ended, _, err = curate("run", "--rounds", 2, "-w", work)
+    assert ended == 0, err
+    assert "train-round up to date" in curate("run", "--rounds", 1, "-w", work)[1]
+    sql = "SELECT round, avg(score) AS score FROM weighted_labels GROUP BY round"
+    rows = json.loads(curate("query", sql, "--json", "-w", work)[1])
+    assert [row["round"] for row in rows] == [1, 2]
+    assert rows[0]["score"] < rows[1]["score"]
 
 
 @pytest.mark.parametrize(

@@ -321,6 +321,10 @@ def test_people_are_seen_where_labels_are_shown(
     assert "1 accepted, 1 added, 1 moved, 1 rejected" in page
     asked = json.loads(curate("query", "--named", "human", "-w", workspace.root, "--json")[1])
     assert sum(row["objects"] for row in asked) == 3
+    for arguments in (("solve", "--policy", "uniform"), ("report", "--policy", "uniform")):
+        assert curate(*arguments, "-w", workspace.root)[0] == 0
+    page = (workspace.root / "reports" / "round-01-uniform.html").read_text()
+    assert "a person rejected it" in page
 
 
 WISHES = (

@@ -88,6 +88,18 @@ def test_a_wrong_description_is_one_line(tmp_path, line, other, message):
     assert "\n" not in str(caught.value)
 
 
+def test_a_folder_of_lists_that_holds_none_is_named(tmp_path):
+    """A slip in its name must not turn val frames into training frames."""
+    write_toy_folder(tmp_path)
+    description = tmp_path / "dataset.toml"
+    description.write_text('splits = "lists"\n' + description.read_text())
+    with pytest.raises(DataError, match="holds no list such as train"):
+        FolderDataset(tmp_path).splits()
+    (tmp_path / "lists").mkdir()
+    (tmp_path / "lists" / "train.txt").write_text("a\n")
+    assert FolderDataset(tmp_path).splits() == {"train": ("a",)}
+
+
 def test_frames_without_images_have_a_size(tmp_path):
     """Points and boxes in the image need no pixels; who asks for them is told."""
     write_toy_folder(tmp_path)

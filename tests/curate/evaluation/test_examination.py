@@ -68,6 +68,7 @@ def test_a_sound_frame_is_ok():
         (lambda b: b * [1, 1, 1, 1, 1, 1, -1], "yaw is negated"),
         (lambda b: b * [1, 1, 1, 1, 1, 1, -1] - [0, 0, 0, 0, 0, 0, np.pi / 2], "rotation_y"),
         (lambda b: b - b[:, 5:6] / 2 * [0, 0, 1, 0, 0, 0, 0], "z is that of the bottom"),
+        (lambda b: b + b[:, 5:6] / 2 * [0, 0, 1, 0, 0, 0, 0], "their centre was taken for"),
         (
             lambda b: np.column_stack(
                 [-b[:, 1], -b[:, 2] + b[:, 5] / 2, b[:, 0], b[:, 3:6], -b[:, 6] - np.pi / 2]
@@ -111,13 +112,14 @@ def test_data_that_cannot_be_is_seen():
 
 @pytest.mark.kitti
 def test_real_boxes_are_sound_and_wrong_ones_are_found(kitti_root):
-    """A weak detector's cars on real sweeps: right, turned, and at their bottom."""
+    """A weak detector's cars on real sweeps: right, turned, too low and too high."""
     dataset = KittiDataset(kitti_root)
     record = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv")
     changes = {
         "right": lambda boxes: boxes,
         "turned": lambda boxes: boxes + QUARTER,
         "bottom": lambda boxes: boxes - boxes[:, 5:6] * np.array([0, 0, 0.5, 0, 0, 0, 0]),
+        "high": lambda boxes: boxes + boxes[:, 5:6] * np.array([0, 0, 0.5, 0, 0, 0, 0]),
     }
     said = {name: [] for name in changes}
     for name in record.frame_ids():
@@ -133,3 +135,4 @@ def test_real_boxes_are_sound_and_wrong_ones_are_found(kitti_root):
     assert {one.state for one in said["right"]} == {"ok"}
     assert all("90 degrees" in one.message or "rotation_y" in one.message for one in said["turned"])
     assert np.mean(["bottom" in one.message for one in said["bottom"]]) > 0.75
+    assert np.mean(["taken for" in one.message for one in said["high"]]) > 0.65
