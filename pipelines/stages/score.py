@@ -7,6 +7,7 @@ formula has changed, its labels are rated again from what is stored, without a l
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from pathlib import Path
 
 import numpy as np
 from sqlalchemy import select
@@ -20,7 +21,7 @@ from pipelines.config import Config
 from pipelines.executors.base import FrameJob, FrameRows
 from pipelines.registry import PRIORS
 from pipelines.stage import FrameStage, Recall, RoundContext, Settings
-from pipelines.workspace import Workspace, open_dataset, sha256
+from pipelines.workspace import Workspace, glance, open_dataset, sha256
 
 # Where evidence is stored, by the column of its trust; at most one prior fills each.
 TABLES = {"rho_diff": "point_prior", "rho_anno": "semantic_prior"}
@@ -145,9 +146,15 @@ def _measured_settings(name: str, workspace: Workspace, _context: RoundContext) 
     if not PRIORS.takes(name, "segmenter"):
         return options
     path = segmenter_path(config)
-    model = sha256(path) if path is not None and path.is_file() else str(path)
     segmenter = config.segmenter.model_dump(mode="json", exclude={"path"})
-    return {**options, "segmenter": segmenter, "model": model}
+    return {**options, "segmenter": segmenter, "model": _identity(path)}
+
+
+def _identity(path: Path | None) -> str:
+    """What tells a model, or a folder of saved maps, from another one in its place."""
+    if path is not None and path.is_dir():
+        return glance(path)
+    return sha256(path) if path is not None and path.is_file() else str(path)
 
 
 def _function(kind: type[Score], name: str, workspace: Workspace, _context: RoundContext) -> Score:

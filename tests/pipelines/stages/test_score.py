@@ -1,5 +1,7 @@
 """Priors as stages: the shipped ones, and those that a user brings."""
 
+from pathlib import Path
+
 import pytest
 from sqlalchemy import text
 
@@ -48,6 +50,23 @@ def test_priors_that_take_turns_do_not_pass_for_each_other(workspace: Workspace)
     assert run(workspace)["points"] == 6
     assert answers(workspace) == before
     assert set(run(workspace).values()) == {0}
+
+
+def test_other_maps_in_the_same_folder_are_looked_at_anew(
+    workspace: Workspace, tmp_path: Path
+) -> None:
+    """A segmenter may be a folder: what is exchanged or renamed in it counts, a look at it not."""
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    (maps / "a.png").write_bytes(b"one map")
+    own = workspace.with_settings("segmenter", path=maps)
+    assert run(own)["semantic"] == 6
+    assert run(own)["semantic"] == 0
+    (maps / "a.png").write_bytes(b"another one")
+    assert run(own)["semantic"] == 6
+    (maps / "a.png").rename(maps / "b.png")
+    assert run(own)["semantic"] == 6
+    assert run(own)["semantic"] == 0
 
 
 def test_two_priors_for_one_place_are_refused() -> None:
