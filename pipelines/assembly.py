@@ -36,10 +36,16 @@ def open_detector(config: Config, path: Path) -> Detector:
             "threads": lambda: 1,
             "frame_ids": lambda: open_dataset(config).frame_ids(),
             "calibration": lambda: _calibrations(config),
+            "wants_views": lambda: wants_views(config),
         },
         options=section.options,
     )
     return detector
+
+
+def wants_views(config: Config) -> bool:
+    """Whether the method weighs by the consistency loss; the priors alone need no second pass."""
+    return config.run.method != "pspsl" or config.solve.self_paced
 
 
 def _calibrations(config: Config) -> Callable[[str], Calibration]:

@@ -8,7 +8,7 @@ from curate.detectors.base import RecordedViews
 from curate.errors import ConfigError, CurateError
 from curate.evaluation.examination import Finding, examine_detections, examine_frame
 from curate.frames import Frame
-from pipelines.assembly import open_detector, open_segmenter
+from pipelines.assembly import open_detector, open_segmenter, wants_views
 from pipelines.config import Config
 from pipelines.rounds import newest_checkpoint
 from pipelines.stages.predict import checked, visible
@@ -74,7 +74,7 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
 
 def _no_views(config: Config) -> Finding:
     """A record without a second pass is fine for methods that need none."""
-    if config.run.method == "pspsl" and not config.solve.self_paced:
+    if not wants_views(config):
         return Finding("views", "ok", "none recorded; the priors alone weigh")
     return Finding(
         "views",

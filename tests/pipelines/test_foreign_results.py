@@ -41,7 +41,7 @@ def begin(curate: Curate, work: Path, root: Path, results: Path, *more: object) 
 
 
 def test_without_a_second_pass_labels_are_kept_with_weight_0(
-    curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path
+    curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """No evidence is weight 0, not a label that vanishes; doctor names the remedy."""
     work = tmp_path / "work"
@@ -52,13 +52,14 @@ def test_without_a_second_pass_labels_are_kept_with_weight_0(
     code, out, err = curate("run", "-w", work)
     assert code == 0, err
     assert "18 labels, 0 with weight > 0" in out
+    assert "no second pass" in caplog.text
     sql = "SELECT count(*) AS n, count(loss) AS losses, sum(weight) AS v FROM weighted_labels"
     [row] = json.loads(curate("query", sql, "--json", "-w", work)[1])
     assert row == {"n": 18, "losses": 0, "v": 0.0}
 
 
 def test_the_priors_alone_weigh_where_the_setting_says_so(
-    curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path
+    curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Every label weighs rho_det, and explain works it out again."""
     work = tmp_path / "work"
@@ -66,6 +67,7 @@ def test_the_priors_alone_weigh_where_the_setting_says_so(
     assert "the priors alone weigh" in curate("doctor", "-w", work)[1]
     code, _, err = curate("run", "-w", work)
     assert code == 0, err
+    assert "no second pass" not in caplog.text
     sql = "SELECT frame, k, rho_det, weight FROM weighted_labels ORDER BY weight DESC"
     rows = json.loads(curate("query", sql, "--json", "-w", work)[1])
     assert len(rows) == 18

@@ -77,6 +77,7 @@ class RecordedDetector:
         frame_ids: of the data set; recorded frames that are not among them are reported.
         calibration: of a frame of the data set, by its name, for views in KITTI's or nuScenes'
             form.
+        wants_views: whether somebody counts on a second pass; one that is missing is then said.
 
     Raises:
         DataError: a file is missing or malformed, or none of its frames is in the data set.
@@ -96,6 +97,7 @@ class RecordedDetector:
         axes: str = "forward-left",
         frame_ids: Sequence[str] = (),
         calibration: Callable[[str], Calibration] | None = None,
+        wants_views: bool = True,
     ) -> None:
         refuse_unknown_kind(kind)
         if axes not in _TURNS:
@@ -105,6 +107,7 @@ class RecordedDetector:
         self.rename = dict(rename or {})
         self._turn = _TURNS[axes]
         self._calibration = calibration
+        self._wants_views = wants_views
         listed = self.path.parent / frame_list if frame_list else None
         self._record = _open(self.path, kind, Reading(tuple(classes), listed), passes)
         if frame_ids:
@@ -130,7 +133,7 @@ class RecordedDetector:
             DataError: nothing was recorded for the frame, or what was is malformed.
         """
         views = self._record.views(frame_id)
-        if not views and not self._record.has_views:
+        if self._wants_views and not views and not self._record.has_views:
             _warn_once(
                 f"{self.path}: no second pass over augmented copies, so no label has a consistency "
                 "loss, and methods that need one weigh every label 0 unless solve.self_paced = "
