@@ -14,6 +14,7 @@ projection = [[...], [...], [...]]             # 3 x 4, camera (z forward) to pi
 lidar_to_camera = [[...], [...], [...]]        # 3 x 4 or 4 x 4, LiDAR (x forward) to camera
 """
 
+import sys
 import tomllib
 from collections.abc import Mapping
 from functools import cached_property
@@ -217,7 +218,8 @@ def _is_size(value: object) -> bool:
 
 
 def _positive(value: object) -> bool:
-    return isinstance(value, int | float) and value > 0
+    # TOML's integers have no end; floating point numbers have.
+    return isinstance(value, int | float) and 0 < value <= sys.float_info.max
 
 
 def _matrix(
@@ -225,7 +227,7 @@ def _matrix(
 ) -> np.ndarray:
     try:
         matrix = np.array(told.get(key, ()), dtype=np.float64)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape not in shapes or not np.isfinite(matrix).all():
         known = " or ".join(f"{rows} x {columns}" for rows, columns in shapes)

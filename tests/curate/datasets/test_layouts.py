@@ -71,8 +71,10 @@ def test_raw_calibration_is_named_where_it_is_wrong(tmp_path):
         ('points = "lidar"\n', "", "no key points"),
         ("intensity_scale = 255\n", "intensity_scale = 0\n", "intensity_scale cannot be"),
         ("intensity_scale = 255\n", "columns = 2\n", "columns cannot be"),
+        ("intensity_scale = 255\n", f"intensity_scale = 1{'0' * 400}\n", "scale cannot be"),
         ("intensity_scale = 255\n", "rings = 64\n", "unknown key rings; known are points"),
         ("projection = [[60.0,", "projection = [[", r"calibration\.projection must be 3 x 4"),
+        ("projection = [[60.0,", f"projection = [[1{'0' * 400},", "projection must be 3 x 4"),
         ("[calibration]\n", "[calibration\n", "not TOML"),
     ],
 )
