@@ -16,7 +16,7 @@ from pathlib import Path
 import typer
 
 from curate.detections import CATEGORIES
-from curate.errors import CurateError
+from curate.errors import CurateError, WorkspaceError
 from curate.evaluation import kitti_ap
 from curate.evaluation.kitti_rules import LOOSE_OVERLAPS
 from pipelines.commands.options import print_report, print_table
@@ -220,7 +220,12 @@ def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:
 def _draw(workspace: Workspace, say: Say) -> None:
     from pipelines.pictures import draw_telling_frame
 
-    for path in draw_telling_frame(workspace, 1):
+    try:
+        pictures = draw_telling_frame(workspace, 1)
+    except WorkspaceError:  # a teacher of a few steps finds nothing
+        say("   no picture: there are no labels; train for more --steps")
+        return
+    for path in pictures:
         say(f"   picture: {_shown(path)}")
 
 
