@@ -85,6 +85,11 @@ def one_line(error: BaseException, longest: int | None = None) -> str:
     return " ".join(str(error).split())[:longest]
 
 
+def joined_lines(error: BaseException | None) -> str:
+    """What a database's error says on several lines, as one: parted by semicolons."""
+    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+
+
 def first_line(error: BaseException) -> str:
     """What another library's error says first, for one whose message is a page."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

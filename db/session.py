@@ -12,7 +12,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
-from curate.errors import ConfigError, DatabaseError, LeakageError
+from curate.errors import ConfigError, DatabaseError, LeakageError, joined_lines
 from db.backups import back_up
 from db.claims import claimed, round_resources
 from db.lock_holders import holders
@@ -131,7 +131,7 @@ class Database:
             raise self._translated(error) from error
 
     def _translated(self, error: BaseException) -> DatabaseError | LeakageError:
-        message = "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+        message = joined_lines(error)
         if "ground truth of an unlabeled frame" in message:
             return LeakageError(f"{self.name}: {message} must not be stored")
         return DatabaseError(f"{self.name}: {message}{self._remedy(message)}")

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import URL, Connection, CursorResult, NullPool, create_engine
 from sqlalchemy.exc import DBAPIError
 
-from curate.errors import ConfigError, DatabaseError, one_line
+from curate.errors import ConfigError, DatabaseError, joined_lines, one_line
 
 # What SQLite may do for a question: read tables and call functions, nothing else. ATTACH would read
 # other files, PRAGMA could switch the protection off.
@@ -120,7 +120,7 @@ def _ask_server(
     try:
         connection = engine.connect()
     except DBAPIError as error:
-        raise DatabaseError(f"{url.render_as_string()}: {_one_line(error.orig)}") from error
+        raise DatabaseError(f"{url.render_as_string()}: {joined_lines(error.orig)}") from error
     end = time.monotonic() + seconds
     try:
         reading = connection.execution_options(postgresql_readonly=True)
@@ -152,17 +152,13 @@ def _server_rows(
 def _servers_words(error: DBAPIError, seconds: float) -> ConfigError:
     if getattr(error.orig, "sqlstate", None) == _TIMED_OUT:
         return _given_up(seconds)
-    return ConfigError(_explain(_one_line(error.orig)))
+    return ConfigError(_explain(joined_lines(error.orig)))
 
 
 def _given_up(seconds: float) -> ConfigError:
     return ConfigError(
         f"query: given up after {seconds:g} seconds; ask for less, or allow more with --seconds"
     )
-
-
-def _one_line(error: BaseException | None) -> str:
-    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
 def _explain(message: str) -> str:

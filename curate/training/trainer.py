@@ -11,7 +11,7 @@ import torch
 from curate.detectors.pillars.checkpoint import load_checkpoint, save_checkpoint
 from curate.detectors.pillars.network import PillarNetwork, checkpoint_of, network_of
 from curate.detectors.pillars.presets import preset_named
-from curate.errors import ConfigError, ModelError
+from curate.errors import ConfigError, ModelError, first_line
 from curate.frames import Frame
 from curate.training.batches import Batches
 from curate.training.labels import WeightedLabels
@@ -164,5 +164,6 @@ def _first_network(
     try:
         return network.to(settings.device)
     except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"device {settings.device!r} cannot be used: {reason}") from None
+        raise ConfigError(
+            f"device {settings.device!r} cannot be used: {first_line(error)}"
+        ) from None

@@ -16,7 +16,7 @@ from curate.detectors.pillars.checkpoint import (
     write_graph,
 )
 from curate.detectors.pillars.encoding import Pillars, decode, encode_points
-from curate.errors import ConfigError, ModelError
+from curate.errors import ConfigError, ModelError, first_line
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.nms import nms_bev
@@ -134,8 +134,7 @@ def _torch_answers(
         place = torch.device(device)
         network = SingleFrame(network_of(checkpoint)).eval().to(place)
     except (RuntimeError, AssertionError) as error:
-        message = str(error).splitlines()[0]
-        raise ConfigError(f"device {device!r} cannot be used: {message}") from None
+        raise ConfigError(f"device {device!r} cannot be used: {first_line(error)}") from None
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None
 

@@ -23,7 +23,7 @@ import numpy as np
 from curate.batches import batched
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded.answers import LARGEST
-from curate.errors import DataError
+from curate.errors import DataError, one_line
 from curate.geometry.similarity import Similarity, wrap_angle
 
 View = tuple[Similarity, Detections]
@@ -68,7 +68,7 @@ class TableRecord:
         except FileNotFoundError:
             raise DataError(f"{path}: no such file of recorded detections") from None
         except (OSError, UnicodeDecodeError, csv.Error) as error:
-            raise DataError(f"{path}: cannot be read as CSV: {error}") from error
+            raise DataError(f"{path}: cannot be read as CSV: {one_line(error)}") from error
         names = np.concatenate([names for names, _ in runs] or [np.empty(0, dtype="S1")])
         places = np.concatenate([places for _, places in runs] or [np.empty((0, 3), np.int64)])
         sort = np.argsort(names, kind="stable")
