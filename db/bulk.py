@@ -132,7 +132,10 @@ def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
 
 
 def _as_they_are(connection: Connection, statement: Select[Any]) -> bool:
-    """Whether SQLite's driver gives the values that are meant, as it does but for times."""
+    """Whether SQLite's driver gives the values that are meant, as it does but for times.
+
+    An object of SQLAlchemy per row takes as long as the row itself.
+    """
     dialect = connection.dialect
     return dialect.name == "sqlite" and all(
         column.type.dialect_impl(dialect).result_processor(dialect, None) is None
@@ -141,12 +144,8 @@ def _as_they_are(connection: Connection, statement: Select[Any]) -> bool:
 
 
 def blocks(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[Row]]:
-    """The rows of a query, some at a time.
-
-    For numbers and text only: SQLite's come as its driver makes them, without an object of
-    SQLAlchemy per row, which takes as long as the row itself.
-    """
-    if connection.dialect.name == "sqlite":
+    """The rows of a query, some at a time."""
+    if _as_they_are(connection, statement):
         result = connection.execute(statement)
         cursor = result.cursor
         while cursor is not None and (rows := cursor.fetchmany(FETCHED_ROWS)):

@@ -7,6 +7,7 @@ from itertools import chain
 import numpy as np
 from sqlalchemy import Connection, select
 
+from curate.batches import batched
 from curate.errors import WorkspaceError
 from curate.label_changes import RoundLabels
 from db import bulk
@@ -87,8 +88,7 @@ def read_blocks(
     labels = dict.fromkeys(rounds, 0)
     with workspace.database.reading() as connection:
         names = sorted(row[0] for row in bulk.select(connection, select(frame)))
-        for first in range(0, len(names), _BLOCK_FRAMES):
-            block = names[first : first + _BLOCK_FRAMES]
+        for block in batched(names, _BLOCK_FRAMES):
             found = {each: _read(workspace, connection, each, policy, block) for each in labels}
             labels = {each: count + len(found[each]) for each, count in labels.items()}
             yield tuple(found[each] for each in rounds)
@@ -121,8 +121,8 @@ def _read(
     ).where(labels.round == round_number, labels.policy == policy)
     queries = [query]
     if wanted is not None:
-        parts = range(0, len(wanted), _ASKED_FRAMES)
-        queries = [query.where(labels.frame.in_(wanted[i : i + _ASKED_FRAMES])) for i in parts]
+        parts = batched(wanted, _ASKED_FRAMES)
+        queries = [query.where(labels.frame.in_(part)) for part in parts]
     frames: dict[str, int] = {}
     categories = {name: i for i, name in enumerate(workspace.config.dataset.categories)}
     keys, tables = [np.zeros((0, 3), np.int64)], [np.zeros((0, len(values)))]
