@@ -45,6 +45,14 @@ def _frame(database: Database, split: str) -> int:
         return connection.exec_driver_sql(query).scalar_one()
 
 
+def _downgrade(connection: Connection) -> None:
+    """Back to the first schema; its views must be gone, or as they were then."""
+    config = Config()
+    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
+    config.attributes["connection"] = connection
+    command.downgrade(config, "0001")
+
+
 def _truth(frame_id: int, split: str) -> tuple:
     return (frame_id, 0, split, "Car", *[1.0] * 7, 0.0, 0, 0.0, *[1.0] * 4)
 
@@ -59,12 +67,9 @@ def test_migrations_make_the_tables_of_the_models(database: Database) -> None:
 def test_a_database_of_an_older_curate_is_migrated(database: Database) -> None:
     """Its rows are kept, the new tables and views are there, and its backward step undoes it."""
     _frame(database, "val")
-    config = Config()
-    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
     with database.writing() as connection:
-        config.attributes["connection"] = connection
         drop_views(connection)
-        command.downgrade(config, "0001")
+        _downgrade(connection)
         assert "audit" not in inspect(connection).get_table_names()
     database.close()
     with Database(database.url).reading() as connection:
@@ -81,11 +86,8 @@ def test_an_older_database_is_kept_before_it_is_migrated(
     database = Database(url)
     assert [path.name for path in tmp_path.glob("*backup*")] == []
     _frame(database, "val")
-    config = Config()
-    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
     with database.writing() as connection:
-        config.attributes["connection"] = connection
-        command.downgrade(config, "0001")
+        _downgrade(connection)
     database.close()
     Database(url).close()
     backup = tmp_path / "curate.db.schema-0001.backup"
@@ -105,12 +107,9 @@ def older_server_database(new_url: Callable[[], str | None]) -> Database:
         pytest.skip("SQLite files are copied, see above")
     database = Database(url)
     _frame(database, "val")
-    config = Config()
-    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
     with database.writing() as connection:
-        config.attributes["connection"] = connection
         drop_views(connection)
-        command.downgrade(config, "0001")
+        _downgrade(connection)
     database.close()
     return database
 
@@ -165,12 +164,9 @@ def test_who_finds_a_database_migrated_meanwhile_leaves_its_copy_alone(
 ) -> None:
     """Two processes find an older schema at once; the copy stays that of the older schema."""
     database = Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
-    config = Config()
-    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
     with database.writing() as connection:
-        config.attributes["connection"] = connection
         drop_views(connection)
-        command.downgrade(config, "0001")
+        _downgrade(connection)
     database.close()
     writing = Database.writing
 
