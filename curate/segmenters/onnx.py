@@ -17,17 +17,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
-from curate.errors import ConfigError, ModelError, first_line
+from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
-from curate.onnx_session import open_session, runtime_errors
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes
-from curate.segmenters.onnx_images import SCALINGS, image_input
+from curate.segmenters.onnx_images import ImageModel, image_of
 
 # A whole image may be squeezed by this factor before it is cut into crops.
 _SQUEEZE_LIMIT = 1.5
@@ -64,17 +62,12 @@ class OnnxSegmenter:
         scaling: str = "imagenet",
         threads: int = 1,
     ) -> None:
-        if scaling not in SCALINGS:
-            raise ConfigError(f"segmenter scaling {scaling!r}: use one of {', '.join(SCALINGS)}")
         if tiles < 1:
             raise ConfigError(f"segmenter tiles {tiles}: at least 1")
-        self.model = Path(model)
         self.classes = checked_classes(classes)
         self.tiles = tiles
-        self.scaling = scaling
-        self._session = open_session(self.model, threads, "segmenter")
-        self._input = image_input(self._session, self.model)
-        _refuse_output(self._session, self.model)
+        self._model = ImageModel(model, scaling, threads)
+        self._output = _map_output(self._model)
 
     def segment(self, frame: Frame) -> SemanticMap:
         """The frame's semantic map.
@@ -82,11 +75,10 @@ class OnnxSegmenter:
         Raises:
             ModelError: the frame has no image, or the model's answer is no semantic map.
         """
-        if frame.image is None:
-            raise ModelError(f"frame {frame.frame_id} was read without the image to segment")
-        height, width = frame.image.shape[:2]
+        image = image_of(frame)
+        height, width = image.shape[:2]
         crops = self._crops(width, height)
-        tiles = [self._run(frame.image[:, crop.left : crop.right]) for crop in crops]
+        tiles = [self._run(image[:, crop.left : crop.right]) for crop in crops]
         return SemanticMap(self._merge(crops, tiles), self.classes)
 
     def _merge(self, crops: list["Crop"], tiles: list[np.ndarray]) -> np.ndarray:
@@ -107,7 +99,7 @@ class OnnxSegmenter:
 
     def _crops(self, width: int, height: int) -> list["Crop"]:
         """The crops of an image; a single one where the model's shape suits it."""
-        shape = self._input
+        shape = self._model.input
         whole = [Crop(0, width, 0, width)]
         if shape.height is None or shape.width is None or self.tiles == 1:
             return whole
@@ -119,15 +111,13 @@ class OnnxSegmenter:
     def _run(self, image: np.ndarray) -> np.ndarray:
         """(h, w) uint8 class ids of an (h, w, 3) image."""
         height, width = image.shape[:2]
-        target = (self._input.width or width, self._input.height or height)
+        shape = self._model.input
+        target = (shape.width or width, shape.height or height)
         shrinks = target[0] < width or target[1] < height
         kind = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         pixels = cv2.resize(image, target, interpolation=kind)
-        try:
-            answer = self._session.run(None, self._input.feed(pixels, self.scaling))[0]
-        except runtime_errors() as error:
-            raise ModelError(f"{self.model}: {first_line(error)}") from error
-        class_ids = _class_ids(answer, target, self.model)
+        (answer,) = self._model.run(pixels, [self._output])
+        class_ids = _class_ids(answer, target, self._model.path)
         return cv2.resize(class_ids, (width, height), interpolation=cv2.INTER_NEAREST)
 
 
@@ -152,11 +142,13 @@ def cut_along(width: int, crop_width: int, count: int) -> list[Crop]:
     ]
 
 
-def _refuse_output(session: Any, model: Path) -> None:
-    """ModelError where a model says that its answer is no map."""
-    output = session.get_outputs()[0]
+def _map_output(model: ImageModel) -> str:
+    """The output that is the map; ModelError where the model says that it is none."""
+    output = model.outputs[0]
     if output.shape and len(output.shape) not in {3, 4}:
-        raise ModelError(f"{model}: answers {output.name} {output.shape}; {_ANSWER}")
+        raise ModelError(f"{model.path}: answers {output.name} {output.shape}; {_ANSWER}")
+    name: str = output.name
+    return name
 
 
 def _class_ids(answer: np.ndarray, size: tuple[int, int], model: Path) -> np.ndarray:

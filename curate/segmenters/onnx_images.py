@@ -1,12 +1,15 @@
-"""The image that an ONNX model takes: its type, the order of its axes, its size, its scaling."""
+"""ONNX models that take an image: its type, the order of its axes, its size, its scaling."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from curate.errors import ModelError
+from curate.errors import ConfigError, ModelError, first_line
+from curate.frames import Frame
+from curate.onnx_session import open_session, runtime_errors
 
 # Mean and standard deviation of ImageNet's RGB, with which most published models were trained.
 _IMAGENET = (np.array([0.485, 0.456, 0.406]) * 255, np.array([0.229, 0.224, 0.225]) * 255)
@@ -50,17 +53,61 @@ class ImageInput:
         return {self.name: np.ascontiguousarray(pixels[None] if self.batched else pixels)}
 
 
-def image_input(session: Any, model: Path, *, single: bool = False) -> ImageInput:
-    """The input of a model that takes one image.
+class ImageModel:
+    """An ONNX model that takes one image.
 
     Args:
-        session: of ONNX Runtime.
-        model: for messages.
+        path: the .onnx file.
+        scaling: see `SCALINGS`.
+        threads: of ONNX Runtime.
         single: whether an image without an axis of images is taken too, [3, height, width].
 
+    Attributes:
+        input: see `ImageInput`.
+        outputs: what it answers, as ONNX Runtime describes it.
+
     Raises:
-        ModelError: it takes something else.
+        ConfigError: there is no such scaling.
+        ModelError: the file is missing or no ONNX model, or it takes something else.
     """
+
+    def __init__(self, path: Path, scaling: str, threads: int, *, single: bool = False) -> None:
+        if scaling not in SCALINGS:
+            raise ConfigError(f"segmenter scaling {scaling!r}: use one of {', '.join(SCALINGS)}")
+        self.path = Path(path)
+        self._scaling = scaling
+        self._session = open_session(self.path, threads, "segmenter")
+        self.input = _image_input(self._session, self.path, single=single)
+        self.outputs = self._session.get_outputs()
+
+    def run(self, pixels: np.ndarray, outputs: Sequence[str]) -> list[Any]:
+        """The named outputs for (height, width, 3) uint8 RGB pixels of the model's size.
+
+        Raises:
+            ModelError: the model fails.
+        """
+        try:
+            found: list[Any] = self._session.run(
+                list(outputs), self.input.feed(pixels, self._scaling)
+            )
+        except runtime_errors() as error:
+            raise ModelError(f"{self.path}: {first_line(error)}") from error
+        return found
+
+
+def image_of(frame: Frame) -> np.ndarray:
+    """(height, width, 3) uint8 RGB, what a frame's camera saw.
+
+    Raises:
+        ModelError: the frame was read without it.
+    """
+    if frame.image is None:
+        raise ModelError(f"frame {frame.frame_id} was read without the image to segment")
+    return frame.image
+
+
+def _image_input(session: Any, model: Path, *, single: bool) -> ImageInput:
+    """The input of a model that takes one image; ModelError where it takes something else."""
     inputs = session.get_inputs()
     found = ", ".join(f"{one.name} {one.type}{one.shape}" for one in inputs)
     fault = ModelError(f"{model}: takes {found}; {_EXPECTED}")

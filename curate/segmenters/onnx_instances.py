@@ -1,6 +1,6 @@
 """Any instance segmentation model that was exported to ONNX, its masks laid over each other.
 
-The model takes one RGB image, see `image_input`. Into a fixed size the image is shrunk with its
+The model takes one RGB image, see `ImageInput`. Into a fixed size the image is shrunk with its
 proportions kept, in the upper left corner of a grey one. Where masks overlap, the higher score is
 on top; a mask of a class that means no category hides what is behind it.
 """
@@ -11,13 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from curate.errors import ConfigError, ModelError, first_line
+from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
-from curate.onnx_session import open_session, runtime_errors
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes, free_id
 from curate.segmenters.onnx_answers import KINDS, Instance
-from curate.segmenters.onnx_images import SCALINGS, image_input
+from curate.segmenters.onnx_images import ImageModel, image_of
 from curate.segmenters.pasting import Box, paste_mask
 
 _OUTPUTS = {name: name for name in ("boxes", "labels", "scores", "masks")}
@@ -56,17 +55,12 @@ class OnnxInstanceSegmenter:
         scaling: str = "unit",
         threads: int = 1,
     ) -> None:
-        if scaling not in SCALINGS:
-            raise ConfigError(f"segmenter scaling {scaling!r}: use one of {', '.join(SCALINGS)}")
         if not 0 <= minimum_score <= 1:
             raise ConfigError(f"segmenter minimum_score {minimum_score}: 0 to 1")
-        self.model = Path(model)
         self.classes = checked_classes(classes)
         self.minimum_score = minimum_score
         self.mask_threshold = mask_threshold
-        self.scaling = scaling
-        self._session = open_session(self.model, threads, "segmenter")
-        self._input = image_input(self._session, self.model, single=True)
+        self._model = ImageModel(model, scaling, threads, single=True)
         self._outputs = self._declared(dict(outputs or _OUTPUTS))
 
     def segment(self, frame: Frame) -> SemanticMap:
@@ -75,10 +69,9 @@ class OnnxInstanceSegmenter:
         Raises:
             ModelError: the frame has no image, or the model's answer is of another kind.
         """
-        if frame.image is None:
-            raise ModelError(f"frame {frame.frame_id} was read without the image to segment")
-        height, width = frame.image.shape[:2]
-        pixels, scale = self._fitted(frame.image)
+        image = image_of(frame)
+        height, width = image.shape[:2]
+        pixels, scale = self._fitted(image)
         size = (pixels.shape[1], pixels.shape[0])
         class_ids = np.full((height, width), free_id(self.classes), dtype=np.uint8)
         wanted = {one for ids in self.classes.values() for one in ids}
@@ -101,19 +94,20 @@ class OnnxInstanceSegmenter:
         if frozenset(outputs) not in KINDS:
             kinds = "; or ".join(", ".join(sorted(kind)) for kind in KINDS)
             raise ConfigError(f"segmenter outputs {', '.join(outputs)}: declare {kinds}")
-        there = [one.name for one in self._session.get_outputs()]
+        there = [one.name for one in self._model.outputs]
         missing = [name for name in outputs.values() if name not in there]
         if missing:
             raise ConfigError(
-                f"{self.model}: has no output {', '.join(missing)} but {', '.join(there)}; say "
-                "which is which in segmenter.options.outputs"
+                f"{self._model.path}: has no output {', '.join(missing)} but {', '.join(there)}; "
+                "say which is which in segmenter.options.outputs"
             )
         return outputs
 
     def _fitted(self, image: np.ndarray) -> tuple[np.ndarray, float]:
         """The image in the size that the model takes, and by what it was scaled."""
         height, width = image.shape[:2]
-        target = (self._input.height or height, self._input.width or width)
+        shape = self._model.input
+        target = (shape.height or height, shape.width or width)
         if target == (height, width):
             return image, 1.0
         scale = min(target[0] / height, target[1] / width)
@@ -125,15 +119,11 @@ class OnnxInstanceSegmenter:
 
     def _ask(self, pixels: np.ndarray) -> dict[str, np.ndarray]:
         """What the model answers, by what it means."""
-        names = list(self._outputs.values())
-        try:
-            found = self._session.run(names, self._input.feed(pixels, self.scaling))
-        except runtime_errors() as error:
-            raise ModelError(f"{self.model}: {first_line(error)}") from error
+        found = self._model.run(pixels, tuple(self._outputs.values()))
         answer = dict(zip(self._outputs, found, strict=True))
         for name, values in answer.items():
             if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub":
-                raise ModelError(f"{self.model}: answers {name} that are no array of numbers")
+                raise ModelError(f"{self._model.path}: answers {name} that are no array of numbers")
         return answer
 
     def _instances(
@@ -143,7 +133,7 @@ class OnnxInstanceSegmenter:
         try:
             yield from KINDS[frozenset(self._outputs)](answer, size, self.minimum_score)
         except ModelError as error:
-            raise ModelError(f"{self.model}: {error}") from None
+            raise ModelError(f"{self._model.path}: {error}") from None
 
 
 def _scaled(box: Box, scale: float) -> Box:

@@ -160,7 +160,8 @@ def test_float_models_get_the_scaling_they_want(tmp_path, monkeypatch, scaling, 
     path = brightest_channel_model(tmp_path / "a.onnx", [1, 3, 4, 6])
     segmenter = OnnxSegmenter(path, CLASSES, scaling=scaling)
     seen = {}
-    run = segmenter._session.run
+    model = segmenter._model
+    run = model._session.run
 
     class Spy:
         """Keeps what the model is asked."""
@@ -169,7 +170,7 @@ def test_float_models_get_the_scaling_they_want(tmp_path, monkeypatch, scaling, 
             seen.update(feeds)
             return run(names, feeds)
 
-    monkeypatch.setattr(segmenter, "_session", Spy())
+    monkeypatch.setattr(model, "_session", Spy())
     segmenter.segment(frame(np.tile(np.array([150, 130, 120], np.uint8), (4, 6, 1))))
     assert seen["image"].dtype == np.float32
     assert seen["image"][0, :, 2, 3] == pytest.approx(expected, abs=1e-3)
