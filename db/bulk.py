@@ -6,9 +6,7 @@ from itertools import chain, repeat
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Select, Table, func
-from sqlalchemy import select as query_of
-from sqlalchemy.schema import CreateIndex, DropIndex
+from sqlalchemy import Connection, Select, Table
 
 from db.models import Base
 
@@ -16,9 +14,6 @@ Row = tuple[Any, ...]
 BLOCK_ROWS = 50_000
 FETCHED_ROWS = 1000  # from SQLite at a time: more do not stay in the processor's cache
 
-# Building an index anew costs a sixth of a row's way in and out of it, measured at 10 million rows.
-_REBUILT_FROM = 100_000
-_REBUILT_SHARE = 1 / 5
 _BULK_CACHE_KIB = 64 * 1024
 # Of one INSERT; every SQLite takes so many variables.
 _MOST_ROWS, _MOST_VARIABLES = 50, 999
@@ -175,30 +170,7 @@ def integers(connection: Connection, statement: Select[Any]) -> np.ndarray:
 
 
 @contextmanager
-def replacing(connection: Connection, name: str, count: int) -> Iterator[None]:
-    """Within it so many rows of a table come, or leave and come again.
-
-    Where they are most of the table, SQLite's indices are made anew afterwards: row by row, each
-    entry of an index by value is a seek of its own. A server's tables stay open to others.
-    """
-    worthwhile = connection.dialect.name == "sqlite" and count >= _REBUILT_FROM
-    if worthwhile:
-        stored = connection.execute(query_of(func.count()).select_from(table(name))).scalar_one()
-        worthwhile = count >= stored * _REBUILT_SHARE
-    if not worthwhile:
-        yield
-        return
-    indices = sorted(table(name).indexes, key=lambda each: str(each.name))
-    for index in indices:
-        connection.execute(DropIndex(index))
-    with _roomy(connection):
-        yield
-        for index in indices:
-            connection.execute(CreateIndex(index))
-
-
-@contextmanager
-def _roomy(connection: Connection) -> Iterator[None]:
+def roomy(connection: Connection) -> Iterator[None]:
     """Within it SQLite has room for the pages in work, and sorts an index on a second core."""
     usual = connection.exec_driver_sql("PRAGMA cache_size").scalar_one()
     connection.exec_driver_sql(f"PRAGMA cache_size = -{_BULK_CACHE_KIB}")

@@ -289,11 +289,12 @@ class SemanticPrior(Base):
 class Weight(Base):
     """The reliability weight v that one policy gives a label; policies stand side by side.
 
-    v = 0 marks a region to ignore. A label that a policy drops has no row of that policy.
+    v = 0 marks a region to ignore. A label that a policy drops has no row of that policy. Each
+    policy has an index by value of its own, see `db.weight_index`.
     """
 
     __tablename__ = "weight"
-    __table_args__ = _evidence(Index("ix_weight_policy_v", "round", "policy", "v"))
+    __table_args__ = _evidence()
 
     round: Mapped[Key]
     frame_id: Mapped[Key]

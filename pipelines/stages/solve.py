@@ -8,7 +8,7 @@ import numpy as np
 from sqlalchemy import Connection
 
 from curate.weighting.base import Evidence, Policy, Weights
-from db import bulk
+from db import bulk, weight_index
 from pipelines.assembly import open_policy
 from pipelines.evidence import LabelKeys, read_evidence, read_memory, solved_fingerprint
 from pipelines.progress import Progress
@@ -51,9 +51,10 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
         evidence = replace(evidence, memory=read_memory(workspace, context.number - 1, policy))
     weights = opened.weigh(evidence, context.age)
     counts = _counts(context.number, policy, keys, weights)
+    weight_index.prepare(workspace.database, policy)
 
     def write(connection: Connection) -> None:
-        with bulk.replacing(connection, "weight", len(keys)):
+        with weight_index.replacing(connection, policy, len(keys)):
             for name in ("weight", "label_count"):
                 table = bulk.table(name)
                 mine = (table.c.round == context.number, table.c.policy == policy)

@@ -7,7 +7,7 @@ from label_questions import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRUSTED, so
 from labels_at_scale import filled_workspace
 from sqlalchemy import text
 
-from db import bulk
+from db import weight_index
 from pipelines.workspace import Workspace
 
 
@@ -40,7 +40,7 @@ def test_no_table_is_read_from_end_to_end(workspace: Workspace, question: str) -
 def test_the_heaviest_labels_come_by_their_index(workspace: Workspace, columns: str) -> None:
     """The weights of the policy come in its order; only what people decided is sorted."""
     plan = _plan(workspace, HEAVIEST.replace("*", columns) + " LIMIT 5")
-    index = "ix_weight_policy_v (round=? AND policy=? AND v>?)"
+    index = "ix_weight_v_pspsl (round=? AND v>?)"
     (part,) = [part for part, step in plan if step.startswith("SEARCH w") and index in step]
     assert [step for of, step in plan if of == part and "TEMP B-TREE" in step] == [], plan
 
@@ -68,7 +68,7 @@ def test_indices_that_were_left_out_of_a_large_load_are_back(
     schema = text("SELECT name, sql FROM sqlite_master WHERE type = 'index' ORDER BY name")
     with workspace.database.reading() as connection:
         before = [connection.execute(each).all() for each in (query, schema)]
-    monkeypatch.setattr(bulk, "_REBUILT_FROM", 1)
+    monkeypatch.setattr(weight_index, "_REBUILT_FROM", 1)
     solved(workspace, rounds=3)
     solved(workspace, rounds=4)
     with workspace.database.reading() as connection:

@@ -1,0 +1,99 @@
+"""The index by value that each policy's weights have."""
+
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from alembic import command
+from alembic.config import Config
+from sqlalchemy import Connection, inspect, select
+
+import db
+from db import bulk, weight_index
+from db.session import Database
+from db.views import drop_views
+
+ENGINES = ("sqlite", "postgresql")
+POLICIES = ("pspsl", "my.curation:Policy", "My.curation:Policy", 'it\'s "quoted"', "x" * 300)
+
+
+@pytest.fixture
+def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
+    """A database whose labels several policies have weighed."""
+    database = Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
+    with database.writing() as connection:
+        bulk.insert(connection, "frame", [("kitti", "x", "unlabeled", "p", "i", "c", None)])
+        bulk.insert(connection, "round", [(1, 1, None, "{}", "0", 0)])
+        rows = [(1, 1, k, "Car", 0.5, *[1.0] * 7, None) for k in range(20)]
+        bulk.insert(connection, "prediction", rows)
+        for policy in POLICIES:
+            _weigh(connection, policy)
+    return database
+
+
+def _weigh(connection: Connection, policy: str) -> None:
+    bulk.insert(connection, "weight", [(1, 1, k, policy, None, 1.0, k / 20) for k in range(20)])
+    bulk.insert(connection, "label_count", [(1, policy, "Car", 20, 19, 9, 9.5)])
+
+
+def _indices(database: Database) -> set[str]:
+    with database.reading() as connection:
+        found = inspect(connection).get_indexes("weight")
+    return {str(each["name"]) for each in found}
+
+
+def test_every_policy_gets_one_index_whatever_its_name(database: Database) -> None:
+    """Also where a class of the user's own weighs; to ask twice changes nothing."""
+    for policy in (*POLICIES, *POLICIES):
+        weight_index.prepare(database, policy)
+    expected = {str(weight_index.index_of(policy).name) for policy in POLICIES}
+    assert len(expected) == len(POLICIES)
+    assert {name.lower() for name in expected} == {name.lower() for name in _indices(database)}
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_a_question_for_a_policy_is_answered_by_its_index(tmp_path: Path, policy: str) -> None:
+    """Whether the policy stands in the question or is given with it."""
+    database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
+    weight_index.prepare(database, policy)
+    weight = bulk.table("weight").c
+    query = select(weight.v).where(weight.round == 1, weight.policy == policy, weight.v > 0.5)
+    name = weight_index.index_of(policy).name
+    literal = query.compile(database.engine, compile_kwargs={"literal_binds": True})
+    with sqlite3.connect(tmp_path / "curate.db") as raw:
+        (plan,) = raw.execute(f"EXPLAIN QUERY PLAN {literal}")
+        assert f"{name} (round=? AND v>?)" in plan[3]
+        asked = "EXPLAIN QUERY PLAN SELECT v FROM weight WHERE round = ? AND policy = ? AND v > ?"
+        (plan,) = raw.execute(asked, (1, policy, 0.5))
+        assert f"{name} (round=? AND v>?)" in plan[3]
+
+
+def test_only_the_policys_own_index_is_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While its weights are replaced it is away, that of another stays; then both are there."""
+    monkeypatch.setattr(weight_index, "_REBUILT_FROM", 1)
+    database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
+    for policy in ("pspsl", "spsl"):
+        weight_index.prepare(database, policy)
+    with database.writing() as connection:
+        with weight_index.replacing(connection, "spsl", 20):
+            within = {str(each["name"]) for each in inspect(connection).get_indexes("weight")}
+        assert within == {"ix_weight_v_pspsl"}
+    assert _indices(database) == {"ix_weight_v_pspsl", "ix_weight_v_spsl"}
+
+
+def test_weights_of_an_older_schema_get_their_indices(database: Database) -> None:
+    """And its backward step leaves the one index that there was."""
+    config = Config()
+    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
+    weight_index.prepare(database, "pspsl")
+    with database.writing() as connection:
+        drop_views(connection)
+        config.attributes["connection"] = connection
+        command.downgrade(config, "0007")
+    database.close()
+    assert _indices(database) == {"ix_weight_policy_v"}
+    Database(database.url).close()
+    assert len(_indices(database)) == len(POLICIES)
