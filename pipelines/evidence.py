@@ -1,41 +1,29 @@
 """What is known of the labels of a round, read from the database in columns.
 
 Every table of evidence is scanned in the order of its key, and one column at a time: a join of them
-costs a seek per label and table, and rows of many columns cost an object per value at once. Of many
-frames the columns are read by several processes, one each at a time: making the objects that a
-driver answers keeps a whole core busy.
+costs a seek per label and table, and rows of many columns cost an object per value at once.
 """
 
-import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
-from sqlalchemy import URL, BigInteger, ColumnElement, Connection, Select, and_, case, cast, select
+from sqlalchemy import BigInteger, ColumnElement, Connection, Select, and_, case, cast, select
 
 from curate.detections import as_categories, empty_boxes
-from curate.errors import CurateError, WorkspaceError
+from curate.errors import WorkspaceError
 from curate.weighting.base import Evidence, Memory
 from db import bulk
+from db.columns import Columns, reading_columns
 from db.models import BOX_COLUMNS
-from db.session import Database
 from pipelines.registry import PRIORS
 from pipelines.stages.score import table_of
 from pipelines.workspace import Workspace
 
 _K_BITS = 32
-# To start processes takes a second or two, as long as to read so many frames in this one.
-_MANY_FRAMES = 20_000
-
-_NUMBERS = {"score", "iou", "loss"}
-
-# A table and one of its columns.
-_Column = tuple[str, str]
+# Compiling the loop that reads them takes a second, as long as the driver takes for so many.
+_MANY_FRAMES = 10_000
 
 
 @dataclass(frozen=True)
@@ -78,16 +66,12 @@ def read_evidence(
     """
     wanted = {"category", "score", "iou", "loss"} if columns is None else set(columns)
     rho = {PRIORS.load(prior).rho_column: table_of(prior) for prior in workspace.config.run.priors}
-    read = [
-        *((table, column) for column, table in rho.items()),
-        *(("consistency" if name == "loss" else "prediction", name) for name in _NUMBERS & wanted),
-        *(("prediction", name) for name in BOX_COLUMNS if boxes),
-    ]
+    database, many = workspace.database, len(frames) >= _MANY_FRAMES
     with (
-        workspace.database.reading() as connection,
-        _read_ahead(workspace, round_number, frames, read) as ahead,
+        database.reading() as connection,
+        reading_columns(database, connection, many=many) as asked,
     ):
-        scan = _Scan(connection, round_number, frames, ahead)
+        scan = _Scan(connection, asked, round_number, frames)
         keys = scan.keys()
         names = as_categories(keys.category_names) if "category" in wanted else None
         return keys, Evidence(
@@ -101,49 +85,19 @@ def read_evidence(
         )
 
 
-@contextmanager
-def _read_ahead(
-    workspace: Workspace, round_number: int, frames: Sequence[int], columns: Sequence[_Column]
-) -> Iterator[Mapping[_Column, "Future[np.ndarray]"]]:
-    """The columns that other processes are reading meanwhile; none of them for few frames."""
-    cores = os.cpu_count() or 1
-    if len(frames) < _MANY_FRAMES or cores == 1:
-        yield {}
-        return
-    with ProcessPoolExecutor(min(cores, len(columns)), get_context("spawn")) as pool:
-        url = workspace.database.url
-        asked = {
-            column: pool.submit(_read_column, url, round_number, *column) for column in columns
-        }
-        try:
-            yield asked
-        except BrokenProcessPool as error:
-            raise CurateError(
-                "a process that read the evidence was killed, for want of memory perhaps; nothing "
-                "was stored, run the command again"
-            ) from error
-
-
-def _read_column(url: URL, round_number: int, table: str, column: str) -> np.ndarray:
-    """(n,) float64 a column of a round, in a process of its own."""
-    with Database(url).reading() as connection:
-        chosen = _ordered(round_number, table, bulk.table(table).c[column])
-        return bulk.numbers(connection, chosen)
-
-
 class _Scan:
     """Reads columns of a round, aligned with the predictions of some frames."""
 
     def __init__(
         self,
         connection: Connection,
+        asked: Columns,
         round_number: int,
         frames: Sequence[int],
-        ahead: Mapping[_Column, "Future[np.ndarray]"],
     ) -> None:
         self._connection = connection
+        self._asked = asked
         self._round = round_number
-        self._ahead = ahead
         self._all, self._category, self._category_names = self._read_predictions()
         wanted = np.isin(self._all >> _K_BITS, np.asarray(frames, dtype=np.int64))
         self._wanted = slice(None) if wanted.all() else np.flatnonzero(wanted)
@@ -156,11 +110,7 @@ class _Scan:
 
     def numbers(self, table: str, column: str) -> np.ndarray:
         """(n,) float64; NaN for null, and where the table has no row of a label."""
-        if (table, column) in self._ahead:
-            found = self._ahead[table, column].result()
-        else:
-            chosen = _ordered(self._round, table, bulk.table(table).c[column])
-            found = bulk.numbers(self._connection, chosen)
+        found = self._asked.numbers(_ordered(self._round, table, bulk.table(table).c[column]))
         if len(found) != len(self._all):
             # Every row belongs to a prediction, so only their number can differ.
             spread = np.full(len(self._all), np.nan)
@@ -190,8 +140,7 @@ class _Scan:
         number = case({name: i for i, name in enumerate(names)}, value=columns.category)
         frame = cast(columns.frame_id, BigInteger) * (1 << _K_BITS)
         place = cast(columns.k, BigInteger) * (1 << bits)
-        query = _ordered(self._round, "prediction", frame + place + number)
-        found = bulk.integers(self._connection, query)
+        found = self._asked.integers(_ordered(self._round, "prediction", frame + place + number))
         frame_bits = found & -(1 << _K_BITS)
         keys = frame_bits + ((found - frame_bits) >> bits)
         return keys, found & ((1 << bits) - 1), tuple(names)
@@ -200,7 +149,7 @@ class _Scan:
         """(n,) int64 frame and k of each row in one ascending number."""
         columns = bulk.table(table).c
         key = cast(columns.frame_id, BigInteger) * (1 << _K_BITS) + columns.k
-        return bulk.integers(self._connection, _ordered(self._round, table, key))
+        return self._asked.integers(_ordered(self._round, table, key))
 
 
 def _ordered(round_number: int, table: str, chosen: ColumnElement[Any]) -> Select[Any]:
