@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 _ROW, _DONE, _NULL = 100, 101, 5
-_READ_ONLY = 1
+# Read only, and without locks against other threads: a connection here belongs to one.
+_FLAGS = 0x1 | 0x8000
 _BLOCK_ROWS = 1_000_000
 # A statement, the array to fill; how many rows it filled, and SQLite's last answer.
 _Fill = Callable[[int | None, np.ndarray], tuple[int, int]]
@@ -39,7 +40,7 @@ class SqliteColumns:
         self._library = _library()
         self._connection = ctypes.c_void_p()
         name, own = str(path).encode(), ctypes.byref(self._connection)
-        opened = self._library.sqlite3_open_v2(name, own, _READ_ONLY, None)
+        opened = self._library.sqlite3_open_v2(name, own, _FLAGS, None)
         try:
             self._must(opened)
             self._library.sqlite3_busy_timeout(self._connection, busy_timeout_ms)
@@ -139,7 +140,9 @@ def _fill(kind: type) -> _Fill:
             answer = step(statement)
             if answer != _ROW:
                 return i, answer
-            found[i] = missing if type_of(statement, 0) == _NULL else value_of(statement, 0)
+            value = value_of(statement, 0)
+            # Null is 0 here, so only of that is the type asked.
+            found[i] = missing if value == 0 and type_of(statement, 0) == _NULL else value
         return len(found), _ROW
 
     filled: _Fill = fill
