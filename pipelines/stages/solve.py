@@ -18,6 +18,9 @@ from pipelines.workspace import Workspace
 
 TRUSTED = 0.5  # a label of a greater weight counts as trusted
 
+# The last of some frames, and the columns of their weights.
+_Block = tuple[int, dict[str, list[Any]]]
+
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
     """What weights depend on beside the evidence."""
@@ -55,12 +58,10 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
 
     def write(connection: Connection) -> None:
         with weight_index.replacing(connection, policy, len(keys)):
-            for name in ("weight", "label_count"):
-                table = bulk.table(name)
-                mine = (table.c.round == context.number, table.c.policy == policy)
-                connection.execute(table.delete().where(*mine))
-            for columns in _columns(context.number, keys, policy, weights, evidence):
-                bulk.insert_columns(connection, "weight", columns)
+            _replace(connection, context.number, policy, _blocks(keys, weights, evidence))
+        former = bulk.table("label_count").c
+        mine = (former.round == context.number, former.policy == policy)
+        connection.execute(former.policy.table.delete().where(*mine))
         bulk.insert(connection, "label_count", counts)
         refresh_matches(connection, context.number)
         bulk.refresh_statistics(connection)
@@ -85,21 +86,38 @@ def _memory_fingerprint(workspace: Workspace, context: RoundContext, policy: str
     return solved_fingerprint(workspace, context.number - 1, policy)
 
 
-def _columns(
-    round_number: int, keys: LabelKeys, policy: str, weights: Weights, evidence: Evidence
-) -> Iterator[dict[str, Any]]:
-    """The columns of `weight`, a block at a time."""
+def _replace(
+    connection: Connection, round_number: int, policy: str, blocks: Iterator[_Block]
+) -> None:
+    """Puts the weights of a policy in the place of its former ones.
+
+    The former ones of some frames leave just before the new ones come: their pages are at hand
+    then, and have room.
+    """
+    weight = bulk.table("weight")
+    mine = [weight.c.round == round_number, weight.c.policy == policy]
+    for last, columns in blocks:
+        until = [weight.c.frame_id <= last]
+        connection.execute(weight.delete().where(*mine, *until))
+        bulk.insert_columns(
+            connection, "weight", {"round": round_number, "policy": policy, **columns}
+        )
+        mine[2:] = [weight.c.frame_id > last]
+    connection.execute(weight.delete().where(*mine))
+
+
+def _blocks(keys: LabelKeys, weights: Weights, evidence: Evidence) -> Iterator[_Block]:
+    """Whole frames at a time, in the order of their keys."""
     columns = (keys.frame_id, keys.k, weights.lambda_u, evidence.rho_det, weights.v)
-    for start in range(0, len(keys), bulk.BLOCK_ROWS):
-        block = slice(start, start + bulk.BLOCK_ROWS)
-        kept = ~weights.dropped[block]
-        frame_id, k, age, rho, v = (column[block][kept].tolist() for column in columns)
+    end = 0
+    while end < len(keys):
+        start, last = end, keys.frame_id[min(end + bulk.BLOCK_ROWS, len(keys)) - 1]
+        end = int(np.searchsorted(keys.frame_id, last, side="right"))
+        kept = ~weights.dropped[start:end]
+        frame_id, k, age, rho, v = (column[start:end][kept].tolist() for column in columns)
         # NaN differs from itself; the database knows null.
         ages = [None if each != each else each for each in age]  # noqa: PLR0124
-        yield {
-            "round": round_number, "frame_id": frame_id, "k": k, "policy": policy,
-            "lambda_u": ages, "rho_det": rho, "v": v,
-        }  # fmt: skip
+        yield int(last), {"frame_id": frame_id, "k": k, "lambda_u": ages, "rho_det": rho, "v": v}
 
 
 def _counts(round_number: int, policy: str, keys: LabelKeys, weights: Weights) -> list[bulk.Row]:

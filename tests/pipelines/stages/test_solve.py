@@ -1,0 +1,54 @@
+"""solve: a policy's weights take the place of its former ones, and of nothing else."""
+
+from pathlib import Path
+
+import pytest
+from label_questions import solved
+from labels_at_scale import EACH, filled_workspace
+from sqlalchemy import text
+
+from db import bulk
+from pipelines.progress import Silent
+from pipelines.stage import RoundContext, RoundJob, Teacher
+from pipelines.stages import solve
+from pipelines.workspace import Workspace
+
+FRAMES = 10
+
+
+@pytest.fixture(params=[1, EACH - 1, EACH, 3 * EACH + 1, 50_000])
+def workspace(
+    tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Workspace:
+    """Ten frames of fifty labels, weighed by two policies, written so many rows at a time."""
+    monkeypatch.setattr(bulk, "BLOCK_ROWS", request.param)
+    workspace = solved(filled_workspace(tmp_path / "work", FRAMES))
+    return solved(workspace, "uda")
+
+
+def _rows(workspace: Workspace, policy: str) -> list[tuple]:
+    query = text("SELECT * FROM weight WHERE policy = :policy ORDER BY round, frame_id, k")
+    with workspace.database.reading() as connection:
+        return [tuple(row) for row in connection.execute(query, {"policy": policy})]
+
+
+def _solved(workspace: Workspace, frames: list[int]) -> None:
+    context = RoundContext(1, 3, 0, Teacher(workspace.root, ""))
+    product = solve.run(workspace, RoundJob(context, "pspsl", frames), Silent())
+    with workspace.database.writing(keys_known=product.keys_known) as connection:
+        product.write(connection)
+
+
+@pytest.mark.parametrize(
+    "left", [[], [1], [FRAMES], [2, 3, 7], list(range(1, FRAMES)), list(range(1, FRAMES + 1))]
+)
+def test_frames_that_are_gone_leave_no_weight(workspace: Workspace, left: list[int]) -> None:
+    """At the start, in the middle or at the end; another policy keeps its weights."""
+    first, others = _rows(workspace, "pspsl"), _rows(workspace, "uda")
+    assert len(first) == len(others) == FRAMES * EACH
+    _solved(workspace, left)
+    found = _rows(workspace, "pspsl")
+    assert [row[:3] for row in found] == [row[:3] for row in first if row[1] in left]
+    _solved(workspace, list(range(1, FRAMES + 1)))
+    assert _rows(workspace, "pspsl") == first
+    assert _rows(workspace, "uda") == others
