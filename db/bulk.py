@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain, repeat
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from sqlalchemy import Connection, Select, Table, func
 from sqlalchemy import select as query_of
 from sqlalchemy.schema import CreateIndex, DropIndex
 
+from db import server_columns
 from db.models import Base
 
 Row = tuple[Any, ...]
@@ -43,8 +44,9 @@ def insert(connection: Connection, name: str, rows: Iterable[Row]) -> None:
     if not rows:
         return
     names = columns(name)
-    if connection.dialect.name == "postgresql":
-        _copy(connection, name, names, rows)
+    if _on_server(connection):
+        columns_of = zip(names, zip(*rows, strict=True), strict=True)
+        server_columns.insert(connection, table(name), dict(columns_of))
         return
     marks = f"({', '.join('?' * len(names))})"
     for start, end, count in _statements(len(rows), _rows_per_statement(len(names))):
@@ -61,15 +63,17 @@ def insert_columns(connection: Connection, name: str, values: Mapping[str, Any])
     Args:
         connection: to the database.
         name: of the table.
-        values: a list per column, all of one length; what is no list is the value of every row.
+        values: a list or array per column, all of one length, NaN in an array of floats for null;
+            what is neither is the value of every row.
     """
+    if _on_server(connection):
+        server_columns.insert(connection, table(name), values)
+        return
+    # SQLite stores NaN as null by itself.
+    values = {c: v.tolist() if isinstance(v, np.ndarray) else v for c, v in values.items()}
     fixed = {column: value for column, value in values.items() if not isinstance(value, list)}
     varying = {column: value for column, value in values.items() if column not in fixed}
     length, width = len(next(iter(varying.values()))), len(varying)
-    if connection.dialect.name == "postgresql":
-        each = [repeat(v, length) if c in fixed else v for c, v in values.items()]
-        _copy(connection, name, tuple(values), zip(*each, strict=True))
-        return
     # The values of all columns, row by row.
     flat: list[Any] = [None] * (length * width)
     for place, column in enumerate(varying.values()):
@@ -84,15 +88,8 @@ def insert_columns(connection: Connection, name: str, values: Mapping[str, Any])
         )
 
 
-def _copy(
-    connection: Connection, name: str, names: Sequence[str], rows: Iterable[Sequence[Any]]
-) -> None:
-    """COPY into a server's table."""
-    quoted = ", ".join(f'"{column}"' for column in names)
-    cursor = connection.connection.cursor()
-    with cursor.copy(f'COPY "{name}" ({quoted}) FROM STDIN') as copy:
-        for row in rows:
-            copy.write_row(row)
+def _on_server(connection: Connection) -> bool:
+    return connection.dialect.name == "postgresql"
 
 
 def _insertion(name: str, names: Sequence[str], rows: Sequence[str]) -> str:
@@ -158,6 +155,8 @@ def blocks(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[
 
 def numbers(connection: Connection, statement: Select[Any]) -> np.ndarray:
     """(n,) float64 the only column of a query; NaN for null."""
+    if _on_server(connection):
+        return server_columns.numbers(connection, statement)
     found = [
         np.array([value for (value,) in rows], dtype=np.float64)
         for rows in blocks(connection, statement)
@@ -167,6 +166,8 @@ def numbers(connection: Connection, statement: Select[Any]) -> np.ndarray:
 
 def integers(connection: Connection, statement: Select[Any]) -> np.ndarray:
     """(n,) int64 the only column of a query, without nulls."""
+    if _on_server(connection):
+        return server_columns.integers(connection, statement)
     found = [
         np.fromiter((value for (value,) in rows), np.int64, len(rows))
         for rows in blocks(connection, statement)
