@@ -212,11 +212,14 @@ def _roomy(connection: Connection) -> Iterator[None]:
 
 
 def refresh_statistics(connection: Connection) -> None:
-    """Lets SQLite look at samples of its tables, some milliseconds; a server does so by itself.
+    """Lets the database look at samples of the tables that questions about labels touch.
 
-    Without them it reads all weights where somebody asks for one frame.
+    Without them SQLite reads all weights where somebody asks for one frame, and a server joins row
+    by row what this transaction has written, until it looks by itself a minute later.
     """
-    if connection.dialect.name == "sqlite":
+    if _on_server(connection):
+        server_columns.refresh_statistics(connection)
+    else:
         connection.exec_driver_sql("PRAGMA analysis_limit = 400")
         connection.exec_driver_sql("ANALYZE")
 

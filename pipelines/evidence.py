@@ -8,7 +8,7 @@ driver answers keeps a whole core busy.
 
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,6 +31,8 @@ from pipelines.workspace import Workspace
 _K_BITS = 32
 # To start processes takes a second or two, as long as to read so many frames in this one.
 _MANY_FRAMES = 20_000
+# A server itself makes the bytes of a column, on a core per connection.
+_FRAMES_FOR_CONNECTIONS, _CONNECTIONS = 1000, 4
 
 _NUMBERS = {"score", "iou", "loss"}
 
@@ -106,15 +108,23 @@ def _read_ahead(
     workspace: Workspace, round_number: int, frames: Sequence[int], columns: Sequence[_Column]
 ) -> Iterator[Mapping[_Column, "Future[np.ndarray]"]]:
     """The columns that other processes are reading meanwhile; none of them for few frames."""
+    if workspace.database.engine.dialect.name == "postgresql":
+        if len(frames) < _FRAMES_FOR_CONNECTIONS:
+            yield {}
+            return
+        with ThreadPoolExecutor(_CONNECTIONS) as threads:
+            yield {
+                column: threads.submit(_read_column, workspace.database, round_number, *column)
+                for column in columns
+            }
+        return
     cores = os.cpu_count() or 1
     if len(frames) < _MANY_FRAMES or cores == 1:
         yield {}
         return
     with ProcessPoolExecutor(min(cores, len(columns)), get_context("spawn")) as pool:
         url = workspace.database.url
-        asked = {
-            column: pool.submit(_read_column, url, round_number, *column) for column in columns
-        }
+        asked = {column: pool.submit(_read_file, url, round_number, *column) for column in columns}
         try:
             yield asked
         except BrokenProcessPool as error:
@@ -124,9 +134,14 @@ def _read_ahead(
             ) from error
 
 
-def _read_column(url: URL, round_number: int, table: str, column: str) -> np.ndarray:
+def _read_file(url: URL, round_number: int, table: str, column: str) -> np.ndarray:
     """(n,) float64 a column of a round, in a process of its own."""
-    with Database(url).reading() as connection:
+    return _read_column(Database(url), round_number, table, column)
+
+
+def _read_column(database: Database, round_number: int, table: str, column: str) -> np.ndarray:
+    """(n,) float64 a column of a round, through a connection of its own."""
+    with database.reading() as connection:
         chosen = _ordered(round_number, table, bulk.table(table).c[column])
         return bulk.numbers(connection, chosen)
 
