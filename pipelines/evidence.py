@@ -3,7 +3,7 @@
 Every table of evidence is scanned in the order of its key, and one column at a time: a join of them
 costs a seek per label and table, and rows of many columns cost an object per value at once. Of many
 frames the columns are read by several processes, one each at a time: making the objects that a
-driver answers keeps a whole core busy.
+driver answers keeps a whole core busy. A server answers columns as bytes, see `db.server_columns`.
 """
 
 import os
@@ -107,7 +107,10 @@ def read_evidence(
 def _read_ahead(
     workspace: Workspace, round_number: int, frames: Sequence[int], columns: Sequence[_Column]
 ) -> Iterator[Mapping[_Column, "Future[np.ndarray]"]]:
-    """The columns that other processes are reading meanwhile; none of them for few frames."""
+    """The columns that others read meanwhile; none of them for few frames.
+
+    A server's are read through connections of their own, SQLite's by other processes.
+    """
     if workspace.database.engine.dialect.name == "postgresql":
         if len(frames) < _FRAMES_FOR_CONNECTIONS:
             yield {}

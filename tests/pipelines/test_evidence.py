@@ -11,11 +11,13 @@ from pipelines.rounds import open_round
 from pipelines.runner import run_frames
 from pipelines.workspace import Workspace
 
+ENGINES = ("sqlite", "postgresql")
 
-def test_several_processes_read_what_one_reads(
+
+def test_several_readers_read_what_one_reads(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of many frames the columns are read ahead; they are the same to the bit."""
+    """Of many frames processes or connections read ahead; columns are the same to the bit."""
     context = open_round(workspace, 1)
     for name in ("predict", "repredict", "points", "semantic"):
         run_frames(workspace, context, stage(name), SerialExecutor(), Silent())
@@ -23,6 +25,7 @@ def test_several_processes_read_what_one_reads(
     keys, alone = evidence.read_evidence(workspace, 1, frames, boxes=True)
     assert len(keys) > 0
     monkeypatch.setattr(evidence, "_MANY_FRAMES", 1)
+    monkeypatch.setattr(evidence, "_FRAMES_FOR_CONNECTIONS", 1)
     monkeypatch.setattr(evidence.os, "cpu_count", lambda: 2)
     same, together = evidence.read_evidence(workspace, 1, frames, boxes=True)
     for one, other in ((keys, same), (alone, together)):
