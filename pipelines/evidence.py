@@ -16,7 +16,18 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
-from sqlalchemy import URL, BigInteger, ColumnElement, Connection, Select, and_, case, cast, select
+from sqlalchemy import (
+    URL,
+    BigInteger,
+    ColumnElement,
+    Connection,
+    Select,
+    and_,
+    case,
+    cast,
+    func,
+    select,
+)
 
 from curate.detections import as_categories, empty_boxes
 from curate.errors import CurateError, WorkspaceError
@@ -200,8 +211,7 @@ class _Scan:
         The database makes one number of all three, of which one object per label comes.
         """
         columns = bulk.table("prediction").c
-        own = select(columns.category).where(columns.round == self._round).distinct()
-        names = sorted(name for (name,) in bulk.select(self._connection, own))
+        names = sorted(_category_names(self._connection, self._round))
         if not names:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), ()
         bits = len(names).bit_length()
@@ -219,6 +229,16 @@ class _Scan:
         columns = bulk.table(table).c
         key = cast(columns.frame_id, BigInteger) * (1 << _K_BITS) + columns.k
         return bulk.integers(self._connection, _ordered(self._round, table, key))
+
+
+def _category_names(connection: Connection, round_number: int) -> Iterator[str]:
+    """Those of a round's predictions, each found by a seek in their index."""
+    columns = bulk.table("prediction").c
+    least = select(func.min(columns.category)).where(columns.round == round_number)
+    name = connection.execute(least).scalar_one()
+    while name is not None:
+        yield name
+        name = connection.execute(least.where(columns.category > name)).scalar_one()
 
 
 def _ordered(round_number: int, table: str, chosen: ColumnElement[Any]) -> Select[Any]:
