@@ -2,12 +2,13 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain, repeat
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, Select, Table
 
+from db import server_columns
 from db.models import Base
 
 Row = tuple[Any, ...]
@@ -38,8 +39,9 @@ def insert(connection: Connection, name: str, rows: Iterable[Row]) -> None:
     if not rows:
         return
     names = columns(name)
-    if connection.dialect.name == "postgresql":
-        _copy(connection, name, names, rows)
+    if _on_server(connection):
+        columns_of = zip(names, zip(*rows, strict=True), strict=True)
+        server_columns.insert(connection, table(name), dict(columns_of))
         return
     marks = f"({', '.join('?' * len(names))})"
     for start, end, count in _statements(len(rows), _rows_per_statement(len(names))):
@@ -56,15 +58,17 @@ def insert_columns(connection: Connection, name: str, values: Mapping[str, Any])
     Args:
         connection: to the database.
         name: of the table.
-        values: a list per column, all of one length; what is no list is the value of every row.
+        values: a list or array per column, all of one length, NaN in an array of floats for null;
+            what is neither is the value of every row.
     """
+    if _on_server(connection):
+        server_columns.insert(connection, table(name), values)
+        return
+    # SQLite stores NaN as null by itself.
+    values = {c: v.tolist() if isinstance(v, np.ndarray) else v for c, v in values.items()}
     fixed = {column: value for column, value in values.items() if not isinstance(value, list)}
     varying = {column: value for column, value in values.items() if column not in fixed}
     length, width = len(next(iter(varying.values()))), len(varying)
-    if connection.dialect.name == "postgresql":
-        each = [repeat(v, length) if c in fixed else v for c, v in values.items()]
-        _copy(connection, name, tuple(values), zip(*each, strict=True))
-        return
     # The values of all columns, row by row.
     flat: list[Any] = [None] * (length * width)
     for place, column in enumerate(varying.values()):
@@ -79,15 +83,8 @@ def insert_columns(connection: Connection, name: str, values: Mapping[str, Any])
         )
 
 
-def _copy(
-    connection: Connection, name: str, names: Sequence[str], rows: Iterable[Sequence[Any]]
-) -> None:
-    """COPY into a server's table."""
-    quoted = ", ".join(f'"{column}"' for column in names)
-    cursor = connection.connection.cursor()
-    with cursor.copy(f'COPY "{name}" ({quoted}) FROM STDIN') as copy:
-        for row in rows:
-            copy.write_row(row)
+def _on_server(connection: Connection) -> bool:
+    return connection.dialect.name == "postgresql"
 
 
 def _insertion(name: str, names: Sequence[str], rows: Sequence[str]) -> str:
@@ -153,6 +150,8 @@ def blocks(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[
 
 def numbers(connection: Connection, statement: Select[Any]) -> np.ndarray:
     """(n,) float64 the only column of a query; NaN for null."""
+    if _on_server(connection):
+        return server_columns.numbers(connection, statement)
     found = [
         np.array([value for (value,) in rows], dtype=np.float64)
         for rows in blocks(connection, statement)
@@ -162,6 +161,8 @@ def numbers(connection: Connection, statement: Select[Any]) -> np.ndarray:
 
 def integers(connection: Connection, statement: Select[Any]) -> np.ndarray:
     """(n,) int64 the only column of a query, without nulls."""
+    if _on_server(connection):
+        return server_columns.integers(connection, statement)
     found = [
         np.fromiter((value for (value,) in rows), np.int64, len(rows))
         for rows in blocks(connection, statement)
@@ -183,11 +184,14 @@ def roomy(connection: Connection) -> Iterator[None]:
 
 
 def refresh_statistics(connection: Connection) -> None:
-    """Lets SQLite look at samples of its tables, some milliseconds; a server does so by itself.
+    """Lets the database look at samples of the tables that questions about labels touch.
 
-    Without them it reads all weights where somebody asks for one frame.
+    Without them SQLite reads all weights where somebody asks for one frame, and a server joins row
+    by row what this transaction has written, until it looks by itself a minute later.
     """
-    if connection.dialect.name == "sqlite":
+    if _on_server(connection):
+        server_columns.refresh_statistics(connection)
+    else:
         connection.exec_driver_sql("PRAGMA analysis_limit = 400")
         connection.exec_driver_sql("ANALYZE")
 

@@ -4,12 +4,12 @@ Every table of evidence is scanned in the order of its key, and one column at a 
 costs a seek per label and table, and rows of many columns cost an object per value at once.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import BigInteger, ColumnElement, Connection, Select, and_, case, cast, select
+from sqlalchemy import BigInteger, ColumnElement, Connection, Select, and_, case, cast, func, select
 
 from curate.detections import as_categories, empty_boxes
 from curate.errors import WorkspaceError
@@ -132,8 +132,7 @@ class _Scan:
         The database makes one number of all three, of which one object per label comes.
         """
         columns = bulk.table("prediction").c
-        own = select(columns.category).where(columns.round == self._round).distinct()
-        names = sorted(name for (name,) in bulk.select(self._connection, own))
+        names = sorted(_category_names(self._connection, self._round))
         if not names:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), ()
         bits = len(names).bit_length()
@@ -150,6 +149,16 @@ class _Scan:
         columns = bulk.table(table).c
         key = cast(columns.frame_id, BigInteger) * (1 << _K_BITS) + columns.k
         return self._asked.integers(_ordered(self._round, table, key))
+
+
+def _category_names(connection: Connection, round_number: int) -> Iterator[str]:
+    """Those of a round's predictions, each found by a seek in their index."""
+    columns = bulk.table("prediction").c
+    least = select(func.min(columns.category)).where(columns.round == round_number)
+    name = connection.execute(least).scalar_one()
+    while name is not None:
+        yield name
+        name = connection.execute(least.where(columns.category > name)).scalar_one()
 
 
 def _ordered(round_number: int, table: str, chosen: ColumnElement[Any]) -> Select[Any]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection
@@ -19,7 +18,7 @@ from pipelines.workspace import Workspace
 TRUSTED = 0.5  # a label of a greater weight counts as trusted
 
 # The last of some frames, and the columns of their weights.
-_Block = tuple[int, dict[str, list[Any]]]
+_Block = tuple[int, dict[str, np.ndarray]]
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
@@ -114,10 +113,8 @@ def _blocks(keys: LabelKeys, weights: Weights, evidence: Evidence) -> Iterator[_
         start, last = end, keys.frame_id[min(end + bulk.BLOCK_ROWS, len(keys)) - 1]
         end = int(np.searchsorted(keys.frame_id, last, side="right"))
         kept = ~weights.dropped[start:end]
-        frame_id, k, age, rho, v = (column[start:end][kept].tolist() for column in columns)
-        # NaN differs from itself; the database knows null.
-        ages = [None if each != each else each for each in age]  # noqa: PLR0124
-        yield int(last), {"frame_id": frame_id, "k": k, "lambda_u": ages, "rho_det": rho, "v": v}
+        frame_id, k, age, rho, v = (column[start:end][kept] for column in columns)
+        yield int(last), {"frame_id": frame_id, "k": k, "lambda_u": age, "rho_det": rho, "v": v}
 
 
 def _counts(round_number: int, policy: str, keys: LabelKeys, weights: Weights) -> list[bulk.Row]:

@@ -6,6 +6,7 @@ import sqlite3
 import numpy as np
 import pytest
 from benchmarks.measuring import OURS, measure
+from benchmarks.rows import frame_rows, prediction_rows
 from sqlalchemy import insert, select
 
 from db import bulk
@@ -31,12 +32,8 @@ def template(tmp_path_factory):
     root = tmp_path_factory.mktemp("database")
     config = make_config({"dataset": {"root": root}}, "benchmark")
     workspace = Workspace.create(root / "work", config)
-    frames = [
-        ("kitti", f"{i:06d}", "unlabeled", f"{i}.bin", f"{i}.png", f"{i}.txt", None)
-        for i in range(FRAMES)
-    ]
     with workspace.database.writing() as connection:
-        bulk.insert(connection, "frame", frames)
+        bulk.insert(connection, "frame", frame_rows(FRAMES))
         bulk.insert(connection, "round", [(1, 3, None, "{}", "0", 0)])
     workspace.database.close()
     return workspace
@@ -45,17 +42,7 @@ def template(tmp_path_factory):
 @pytest.fixture(scope="module")
 def predictions():
     """The rows of `prediction`."""
-    generator = np.random.default_rng(0)
-    boxes, scores = generator.normal(0, 10, (ROWS, 7)).tolist(), generator.random(ROWS).tolist()
-    categories = generator.choice(["Car", "Pedestrian", "Cyclist"], ROWS).tolist()
-    place = {name: position for position, name in enumerate(bulk.columns("prediction"))}
-    rows = []
-    for i, (box, score, category) in enumerate(zip(boxes, scores, categories, strict=True)):
-        row = [1, 1 + i // EACH, i % EACH, *[None] * (len(place) - 3)]
-        row[place["category"]], row[place["score"]] = category, score
-        row[place["x"] : place["yaw"] + 1] = box
-        rows.append(tuple(row))
-    return rows
+    return prediction_rows(FRAMES, EACH)
 
 
 @pytest.fixture

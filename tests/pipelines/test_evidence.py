@@ -11,6 +11,8 @@ from pipelines.rounds import open_round
 from pipelines.runner import run_frames
 from pipelines.workspace import Workspace
 
+ENGINES = ("sqlite", "postgresql")
+
 
 def test_evidence_of_many_frames_is_read_alike(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch

@@ -1,0 +1,29 @@
+"""Rows of frames and predictions for the benchmarks of the database."""
+
+import numpy as np
+
+from db import bulk
+
+
+def frame_rows(count):
+    """Unlabeled frames, the rows of `frame`."""
+    return [
+        ("kitti", f"{i:06d}", "unlabeled", f"{i}.bin", f"{i}.png", f"{i}.txt", None)
+        for i in range(count)
+    ]
+
+
+def prediction_rows(frames, each):
+    """As many labels of each frame in round 1, the rows of `prediction`."""
+    count = frames * each
+    generator = np.random.default_rng(0)
+    boxes, scores = generator.normal(0, 10, (count, 7)).tolist(), generator.random(count).tolist()
+    categories = generator.choice(["Car", "Pedestrian", "Cyclist"], count).tolist()
+    place = {name: position for position, name in enumerate(bulk.columns("prediction"))}
+    rows = []
+    for i, (box, score, category) in enumerate(zip(boxes, scores, categories, strict=True)):
+        row = [1, 1 + i // each, i % each, *[None] * (len(place) - 3)]
+        row[place["category"]], row[place["score"]] = category, score
+        row[place["x"] : place["yaw"] + 1] = box
+        rows.append(tuple(row))
+    return rows
