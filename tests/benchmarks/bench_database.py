@@ -10,6 +10,7 @@ from benchmarks.rows import frame_rows, prediction_rows
 from sqlalchemy import insert, select
 
 from db import bulk
+from db.columns import reading_columns
 from db.session import BUSY_TIMEOUT_MS, Database
 from pipelines.config import make_config
 from pipelines.progress import Silent
@@ -21,6 +22,7 @@ FRAMES, EACH = 2000, 50
 ROWS = FRAMES * EACH
 WRITE = f"Writing {ROWS:,} rows of prediction (SQLite)"
 READ = f"Reading {ROWS:,} rows of prediction (SQLite)"
+COLUMN = f"Reading a column of {ROWS:,} labels into NumPy (SQLite)"
 SOLVE = f"The stage solve on {ROWS:,} labels in SQLite, without writing"
 WEIGHTS = f"Replacing {ROWS:,} rows of weight, as solve does (SQLite)"
 BARE = "sqlite3, bare driver"
@@ -142,6 +144,34 @@ def bench_read(benchmark, name, copies, predictions):
     read = ours if name == OURS else driver
     rows = measure(benchmark, read, group=READ, name=name, amount=ROWS, unit="rows")
     assert len(rows) == ROWS
+    database.close()
+    bare.close()
+
+
+@pytest.mark.parametrize("name", [OURS, BARE])
+def bench_read_column(benchmark, name, copies, predictions):
+    """The scores of all labels by frame and k as an array, as solve reads its evidence."""
+    path = copies()
+    write_bare(path, predictions)
+    database, bare = Database(f"sqlite:///{path}"), bare_connection(path)
+    prediction = bulk.table("prediction").c
+    query = select(prediction.score).where(prediction.round == 1)
+    query = query.order_by(prediction.frame_id, prediction.k)
+
+    def ours():
+        with (
+            database.reading() as connection,
+            reading_columns(database, connection, many=True) as asked,
+        ):
+            return asked.numbers(query)
+
+    def driver():
+        asked = "SELECT score FROM prediction WHERE round = 1 ORDER BY frame_id, k"
+        return np.array(bare.execute(asked).fetchall(), dtype=np.float64)[:, 0]
+
+    read = ours if name == OURS else driver
+    found = measure(benchmark, read, group=COLUMN, name=name, amount=ROWS, unit="values")
+    assert np.array_equal(found, driver())
     database.close()
     bare.close()
 
