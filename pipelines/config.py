@@ -179,6 +179,8 @@ def read_config(path: Path) -> Config:
     Raises:
         ConfigError: the file is not TOML, or some settings are wrong; all of them are named.
     """
+    if path.exists() and not path.is_file():
+        raise ConfigError(f"{path}: is no file but a folder, a pipe or a device; remove it")
     try:
         document = parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:

@@ -12,7 +12,7 @@ from curate.toml_text import MOST_CHARACTERS, MOST_PARTS, parse_toml
     [
         f"{'a.' * 15_000}a = 1",
         f"[{'a.' * 15_000}a]",
-        'x = {' + '"a" . ' * 15_000 + "a = 1}",
+        "x = {" + '"a" . ' * 15_000 + "a = 1}",
         "#" * (MOST_CHARACTERS + 1),
     ],
 )
