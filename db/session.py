@@ -9,6 +9,7 @@ from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
+from alembic.util import CommandError
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
@@ -112,7 +113,12 @@ class Database:
 
     def _revision(self, connection: Connection, script: ScriptDirectory) -> str | None:
         """Of the schema; None for an empty database, DatabaseError where it is unknown here."""
-        current = MigrationContext.configure(connection).get_current_revision()
+        try:
+            current = MigrationContext.configure(connection).get_current_revision()
+        except CommandError as error:  # more than one row, which no curate writes
+            raise DatabaseError(
+                f"{self.name}: table alembic_version names several schemas; restore a backup"
+            ) from error
         if current is not None and current not in {r.revision for r in script.walk_revisions()}:
             raise DatabaseError(
                 f"{self.name}: written by a newer curate (schema {current}); update curate"
@@ -155,7 +161,8 @@ def parse_url(address: str) -> URL:
         ConfigError: it is none.
     """
     try:
-        url = make_url(address)
+        # No driver takes a zero byte, and each says so with an error of its own.
+        url = make_url("" if "\0" in address else address)
     except ArgumentError as error:
         # The text is not repeated: it may hold a password.
         raise ConfigError(

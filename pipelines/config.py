@@ -18,6 +18,7 @@ from pydantic import (
 from curate.atomic import replace_file
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, one_line
+from curate.toml_text import parse_toml
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -178,8 +179,10 @@ def read_config(path: Path) -> Config:
     Raises:
         ConfigError: the file is not TOML, or some settings are wrong; all of them are named.
     """
+    if path.exists() and not path.is_file():
+        raise ConfigError(f"{path}: is no file but a folder, a pipe or a device; remove it")
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file; `curate init` makes a workspace") from error
     except (RecursionError, ValueError) as error:  # ValueError: also of absurdly long numbers

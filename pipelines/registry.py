@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from curate.errors import ConfigError, CurateError
+from curate.errors import ConfigError, CurateError, one_line
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,23 @@ class Registry:
         """The class behind a name.
 
         Raises:
-            ConfigError: nobody knows the name, or what it names cannot be imported.
+            ConfigError: nobody knows the name, or what it names cannot be imported or called.
         """
         self.refuse_unknown(name)
         module_name, _, class_name = self.classes.get(name, name).partition(":")
         try:
-            return getattr(importlib.import_module(module_name), class_name)
+            found = getattr(importlib.import_module(module_name), class_name)
         except (ImportError, AttributeError) as error:
             raise ConfigError(f"{self.kind} '{name}' cannot be imported: {error}") from error
+        except (Exception, SystemExit) as error:  # the module may be the user's, and do anything
+            words = one_line(error, 200)
+            raise ConfigError(
+                f"{self.kind} '{name}' cannot be imported: its module raises "
+                f"{type(error).__name__}: {words}"
+            ) from error
+        if not callable(found):
+            raise ConfigError(f"{self.kind} '{name}' is no class but {found!r:.80}")
+        return found
 
     def takes(self, name: str, argument: str) -> bool:
         """Whether the constructor behind a name has an argument of that name."""

@@ -125,9 +125,10 @@ def find_teacher(workspace: Workspace, number: int) -> tuple[int, Teacher]:
     if not found:
         raise WorkspaceError(f"round {number} has no teacher yet; run `{before}`")
     key, path, digest = found[0]
-    if not (workspace.root / path).exists():
-        raise WorkspaceError(f"{workspace.root / path}: the checkpoint is gone; run `{before}`")
-    return key, Teacher(workspace.root / path, digest)
+    place = workspace.root / path
+    if not (place.is_file() or place.is_dir()):  # a pipe in its place would never end
+        raise WorkspaceError(f"{place}: the checkpoint is gone; run `{before}`")
+    return key, Teacher(place, digest)
 
 
 def newest_checkpoint(workspace: Workspace) -> Path:

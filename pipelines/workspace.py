@@ -147,10 +147,12 @@ def sha256(path: Path) -> str:
     """The hash of a file, or of the files in a folder with their names.
 
     Raises:
-        ConfigError: there is no such file.
+        ConfigError: there is no such file, or it is a pipe or a device, which may have no end.
     """
     if not path.exists():
         raise ConfigError(f"{path}: no such file")
+    if not (path.is_file() or path.is_dir()):
+        raise ConfigError(f"{path}: is a pipe or a device, no file; name a file or a folder")
     digest = hashlib.sha256()
     for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
         if file != path:

@@ -15,7 +15,6 @@ lidar_to_camera = [[...], [...], [...]]        # 3 x 4 or 4 x 4, LiDAR (x forwar
 """
 
 import sys
-import tomllib
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -37,6 +36,7 @@ from curate.datasets.kitti_labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.frames import Calibration, Frame, FrameFiles
+from curate.toml_text import parse_toml
 
 DESCRIPTION = "dataset.toml"
 _FOLDERS = ("points", "images", "labels", "splits")
@@ -181,7 +181,7 @@ class FolderDataset:
 def _read_description(path: Path) -> Mapping[str, Any]:
     """What dataset.toml says; DataError where it cannot be."""
     try:
-        told = tomllib.loads(read_bytes(path, "description").decode("utf-8"))
+        told = parse_toml(read_bytes(path, "description").decode("utf-8"))
     except (RecursionError, ValueError) as error:  # ValueError: also of absurdly long numbers
         raise DataError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
     unknown = sorted(set(told) - set(_KEYS))

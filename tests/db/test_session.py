@@ -5,7 +5,7 @@ import shutil
 import sqlite3
 import subprocess
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 
 import pytest
@@ -274,3 +274,14 @@ def test_a_database_of_a_newer_curate_is_refused(database: Database) -> None:
     database.close()
     with pytest.raises(DatabaseError, match="newer curate"):
         Database(database.url)
+
+
+def test_a_database_of_two_schemas_is_refused(tmp_path: Path) -> None:
+    """A second row in alembic's table, written by hand, is told in one line."""
+    path = tmp_path / "curate.db"
+    Database(f"sqlite:///{path}").close()
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("INSERT INTO alembic_version VALUES ('0001')")
+        connection.commit()
+    with pytest.raises(DatabaseError, match="names several schemas; restore a backup"):
+        Database(f"sqlite:///{path}")

@@ -118,6 +118,14 @@ def _safetensors(path: Path) -> None:
     path.write_bytes(struct.pack("<Q", 2**40) + b"{}")
 
 
+def _dotted_key(path: Path) -> None:
+    path.write_text(f"{'a.' * 15_000}a = 1\n")
+
+
+def _dotted_heading(path: Path) -> None:
+    path.write_text("[" + '"a" . ' * 15_000 + "a]\na = 1\n")
+
+
 _VERTICES = b"element vertex 100"
 BOMBS: Mapping[str, tuple[str, Callable[[Path], None]]] = {
     "a png of a gigapixel": ("png", _png),
@@ -139,4 +147,6 @@ BOMBS: Mapping[str, tuple[str, Callable[[Path], None]]] = {
     "labels without end": ("label file", _endless_view),
     "a cell of half a gigabyte": ("label file", _wide_column),
     "a checkpoint's header": ("checkpoint", _safetensors),
+    "a key of many parts": ("description", _dotted_key),
+    "a heading of many parts": ("configuration", _dotted_heading),
 }

@@ -74,7 +74,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
     """The checkpoint in a file.
 
     Raises:
-        ModelError: the file is missing, damaged, or no checkpoint of this detector.
+        ModelError: the file is missing, damaged, or no checkpoint of this detector, or a weight
+            of it is no number.
     """
     try:
         with safe_open(path, framework="numpy") as file:
@@ -96,6 +97,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
         categories = tuple(str(name) for name in json.loads(metadata["categories"]))
     except (KeyError, TypeError, ValueError) as error:
         raise ModelError(f"{path}: damaged metadata: {first_line(error)}; train again") from None
+    broken = [name for name, values in weights.items() if not np.isfinite(values).all()]
+    if broken:  # it would find nothing in any frame, and no one would be told
+        raise ModelError(f"{path}: {broken[0]} holds NaN or infinite weights; train again")
     return Checkpoint(preset, categories, weights)
 
 

@@ -123,3 +123,15 @@ def test_tensors_of_another_size_are_refused(checkpoint):
     weights = {**checkpoint.weights, "answer.bias": np.zeros(99, dtype=np.float32)}
     with pytest.raises(ModelError, match=r"answer\.bias"):
         network_of(type(checkpoint)(checkpoint.preset, checkpoint.categories, weights))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_weights_that_are_no_numbers_are_refused(tmp_path, checkpoint, value):
+    """They would find nothing in any frame, which looks like empty frames."""
+    path = tmp_path / "teacher.safetensors"
+    weights = {name: array.copy() for name, array in checkpoint.weights.items()}
+    broken = next(name for name, array in weights.items() if array.dtype.kind == "f")
+    weights[broken].flat[0] = value
+    save_file(weights, path, META | {"categories": '["Car", "Tram"]'})
+    with pytest.raises(ModelError, match=f"{broken} holds NaN or infinite weights; train again"):
+        load_checkpoint(path)

@@ -1,0 +1,28 @@
+"""Reading TOML that may be hostile: tomllib takes memory by the square of a dotted key's length."""
+
+import re
+import tomllib
+from typing import Any
+
+# Far beyond every setting; a key of n parts takes n^2 / 2 references.
+MOST_PARTS = 64
+MOST_CHARACTERS = 4 << 20
+
+_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MOST_PARTS}}}")
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The document in a text.
+
+    Raises:
+        ValueError: it is no TOML, longer than any settings, or a key of it has too many parts.
+        RecursionError: its values are nested too deeply.
+    """
+    if len(text) > MOST_CHARACTERS:
+        raise ValueError(f"more than {MOST_CHARACTERS} characters")
+    found = _LONG_KEY.search(text)
+    if found:
+        line = text.count("\n", 0, found.start()) + 1
+        raise ValueError(f"a key of more than {MOST_PARTS} parts (at line {line})")
+    return tomllib.loads(text)
