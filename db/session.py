@@ -10,13 +10,14 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from alembic.util import CommandError
-from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError, joined_lines
 from db.backups import back_up
 from db.claims import claimed, round_resources
 from db.lock_holders import holders
+from db.models import Base
 from db.views import create_views, drop_views
 
 # A writer that finds another one waits this long before it gives up.
@@ -95,6 +96,7 @@ class Database:
         head = script.get_current_head()
         with self.engine.connect() as connection:
             if self._revision(connection, script) == head:
+                self._refuse_missing_tables(connection)
                 return
         with self.writing() as connection:
             if self.engine.dialect.name == "postgresql":
@@ -110,6 +112,14 @@ class Database:
             drop_views(connection)
             command.upgrade(config, "head")
             create_views(connection)
+
+    def _refuse_missing_tables(self, connection: Connection) -> None:
+        """DatabaseError where somebody has dropped a table of this schema."""
+        missing = sorted(set(Base.metadata.tables) - set(inspect(connection).get_table_names()))
+        if missing:
+            raise DatabaseError(
+                f"{self.name}: has no table {', '.join(missing)}; restore a backup of it"
+            )
 
     def _revision(self, connection: Connection, script: ScriptDirectory) -> str | None:
         """Of the schema; None for an empty database, DatabaseError where it is unknown here."""

@@ -267,6 +267,16 @@ def test_a_damaged_file_is_named_with_a_remedy(tmp_path: Path) -> None:
     assert "\n" not in str(error.value)
 
 
+def test_a_dropped_table_is_missed(database: Database) -> None:
+    """At once, not by the first command that needs it."""
+    with database.writing() as connection:
+        drop_views(connection)
+        connection.exec_driver_sql("DROP TABLE weight")
+    database.close()
+    with pytest.raises(DatabaseError, match="has no table weight; restore a backup"):
+        Database(database.url)
+
+
 def test_a_database_of_a_newer_curate_is_refused(database: Database) -> None:
     """Its schema is unknown here."""
     with database.writing() as connection:
