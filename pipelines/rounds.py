@@ -35,8 +35,8 @@ def open_round(
         rounds: E for a round that has no student yet; None for the configured number.
 
     Raises:
-        WorkspaceError: the detector that would answer in the round does not exist yet, or the
-            workspace has no frames.
+        WorkspaceError: the detector that would answer in the round does not exist yet or is not
+            the one that was stored, or the workspace has no frames.
         DatabaseError: another process works on the round with other settings.
     """
     if not _has_frames(workspace):
@@ -48,7 +48,7 @@ def open_round(
     wanted = rounds or workspace.config.run.rounds
     if number is None:
         number = next(e for e in range(1, wanted + 1) if e not in students or e == wanted)
-    teacher_id, teacher = find_teacher(workspace, number)
+    teacher_id, teacher = find_teacher(workspace, number, to_work=True)
     stored = _stored_rounds(workspace, number)
     rounds = stored if stored and number in students else max(wanted, number)
     row = {
@@ -99,14 +99,21 @@ def peek_round(workspace: Workspace, number: int) -> RoundContext | None:
     return RoundContext(number, max(rounds, number), workspace.config.run.seed, teacher)
 
 
-def find_teacher(workspace: Workspace, number: int) -> tuple[int, Teacher]:
+def find_teacher(
+    workspace: Workspace, number: int, *, to_work: bool = False
+) -> tuple[int, Teacher]:
     """The key and the file of the detector that answers in a round.
 
     A detector that the user brings answers in the first round, and in later ones as well where it
     is not trained; where it is, the student of the round before does.
 
+    Args:
+        workspace: see `Workspace`.
+        number: e.
+        to_work: whether it is about to answer, so that its file must be the one that was stored.
+
     Raises:
-        WorkspaceError: it does not exist yet.
+        WorkspaceError: it does not exist yet, or is another.
         ConfigError: the user's file does not exist.
     """
     brought = not is_trainable(workspace)
@@ -128,6 +135,11 @@ def find_teacher(workspace: Workspace, number: int) -> tuple[int, Teacher]:
     place = workspace.root / path
     if not (place.is_file() or place.is_dir()):  # a pipe in its place would never end
         raise WorkspaceError(f"{place}: the checkpoint is gone; run `{before}`")
+    if to_work and sha256(place) != digest:  # its answers would be taken for those of the other
+        raise WorkspaceError(
+            f"{place}: has changed since it was made; put the one that was made back, or take the "
+            f"file away and run `{before}`"
+        )
     return key, Teacher(place, digest)
 
 
@@ -138,7 +150,8 @@ def newest_checkpoint(workspace: Workspace) -> Path:
         WorkspaceError: there is no detector yet.
     """
     students = _students(workspace)
-    return find_teacher(workspace, max(students, default=0) + 1)[1].path
+    number = max(students, default=0) + 1
+    return find_teacher(workspace, number, to_work=True)[1].path
 
 
 def register_checkpoint(

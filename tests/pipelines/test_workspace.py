@@ -8,7 +8,13 @@ import pytest
 from curate.errors import ConfigError, WorkspaceError
 from db.session import parse_url
 from pipelines.config import read_config
-from pipelines.rounds import find_teacher, register_checkpoint
+from pipelines.rounds import (
+    find_teacher,
+    newest_checkpoint,
+    open_round,
+    peek_round,
+    register_checkpoint,
+)
 from pipelines.workspace import Workspace, sha256
 
 
@@ -47,6 +53,22 @@ def test_a_checkpoint_that_became_a_pipe_counts_as_gone(workspace: Workspace) ->
     os.mkfifo(path)
     with pytest.raises(WorkspaceError, match="the checkpoint is gone; run `curate train-round"):
         find_teacher(workspace, 2)
+
+
+def test_a_checkpoint_that_was_exchanged_does_not_answer(workspace: Workspace) -> None:
+    """Its answers would stand as those of the one that was made; once that is back, all is well."""
+    path = workspace.root / "checkpoints" / "teacher"
+    path.write_bytes(b"made")
+    with workspace.database.writing() as connection:
+        register_checkpoint(connection, workspace, 1, workspace.config.run.method, path)
+    assert open_round(workspace, 2).teacher.path == path
+    path.write_bytes(b"another")
+    for ask in (lambda: open_round(workspace, 2), lambda: newest_checkpoint(workspace)):
+        with pytest.raises(WorkspaceError, match=r"has changed since .* run `curate train-round"):
+            ask()
+    assert peek_round(workspace, 2) is not None
+    path.write_bytes(b"made")
+    assert newest_checkpoint(workspace) == path
 
 
 def test_a_zero_byte_in_the_address_of_a_database() -> None:
