@@ -7,16 +7,23 @@ import importlib
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, get_origin
 
 from curate.errors import ConfigError, CurateError, one_line
 
 
 @dataclass(frozen=True)
 class Registry:
-    """Names and the classes behind them, imported when they are asked for."""
+    """Names and the classes behind them, imported when they are asked for.
+
+    Attributes:
+        kind: of extension, for messages.
+        protocol: what each of them offers, as `package.module:Class`.
+        classes: likewise, by name.
+    """
 
     kind: str
+    protocol: str
     classes: Mapping[str, str]
 
     def refuse_unknown(self, name: str, *others: str) -> None:
@@ -45,7 +52,25 @@ class Registry:
             ) from error
         if not callable(found):
             raise ConfigError(f"{self.kind} '{name}' is no class but {found!r:.80}")
+        missing = [member for member in self._members() if not hasattr(found, member)]
+        if isinstance(found, type) and missing:
+            raise ConfigError(
+                f"{self.kind} '{name}' has no {', '.join(missing)}; see "
+                f"{self.protocol.replace(':', '.')}"
+            )
         return found
+
+    def _members(self) -> list[str]:
+        """The methods and attributes that the classes themselves must have."""
+        module_name, _, class_name = self.protocol.partition(":")
+        members = vars(getattr(importlib.import_module(module_name), class_name))
+        fixed = [
+            name
+            for name, kind in members.get("__annotations__", {}).items()
+            if get_origin(kind) is ClassVar
+        ]
+        methods = [name for name, member in members.items() if inspect.isfunction(member)]
+        return [*fixed, *(name for name in methods if not name.startswith("_"))]
 
     def takes(self, name: str, argument: str) -> bool:
         """Whether the constructor behind a name has an argument of that name."""
@@ -89,6 +114,7 @@ class Registry:
 
 DATASETS = Registry(
     "dataset",
+    "curate.datasets.base:Dataset",
     {
         "kitti": "curate.datasets.kitti:KittiDataset",
         "kitti-raw": "curate.datasets.kitti_raw:KittiRawDataset",
@@ -98,6 +124,7 @@ DATASETS = Registry(
 )
 DETECTORS = Registry(
     "detector",
+    "curate.detectors.base:Detector",
     {
         "pillars": "curate.detectors.pillars:PillarDetector",
         "onnx": "curate.detectors.onnx:OnnxDetector",
@@ -106,6 +133,7 @@ DETECTORS = Registry(
 )
 SEGMENTERS = Registry(
     "segmenter",
+    "curate.segmenters.base:Segmenter",
     {
         "onnx": "curate.segmenters.onnx:OnnxSegmenter",
         "onnx-instances": "curate.segmenters.onnx_instances:OnnxInstanceSegmenter",
@@ -116,6 +144,7 @@ SEGMENTERS = Registry(
 )
 PRIORS = Registry(
     "prior",
+    "curate.priors.base:Prior",
     {
         "points": "curate.priors.points:PointPrior",
         "semantic": "curate.priors.semantic:SemanticPrior",
@@ -123,6 +152,7 @@ PRIORS = Registry(
 )
 POLICIES = Registry(
     "policy",
+    "curate.weighting.base:Policy",
     {
         "pspsl": "curate.weighting.self_paced:PSPSL",
         "spsl": "curate.weighting.self_paced:SPSL",
@@ -139,6 +169,7 @@ POLICIES = Registry(
 )
 EXPORTERS = Registry(
     "exporter",
+    "curate.exporters.base:Exporter",
     {
         "sqlite": "curate.exporters.sqlite:SqliteExporter",
         "kitti": "curate.exporters.kitti:KittiExporter",
@@ -153,6 +184,7 @@ EXPORTERS = Registry(
 )
 EXECUTORS = Registry(
     "executor",
+    "pipelines.executors.base:Executor",
     {
         "serial": "pipelines.executors.serial:SerialExecutor",
         "process": "pipelines.executors.process:ProcessExecutor",
@@ -161,6 +193,7 @@ EXECUTORS = Registry(
 )
 EDITORS = Registry(
     "editor",
+    "curate.review.editors.base:Editor",
     {
         "kitti": "curate.review.editors.kitti:KittiEditor",
         "labelcloud": "curate.review.editors.labelcloud:LabelCloudEditor",

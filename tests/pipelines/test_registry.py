@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from curate.errors import ConfigError
-from pipelines.registry import DETECTORS
+from pipelines.registry import DETECTORS, PRIORS
 
 
 @pytest.mark.parametrize(
@@ -16,6 +16,7 @@ from pipelines.registry import DETECTORS
         ("def f(", "raises SyntaxError"),
         ("Mine = 3", "is no class but 3"),
         ("", "cannot be imported"),
+        ("class Mine: ...", "has no predict; see curate.detectors.base.Detector"),
     ],
 )
 def test_a_module_that_cannot_be_used_is_named(
@@ -28,3 +29,18 @@ def test_a_module_that_cannot_be_used_is_named(
     with pytest.raises(ConfigError, match=f"^detector '{name}:Mine' .*{words}") as found:
         DETECTORS.load(f"{name}:Mine")
     assert "\n" not in str(found.value)
+
+
+def test_a_class_without_what_the_pipeline_asks_for_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Methods and class attributes; what an instance brings may be made later."""
+    (tmp_path / "priors_of_a_user.py").write_text(
+        "class Mine:\n    name = 'mine'\n    measured_columns = ()\n"
+        "    def measure(self, frame, detections): ...\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        ConfigError, match=r"^prior '.*' has no rho_column, rate, score; see curate"
+    ):
+        PRIORS.load("priors_of_a_user:Mine")
