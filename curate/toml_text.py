@@ -21,6 +21,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     """
     if len(text) > MOST_CHARACTERS:
         raise ValueError(f"more than {MOST_CHARACTERS} characters")
+    text = text.removeprefix("\ufeff")  # which some editors write in front of every file
     found = _LONG_KEY.search(text)
     if found:
         line = text.count("\n", 0, found.start()) + 1

@@ -22,6 +22,7 @@ from curate.toml_text import parse_toml
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
+Scale = Annotated[float, Field(gt=0, le=100)]
 AtLeastOne = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Options = dict[str, Any]
@@ -85,7 +86,7 @@ class RepredictSection(Section):
     views: AtLeastOne = 1
     flip_probability: Share = 0.5
     rotation_limit_rad: Annotated[float, Field(ge=0)] = 0.7853981633974483
-    scale_range: Annotated[tuple[Positive, Positive], AfterValidator(_rising)] = (0.95, 1.05)
+    scale_range: Annotated[tuple[Scale, Scale], AfterValidator(_rising)] = (0.95, 1.05)
     score_weight: Annotated[float, Field(ge=0)] = 1.0
     box_weight: Annotated[float, Field(ge=0)] = 2.0
     beta: Positive = 1 / 9

@@ -297,7 +297,10 @@ def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str
 def read_frame_list(path: Path) -> tuple[str, ...]:
     """The frame ids of a text file, one per line; DataError for what is no frame id."""
     names: list[str] = []
-    text = read_bytes(path, "frame list").decode("utf-8", errors="replace")
+    try:
+        text = read_bytes(path, "frame list").decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: is no UTF-8 text: {error.reason} at {error.start}") from None
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip():
             try:

@@ -41,3 +41,8 @@ def test_the_look_itself_takes_no_time(text: str) -> None:
     """It ends, where a pattern that goes back and forth would not."""
     with pytest.raises(tomllib.TOMLDecodeError):
         parse_toml(text)
+
+
+def test_a_mark_in_front_of_the_text_is_no_part_of_it() -> None:
+    """Some editors write one."""
+    assert parse_toml("\ufeffa = 1\n") == {"a": 1}

@@ -187,6 +187,7 @@ def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> Non
         ('priors = ["points", "semantic"]', 'priors = ["points", "points"]', "named twice"),
         ('categories = ["Car", "Pedestrian", "Cyclist"]', "categories = []", "dataset.categories"),
         ("scale_range = [0.95, 1.05]", "scale_range = [1.2, 0.8]", "lower limit"),
+        ("scale_range = [0.95, 1.05]", "scale_range = [1e308, 1e308]", "repredict.scale_range"),
         ("minimum_iou = 0.1", "minimum_iou = 1.0", "repredict.minimum_iou"),
         ("seed = 0", "seed = -1", "run.seed"),
         ("seed = 0", "seed = 99999999999999999999", "run.seed"),

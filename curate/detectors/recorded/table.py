@@ -11,6 +11,7 @@ never recorded. A frame without any row is therefore an error, so that it shows 
 instead of passing for an empty street; a frame with rows of other views only has no detections.
 """
 
+import codecs
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
@@ -127,8 +128,10 @@ class _Rows:
 
     def _lines(self, file: BinaryIO) -> Iterator[str]:
         for line in file:
+            # Spreadsheets write a mark in front of their files.
+            text = line.removeprefix(codecs.BOM_UTF8) if self._end == 0 else line
             self._end += len(line)
-            yield line.decode()
+            yield text.decode()
 
     def header(self) -> tuple[int, ...]:
         """Where each of `_COLUMNS` stands; DataError where one is missing."""

@@ -129,6 +129,15 @@ def test_a_list_with_a_path_in_it_is_refused_with_its_place(toy_kitti):
         KittiDataset(toy_kitti).splits()
 
 
+def test_a_list_is_text(toy_kitti):
+    """With or without a mark in front; no name is made up of bytes that are no letters."""
+    (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"\xef\xbb\xbf000001\n")
+    assert KittiDataset(toy_kitti).splits()["train"] == ("000001",)
+    (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"000001\n\xff\xfe\n")
+    with pytest.raises(DataError, match=r"train\.txt: is no UTF-8 text"):
+        KittiDataset(toy_kitti).splits()
+
+
 def test_annotations_are_in_the_lidar_frame(toy_kitti):
     """The labelled boxes hold the bright points of the toy frames."""
     dataset = KittiDataset(toy_kitti)

@@ -42,6 +42,15 @@ def test_answers_what_was_recorded(tmp_path):
     assert isinstance(detector, RecordedViews)
 
 
+def test_a_mark_in_front_of_a_spreadsheets_file_is_no_part_of_it(tmp_path):
+    """The first column keeps its name, and every row its place."""
+    path = write(tmp_path / "a.csv", PLAIN, MOVED)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    detector = RecordedDetector(path)
+    assert detector.predict(frame("000001")).scores.tolist() == [0.9]
+    assert detector.views("000001")[0][1].scores.tolist() == [0.8]
+
+
 def test_low_scores_are_left_out_of_every_view(tmp_path):
     """`minimum_score` includes its own value."""
     low = PLAIN.replace("0.9", "0.1")
