@@ -203,7 +203,15 @@ def _engine(url: URL) -> Engine:
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_pragmas)
         event.listen(engine, "begin", _begin)
+    else:
+        event.listen(engine, "connect", _start_at_once)
     return engine
+
+
+def _start_at_once(connection: Any, _record: Any) -> None:
+    # A server that compiles a question first takes longer for it than for most answers.
+    connection.execute("SET jit = off")
+    connection.commit()
 
 
 def _set_pragmas(connection: Any, _record: Any) -> None:

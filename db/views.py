@@ -29,9 +29,11 @@ _REAL, _INTEGER = "CAST(NULL AS DOUBLE PRECISION)", "CAST(NULL AS INTEGER)"
 # hold for objects. Decisions are few: SQLite, which keeps the order of a CROSS JOIN, walks through
 # them first and looks their frames up one by one. A condition on frames alone, the split's for one,
 # would make it read all frames into a Bloom filter before the first row, hence the CASE on a k.
+# A server finds one frame's labels of all rounds by their key only where it is given the rounds.
 _WEIGHTED_LABELS = f"""
         SELECT p.round, f.frame, {_PREDICTED}, 'detector' AS provenance, w.policy, w.v AS weight
-        FROM weight AS w
+        FROM round AS r
+        JOIN weight AS w ON w.round = r.number
         JOIN prediction AS p ON p.round = w.round AND p.frame_id = w.frame_id AND p.k = w.k
         JOIN frame AS f ON f.id = w.frame_id
         {_EVIDENCE}

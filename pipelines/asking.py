@@ -124,6 +124,9 @@ def _ask_server(
     end = time.monotonic() + seconds
     try:
         reading = connection.execution_options(postgresql_readonly=True)
+        # The first rows are what somebody waits for: nothing is compiled, little is prepared.
+        reading.exec_driver_sql("SET LOCAL jit = off")
+        reading.exec_driver_sql("SET LOCAL cursor_tuple_fraction = 0.0001")
         reading.exec_driver_sql(f"SET LOCAL statement_timeout = {max(1, round(seconds * 1000))}")
         reading = reading.execution_options(stream_results=True, max_row_buffer=SERVER_ROWS)
         result = reading.exec_driver_sql(sql)

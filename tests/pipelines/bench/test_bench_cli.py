@@ -24,6 +24,7 @@ from pipelines.bench.settings import Bench, read_bench
 from pipelines.methods import METHODS
 from pipelines.rounds import open_round
 from pipelines.setup import initialise
+from pipelines.workspace import sha256
 
 ROOT = Path(__file__).parents[3]
 GIVE_UP_S = 3600
@@ -134,7 +135,8 @@ def test_methods_share_the_teacher_and_its_evidence(toy_kitti: Path, tmp_path: P
     """No method's settings make stale what was prepared once for all of them."""
     bench = make_bench(tmp_path, toy_kitti)
     workspace = initialise(tmp_path / "work", bench.config(0), "0.25", "")
-    checkpoint = (0, "", "pillars", "curate.toml", "0" * 64, "2023-02-01 00:00:00")
+    digest = sha256(workspace.root / "curate.toml")
+    checkpoint = (0, "", "pillars", "curate.toml", digest, "2023-02-01 00:00:00")
     with workspace.database.writing() as connection:
         bulk.insert(connection, "checkpoint", [checkpoint])
     context = open_round(workspace, 1)
