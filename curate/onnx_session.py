@@ -26,7 +26,7 @@ def open_session(model: Path, threads: int, section: str) -> Any:
     options.inter_op_num_threads = 1
     # Waiting threads would take the cores from the other workers.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.log_severity_level = 3
+    options.log_severity_level = 4  # what is an error is raised, and need not be printed too
     refusals: tuple[type[Exception], ...] = (*runtime_errors(), RuntimeError, ValueError)
     try:
         # With its fallback, it would print what is wrong and try the same provider again.

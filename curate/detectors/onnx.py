@@ -124,10 +124,13 @@ class OnnxDetector:
         labels = named.get("labels")
         if scores.ndim == 2 and scores.shape[1] == 1 and labels is not None:
             scores = scores[:, 0]
-        if labels is None and scores.ndim == 2:
+        if labels is None and scores.ndim == 2 and scores.shape[1]:
             labels, scores = scores.argmax(axis=1) + self.first_label, scores.max(axis=1)
         labels = np.zeros(0, np.int64) if labels is None else np.asarray(labels).reshape(-1)
         shapes = {"boxes": boxes.shape, "scores": scores.shape, "labels": labels.shape}
+        strange = [each.dtype for each in (boxes, scores, labels) if each.dtype.kind not in "fiub"]
+        if strange:
+            raise ModelError(f"{self.model}: answers {strange[0]} where numbers were expected")
         if (
             boxes.ndim != 2
             or boxes.shape[1] < 7
@@ -157,7 +160,8 @@ class OnnxDetector:
                 "[0, 1]; set detector.options.sigmoid = true where they are logits"
             )
         last = self.first_label + len(self.classes) - 1
-        if not (labels.min() >= self.first_label and labels.max() <= last):
+        within = labels.min() >= self.first_label and labels.max() <= last
+        if not within or (labels != np.floor(labels)).any():
             raise ModelError(
                 f"{self.model}: labels {labels.min()} to {labels.max()}, but classes "
                 f"{', '.join(self.classes)} are {self.first_label} to {last}; set classes and "

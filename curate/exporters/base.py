@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -71,7 +72,7 @@ class LabelSet:
 
     Raises:
         LeakageError: ground truth of a frame that is not labeled, or a frame of another split.
-        DataError: labels of a frame that is not unlabeled.
+        DataError: labels of a frame that is not unlabeled, or a weight that is no number.
     """
 
     description: LabelFileDescription
@@ -93,16 +94,23 @@ class LabelSet:
                 f"the labeled split: {named(others or leaked)}; export labeled and unlabeled "
                 "frames only, with ground truth of labeled ones"
             )
-        frame, category = map(WEIGHTED_LABEL_COLUMNS.index, ("frame", "category"))
-        found = {(row[frame], row[category]) for row in self.labels}
-        strays = {name for name, _ in found if splits.get(name) != "unlabeled"}
+        columns = ("frame", "category", "weight")
+        frame, category, weight = map(WEIGHTED_LABEL_COLUMNS.index, columns)
+        found = {(row[frame], row[category], type(row[weight])) for row in self.labels}
+        words = {name for name, _, kind in found if not issubclass(kind, Real)}
+        if words:  # SQLite keeps text in a column of numbers
+            raise DataError(
+                f"weights of {named(words)} are no numbers; something else has written them into "
+                "the database: restore a backup"
+            )
+        strays = {name for name, _, _ in found if splits.get(name) != "unlabeled"}
         if strays:
             raise DataError(
                 f"labels to export belong to frames outside the unlabeled split: {named(strays)}; "
                 "export labels of unlabeled frames only"
             )
         of_truth = GROUND_TRUTH_COLUMNS.index("category")
-        categories = {row[of_truth] for row in self.ground_truth} | {name for _, name in found}
+        categories = {row[of_truth] for row in self.ground_truth} | {name for _, name, _ in found}
         object.__setattr__(self, "categories", frozenset(map(str, categories)))
 
 

@@ -3,9 +3,12 @@
 DIRECTORY/export.json marks the folder as an export and says in which format.
 """
 
+import glob
 import json
+import os
 import pickle
 import shutil
+import socket
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -36,8 +39,7 @@ def write_folder(
         ConfigError: the directory holds something else.
     """
     _refuse_foreign(directory, format_name)
-    partial = directory.with_name(f".{directory.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of an export that was killed
+    partial = _own_partial(directory)
     try:
         partial.mkdir(parents=True)
         facts = fill(partial)
@@ -80,6 +82,30 @@ def _refuse_foreign(directory: Path, format_name: str) -> None:
         known = False
     if not known:
         raise ConfigError(f"{directory}: is there and is no former export; name another folder")
+
+
+def _own_partial(directory: Path) -> Path:
+    """A place beside an export that no other process writes to; those of killed ones are removed.
+
+    Two processes that shared one would mix their files, or end with half an export.
+    """
+    own = f".{directory.name}.{socket.gethostname()}-"
+    for left in directory.parent.glob(f"{glob.escape(own)}*.partial"):
+        process = left.stem.removeprefix(own)
+        if process.isdecimal() and not _runs(int(process)):
+            shutil.rmtree(left, ignore_errors=True)
+    return directory.with_name(f"{own}{os.getpid()}.partial")
+
+
+def _runs(process: int) -> bool:
+    """Whether a process of this machine has that number, and is not this one."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        return True
+    return process != os.getpid()
 
 
 def _take_place(partial: Path, directory: Path) -> None:

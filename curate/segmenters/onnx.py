@@ -106,7 +106,8 @@ class OnnxSegmenter:
         squeeze = (width / height) / (shape.width / shape.height)
         if squeeze <= _SQUEEZE_LIMIT:
             return whole
-        return cut_along(width, round(width / squeeze), max(self.tiles, ceil(squeeze)))
+        crop_width = max(round(width / squeeze), 1)
+        return cut_along(width, crop_width, max(self.tiles, ceil(squeeze)))
 
     def _run(self, image: np.ndarray) -> np.ndarray:
         """(h, w) uint8 class ids of an (h, w, 3) image."""
@@ -158,9 +159,12 @@ def _class_ids(answer: np.ndarray, size: tuple[int, int], model: Path) -> np.nda
     answer, the one whose h : w is nearer to the input's is right.
     """
     fault = ModelError(f"{model}: answers {answer.dtype} {list(answer.shape)}; {_ANSWER}")
-    if answer.ndim not in {3, 4} or answer.shape[0] != 1 or 0 in answer.shape:
+    numbers = answer.dtype.kind in "fiub"
+    if not numbers or answer.ndim not in {3, 4} or answer.shape[0] != 1 or 0 in answer.shape:
         raise fault
     scores = answer[0]
+    if np.isnan(scores.max()):  # the highest of them would be class 0, or any other
+        raise ModelError(f"{model}: answers scores that are NaN; mend the model or its scaling")
     if scores.ndim == 3:
         first, second, third = scores.shape
         aspect = np.log(size[1] / size[0])

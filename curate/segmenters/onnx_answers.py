@@ -101,7 +101,8 @@ def prototype_instances(
     for i in first[np.sort(np.asarray(kept, dtype=np.int64))].tolist():
         sums = np.tensordot(rows[i, 4 + classes :], prototypes[0].astype(np.float64), axes=1)
         # The logistic function, which does not overflow in this form.
-        yield Instance(int(labels[i]), _box(corners[i]), (1 + np.tanh(sums / 2)) / 2, is_whole=True)
+        mask = _cells((1 + np.tanh(sums / 2)) / 2)
+        yield Instance(int(labels[i]), _box(corners[i]), mask, is_whole=True)
 
 
 Reader = Callable[[Answer, tuple[int, int], float], Iterator[Instance]]
@@ -147,8 +148,15 @@ def _box(row: np.ndarray) -> Box:
 
 
 def _cells(mask: np.ndarray) -> np.ndarray:
-    """Values from 0 to 1 of a mask that may be of whole numbers, where all above 0 are 1."""
-    return mask if np.issubdtype(mask.dtype, np.floating) else mask > 0
+    """Values from 0 to 1 of a mask that may be of whole numbers, where all above 0 are 1.
+
+    ModelError where one is NaN: it would pass for a pixel that is not the object's.
+    """
+    if not np.issubdtype(mask.dtype, np.floating):
+        return mask > 0
+    if np.isnan(mask).any():
+        raise ModelError("answers a mask that holds NaN")
+    return mask
 
 
 def _misfit(answer: Answer, expected: str) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from curate.datasets.images import MOST_PIXELS
 from curate.errors import ConfigError, ModelError, first_line
 from curate.frames import Frame
 from curate.onnx_session import open_session, runtime_errors
@@ -125,4 +126,7 @@ def _image_input(session: Any, model: Path, *, single: bool) -> ImageInput:
     ):
         raise fault
     height, width = (second, last) if channels_first else (first, second)
+    if 0 in {height, width} or (height or 1) * (width or 1) > MOST_PIXELS:
+        # Each frame would be blown up to that size.
+        raise ModelError(f"{model}: takes {found}; images of 1 to {MOST_PIXELS} pixels are made")
     return ImageInput(one.name, one.type == "tensor(float)", channels_first, batched, height, width)

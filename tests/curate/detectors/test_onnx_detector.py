@@ -1,7 +1,9 @@
 """Tests of the detector that runs any exported model."""
 
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto, helper, numpy_helper
 from tiny_onnx import tiny_detector
 from toys import toy_calibration
 
@@ -35,6 +37,18 @@ def upside_down(outputs):
         "boxes": outputs["boxes"][::-1],
         "scores": outputs["scores"][::-1],
         "labels": outputs["labels"],
+    }
+
+
+def in_words(outputs):
+    """A postprocess that names the classes."""
+    return {**outputs, "labels": np.array(["Car"] * len(outputs["labels"]))}
+
+
+def between_classes(outputs):
+    """A postprocess whose labels are no whole numbers."""
+    return {**outputs, "labels": outputs["labels"][:2] + 0.5} | {
+        key: outputs[key][:2] for key in ("boxes", "scores")
     }
 
 
@@ -124,6 +138,9 @@ def test_functions_of_the_user_come_before_and_after(path):
         ({}, {"scores": np.array([3.0, 2, -1])}, ModelError, "from -1 to 3 are not in"),
         ({}, {"labels": np.array([0, 1, 7])}, ModelError, "labels 0 to 7, but classes Car,"),
         ({}, {"labels": np.array([0, 1])}, ModelError, r"labels \[2\]; expected"),
+        ({}, {"scores": np.zeros((3, 0))}, ModelError, r"scores \[3, 0\], labels \[0\]; expected"),
+        ({"postprocess": f"{__name__}:in_words"}, {}, ModelError, "answers <U3 where numbers were"),
+        ({"postprocess": f"{__name__}:between_classes"}, {}, ModelError, "labels 0.5 to 1.5, but"),
         ({"convention": {"order": "xyz"}}, {}, ConfigError, "order 'xyz': use lwh"),
         ({"convention": {"handed": "left"}}, {}, ConfigError, "unexpected keyword"),
         ({"preprocess": "nowhere:f"}, {}, ConfigError, "'nowhere:f' cannot be imported"),
@@ -142,3 +159,19 @@ def test_a_sweep_without_points_is_not_shown_to_the_model(path):
     """Many exports fail on it."""
     tiny_detector(path)
     assert len(OnnxDetector(path, classes=CATEGORIES).predict(frame(POINTS[:0]))) == 0
+
+
+def test_a_model_that_fails_prints_nothing_itself(path, capfd):
+    """ONNX Runtime's own log is several coloured lines beside the one of the error."""
+    points = helper.make_tensor_value_info("points", TensorProto.FLOAT, ["n", 4])
+    shape = numpy_helper.from_array(np.int64([10**13, 7]), "shape")
+    names = ("boxes", "scores")
+    nodes = [helper.make_node("ConstantOfShape", ["shape"], [name]) for name in names]
+    outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", 7]) for name in names]
+    graph = helper.make_graph(nodes, "giant", [points], outputs, [shape])
+    onnx.save(
+        helper.make_model(graph, ir_version=9, opset_imports=[helper.make_opsetid("", 18)]), path
+    )
+    with pytest.raises(ModelError, match="Failed to allocate memory"):
+        OnnxDetector(path, classes=CATEGORIES).predict(frame())
+    assert capfd.readouterr() == ("", "")

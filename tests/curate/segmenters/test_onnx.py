@@ -216,6 +216,43 @@ def test_an_answer_that_is_no_map_is_refused(tmp_path):
         OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
 
 
+def test_scores_that_are_nan_are_refused(tmp_path):
+    """They would be class 0 in every pixel, and no frame would fail."""
+    nodes = [helper.make_node("Log", ["image"], ["answer"])]
+    path = model(
+        tmp_path / "a.onnx", nodes, [1, 3, 8, 8], TensorProto.FLOAT,
+        answer=TensorProto.FLOAT, rank=4,
+    )  # fmt: skip
+    with pytest.raises(ModelError, match=r"a\.onnx: answers scores that are NaN"):
+        OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
+
+
+def test_names_of_classes_are_no_scores(tmp_path):
+    """Text cannot be compared with numbers."""
+    nodes = [helper.make_node("Cast", ["image"], ["answer"], to=TensorProto.STRING)]
+    path = model(
+        tmp_path / "a.onnx", nodes, [1, 3, 8, 8], TensorProto.FLOAT,
+        answer=TensorProto.STRING, rank=4,
+    )  # fmt: skip
+    with pytest.raises(ModelError, match=r"answers object .*expected class ids"):
+        OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
+
+
+@pytest.mark.parametrize("shape", [[1, 3, 200_000, 200_000], [1, 3, 0, 8], [1, "h", 1 << 26, 3]])
+def test_an_absurd_input_is_refused_before_a_frame_fills_the_memory(tmp_path, shape):
+    """Every frame would be resized to what the model declares."""
+    path = brightest_channel_model(tmp_path / "a.onnx", shape)
+    with pytest.raises(ModelError, match=r"a\.onnx: takes image .*images of 1 to 33554432 pixels"):
+        OnnxSegmenter(path, CLASSES)
+
+
+def test_a_model_of_one_column_has_crops_of_one(tmp_path):
+    """A crop never has a width of zero."""
+    path = red_channel_model(tmp_path / "a.onnx", [1, 32, 1, 3])
+    found = OnnxSegmenter(path, CLASSES).segment(frame(banded(8, 16, [7, 15]))).class_ids
+    np.testing.assert_array_equal(found, banded(8, 16, [7, 15])[..., 0])
+
+
 def test_ids_beyond_a_map_are_refused(tmp_path):
     """Class 300 does not fit into 8 bits and is not silently another class."""
     path = constant_model(tmp_path / "a.onnx", np.full((8, 8), 300))

@@ -183,6 +183,7 @@ BAD = {
     "no number": ({"boxes": np.full((1, 4), np.nan, np.float32)}, "NaN, infinite or beyond"),
     "half a label": ({"labels": np.float32([0.5])}, "label 0.5, which is no whole number"),
     "masks without cells": ({"masks": np.ones((1, 0, 28), np.float32)}, "28 x 0 cells"),
+    "a mask of no numbers": ({"masks": np.full((1, 28, 28), np.nan, np.float32)}, "holds NaN"),
     "an endless mask": ({"masks": np.ones((1, 1, 9000), np.float32)}, "9000 x 1 cells"),
 }
 
@@ -197,6 +198,15 @@ def test_other_answers_are_refused_in_one_line(tmp_path, name):
     assert_one_line(caught.value)
     assert message in str(caught.value)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_prototypes_that_are_nan_are_refused(tmp_path):
+    """They would leave the object without a single pixel."""
+    found = {"predictions": np.full((1, 6, 1), 0.9, np.float32)}
+    found["prototypes"] = np.full((1, 1, 4, 4), np.nan, np.float32)
+    path = constant_model(tmp_path / "a.onnx", found)
+    with pytest.raises(ModelError, match=r"a\.onnx: answers a mask that holds NaN"):
+        asked(path, {"Car": (0,)}, outputs={name: name for name in found})
 
 
 def test_wrong_prototypes_are_refused(tmp_path):
