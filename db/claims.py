@@ -10,13 +10,14 @@ import socket
 import time
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection, Engine, text
+from sqlalchemy.exc import DBAPIError
 
 from curate.errors import DatabaseError
 
@@ -95,8 +96,10 @@ def _session(engine: Engine, owner: str) -> Iterator[Connection]:
         try:
             yield connection
         finally:
-            # A server notices the end of a connection only a little later.
-            connection.execute(text("SELECT pg_advisory_unlock_all()"))
+            # A server notices the end of a connection a little later. One that is lost has lost
+            # its claims, too, and what was lost with it is told by whoever worked.
+            with suppress(DBAPIError):
+                connection.execute(text("SELECT pg_advisory_unlock_all()"))
 
 
 def _claim_session(connection: Connection, resource: Resource) -> None:

@@ -76,3 +76,26 @@ def test_an_error_ends_the_claim(pair: tuple[Database, Database]) -> None:
         raise ZeroDivisionError
     with pair[1].claiming_round(1, None, "predict"):
         pass
+
+
+def test_a_server_that_is_lost_in_the_midst_is_told_in_one_line(
+    new_url: Callable[[], str | None],
+) -> None:
+    """The claim is lost as well; giving it back must not speak in place of what failed."""
+    url = new_url()
+    if url is None:
+        pytest.skip("a file is not lost like this")
+    database, other = Database(url), Database(url)
+
+    def lost_in_the_midst() -> None:
+        with database.claiming_round(1, None, "predict"), database.writing() as connection:
+            with other.writing() as ending:
+                ending.exec_driver_sql(
+                    "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+                    "WHERE pid <> pg_backend_pid() AND datname = current_database()"
+                )
+            connection.exec_driver_sql("SELECT 1")
+
+    with pytest.raises(DatabaseError, match="check that the server runs") as found:
+        lost_in_the_midst()
+    assert "\n" not in str(found.value)
