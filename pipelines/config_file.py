@@ -1,12 +1,12 @@
 """Single settings in a configuration file: changed line by line, all else stays as it was typed."""
 
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from curate.atomic import replace_file
 from curate.errors import ConfigError
+from curate.toml_text import parse_toml
 from pipelines.config import toml
 
 
@@ -19,14 +19,14 @@ def change_settings(path: Path, section: str, changes: Mapping[str, str]) -> Non
     lines = [f"{key} = {toml(value)}" for key, value in changes.items()]
     fault = "cannot be changed line by line"
     try:
-        text = path.read_text(encoding="utf-8")
-        before = tomllib.loads(text)
+        text = path.read_text(encoding="utf-8-sig")
+        before = parse_toml(text)
         changed = "\n".join(_changed(text.splitlines(), section, lines)) + "\n"
         wanted = {**before, section: {**before.get(section, {}), **changes}}
-        if tomllib.loads(changed) == wanted:
+        if parse_toml(changed) == wanted:
             replace_file(path, changed.encode())
             return
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+    except ValueError:
         pass  # what was written is no TOML: a table in braces, or a text over several lines
     except OSError as error:
         fault = f"cannot be changed: {error.strerror}"

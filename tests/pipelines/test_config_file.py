@@ -38,6 +38,14 @@ def test_only_what_is_said_changes(tmp_path: Path, before: str, after: str) -> N
     assert tomllib.loads(path.read_text())["train"].items() >= CHANGES.items()
 
 
+def test_a_mark_in_front_of_the_file_does_not_hide_its_first_line(tmp_path: Path) -> None:
+    """Some editors write one; such a file is read, so it can be changed."""
+    path = tmp_path / "curate.toml"
+    path.write_bytes(b"\xef\xbb\xbf[train]\nsteps = 1\n")
+    change_settings(path, "train", {"labels_format": "st3d"})
+    assert path.read_text() == '[train]\nlabels_format = "st3d"\nsteps = 1\n'
+
+
 @pytest.mark.parametrize(
     "text",
     [
