@@ -1,25 +1,30 @@
 """Whole columns of committed rows as NumPy arrays, the fastest way that a database offers."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Dialect, Select
+from sqlalchemy import Connection, Select
 
 from db import bulk, sqlite_columns
 from db.session import BUSY_TIMEOUT_MS, Database
 
 
-class Columns(Protocol):
-    """Answers queries of one column."""
+@dataclass(frozen=True)
+class Columns:
+    """Answers queries of one column.
 
-    def numbers(self, statement: Select[Any]) -> np.ndarray:
-        """(n,) float64; NaN for null."""
+    Attributes:
+        numbers: (n,) float64; NaN for null.
+        integers: (n,) int64, without nulls.
+    """
 
-    def integers(self, statement: Select[Any]) -> np.ndarray:
-        """(n,) int64, without nulls."""
+    numbers: Callable[[Select[Any]], np.ndarray]
+    integers: Callable[[Select[Any]], np.ndarray]
 
 
 @contextmanager
@@ -35,39 +40,15 @@ def reading_columns(
     """
     dialect = connection.dialect
     if not many or dialect.name != "sqlite" or not sqlite_columns.available():
-        yield _Driver(connection)
+        yield Columns(partial(bulk.numbers, connection), partial(bulk.integers, connection))
         return
+
+    def written(statement: Select[Any]) -> str:
+        return str(statement.compile(dialect=dialect, compile_kwargs={"literal_binds": True}))
+
     path = Path(str(database.url.database))
     with closing(sqlite_columns.SqliteColumns(path, BUSY_TIMEOUT_MS)) as asked:
-        yield _Library(asked, dialect)
-
-
-class _Driver:
-    """`Columns` through the driver of a connection."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-
-    def numbers(self, statement: Select[Any]) -> np.ndarray:
-        return bulk.numbers(self._connection, statement)
-
-    def integers(self, statement: Select[Any]) -> np.ndarray:
-        return bulk.integers(self._connection, statement)
-
-
-class _Library:
-    """`Columns` from SQLite's own library."""
-
-    def __init__(self, asked: sqlite_columns.SqliteColumns, dialect: Dialect) -> None:
-        self._asked = asked
-        self._dialect = dialect
-
-    def numbers(self, statement: Select[Any]) -> np.ndarray:
-        return self._asked.numbers(self._sql(statement))
-
-    def integers(self, statement: Select[Any]) -> np.ndarray:
-        return self._asked.integers(self._sql(statement))
-
-    def _sql(self, statement: Select[Any]) -> str:
-        written = statement.compile(dialect=self._dialect, compile_kwargs={"literal_binds": True})
-        return str(written)
+        yield Columns(
+            lambda statement: asked.numbers(written(statement)),
+            lambda statement: asked.integers(written(statement)),
+        )
