@@ -84,6 +84,12 @@ def claimed(engine: Engine, resources: Sequence[Resource], purpose: str) -> Iter
         yield
 
 
+def one_at_a_time(connection: Connection, lock: int) -> None:
+    """Waits for other transactions with this lock to end; SQLite's writers always do."""
+    if connection.dialect.name == "postgresql":
+        connection.execute(text(f"SELECT pg_advisory_xact_lock({lock})"))
+
+
 @contextmanager
 def _session(engine: Engine, owner: str) -> Iterator[Connection]:
     """A connection of its own, which ends with its claims."""

@@ -10,12 +10,12 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from alembic.util import CommandError
-from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url, text
+from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError, joined_lines
 from db.backups import back_up
-from db.claims import claimed, round_resources
+from db.claims import claimed, one_at_a_time, round_resources
 from db.lock_holders import holders
 from db.models import Base
 from db.views import create_views, drop_views
@@ -99,8 +99,7 @@ class Database:
                 self._refuse_missing_tables(connection)
                 return
         with self.writing() as connection:
-            if self.engine.dialect.name == "postgresql":
-                connection.execute(text(f"SELECT pg_advisory_xact_lock({_MIGRATION_LOCK})"))
+            one_at_a_time(connection, _MIGRATION_LOCK)
             # Whoever had the lock before may have migrated it: its copy is of the older schema,
             # and one that is made now would take its place.
             current = self._revision(connection, script)

@@ -5,23 +5,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 
-from sqlalchemy import (
-    Column,
-    Connection,
-    Float,
-    Index,
-    Integer,
-    MetaData,
-    Table,
-    Text,
-    func,
-    inspect,
-    select,
-    text,
-)
+from sqlalchemy import Connection, Index, MetaData, func, inspect, select
 from sqlalchemy.schema import CreateIndex, DropIndex
 
 from db import bulk
+from db.claims import one_at_a_time
 from db.session import Database
 
 PREFIX = "ix_weight_v_"
@@ -39,14 +27,8 @@ def index_of(policy: str) -> Index:
     """The index of a policy's weights, by round and value."""
     named = _PLAIN.fullmatch(policy)
     name = policy if named else sha256(policy.encode()).hexdigest()[:32]
-    # A table of its own: an index joins the models of the one that it is made for.
-    weight = Table(
-        "weight",
-        MetaData(),
-        Column("round", Integer),
-        Column("policy", Text),
-        Column("v", Float(53)),
-    )
+    # A copy of the table: an index joins the models of the one that it is made for.
+    weight = bulk.table("weight").to_metadata(MetaData())
     mine = weight.c.policy == policy
     return Index(
         PREFIX + name, weight.c.round, weight.c.v, sqlite_where=mine, postgresql_where=mine
@@ -64,8 +46,7 @@ def prepare(database: Database, policy: str) -> None:
         if _exists(connection, index):
             return
     with database.writing() as connection:
-        if connection.dialect.name == "postgresql":
-            connection.execute(text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
+        one_at_a_time(connection, _LOCK)
         if not _exists(connection, index):
             connection.execute(CreateIndex(index))
 
