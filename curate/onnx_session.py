@@ -3,7 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from curate.errors import ModelError, first_line
+
+
+def are_numbers(answer: Any) -> bool:
+    """Whether a model's answer is an array of numbers, not of text, nor a sequence or a map."""
+    return isinstance(answer, np.ndarray) and answer.dtype.kind in "fiub"
 
 
 def open_session(model: Path, threads: int, section: str) -> Any:

@@ -18,7 +18,7 @@ from curate.detectors.conventions import BoxConvention
 from curate.errors import ConfigError, ModelError, first_line
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
-from curate.onnx_session import open_session, runtime_errors
+from curate.onnx_session import are_numbers, open_session, runtime_errors
 
 _KEYS = ("boxes", "scores", "labels")
 
@@ -128,7 +128,7 @@ class OnnxDetector:
             labels, scores = scores.argmax(axis=1) + self.first_label, scores.max(axis=1)
         labels = np.zeros(0, np.int64) if labels is None else np.asarray(labels).reshape(-1)
         shapes = {"boxes": boxes.shape, "scores": scores.shape, "labels": labels.shape}
-        strange = [each.dtype for each in (boxes, scores, labels) if each.dtype.kind not in "fiub"]
+        strange = [each.dtype for each in (boxes, scores, labels) if not are_numbers(each)]
         if strange:
             raise ModelError(f"{self.model}: answers {strange[0]} where numbers were expected")
         if (

@@ -23,6 +23,7 @@ import numpy as np
 
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
+from curate.onnx_session import are_numbers
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes
 from curate.segmenters.onnx_images import ImageModel, image_of
@@ -159,8 +160,12 @@ def _class_ids(answer: np.ndarray, size: tuple[int, int], model: Path) -> np.nda
     answer, the one whose h : w is nearer to the input's is right.
     """
     fault = ModelError(f"{model}: answers {answer.dtype} {list(answer.shape)}; {_ANSWER}")
-    numbers = answer.dtype.kind in "fiub"
-    if not numbers or answer.ndim not in {3, 4} or answer.shape[0] != 1 or 0 in answer.shape:
+    if (
+        not are_numbers(answer)
+        or answer.ndim not in {3, 4}
+        or answer.shape[0] != 1
+        or 0 in answer.shape
+    ):
         raise fault
     scores = answer[0]
     if np.isnan(scores.max()):  # the highest of them would be class 0, or any other

@@ -13,6 +13,7 @@ import numpy as np
 
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
+from curate.onnx_session import are_numbers
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes, free_id
 from curate.segmenters.onnx_answers import KINDS, Instance
@@ -122,7 +123,7 @@ class OnnxInstanceSegmenter:
         found = self._model.run(pixels, tuple(self._outputs.values()))
         answer = dict(zip(self._outputs, found, strict=True))
         for name, values in answer.items():
-            if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub":
+            if not are_numbers(values):
                 raise ModelError(f"{self._model.path}: answers {name} that are no array of numbers")
         return answer
 
