@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from one_frame import add_one_frame
 from sqlalchemy import BigInteger, Float, Integer, cast, literal, select, text
 
 from curate.errors import DatabaseError
@@ -24,8 +25,7 @@ def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
     """A database with a few predictions."""
     database = Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
     with database.writing() as connection:
-        bulk.insert(connection, "frame", [("kitti", "x", "unlabeled", "p", "i", "c", None)])
-        bulk.insert(connection, "round", [(1, 1, None, "{}", "0", 0)])
+        add_one_frame(connection)
         rows = [
             (1, 1, k, f"é{k}\t\\N\n", k / 7, *[k / 3] * 7, k / 9 if k % 2 else None)
             for k in range(COUNT)

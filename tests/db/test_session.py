@@ -9,13 +9,11 @@ from contextlib import AbstractContextManager, closing
 from pathlib import Path
 
 import pytest
-from alembic import command
 from alembic.autogenerate import compare_metadata
-from alembic.config import Config
 from alembic.migration import MigrationContext
+from older_schema import downgrade
 from sqlalchemy import Connection, inspect
 
-import db
 from curate.errors import DatabaseError, LeakageError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db import bulk
@@ -45,14 +43,6 @@ def _frame(database: Database, split: str) -> int:
         return connection.exec_driver_sql(query).scalar_one()
 
 
-def _downgrade(connection: Connection) -> None:
-    """Back to the first schema; its views must be gone, or as they were then."""
-    config = Config()
-    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
-    config.attributes["connection"] = connection
-    command.downgrade(config, "0001")
-
-
 def _truth(frame_id: int, split: str) -> tuple:
     return (frame_id, 0, split, "Car", *[1.0] * 7, 0.0, 0, 0.0, *[1.0] * 4)
 
@@ -69,7 +59,7 @@ def test_a_database_of_an_older_curate_is_migrated(database: Database) -> None:
     _frame(database, "val")
     with database.writing() as connection:
         drop_views(connection)
-        _downgrade(connection)
+        downgrade(connection, "0001")
         assert "audit" not in inspect(connection).get_table_names()
     database.close()
     with Database(database.url).reading() as connection:
@@ -87,7 +77,7 @@ def test_an_older_database_is_kept_before_it_is_migrated(
     assert [path.name for path in tmp_path.glob("*backup*")] == []
     _frame(database, "val")
     with database.writing() as connection:
-        _downgrade(connection)
+        downgrade(connection, "0001")
     database.close()
     Database(url).close()
     backup = tmp_path / "curate.db.schema-0001.backup"
@@ -109,7 +99,7 @@ def older_server_database(new_url: Callable[[], str | None]) -> Database:
     _frame(database, "val")
     with database.writing() as connection:
         drop_views(connection)
-        _downgrade(connection)
+        downgrade(connection, "0001")
     database.close()
     return database
 
@@ -166,7 +156,7 @@ def test_who_finds_a_database_migrated_meanwhile_leaves_its_copy_alone(
     database = Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
     with database.writing() as connection:
         drop_views(connection)
-        _downgrade(connection)
+        downgrade(connection, "0001")
     database.close()
     writing = Database.writing
 

@@ -5,11 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from alembic import command
-from alembic.config import Config
+from older_schema import downgrade
+from one_frame import add_one_frame
 from sqlalchemy import Connection, inspect, select
 
-import db
 from db import bulk, weight_index
 from db.session import Database
 from db.views import drop_views
@@ -23,8 +22,7 @@ def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
     """A database whose labels several policies have weighed."""
     database = Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
     with database.writing() as connection:
-        bulk.insert(connection, "frame", [("kitti", "x", "unlabeled", "p", "i", "c", None)])
-        bulk.insert(connection, "round", [(1, 1, None, "{}", "0", 0)])
+        add_one_frame(connection)
         rows = [(1, 1, k, "Car", 0.5, *[1.0] * 7, None) for k in range(20)]
         bulk.insert(connection, "prediction", rows)
         for policy in POLICIES:
@@ -86,13 +84,10 @@ def test_only_the_policys_own_index_is_made_anew(
 
 def test_weights_of_an_older_schema_get_their_indices(database: Database) -> None:
     """And its backward step leaves the one index that there was."""
-    config = Config()
-    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
     weight_index.prepare(database, "pspsl")
     with database.writing() as connection:
         drop_views(connection)
-        config.attributes["connection"] = connection
-        command.downgrade(config, "0007")
+        downgrade(connection, "0007")
     database.close()
     assert _indices(database) == {"ix_weight_policy_v"}
     Database(database.url).close()

@@ -13,14 +13,12 @@ from itertools import cycle
 from pathlib import Path
 
 import numpy as np
+import older_schema
 import pytest
-from alembic import command as alembic
-from alembic.config import Config
 from command_forks import CommandForks
 from stored_rows import dump
 from toys import toy_document, write_toy_kitti
 
-import db
 from db.views import drop_views
 from pipelines.config import make_config
 from pipelines.executors.serial import SerialExecutor
@@ -205,12 +203,9 @@ def bring_up_to(workspace: Workspace, until: str) -> None:
 
 def downgrade(workspace: Workspace) -> None:
     """Gives the database the schema of an older curate."""
-    config = Config()
-    config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
     with workspace.database.writing() as connection:
-        config.attributes["connection"] = connection
         drop_views(connection)
-        alembic.downgrade(config, OLDER_SCHEMA)
+        older_schema.downgrade(connection, OLDER_SCHEMA)
 
 
 def refuse_half_frames(path: Path) -> None:

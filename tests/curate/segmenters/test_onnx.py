@@ -46,6 +46,11 @@ def brightest_channel_model(path, shape, *, channels_last=False):
     return model(path, nodes, shape, TensorProto.FLOAT, answer=TensorProto.FLOAT, rank=4)
 
 
+def one_step_model(path, node, answer):
+    """A model that does one thing with a float image of 8 x 8 pixels."""
+    return model(path, [node], [1, 3, 8, 8], TensorProto.FLOAT, answer=answer, rank=4)
+
+
 def constant_model(path, class_ids):
     """A uint8 NHWC model; the same class ids whatever the image."""
     height, width = class_ids.shape
@@ -218,22 +223,16 @@ def test_an_answer_that_is_no_map_is_refused(tmp_path):
 
 def test_scores_that_are_nan_are_refused(tmp_path):
     """They would be class 0 in every pixel, and no frame would fail."""
-    nodes = [helper.make_node("Log", ["image"], ["answer"])]
-    path = model(
-        tmp_path / "a.onnx", nodes, [1, 3, 8, 8], TensorProto.FLOAT,
-        answer=TensorProto.FLOAT, rank=4,
-    )  # fmt: skip
+    node = helper.make_node("Log", ["image"], ["answer"])
+    path = one_step_model(tmp_path / "a.onnx", node, TensorProto.FLOAT)
     with pytest.raises(ModelError, match=r"a\.onnx: answers scores that are NaN"):
         OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
 
 
 def test_names_of_classes_are_no_scores(tmp_path):
     """Text cannot be compared with numbers."""
-    nodes = [helper.make_node("Cast", ["image"], ["answer"], to=TensorProto.STRING)]
-    path = model(
-        tmp_path / "a.onnx", nodes, [1, 3, 8, 8], TensorProto.FLOAT,
-        answer=TensorProto.STRING, rank=4,
-    )  # fmt: skip
+    node = helper.make_node("Cast", ["image"], ["answer"], to=TensorProto.STRING)
+    path = one_step_model(tmp_path / "a.onnx", node, TensorProto.STRING)
     with pytest.raises(ModelError, match=r"answers object .*expected class ids"):
         OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
 

@@ -8,9 +8,6 @@ from labels_at_scale import EACH, filled_workspace
 from sqlalchemy import text
 
 from db import bulk
-from pipelines.progress import Silent
-from pipelines.stage import RoundContext, RoundJob, Teacher
-from pipelines.stages import solve
 from pipelines.workspace import Workspace
 
 FRAMES = 10
@@ -32,13 +29,6 @@ def _rows(workspace: Workspace, policy: str) -> list[tuple]:
         return [tuple(row) for row in connection.execute(query, {"policy": policy})]
 
 
-def _solved(workspace: Workspace, frames: list[int]) -> None:
-    context = RoundContext(1, 3, 0, Teacher(workspace.root, ""))
-    product = solve.run(workspace, RoundJob(context, "pspsl", frames), Silent())
-    with workspace.database.writing(keys_known=product.keys_known) as connection:
-        product.write(connection)
-
-
 @pytest.mark.parametrize(
     "left", [[], [1], [FRAMES], [2, 3, 7], list(range(1, FRAMES)), list(range(1, FRAMES + 1))]
 )
@@ -46,9 +36,9 @@ def test_frames_that_are_gone_leave_no_weight(workspace: Workspace, left: list[i
     """At the start, in the middle or at the end; another policy keeps its weights."""
     first, others = _rows(workspace, "pspsl"), _rows(workspace, "uda")
     assert len(first) == len(others) == FRAMES * EACH
-    _solved(workspace, left)
+    solved(workspace, frames=left)
     found = _rows(workspace, "pspsl")
     assert [row[:3] for row in found] == [row[:3] for row in first if row[1] in left]
-    _solved(workspace, list(range(1, FRAMES + 1)))
+    solved(workspace)
     assert _rows(workspace, "pspsl") == first
     assert _rows(workspace, "uda") == others

@@ -1,0 +1,11 @@
+"""The least that predictions can belong to: an unlabeled frame and a round."""
+
+from sqlalchemy import Connection
+
+from db import bulk
+
+
+def add_one_frame(connection: Connection) -> None:
+    """Into an empty database; both have the key 1."""
+    bulk.insert(connection, "frame", [("kitti", "x", "unlabeled", "p", "i", "c", None)])
+    bulk.insert(connection, "round", [(1, 1, None, "{}", "0", 0)])
