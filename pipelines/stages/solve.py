@@ -1,7 +1,8 @@
 """solve: the weight of every label under a policy, in closed form over the whole round."""
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection
@@ -16,9 +17,6 @@ from pipelines.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.workspace import Workspace
 
 TRUSTED = 0.5  # a label of a greater weight counts as trusted
-
-# The last of some frames, and the columns of their weights.
-_Block = tuple[int, dict[str, np.ndarray]]
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
@@ -52,12 +50,13 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     if looks_back:
         evidence = replace(evidence, memory=read_memory(workspace, context.number - 1, policy))
     weights = opened.weigh(evidence, context.age)
+    columns = _columns(keys, weights, evidence)
     counts = _counts(context.number, policy, keys, weights)
     weight_index.prepare(workspace.database, policy)
 
     def write(connection: Connection) -> None:
         with weight_index.replacing(connection, policy, len(keys)):
-            _replace(connection, context.number, policy, _blocks(keys, weights, evidence))
+            _store(connection, context.number, policy, columns)
         former = bulk.table("label_count").c
         mine = (former.round == context.number, former.policy == policy)
         connection.execute(former.policy.table.delete().where(*mine))
@@ -85,36 +84,51 @@ def _memory_fingerprint(workspace: Workspace, context: RoundContext, policy: str
     return solved_fingerprint(workspace, context.number - 1, policy)
 
 
-def _replace(
-    connection: Connection, round_number: int, policy: str, blocks: Iterator[_Block]
+def _store(
+    connection: Connection, round_number: int, policy: str, columns: Mapping[str, np.ndarray]
 ) -> None:
     """Puts the weights of a policy in the place of its former ones.
+
+    Those of the same labels are changed where they are; a server makes a new row of each change.
+    """
+    mine = {"round": round_number, "policy": policy}
+    if bulk.on_server(connection) or not bulk.update_columns(
+        connection, "weight", mine, ("frame_id", "k"), columns
+    ):
+        _replace(connection, mine, columns)
+
+
+def _replace(
+    connection: Connection, mine: Mapping[str, Any], columns: Mapping[str, np.ndarray]
+) -> None:
+    """Deletes the former weights and inserts the new ones.
 
     The former ones of some frames leave just before the new ones come: their pages are at hand
     then, and have room.
     """
     weight = bulk.table("weight")
-    mine = [weight.c.round == round_number, weight.c.policy == policy]
-    for last, columns in blocks:
-        until = [weight.c.frame_id <= last]
-        connection.execute(weight.delete().where(*mine, *until))
-        bulk.insert_columns(
-            connection, "weight", {"round": round_number, "policy": policy, **columns}
-        )
-        mine[2:] = [weight.c.frame_id > last]
-    connection.execute(weight.delete().where(*mine))
+    former = [weight.c[name] == value for name, value in mine.items()]
+    frame_id, end = columns["frame_id"], 0
+    while end < len(frame_id):
+        start, last = end, int(frame_id[min(end + bulk.BLOCK_ROWS, len(frame_id)) - 1])
+        end = int(np.searchsorted(frame_id, last, side="right"))
+        connection.execute(weight.delete().where(*former, weight.c.frame_id <= last))
+        block = {name: values[start:end] for name, values in columns.items()}
+        bulk.insert_columns(connection, "weight", {**mine, **block})
+        former[len(mine) :] = [weight.c.frame_id > last]
+    connection.execute(weight.delete().where(*former))
 
 
-def _blocks(keys: LabelKeys, weights: Weights, evidence: Evidence) -> Iterator[_Block]:
-    """Whole frames at a time, in the order of their keys."""
-    columns = (keys.frame_id, keys.k, weights.lambda_u, evidence.rho_det, weights.v)
-    end = 0
-    while end < len(keys):
-        start, last = end, keys.frame_id[min(end + bulk.BLOCK_ROWS, len(keys)) - 1]
-        end = int(np.searchsorted(keys.frame_id, last, side="right"))
-        kept = ~weights.dropped[start:end]
-        frame_id, k, age, rho, v = (column[start:end][kept] for column in columns)
-        yield int(last), {"frame_id": frame_id, "k": k, "lambda_u": age, "rho_det": rho, "v": v}
+def _columns(keys: LabelKeys, weights: Weights, evidence: Evidence) -> dict[str, np.ndarray]:
+    """The columns of `weight`, of the labels that are not dropped, by frame and k."""
+    kept = ~weights.dropped if weights.dropped.any() else slice(None)
+    return {
+        "frame_id": keys.frame_id[kept],
+        "k": keys.k[kept],
+        "lambda_u": weights.lambda_u[kept],
+        "rho_det": evidence.rho_det[kept],
+        "v": weights.v[kept],
+    }
 
 
 def _counts(round_number: int, policy: str, keys: LabelKeys, weights: Weights) -> list[bulk.Row]:

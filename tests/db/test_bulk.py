@@ -13,11 +13,12 @@ from one_frame import add_one_frame
 from sqlalchemy import BigInteger, Float, Integer, cast, literal, select, text
 
 from curate.errors import DatabaseError
-from db import bulk, server_columns
+from db import bulk, server_columns, weight_index
 from db.session import Database
 
 ENGINES = ("sqlite", "postgresql")
 COUNT = 23
+KEYS, SPSL = ("frame_id", "k"), {"round": 1, "policy": "spsl"}
 
 
 @pytest.fixture
@@ -261,3 +262,85 @@ def test_statistics_are_those_of_the_rows_just_written(database: Database) -> No
 def _refresh(database: Database) -> None:
     with database.writing() as connection:
         bulk.refresh_statistics(connection)
+
+
+@pytest.fixture
+def labels(tmp_path: Path) -> Database:
+    """Some predictions in SQLite."""
+    database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
+    with database.writing() as connection:
+        add_one_frame(connection)
+        rows = [(1, 1, k, "Car", 0.5, *[1.0] * 7, None) for k in range(COUNT)]
+        bulk.insert(connection, "prediction", rows)
+    return database
+
+
+@pytest.mark.parametrize("count", [COUNT - 1, COUNT, COUNT + 1])
+def test_rows_get_new_values_along_their_key(labels: Database, count: int) -> None:
+    """Each its own, null among them, whatever indices lead elsewhere; or it says that they do not.
+
+    A policy that stands beside keeps its weights.
+    """
+    falling = np.arange(count, 0, -1) / 7
+    values = {"frame_id": np.ones(count, np.int64), "k": np.arange(count)}
+    new = {"lambda_u": np.where(falling > 2, np.nan, falling), "rho_det": falling**2}
+    order = np.random.default_rng(0).permutation(COUNT).tolist()
+    weight_index.prepare(labels, "spsl")
+    with labels.writing() as connection:
+        for policy in ("aside", "spsl"):
+            shuffled = {"k": order, "v": [k / COUNT for k in order], "policy": policy}
+            bulk.insert_columns(connection, "weight", _weights(COUNT) | shuffled)
+    before = _of_policy(labels, "aside")
+    with labels.writing() as connection:
+        new["v"] = falling / COUNT
+        done = bulk.update_columns(connection, "weight", SPSL, KEYS, values | new)
+    assert done == (count == COUNT)
+    assert _of_policy(labels, "aside") == before
+    if done:
+        expected = zip(*(each.tolist() for each in new.values()), strict=True)
+        found = _of_policy(labels, "spsl")
+        assert [row[:1] + row[2:] for row in found if row[1] is None] == [
+            (k, rho, v) for k, (age, rho, v) in enumerate(expected) if math.isnan(age)
+        ]
+        names = ("lambda_u", "rho_det", "v")
+        stored = np.array([row[1:] for row in found], dtype=np.float64)
+        assert stored.tobytes() == np.stack([new[name] for name in names], axis=1).tobytes()
+
+
+def _of_policy(database: Database, policy: str) -> list[tuple]:
+    table = bulk.table("weight").c
+    query = select(table.k, table.lambda_u, table.rho_det, table.v).where(table.policy == policy)
+    with database.reading() as connection:
+        return bulk.select(connection, query.order_by(table.k))
+
+
+@pytest.mark.parametrize("k", [
+    [0, 1, 2, 4], [0, 1, 2, 3, 4], [0, 1, 2], [1, 2, 3], [0, 2, 3], [1, 0, 2, 3], [0, 1, 3, 2], [],
+])  # fmt: skip
+@pytest.mark.parametrize("frame_id", [1, 2])
+def test_only_the_very_same_rows_get_new_values(
+    labels: Database, k: list[int], frame_id: int
+) -> None:
+    """More, fewer, others, another order or another frame are told."""
+    with labels.writing() as connection:
+        bulk.insert_columns(connection, "weight", _weights(4))
+    values = {"frame_id": np.full(len(k), frame_id), "k": np.array(k), "v": np.ones(len(k))}
+    with labels.writing() as connection:
+        assert not bulk.update_columns(connection, "weight", SPSL, KEYS, values)
+
+
+def test_new_values_that_the_table_refuses_are_one_line(labels: Database) -> None:
+    """And the rows are as they were; the next values are drawn from the start."""
+    keys = {"frame_id": np.ones(COUNT, np.int64), "k": np.arange(COUNT)}
+    with labels.writing() as connection:
+        bulk.insert_columns(connection, "weight", _weights(COUNT))
+    before = _of_policy(labels, "spsl")
+    missing = {"v": np.where(np.arange(COUNT) == 9, np.nan, 0.25)}
+    with pytest.raises(DatabaseError, match="NOT NULL") as raised, labels.writing() as connection:
+        bulk.update_columns(connection, "weight", SPSL, KEYS, keys | missing)
+    assert "\n" not in str(raised.value)
+    assert _of_policy(labels, "spsl") == before
+    with labels.writing() as connection:
+        values = keys | {"v": np.full(COUNT, 0.25)}
+        assert bulk.update_columns(connection, "weight", SPSL, KEYS, values)
+    assert {row[3] for row in _of_policy(labels, "spsl")} == {0.25}

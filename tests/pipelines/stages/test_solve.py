@@ -42,3 +42,31 @@ def test_frames_that_are_gone_leave_no_weight(workspace: Workspace, left: list[i
     solved(workspace)
     assert _rows(workspace, "pspsl") == first
     assert _rows(workspace, "uda") == others
+
+
+def test_another_age_in_place_gives_the_rows_of_a_first_solve(
+    workspace: Workspace, tmp_path: Path
+) -> None:
+    """To the last bit, although they are changed where they stand."""
+    others = _rows(workspace, "uda")
+    younger = _rows(workspace, "pspsl")
+    solved(workspace, rounds=7)
+    anew = solved(filled_workspace(tmp_path / "anew", FRAMES), rounds=7)
+    assert _rows(workspace, "pspsl") == _rows(anew, "pspsl") != younger
+    assert _rows(workspace, "uda") == others
+
+
+@pytest.mark.parametrize("statement", [
+    "DELETE FROM weight WHERE policy = 'pspsl' AND frame_id = 4 AND k = 17",
+    "UPDATE weight SET k = 1000 WHERE policy = 'pspsl' AND frame_id = 4 AND k = 17",
+    "INSERT INTO weight SELECT round, frame_id, 1000 + k, policy, lambda_u, rho_det, v FROM weight",
+])  # fmt: skip
+def test_weights_that_somebody_changed_by_hand_are_replaced(
+    workspace: Workspace, statement: str
+) -> None:
+    """Rows that are not those of the labels get no values of others."""
+    before = _rows(workspace, "pspsl")
+    with workspace.database.writing(keys_known=True) as connection:
+        connection.execute(text(statement))
+    solved(workspace)
+    assert _rows(workspace, "pspsl") == before
