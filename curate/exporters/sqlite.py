@@ -20,7 +20,9 @@ from curate.exporters.base import (
     WEIGHTED_LABEL_COLUMNS,
     LabelFileDescription,
     LabelSet,
+    bad_weight,
     named,
+    refuse_link,
 )
 
 FORMAT_VERSION = 1
@@ -188,6 +190,8 @@ def _fill(
                 f"{path}: frame {last[0][0]} is of split {last[0][1]!r}; "
                 "only labeled and unlabeled frames are trained on"
             ) from None
+        if "weight BETWEEN" in str(error):
+            raise bad_weight(*last[0][1:3], last[0][-1]) from None
         raise DataError(f"{path}: a row was refused: {error}; the last was {last[0]}") from None
     except (sqlite3.ProgrammingError, sqlite3.InterfaceError) as error:
         reason = f"{error}; it was {last[0]}"
@@ -209,6 +213,7 @@ def _meta(description: LabelFileDescription) -> dict[str, str]:
 
 def _refuse_foreign(path: Path) -> None:
     """ConfigError where something would be lost that is no former export."""
+    refuse_link(path)
     if not path.exists():
         return
     try:
