@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from sqlalchemy import Connection, bindparam, or_, select
+from sqlalchemy import BindParameter, Connection, bindparam, or_, select
 
 from curate.detections import Detections
 from curate.errors import WorkspaceError
@@ -75,7 +75,7 @@ def refuse_bad_weights(
     """
     weight, frames = bulk.table("weight"), bulk.table("frame")
     # A value in the text of the query lets the policy's own index answer it.
-    chosen = bindparam("policy", policy, literal_execute=True)
+    chosen: BindParameter[str] = bindparam("policy", policy, literal_execute=True)
     # Text and NaN are beyond 1, in the order of either database.
     impossible = or_(weight.c.v < 0, weight.c.v > 1, weight.c.v.is_(None))
     query = (

@@ -71,7 +71,7 @@ def refuse_bad_weights(labels: LabelSet) -> None:
     """DataError where a weight is not in [0, 1]."""
     for row in labels.labels:
         if not 0 <= row[-1] <= 1:
-            raise bad_weight(*row[1:3], row[-1])
+            raise bad_weight(row[1], row[2], row[-1])
 
 
 def difficulties(boxes_2d: np.ndarray, truncated: np.ndarray, occluded: np.ndarray) -> np.ndarray:

@@ -104,7 +104,7 @@ def _groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
     for group in batched(rows, size):
         for row in group:
             if not 0 <= row[-1] <= 1:
-                raise bad_weight(*row[1:3], row[-1])
+                raise bad_weight(row[1], row[2], row[-1])
         yield group
 
 
