@@ -105,7 +105,9 @@ class Database:
             current = self._revision(connection, script)
             if current == head:
                 return
-            if current is not None:
+            if current is None:
+                self._refuse_foreign_tables(connection)
+            else:
                 back_up(self.url, current, backups)
             config.attributes["connection"] = connection
             drop_views(connection)
@@ -118,6 +120,20 @@ class Database:
         if missing:
             raise DatabaseError(
                 f"{self.name}: has no table {', '.join(missing)}; restore a backup of it"
+            )
+
+    def _refuse_foreign_tables(self, connection: Connection) -> None:
+        """DatabaseError where a database without a schema of ours has tables.
+
+        A server's database may hold others beside ours, a file is for curate alone.
+        """
+        found = set(inspect(connection).get_table_names()) - {"alembic_version"}
+        if self.engine.dialect.name != "sqlite":
+            found &= set(Base.metadata.tables)
+        if found:
+            raise DatabaseError(
+                f"{self.name}: has a table {min(found)} but no schema of curate in table "
+                "alembic_version: move it away if it is another program's, restore a backup if not"
             )
 
     def _revision(self, connection: Connection, script: ScriptDirectory) -> str | None:

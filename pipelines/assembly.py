@@ -70,12 +70,7 @@ def open_segmenter(config: Config) -> Segmenter:
         ConfigError: none is configured, or it needs a path.
     """
     section = config.segmenter
-    path = segmenter_path(config)
-    if path is None:
-        raise ConfigError(
-            f"segmenter '{section.name}' needs a path: set segmenter.path in curate.toml, "
-            "or leave 'semantic' out of run.priors"
-        )
+    path = required_segmenter_path(config)
     name, classes = section.name, section.classes
     if name == "simulated":
         name, classes = "onnx", "simulated"
@@ -98,6 +93,17 @@ def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, .
             "to a table like {Car = [7]}"
         )
     return class_map(classes)
+
+
+def required_segmenter_path(config: Config) -> Path:
+    """The segmenter's model or folder; ConfigError where none is configured."""
+    path = segmenter_path(config)
+    if path is None:
+        raise ConfigError(
+            f"segmenter '{config.segmenter.name}' needs a path: set segmenter.path in curate.toml, "
+            "or leave 'semantic' out of run.priors"
+        )
+    return path
 
 
 def segmenter_path(config: Config) -> Path | None:

@@ -17,6 +17,7 @@ from db import bulk
 from db.views import WEIGHTED_LABELS
 from pipelines.assembly import semantic_settings
 from pipelines.config import Config, make_config
+from pipelines.labels import refuse_bad_weights
 from pipelines.registry import PRIORS
 from pipelines.review.told import tell_decision
 from pipelines.workspace import Workspace
@@ -92,6 +93,7 @@ def explain_label(
 
     Raises:
         WorkspaceError: the policy has not weighted such a label in that round.
+        DataError: a weight of the frame is not in [0, 1].
     """
     label = _label(workspace, frame, k, round_number, policy)
     if label["provenance"] == "human":
@@ -132,6 +134,7 @@ def _label(
             newest = select(func.max(weight.c.round)).where(weight.c.policy == policy)
             round_number = connection.execute(newest).scalar_one()
         labels = WEIGHTED_LABELS.c
+        refuse_bad_weights(connection, round_number or 1, policy, frame)
         key = {"round": round_number, "frame": frame, "k": k, "policy": policy}
         query = select(WEIGHTED_LABELS).where(*(labels[name] == key[name] for name in key))
         row = connection.execute(query).fetchone()

@@ -11,6 +11,7 @@ from curate.review.human_labels import REJECTED
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
+from pipelines.labels import refuse_bad_weights
 from pipelines.review.human_labels import human_boxes
 from pipelines.workspace import Workspace
 
@@ -93,10 +94,11 @@ def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) 
 
     Raises:
         ConfigError: no frame has that name.
+        DataError: a weight is not in [0, 1].
     """
     split, key = _find(workspace, name)
     labels = workspace.predictions(round_number, [key])[key]
-    weights = _weights(workspace, round_number, key, policy, len(labels))
+    weights = _weights(workspace, round_number, (key, name), policy, len(labels))
     truth = None if split == "unlabeled" else workspace.ground_truth(split)[name]
     rejected, replaced = _decided(workspace, round_number, key, len(labels))
     weights[rejected] = 0.0
@@ -121,12 +123,14 @@ def _find(workspace: Workspace, name: str) -> tuple[str, int]:
 
 
 def _weights(
-    workspace: Workspace, round_number: int, key: int, policy: str, count: int
+    workspace: Workspace, round_number: int, frame: tuple[int, str], policy: str, count: int
 ) -> np.ndarray:
-    """(count,) by k."""
+    """(count,) by k, of the frame with that key and name."""
     table = bulk.table("weight")
+    key, name = frame
     here = (table.c.round == round_number, table.c.policy == policy, table.c.frame_id == key)
     with workspace.database.reading() as connection:
+        refuse_bad_weights(connection, round_number, policy, name)
         found = bulk.select(connection, select(table.c.k, table.c.v).where(*here))
     weights = np.full(count, 0.0 if found else np.nan)
     for k, v in found:

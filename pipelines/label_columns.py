@@ -13,6 +13,7 @@ from curate.label_changes import RoundLabels
 from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
+from pipelines.labels import refuse_bad_weights
 from pipelines.workspace import Workspace
 
 NUMBERS = ("score", "loss", "points", "rho_diff", "rho_anno", "rho_det", "lambda_u", "weight")
@@ -58,8 +59,10 @@ def read_columns(workspace: Workspace, round_number: int, policy: str) -> LabelC
 
     Raises:
         WorkspaceError: the policy has weighted nothing in that round.
+        DataError: a weight is not in [0, 1].
     """
     with workspace.database.reading() as connection:
+        refuse_bad_weights(connection, round_number, policy)
         found = _read(workspace, connection, round_number, policy)
     if not len(found):
         raise unweighted(round_number, policy)
@@ -83,10 +86,13 @@ def read_blocks(
 
     Raises:
         WorkspaceError: the policy has weighted nothing in one of the rounds.
+        DataError: a weight is not in [0, 1].
     """
     frame = bulk.table("frame").c.frame
     labels = dict.fromkeys(rounds, 0)
     with workspace.database.reading() as connection:
+        for each in labels:
+            refuse_bad_weights(connection, each, policy)
         names = sorted(row[0] for row in bulk.select(connection, select(frame)))
         for block in batched(names, _BLOCK_FRAMES):
             found = {each: _read(workspace, connection, each, policy, block) for each in labels}

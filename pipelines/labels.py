@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from sqlalchemy import select
+from sqlalchemy import BindParameter, Connection, bindparam, or_, select
 
 from curate.detections import Detections
 from curate.errors import WorkspaceError
+from curate.exporters.base import bad_weight
 from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
@@ -37,6 +38,7 @@ def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterato
 
     Raises:
         WorkspaceError: the policy has weighted nothing in that round.
+        DataError: a weight is not in [0, 1].
     """
     labels = WEIGHTED_LABELS.c
     names = ("frame", "category", "score", *BOX_COLUMNS, "weight", "points")
@@ -46,6 +48,7 @@ def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterato
         .order_by(labels.frame, labels.k)
     )
     with workspace.database.reading() as connection:
+        refuse_bad_weights(connection, round_number, policy)
         rows = bulk.select(connection, query)
     if not rows:
         raise WorkspaceError(
@@ -61,3 +64,27 @@ def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterato
             np.array([row[10] for row in own], dtype=np.float64),
             None if None in counts else np.array(counts),
         )
+
+
+def refuse_bad_weights(
+    connection: Connection, round_number: int, policy: str, frame: str | None = None
+) -> None:
+    """DataError where a weight of a round, or of one frame in it, is not in [0, 1].
+
+    No policy makes one, but SQLite keeps whatever else writes into the table.
+    """
+    weight, frames = bulk.table("weight"), bulk.table("frame")
+    # A value in the text of the query lets the policy's own index answer it.
+    chosen: BindParameter[str] = bindparam("policy", policy, literal_execute=True)
+    # Text and NaN are beyond 1, in the order of either database.
+    impossible = or_(weight.c.v < 0, weight.c.v > 1, weight.c.v.is_(None))
+    query = (
+        select(frames.c.frame, weight.c.k, weight.c.v)
+        .join(frames, frames.c.id == weight.c.frame_id)
+        .where(weight.c.round == round_number, weight.c.policy == chosen, impossible)
+        .limit(1)
+    )
+    if frame is not None:
+        query = query.where(frames.c.frame == frame)
+    for row in bulk.select(connection, query):
+        raise bad_weight(*row)

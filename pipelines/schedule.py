@@ -2,8 +2,9 @@
 
 from collections.abc import Iterator
 
-from pipelines.assembly import open_policy
+from pipelines.assembly import open_policy, required_segmenter_path
 from pipelines.progress import Progress
+from pipelines.registry import PRIORS
 from pipelines.round import active
 from pipelines.rounds import is_student_trained, is_trainable, open_round
 from pipelines.runner import Report, open_executor, run_frames, run_round
@@ -36,6 +37,8 @@ def run_all(
     trained = train and is_student_trained(workspace)
     policy = workspace.config.run.method
     open_policy(workspace.config, policy)  # a wrong one is better known before hours of work
+    if evidence and any(PRIORS.takes(name, "segmenter") for name in workspace.config.run.priors):
+        required_segmenter_path(workspace.config)
     if is_trainable(workspace):
         yield pretrain(workspace, progress)
     total = (rounds or workspace.config.run.rounds) if trained else 1

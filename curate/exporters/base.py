@@ -6,7 +6,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from curate.errors import DataError, LeakageError
+from curate.errors import ConfigError, DataError, LeakageError
 from curate.exporters.columns import WEIGHTED_LABELS
 from curate.frames import Frame
 
@@ -133,6 +133,23 @@ class Exporter(Protocol):
             DataError: a label cannot be, such as one whose weight is not in [0, 1].
         """
         ...
+
+
+def bad_weight(frame: str, k: int, weight: object) -> DataError:
+    """What is wrong with a label whose weight cannot be."""
+    return DataError(
+        f"frame {frame}: label {k} has weight {weight!r}; weights are in [0, 1], something else "
+        "has written this one: restore a backup"
+    )
+
+
+def refuse_link(path: Path) -> None:
+    """ConfigError where an export would take the place of a link and leave what it leads to."""
+    if path.is_symlink():
+        raise ConfigError(
+            f"{path}: is a link, in whose place the export would come; name what it leads to, or "
+            "remove the link"
+        )
 
 
 def named(frames: Iterable[str]) -> str:

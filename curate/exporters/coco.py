@@ -16,7 +16,7 @@ import numpy as np
 
 from curate.atomic import replace_file
 from curate.errors import ConfigError
-from curate.exporters.base import LabelSet
+from curate.exporters.base import LabelSet, refuse_link
 from curate.exporters.objects import FrameObjects, frame_objects
 from curate.frames import Frame
 from curate.geometry.projection import image_rectangles
@@ -104,6 +104,7 @@ def _annotations(
 
 def _refuse_foreign(path: Path) -> None:
     """ConfigError where something would be lost that is no former export."""
+    refuse_link(path)
     if not path.exists():
         return
     try:

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from curate.atomic import replace_file
 from curate.errors import ConfigError
-from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelSet
+from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelSet, refuse_link
 from curate.exporters.objects import refuse_bad_weights
 
 _HEADER = ",".join(WEIGHTED_LABEL_COLUMNS)
@@ -37,6 +37,7 @@ class CsvExporter:
 
 def _refuse_foreign(path: Path) -> None:
     """ConfigError where something would be lost that is no former export."""
+    refuse_link(path)
     if not path.exists():
         return
     try:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from curate.errors import ConfigError
+from curate.exporters.base import refuse_link
 
 _MARKER = "export.json"
 # Read by every Python 3 that a training framework still runs on.
@@ -73,6 +74,7 @@ class _ArrayPickler(pickle.Pickler):
 
 def _refuse_foreign(directory: Path, format_name: str) -> None:
     """ConfigError where something would be lost that is no former export."""
+    refuse_link(directory)
     if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
         return
     try:

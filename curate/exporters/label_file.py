@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from curate.errors import DataError, one_line
-from curate.exporters.sqlite import FORMAT_VERSION, TABLES
+from curate.exporters.sqlite import FORMAT_VERSION, TABLES, refuse_locked
 
 _KEYS = ("categories", "round", "policy", "root")
 # No cell of a label file is longer; SQLite's own limit is a gigabyte.
@@ -55,6 +55,7 @@ def open_label_file(path: Path) -> Iterator[sqlite3.Connection]:
             _refuse_foreign_tables(rows, path)
             yield rows
     except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
+        refuse_locked(path, error)
         raise DataError(
             f"{path}: not a label file: {one_line(error)}; delete it and export it again"
         ) from None

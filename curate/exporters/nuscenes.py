@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from curate.atomic import replace_file
 from curate.datasets.nuscenes.names import detection_name
 from curate.errors import ConfigError, DataError
-from curate.exporters.base import LabelSet
+from curate.exporters.base import LabelSet, refuse_link
 from curate.exporters.objects import FrameObjects, frame_objects
 from curate.frames import Calibration
 
@@ -110,6 +110,7 @@ def _name(objects: FrameObjects, k: int) -> str:
 
 def _refuse_foreign(path: Path) -> None:
     """ConfigError where something would be lost that is no former export."""
+    refuse_link(path)
     if not path.exists():
         return
     try:

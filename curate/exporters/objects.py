@@ -7,7 +7,6 @@ from operator import itemgetter
 import numpy as np
 
 from curate.detections import Detections
-from curate.errors import DataError
 from curate.evaluation.kitti_rules import MAX_OCCLUSIONS, MAX_TRUNCATIONS, MIN_HEIGHTS
 from curate.exporters.base import (
     BOX_COLUMNS,
@@ -15,6 +14,7 @@ from curate.exporters.base import (
     WEIGHTED_LABEL_COLUMNS,
     LabelSet,
     Row,
+    bad_weight,
 )
 
 UNKNOWN = -1
@@ -71,9 +71,7 @@ def refuse_bad_weights(labels: LabelSet) -> None:
     """DataError where a weight is not in [0, 1]."""
     for row in labels.labels:
         if not 0 <= row[-1] <= 1:
-            raise DataError(
-                f"frame {row[1]}: label {row[2]} has weight {row[-1]}; weights are in [0, 1]"
-            )
+            raise bad_weight(row[1], row[2], row[-1])
 
 
 def difficulties(boxes_2d: np.ndarray, truncated: np.ndarray, occluded: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 from curate.batches import batched
 from curate.errors import ConfigError, DataError, one_line
-from curate.exporters.base import LabelFileDescription, LabelSet, Row
+from curate.exporters.base import LabelFileDescription, LabelSet, Row, bad_weight, refuse_link
 from curate.exporters.columns import WEIGHTED_LABELS
 from curate.parquet import load_parquet
 
@@ -104,9 +104,7 @@ def _groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
     for group in batched(rows, size):
         for row in group:
             if not 0 <= row[-1] <= 1:
-                raise DataError(
-                    f"frame {row[1]}: label {row[2]} has weight {row[-1]}; weights are in [0, 1]"
-                )
+                raise bad_weight(row[1], row[2], row[-1])
         yield group
 
 
@@ -128,6 +126,7 @@ def _batch(arrow: Any, schema: Any, rows: list[Row]) -> Any:
 
 def _refuse_foreign(path: Path) -> None:
     """ConfigError where something would be lost that is no former export."""
+    refuse_link(path)
     if not path.exists():
         return
     arrow, parquet = load_parquet()

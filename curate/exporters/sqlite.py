@@ -20,7 +20,9 @@ from curate.exporters.base import (
     WEIGHTED_LABEL_COLUMNS,
     LabelFileDescription,
     LabelSet,
+    bad_weight,
     named,
+    refuse_link,
 )
 
 FORMAT_VERSION = 1
@@ -150,6 +152,14 @@ def write_labels(
         partial.unlink(missing_ok=True)
 
 
+def refuse_locked(path: Path, error: Exception) -> None:
+    """DataError where a label file could not be read for another program's lock."""
+    if "locked" in str(error):
+        raise DataError(
+            f"{path}: another program writes into it; end that one and run the command again"
+        ) from None
+
+
 def refuse_leakage(connection: sqlite3.Connection, path: Path) -> None:
     """LeakageError where a label file holds ground truth of frames that are not labeled."""
     leaked = _strangers(connection, "ground_truth", "labeled")
@@ -188,6 +198,8 @@ def _fill(
                 f"{path}: frame {last[0][0]} is of split {last[0][1]!r}; "
                 "only labeled and unlabeled frames are trained on"
             ) from None
+        if "weight BETWEEN" in str(error):
+            raise bad_weight(last[0][1], last[0][2], last[0][-1]) from None
         raise DataError(f"{path}: a row was refused: {error}; the last was {last[0]}") from None
     except (sqlite3.ProgrammingError, sqlite3.InterfaceError) as error:
         reason = f"{error}; it was {last[0]}"
@@ -209,12 +221,14 @@ def _meta(description: LabelFileDescription) -> dict[str, str]:
 
 def _refuse_foreign(path: Path) -> None:
     """ConfigError where something would be lost that is no former export."""
+    refuse_link(path)
     if not path.exists():
         return
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as former:
             former.execute("SELECT value FROM meta WHERE key = 'format_version'").fetchone()[0]
-    except (sqlite3.Error, TypeError):
+    except (sqlite3.Error, TypeError) as error:
+        refuse_locked(path, error)
         raise ConfigError(f"{path}: is there and is no former export; name another file") from None
 
 

@@ -136,6 +136,8 @@ def _drawn_ahead(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     behind = depth < _NEAR_METRES
     share = np.where(behind, (_NEAR_METRES - depth) / np.where(behind, other_depth - depth, 1), 0)
     moved: np.ndarray = points + share[:, None] * (others - points)
+    # The sum leaves nothing of the near plane where a box is as large as the universe.
+    moved[behind, 2] = _NEAR_METRES
     return moved
 
 

@@ -18,6 +18,7 @@ from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
 from pipelines.firewall.rules import enforce
+from pipelines.labels import refuse_bad_weights
 from pipelines.progress import Progress
 from pipelines.review.human_labels import fingerprint
 from pipelines.stage import Product, RoundContext, RoundJob, Settings
@@ -39,8 +40,13 @@ def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
 
 
 def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
-    """LeakageError where ground truth would reach what it must not, see `firewall`."""
+    """LeakageError where ground truth would reach what it must not, see `firewall`.
+
+    DataError where a weight is not in [0, 1].
+    """
     enforce(workspace, context.number, file(workspace, context, policy))
+    with workspace.database.reading() as connection:
+        refuse_bad_weights(connection, context.number, policy)
 
 
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
@@ -111,6 +117,7 @@ def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:
     )
     labels = StoredLabels(workspace, round_number, policy)
     with workspace.database.reading() as connection:
+        refuse_bad_weights(connection, round_number, policy)
         frames = _frames(connection, labels.frames(connection))
         truth = _ground_truth(connection)
     read = partial(workspace.dataset.read, points=False)

@@ -280,7 +280,7 @@ def test_an_export_that_fails_leaves_the_former_as_it_was(
     assert not path.exists()
     exporter.write(path, labels)
     before = files(path)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="weight") as caught:
         exporter.write(path, with_weight(labels, weight))
     assert_one_line(caught.value)
     assert files(path) == before
@@ -297,6 +297,23 @@ def test_what_is_no_former_export_is_left_alone(exporter, labels, tmp_path, kind
         exporter.write(path, labels)
     assert_one_line(caught.value)
     assert files(path) == {str(precious.relative_to(path.parent)): b"precious"}
+
+
+@pytest.mark.parametrize("kind", ["dangling", "loop", "former"])
+def test_a_link_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
+    """An export in its place would leave old labels, or none, where it leads."""
+    path = place(exporter, tmp_path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    target = path if kind == "loop" else path.with_name(f"real{exporter.suffix}")
+    if kind == "former":
+        exporter.write(target, labels)
+    path.symlink_to(target)
+    before = sorted(path.parent.iterdir())
+    with pytest.raises(ConfigError, match=f"{path.name}: is a link") as caught:
+        exporter.write(path, labels)
+    assert_one_line(caught.value)
+    assert path.is_symlink()
+    assert sorted(path.parent.iterdir()) == before
 
 
 def test_the_labels_are_left_as_they_are(exporter, labels, tmp_path) -> None:

@@ -285,3 +285,15 @@ def test_a_database_of_two_schemas_is_refused(tmp_path: Path) -> None:
         connection.commit()
     with pytest.raises(DatabaseError, match="names several schemas; restore a backup"):
         Database(f"sqlite:///{path}")
+
+
+@pytest.mark.parametrize("table", ["photos", "frame"])
+def test_a_database_of_another_program_is_left_alone(tmp_path: Path, table: str) -> None:
+    """Its tables are named, and none of ours come beside them."""
+    path = tmp_path / "curate.db"
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(f"CREATE TABLE {table} (id, name)")
+    with pytest.raises(DatabaseError, match=f"has a table {table} but no schema of curate"):
+        Database(f"sqlite:///{path}")
+    with closing(sqlite3.connect(path)) as connection:
+        assert connection.execute("SELECT name FROM sqlite_master").fetchall() == [(table,)]

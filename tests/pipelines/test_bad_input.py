@@ -13,6 +13,8 @@ from pipelines_cli import Curate
 
 from curate.datasets.kitti import KittiDataset
 from curate.errors import ConfigError, DataError, FramesFailed
+from pipelines.progress import Silent
+from pipelines.schedule import run_all
 from pipelines.stages import predict
 from pipelines.workspace import Workspace
 
@@ -172,3 +174,12 @@ def test_a_report_needs_no_network(curate: Curate, workspace: Workspace, tmp_pat
     shown, pictures, asked = map(int, title.groups())
     assert shown == pictures > 0
     assert asked == 0
+
+
+def test_a_segmenter_without_its_path_is_told_before_any_work(workspace: Workspace) -> None:
+    """Not after hours of predictions; without the semantic prior nobody misses it."""
+    pathless = workspace.with_settings("segmenter", name="onnx", path=None)
+    with pytest.raises(ConfigError, match="segmenter 'onnx' needs a path"):
+        next(run_all(pathless, 1, Silent()))
+    points_alone = pathless.with_settings("run", priors=("points",))
+    assert next(run_all(points_alone, 1, Silent())).done

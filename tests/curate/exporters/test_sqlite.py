@@ -6,10 +6,12 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from exported import toy_labels
 
 from curate.errors import DataError, LeakageError
 from curate.exporters.base import LabelFileDescription
-from curate.exporters.sqlite import write_labels
+from curate.exporters.label_file import read_frames
+from curate.exporters.sqlite import SqliteExporter, write_labels
 
 DESCRIPTION = LabelFileDescription(
     "kitti", Path("/data/kitti"), ("Car", "Cyclist"), 2, "pspsl", "1"
@@ -138,7 +140,7 @@ def test_the_finished_file_refuses_ground_truth_of_unlabeled_frames_too(tmp_path
 )
 def test_a_row_that_does_not_fit_is_refused(tmp_path, row):
     """Weights outside [0, 1], NaN, sides below zero, text for a number, and missing columns."""
-    with pytest.raises(DataError, match=r"labels\.sqlite: a row"):
+    with pytest.raises(DataError, match=r"labels\.sqlite: a row|label 0 has weight 1\.5"):
         write(tmp_path / "labels.sqlite", labels=[row])
     assert list(tmp_path.iterdir()) == []
 
@@ -170,3 +172,16 @@ def test_a_frame_is_found_by_index(tmp_path):
     write(path, labels=[label(name, k) for name in "bc" for k in range(200)])
     plan = select(path, "EXPLAIN QUERY PLAN SELECT weight FROM weighted_labels WHERE frame = 'b'")
     assert "USING INDEX label_frame" in plan[0][3]
+
+
+def test_a_file_that_another_program_writes_is_not_taken_for_a_foreign_one(tmp_path):
+    """Neither where it would be replaced nor where it is read; once let go it is."""
+    path = tmp_path / "labels.sqlite"
+    SqliteExporter().write(path, toy_labels())
+    with closing(sqlite3.connect(path, isolation_level=None, timeout=0)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        for look in (lambda: SqliteExporter().write(path, toy_labels()), lambda: read_frames(path)):
+            with pytest.raises(DataError, match="another program writes into it"):
+                look()
+        other.execute("ROLLBACK")
+    SqliteExporter().write(path, toy_labels())

@@ -90,3 +90,10 @@ def test_ground_truth_may_be_drawn():
     changed = picture[(picture != nothing).any(axis=2)]
     assert len(changed) > 100
     assert changed.max() > 230
+
+
+def test_a_box_as_large_as_the_universe_is_drawn_within_limits():
+    """What is cut at the near plane lies on it, whatever the sum of so large numbers leaves."""
+    boxes = np.array([[20.0, 0, 0, 3e38, 3e38, 3e38, 0.3], [3e38, 0, 0, 3e38, 3e38, 3e38, 0.3]])
+    for strokes in box_strokes(boxes, calibration(), SIZE):
+        assert np.isfinite(strokes).all()

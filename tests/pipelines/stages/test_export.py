@@ -4,10 +4,11 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import pytest
 from pipelines_cli import Curate
 from sqlalchemy import text
 
-from curate.errors import ConfigError, WorkspaceError
+from curate.errors import ConfigError, DataError, WorkspaceError
 from curate.training.labels import WeightedLabels
 from pipelines.progress import Silent
 from pipelines.schedule import run_all
@@ -100,3 +101,30 @@ def test_a_student_of_labeled_frames_alone_gets_no_others(
     """Not even as background."""
     own = workspace.with_settings("run", method="baseline")
     assert WeightedLabels(run(own)).labeled.all()
+
+
+@pytest.mark.parametrize("weight", ["1.5", "-0.1", "'NaN'", "9e999"])
+def test_a_weight_written_by_hand_is_told_and_goes_nowhere(
+    curate: Curate, workspace: Workspace, tmp_path: Path, weight: str
+) -> None:
+    """By every command that hands weights out, even where the export is up to date."""
+    exported = run(workspace).read_bytes()
+    with workspace.database.writing() as connection:
+        chosen = "round = 1 AND policy = 'pspsl' AND k = 0"
+        connection.execute(text(f"UPDATE weight SET v = {weight} WHERE {chosen}"))
+    frame = first(workspace, "unlabeled")
+    for command in (
+        ("export",),
+        ("export", "--output", tmp_path / "labels.sqlite"),
+        ("export", "--format", "csv", "--output", tmp_path / "labels.csv"),
+        ("train-round",),
+        ("report",),
+        ("view", frame),
+        ("explain", frame, "0"),
+    ):
+        code, _, err = curate(*command, "-w", workspace.root)
+        assert code == DataError.exit_code, command
+        assert f"frame {frame}: label 0 has weight" in err
+        assert len(err.splitlines()) == 1
+    assert (workspace.root / "exports" / "labels.sqlite").read_bytes() == exported
+    assert not list(tmp_path.glob("labels.*"))
