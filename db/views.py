@@ -28,9 +28,8 @@ _REAL, _INTEGER = "CAST(NULL AS DOUBLE PRECISION)", "CAST(NULL AS INTEGER)"
 # What the policies say where nobody has decided, predictions that people rejected, and what they
 # hold for objects. Decisions are few: SQLite, which keeps the order of a CROSS JOIN, walks through
 # them first and looks their frames up one by one. A condition on frames alone, the split's for one,
-# would make it read all frames into a Bloom filter before the first row, hence the k beside it,
-# which is never negative. A server that finds an expression there guesses how many frames it means.
-# It finds one frame's labels of all rounds by their key only where it is given the rounds.
+# would make it read all frames into a Bloom filter before the first row, hence the CASE on a k.
+# A server finds one frame's labels of all rounds by their key only where it is given the rounds.
 _WEIGHTED_LABELS = f"""
         SELECT p.round, f.frame, {_PREDICTED}, 'detector' AS provenance, w.policy, w.v AS weight
         FROM round AS r
@@ -38,7 +37,7 @@ _WEIGHTED_LABELS = f"""
         JOIN prediction AS p ON p.round = w.round AND p.frame_id = w.frame_id AND p.k = w.k
         JOIN frame AS f ON f.id = w.frame_id
         {_EVIDENCE}
-        WHERE (w.k < 0 OR f.split = 'unlabeled') AND NOT EXISTS (
+        WHERE CASE WHEN w.k >= 0 THEN f.split END = 'unlabeled' AND NOT EXISTS (
             SELECT 1 FROM human_match AS m
             WHERE m.round = w.round AND m.frame_id = w.frame_id AND m.k = w.k
         )
