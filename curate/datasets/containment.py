@@ -5,6 +5,7 @@ that its archive has brought along, would make curate read files that nobody mea
 named pipe would make it wait for ever.
 """
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -40,16 +41,15 @@ class Boundary:
     def check(self, *paths: Path) -> None:
         """DataError where a path leads out, by a link or by its name, or is a pipe or a device.
 
-        It need not be there.
+        Or where no file could have that name. It need not be there.
         """
         if self._open:
+            for path in paths:
+                _mode(os.fspath(path))
             return
         home = self._real_folder(self._root)
         for path in paths:
-            try:
-                real, mode = self._real(path)
-            except ValueError:  # a zero byte
-                raise DataError(f"{str(path)!r} is no path") from None
+            real, mode = self._real(path)
             if real != home and not real.startswith(home.rstrip(os.sep) + os.sep):
                 raise DataError(
                     f"{path}: leads out of the data set, to {real}; if you made that link "
@@ -78,7 +78,12 @@ class Boundary:
 
 
 def _mode(path: str) -> int:
+    """0 where nothing is there; DataError where nothing could be."""
     try:
         return os.lstat(path).st_mode
-    except OSError:
+    except ValueError:  # a zero byte
+        raise DataError(f"{path!r} is no path") from None
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise DataError(f"{path[:80]!r}...: is no path, its name is too long") from None
         return 0

@@ -96,6 +96,21 @@ def test_a_description_that_leads_out_is_refused(tmp_path: Path, key: str) -> No
             FolderDataset(tmp_path)
 
 
+@pytest.mark.parametrize("follow_links", [False, True])
+@pytest.mark.parametrize("key", ["points", "images", "labels", "splits", "calibration"])
+def test_a_name_that_no_file_could_have_is_refused(
+    tmp_path: Path, key: str, *, follow_links: bool
+) -> None:
+    """In one short line, also where links may lead out."""
+    for where in ("9" * 5000, "nul\\u0000"):
+        told = {"points": "lidar", "images": "camera", "calibration": "calib.txt", key: where}
+        lines = [f'{name} = "{value}"' for name, value in told.items()]
+        (tmp_path / "dataset.toml").write_text("\n".join(lines))
+        with pytest.raises(DataError, match="is no path") as raised:
+            FolderDataset(tmp_path, follow_links=follow_links)
+        assert len(str(raised.value)) < 500
+
+
 def test_a_link_in_place_of_a_description_is_not_followed(tmp_path: Path) -> None:
     """What a message would repeat of another file stays there."""
     (tmp_path / "secret").write_text("password = 1\n")
