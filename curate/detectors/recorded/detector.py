@@ -160,7 +160,9 @@ class RecordedDetector:
         if self.rename:
             names = [self.rename.get(name, name) for name in answer.categories.tolist()]
             answer = replace(answer, categories=as_categories(names))
-        return answer.select(np.flatnonzero(answer.scores >= self.minimum_score))
+        kept = answer.select(np.flatnonzero(answer.scores >= self.minimum_score))
+        _refuse_repeated(f"{self.path}: frame {frame_id}", kept)
+        return kept
 
     def _placed(
         self, frame_id: str, answer: KittiObjects | Placed, calibration: Calibration
@@ -188,6 +190,20 @@ class RecordedDetector:
                 f"{self.path}: {len(strays)} of {recorded} results are for frames that the "
                 f"data set does not have ({few}); they are left out"
             )
+
+
+def _refuse_repeated(place: str, found: Detections) -> None:
+    """DataError where a box comes twice, as all do in a file that was appended to itself."""
+    numbers = np.column_stack([found.boxes, found.scores]).tolist()
+    seen: set[tuple[Any, ...]] = set()
+    for category, box in zip(found.categories.tolist(), map(tuple, numbers), strict=True):
+        if (category, *box) in seen:
+            x, y, score = (round(number, 3) for number in (*box[:2], box[-1]))
+            raise DataError(
+                f"{place}: the {category} of score {score} at x {x}, y {y} comes twice; were the "
+                "results written twice into one file?"
+            )
+        seen.add((category, *box))
 
 
 def _open(path: Path, kind: str, reading: Reading, passes: Sequence[Mapping[str, Any]]) -> Record:

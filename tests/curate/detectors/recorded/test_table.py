@@ -61,11 +61,31 @@ def test_low_scores_are_left_out_of_every_view(tmp_path):
     assert len(RecordedDetector(path, minimum_score=0.95).predict(frame("000001"))) == 0
 
 
+def test_a_box_that_comes_twice_fails_its_frame(tmp_path):
+    """A file that was appended to itself would double every label; boxes left out do not count."""
+    other = PLAIN.replace("000001", "000002")
+    alike = [
+        PLAIN.replace("Car", "Cyclist"),
+        PLAIN.replace("0.9", "0.8"),
+        PLAIN.replace("12.0", "9"),
+    ]
+    path = write(tmp_path / "a.csv", PLAIN, MOVED, other, *alike, MOVED)
+    detector = RecordedDetector(path)
+    assert len(detector.predict(frame("000001"))) == 4
+    with pytest.raises(DataError, match=r"000001: the Car of .* at x 12.0, y 4.2 comes twice"):
+        detector.views("000001")
+    assert len(RecordedDetector(path, minimum_score=0.85).views("000001")[0][1]) == 0
+    path.write_text(path.read_text() + f"{other}\n")
+    with pytest.raises(DataError, match=r"000002: the Car of score 0.9 .* written twice"):
+        RecordedDetector(path).predict(frame("000002"))
+
+
 def test_views_come_in_the_order_of_their_numbers(tmp_path):
     """Rows of frames and views may be mixed; there may be several views."""
     second = MOVED.replace("000001,1", "000001,2").replace("0.25", "-0.5")
     other = PLAIN.replace("000001", "000002")
-    detector = RecordedDetector(write(tmp_path / "a.csv", second, other, MOVED, PLAIN, second))
+    beside = second.replace("12.0", "22.0")
+    detector = RecordedDetector(write(tmp_path / "a.csv", second, other, MOVED, PLAIN, beside))
     views = detector.views("000001")
     assert [similarity.rotation_rad for similarity, _ in views] == [0.25, -0.5]
     assert [len(found) for _, found in views] == [1, 2]
