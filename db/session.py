@@ -1,7 +1,7 @@
 """Opening a database: pragmas, migrations, and errors in our own words."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -95,9 +95,14 @@ class Database:
         script = ScriptDirectory.from_config(config)
         head = script.get_current_head()
         with self.engine.connect() as connection:
-            if self._revision(connection, script) == head:
+            current = self._revision(connection, script)
+            if current is None:
+                self._refuse_foreign_tables(connection)
+            elif current == head:
                 self._refuse_missing_tables(connection)
-                return
+        self._write_ahead()
+        if current == head:
+            return
         with self.writing() as connection:
             one_at_a_time(connection, _MIGRATION_LOCK)
             # Whoever had the lock before may have migrated it: its copy is of the older schema,
@@ -105,14 +110,18 @@ class Database:
             current = self._revision(connection, script)
             if current == head:
                 return
-            if current is None:
-                self._refuse_foreign_tables(connection)
-            else:
+            if current is not None:
                 back_up(self.url, current, backups)
             config.attributes["connection"] = connection
             drop_views(connection)
             command.upgrade(config, "head")
             create_views(connection)
+
+    def _write_ahead(self) -> None:
+        """Lets readers of an SQLite file go on beside a writer; the file remembers it."""
+        if self.engine.dialect.name == "sqlite":
+            with closing(self.engine.raw_connection()) as connection:
+                connection.cursor().execute("PRAGMA journal_mode = WAL")
 
     def _refuse_missing_tables(self, connection: Connection) -> None:
         """DatabaseError where somebody has dropped a table of this schema."""
@@ -234,7 +243,6 @@ def _set_pragmas(connection: Any, _record: Any) -> None:
     connection.isolation_level = None
     cursor = connection.cursor()
     cursor.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
-    cursor.execute("PRAGMA journal_mode = WAL")
     cursor.execute("PRAGMA synchronous = NORMAL")
     cursor.close()
 

@@ -67,10 +67,16 @@ def open_segmenter(config: Config) -> Segmenter:
     """The segmenter.
 
     Raises:
-        ConfigError: none is configured, or it needs a path.
+        ConfigError: none is configured, or a setting is missing or wrong.
+        CurateError: its model or folder is missing or of another kind.
     """
     section = config.segmenter
-    path = required_segmenter_path(config)
+    path = segmenter_path(config)
+    if path is None:
+        raise ConfigError(
+            f"segmenter '{section.name}' needs a path: set segmenter.path in curate.toml, or leave "
+            "'semantic' out of run.priors"
+        )
     name, classes = section.name, section.classes
     if name == "simulated":
         name, classes = "onnx", "simulated"
@@ -93,17 +99,6 @@ def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, .
             "to a table like {Car = [7]}"
         )
     return class_map(classes)
-
-
-def required_segmenter_path(config: Config) -> Path:
-    """The segmenter's model or folder; ConfigError where none is configured."""
-    path = segmenter_path(config)
-    if path is None:
-        raise ConfigError(
-            f"segmenter '{config.segmenter.name}' needs a path: set segmenter.path in curate.toml, "
-            "or leave 'semantic' out of run.priors"
-        )
-    return path
 
 
 def segmenter_path(config: Config) -> Path | None:

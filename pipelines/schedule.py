@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from pipelines.assembly import open_policy, required_segmenter_path
+from pipelines.assembly import open_policy, open_segmenter
 from pipelines.progress import Progress
 from pipelines.registry import PRIORS
 from pipelines.round import active
@@ -36,9 +36,10 @@ def run_all(
     """
     trained = train and is_student_trained(workspace)
     policy = workspace.config.run.method
-    open_policy(workspace.config, policy)  # a wrong one is better known before hours of work
+    # What is wrong with these is better known before hours of work.
+    open_policy(workspace.config, policy)
     if evidence and any(PRIORS.takes(name, "segmenter") for name in workspace.config.run.priors):
-        required_segmenter_path(workspace.config)
+        open_segmenter(workspace.config)
     if is_trainable(workspace):
         yield pretrain(workspace, progress)
     total = (rounds or workspace.config.run.rounds) if trained else 1

@@ -101,7 +101,7 @@ class SqliteExporter:
 
     def write(self, path: Path, labels: LabelSet) -> int:
         """See `curate.exporters.base.Exporter`."""
-        _refuse_foreign(path)
+        refuse_foreign(path)
         write_labels(
             path,
             description=labels.description,
@@ -158,6 +158,19 @@ def refuse_locked(path: Path, error: Exception) -> None:
         raise DataError(
             f"{path}: another program writes into it; end that one and run the command again"
         ) from None
+
+
+def refuse_foreign(path: Path) -> None:
+    """ConfigError where something would be lost that is no former export."""
+    refuse_link(path)
+    if not path.exists():
+        return
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as former:
+            former.execute("SELECT value FROM meta WHERE key = 'format_version'").fetchone()[0]
+    except (sqlite3.Error, TypeError) as error:
+        refuse_locked(path, error)
+        raise ConfigError(f"{path}: is there and is no former export; name another file") from None
 
 
 def refuse_leakage(connection: sqlite3.Connection, path: Path) -> None:
@@ -217,19 +230,6 @@ def _meta(description: LabelFileDescription) -> dict[str, str]:
         "policy": description.policy,
         "code_version": description.code_version,
     }
-
-
-def _refuse_foreign(path: Path) -> None:
-    """ConfigError where something would be lost that is no former export."""
-    refuse_link(path)
-    if not path.exists():
-        return
-    try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as former:
-            former.execute("SELECT value FROM meta WHERE key = 'format_version'").fetchone()[0]
-    except (sqlite3.Error, TypeError) as error:
-        refuse_locked(path, error)
-        raise ConfigError(f"{path}: is there and is no former export; name another file") from None
 
 
 def _remembered(rows: Iterable[tuple], last: list[tuple]) -> Iterator[tuple]:

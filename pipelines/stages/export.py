@@ -12,7 +12,7 @@ from sqlalchemy import ColumnElement, Connection, Select, func, select
 import curate
 from curate.errors import WorkspaceError
 from curate.exporters.base import Exporter, LabelFileDescription, LabelSet
-from curate.exporters.sqlite import SqliteExporter
+from curate.exporters.sqlite import SqliteExporter, refuse_foreign
 from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
@@ -52,14 +52,17 @@ def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     """Writes the round's file; `labels.sqlite` becomes a copy where the policy is the trainer's."""
     path = file(workspace, job.context, job.policy)
+    current = path.with_name(CURRENT) if job.policy == workspace.config.run.method else None
+    if current:
+        refuse_foreign(current)
     unlabeled = open_policy(workspace.config, job.policy).uses_unlabeled
     labels = write_label_file(workspace, path, job.context.number, job.policy if unlabeled else "")
     written = [path]
-    if job.policy == workspace.config.run.method:
-        written.append(path.with_name(CURRENT))
+    if current:
         partial = path.with_suffix(".partial")
         shutil.copyfile(path, partial)
-        partial.replace(written[-1])
+        partial.replace(current)
+        written.append(current)
 
     def write(connection: Connection) -> None:
         for each in written:

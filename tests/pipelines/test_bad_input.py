@@ -6,13 +6,15 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from pipelines_cli import Curate
 
 from curate.datasets.kitti import KittiDataset
-from curate.errors import ConfigError, DataError, FramesFailed
+from curate.errors import ConfigError, CurateError, DataError, FramesFailed
+from pipelines.assembly import SHIPPED_SEGMENTER
 from pipelines.progress import Silent
 from pipelines.schedule import run_all
 from pipelines.stages import predict
@@ -176,10 +178,21 @@ def test_a_report_needs_no_network(curate: Curate, workspace: Workspace, tmp_pat
     assert asked == 0
 
 
-def test_a_segmenter_without_its_path_is_told_before_any_work(workspace: Workspace) -> None:
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"name": "onnx", "path": None}, "segmenter 'onnx' needs a path"),
+        ({"name": "onnx", "path": "gone.onnx", "classes": "voc"}, "gone.onnx"),
+        ({"name": "onnx", "path": SHIPPED_SEGMENTER, "classes": None}, "class numbers mean"),
+        ({"name": "saved", "path": "gone", "classes": "voc"}, "no such folder of semantic maps"),
+    ],
+)
+def test_a_wrong_segmenter_is_told_before_any_work(
+    workspace: Workspace, settings: dict[str, Any], message: str
+) -> None:
     """Not after hours of predictions; without the semantic prior nobody misses it."""
-    pathless = workspace.with_settings("segmenter", name="onnx", path=None)
-    with pytest.raises(ConfigError, match="segmenter 'onnx' needs a path"):
-        next(run_all(pathless, 1, Silent()))
-    points_alone = pathless.with_settings("run", priors=("points",))
+    wrong = workspace.with_settings("segmenter", **settings)
+    with pytest.raises(CurateError, match=message):
+        next(run_all(wrong, 1, Silent()))
+    points_alone = wrong.with_settings("run", priors=("points",))
     assert next(run_all(points_alone, 1, Silent())).done

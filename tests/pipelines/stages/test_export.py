@@ -95,6 +95,26 @@ def test_what_is_no_export_is_not_overwritten(
     assert "curate solve --policy spsl" in err
 
 
+@pytest.mark.parametrize("leads", ["link", "nowhere", "thesis"])
+def test_what_stands_where_the_trainer_looks_is_not_overwritten(
+    workspace: Workspace, tmp_path: Path, leads: str
+) -> None:
+    """Neither a link, which an export would take the place of, nor a file of another kind."""
+    former = run(workspace)
+    target = tmp_path / "elsewhere.sqlite"
+    if leads == "link":
+        former.rename(target)
+    former.unlink(missing_ok=True)
+    if leads == "thesis":
+        former.write_text("precious")
+    else:
+        former.symlink_to(target)
+    with pytest.raises(ConfigError, match=r"labels.sqlite: is (a link|there and is no former)"):
+        run(workspace.with_settings("solve", quantile=0.4))
+    assert former.read_text() == "precious" if leads == "thesis" else former.is_symlink()
+    assert target.exists() == (leads == "link")
+
+
 def test_a_student_of_labeled_frames_alone_gets_no_others(
     workspace: Workspace,
 ) -> None:
