@@ -9,10 +9,11 @@ import os
 import socket
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,9 @@ _POSTGRES_OWNER = text("""
 # Who asks whose a claim is holds its file for a moment; that moment is waited out.
 _TRIES, _PAUSE_S = 5, 0.01
 LONGEST_NAME = 63  # bytes of an application's name that PostgreSQL keeps
+
+Check = Callable[[], object]
+"""Raises where a claim was lost."""
 
 
 @dataclass(frozen=True)
@@ -64,24 +68,28 @@ def round_resources(number: int, policy: str | None = None) -> tuple[Resource, .
 
 
 @contextmanager
-def claimed(engine: Engine, resources: Sequence[Resource], purpose: str) -> Iterator[None]:
+def claimed(engine: Engine, resources: Sequence[Resource], purpose: str) -> Iterator[Check]:
     """Holds resources against every other process until the block ends.
+
+    Yields:
+        What raises where the claim was lost in the meantime, so that others may work on the same.
 
     Raises:
         DatabaseError: another process has one of them; the message says which and since when.
     """
     owner = f"{purpose}, process {os.getpid()} on {socket.gethostname()}"
+    checks: list[Check] = []
     with ExitStack() as held:
         if engine.dialect.name == "postgresql":
             connection = held.enter_context(_session(engine, owner))
             for resource in resources:
                 _claim_session(connection, resource)
+            checks = [partial(connection.execute, text("SELECT 1"))]
         elif engine.url.database:
             # Who opens the file by a link works on the same one.
             folder = Path(f"{os.path.realpath(engine.url.database)}-locks")
-            for resource in resources:
-                held.enter_context(_claimed_file(folder, resource, owner))
-        yield
+            checks = [held.enter_context(_claimed_file(folder, one, owner)) for one in resources]
+        yield lambda: [check() for check in checks]
 
 
 def one_at_a_time(connection: Connection, lock: int) -> None:
@@ -105,7 +113,8 @@ def _session(engine: Engine, owner: str) -> Iterator[Connection]:
             # A server notices the end of a connection a little later. One that is lost has lost
             # its claims, too, and what was lost with it is told by whoever worked.
             with suppress(DBAPIError):
-                connection.execute(text("SELECT pg_advisory_unlock_all()"))
+                if not connection.invalidated:
+                    connection.execute(text("SELECT pg_advisory_unlock_all()"))
 
 
 def _claim_session(connection: Connection, resource: Resource) -> None:
@@ -118,7 +127,7 @@ def _claim_session(connection: Connection, resource: Resource) -> None:
 
 
 @contextmanager
-def _claimed_file(folder: Path, resource: Resource, owner: str) -> Iterator[None]:
+def _claimed_file(folder: Path, resource: Resource, owner: str) -> Iterator[Check]:
     import fcntl
 
     path = folder / "".join(c if c.isalnum() else "-" for c in resource.name)
@@ -130,7 +139,20 @@ def _claimed_file(folder: Path, resource: Resource, owner: str) -> Iterator[None
             file.truncate(0)
             file.write(f"{owner}, since {datetime.now().astimezone():%Y-%m-%d %H:%M:%S}")
             file.flush()
-        yield
+        yield partial(_refuse_lost, path, file)
+
+
+def _refuse_lost(path: Path, file: "TextIOWrapper") -> None:
+    """DatabaseError where the file that is locked is not the one that others would try."""
+    try:
+        same = os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        same = False
+    if not same:
+        raise DatabaseError(
+            f"{path}: was moved or deleted while this command held it, so another one may work on "
+            "the same; run the command again, finished frames are kept"
+        )
 
 
 def _opened(path: Path) -> "TextIOWrapper":

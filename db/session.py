@@ -15,7 +15,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError, joined_lines
 from db.backups import back_up
-from db.claims import claimed, one_at_a_time, round_resources
+from db.claims import Check, claimed, one_at_a_time, round_resources
 from db.lock_holders import holders
 from db.models import Base
 from db.views import create_views, drop_views
@@ -42,6 +42,7 @@ class Database:
     def __init__(self, url: str | URL, backups: Path | None = None) -> None:
         self.url = parse_url(url) if isinstance(url, str) else url
         self.engine = _engine(self.url)
+        self._claims: list[Check] = []
         with self._own_words():
             self._migrate(backups)
 
@@ -65,12 +66,18 @@ class Database:
         Args:
             keys_known: that the rows which others refer to were read under a claim, so SQLite need
                 not look each of them up, nor delete what refers to deleted rows.
+
+        Raises:
+            DatabaseError: a claim was lost, so that others may write the same; nothing is written.
         """
         writer = self.engine.execution_options(
             sqlite_begin="IMMEDIATE", sqlite_foreign_keys=not keys_known
         )
-        with self._own_words(), writer.begin() as connection:
-            yield connection
+        with self._own_words():
+            for still_held in self._claims:
+                still_held()
+            with writer.begin() as connection:
+                yield connection
 
     @contextmanager
     def claiming_round(self, number: int, policy: str | None, purpose: str) -> Iterator[None]:
@@ -82,7 +89,9 @@ class Database:
         resources = round_resources(number, policy)
         with ExitStack() as held:
             with self._own_words():
-                held.enter_context(claimed(self.engine, resources, purpose))
+                still_held = held.enter_context(claimed(self.engine, resources, purpose))
+            self._claims.append(still_held)
+            held.callback(self._claims.remove, still_held)
             yield
 
     def close(self) -> None:

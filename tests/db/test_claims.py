@@ -1,6 +1,7 @@
 """Claims: who may work on a round beside whom, on either engine."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -76,6 +77,40 @@ def test_an_error_ends_the_claim(pair: tuple[Database, Database]) -> None:
         raise ZeroDivisionError
     with pair[1].claiming_round(1, None, "predict"):
         pass
+
+
+def lose_claims(database: Database) -> None:
+    """Ends the session that holds them, or deletes the locked files."""
+    if database.engine.dialect.name == "sqlite":
+        shutil.rmtree(f"{database.url.database}-locks")
+        return
+    with database.reading() as connection:
+        ended = connection.exec_driver_sql(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE pid <> pg_backend_pid() "
+            "AND datname = current_database() AND application_name LIKE 'predict, process%%'"
+        ).scalars()
+        assert list(ended) == [True]
+
+
+def test_who_lost_a_claim_writes_nothing_more(pair: tuple[Database, Database]) -> None:
+    """Another process may have got it in the meantime; what was written before is kept."""
+    mine, theirs = pair
+    add = "INSERT INTO label_file (path, round, policy, sha256) VALUES ('{}', 1, 'p', '')"
+
+    def lost_in_the_midst() -> None:
+        with mine.claiming_round(1, None, "predict"):
+            with mine.writing() as connection:
+                connection.exec_driver_sql(add.format("before"))
+            lose_claims(mine)
+            with theirs.claiming_round(1, None, "solve"), mine.writing() as connection:
+                connection.exec_driver_sql(add.format("after"))
+
+    with pytest.raises(DatabaseError, match="finished frames are kept") as found:
+        lost_in_the_midst()
+    assert "\n" not in str(found.value)
+    with theirs.claiming_round(1, None, "solve"), mine.writing() as connection:
+        stored = connection.exec_driver_sql("SELECT path FROM label_file").scalars()
+        assert list(stored) == ["before"]
 
 
 def test_a_server_that_is_lost_in_the_midst_is_told_in_one_line(
