@@ -35,7 +35,8 @@ _POSTGRES_OWNER = text("""
           AND l.database = (SELECT oid FROM pg_database WHERE datname = current_database())
     ORDER BY a.backend_start LIMIT 1
 """)
-# Who asks whose a claim is holds its file for a moment; that moment is waited out.
+# Who asks whose a claim is, or finds half of its own taken, holds it for a moment; that moment is
+# waited out.
 _TRIES, _PAUSE_S = 5, 0.01
 LONGEST_NAME = 63  # bytes of an application's name that PostgreSQL keeps
 
@@ -120,10 +121,13 @@ def _session(engine: Engine, owner: str) -> Iterator[Connection]:
 def _claim_session(connection: Connection, resource: Resource) -> None:
     place = {"class": _POSTGRES_CLASS, "key": zlib.crc32(resource.name.encode()) & 0x7FFFFFFF}
     function = f"pg_try_advisory_lock{'_shared' if resource.shared else ''}"
-    taken = connection.execute(text(f"SELECT {function}(:class, :key)"), place).scalar_one()
-    if not taken:
-        found = connection.execute(_POSTGRES_OWNER, place).first()
-        raise _refusal(resource, f"{found[0]}, since {found[1]:%Y-%m-%d %H:%M:%S}" if found else "")
+    take = text(f"SELECT {function}(:class, :key)")
+    for _ in range(_TRIES):
+        if connection.execute(take, place).scalar_one():
+            return
+        time.sleep(_PAUSE_S)
+    found = connection.execute(_POSTGRES_OWNER, place).first()
+    raise _refusal(resource, f"{found[0]}, since {found[1]:%Y-%m-%d %H:%M:%S}" if found else "")
 
 
 @contextmanager

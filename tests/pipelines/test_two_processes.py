@@ -56,7 +56,7 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen | None =
     while not condition():
         assert process is None or process.poll() is None, process.communicate()[1]
         assert time.monotonic() < end
-        time.sleep(0.02)
+        time.sleep(0.1)  # who asks for an owner holds the claim for a moment
 
 
 def labels(workspace: Workspace, number: int) -> list[tuple]:
