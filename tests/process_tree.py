@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -46,13 +47,23 @@ def peaks(process: subprocess.Popen) -> tuple[int, int]:
     """The peak memory of a command and of its largest worker in KiB, once it has ended."""
     parent, worker = 0, 0
     while process.poll() is None:
-        parent = max(parent, _peak(process.pid))
-        worker = max(worker, *map(_peak, workers(process.pid)), 0)
+        parent = max(parent, peak(process.pid))
+        worker = max(worker, *map(peak, workers(process.pid)), 0)
         time.sleep(0.1)
     return parent, worker
 
 
-def _peak(pid: int) -> int:
+def forget_peak() -> None:
+    """Lets the peak of this process begin anew, with what it has now."""
+    with suppress(OSError):  # only Linux tells peaks, and lets them be forgotten
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak(pid: int | str = "self") -> int:
+    """The peak memory of a process in KiB, 0 for none.
+
+    The greatest size that `getrusage` tells begins with that of the process which started it.
+    """
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     except OSError:

@@ -11,7 +11,8 @@ from curate.errors import DataError
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_START = PNG_SIGNATURE + b"\0\0\0\rIHDR"
 PNG_HEADER_BYTES = 24  # PNG_START, width, height
-PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+_PNG_CHUNK = struct.Struct(">I4s")  # length and kind, before the content and its checksum
+_PNG_CHECK_BYTES = 4
 JPEG_START = b"\xff\xd8"
 # Markers of JPEG that tell the size: start of frame, without the three that mean other things.
 _SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -62,7 +63,7 @@ def decode_image(path: Path, mode: int) -> np.ndarray:
     """
     content = _read_bytes(path)
     _claimed_size(content, path)
-    if content.startswith(PNG_SIGNATURE) and PNG_END not in content:
+    if content.startswith(PNG_SIGNATURE) and not _has_end(content):
         raise DataError(f"{path}: the PNG ends before its end mark; fetch the file again")
     try:
         pixels = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
@@ -88,6 +89,19 @@ def _claimed_size(content: bytes, path: Path) -> tuple[int, int]:
             f"{path}: claims {width} x {height} pixels; images of up to {MOST_PIXELS} are read"
         )
     return width, height
+
+
+def _has_end(content: bytes) -> bool:
+    """Whether a PNG's chunks lead to its end mark within the file.
+
+    A decoder takes memory for as many bytes as a chunk claims before it reads the first.
+    """
+    at = len(PNG_SIGNATURE)
+    kind = b""
+    while kind != b"IEND" and at + _PNG_CHUNK.size <= len(content):
+        length, kind = _PNG_CHUNK.unpack_from(content, at)
+        at += _PNG_CHUNK.size + length + _PNG_CHECK_BYTES
+    return kind == b"IEND" and at <= len(content)
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:

@@ -30,6 +30,15 @@ def _png(path: Path) -> None:
     )
 
 
+def _png_piece(path: Path) -> None:
+    """The pixels claim to be so long."""
+    TARGETS["png"].write(path)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"IDAT")
+    content[at - 4 : at] = struct.pack(">I", 4_000_000_000)
+    path.write_bytes(content)
+
+
 def _jpeg(path: Path) -> None:
     TARGETS["jpg"].write(path)
     content = bytearray(path.read_bytes())
@@ -129,6 +138,8 @@ def _dotted_heading(path: Path) -> None:
 _VERTICES = b"element vertex 100"
 BOMBS: Mapping[str, tuple[str, Callable[[Path], None]]] = {
     "a png of a gigapixel": ("png", _png),
+    "a png with a piece of four gigabytes": ("png", _png_piece),
+    "a map with a piece of four gigabytes": ("saved map", _png_piece),
     "a jpeg of four gigapixels": ("jpg", _jpeg),
     "a map of a gigapixel": ("saved map", _png),
     "an npy of 64 gigabytes": ("npy", _npy),

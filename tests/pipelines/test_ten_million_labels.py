@@ -5,13 +5,13 @@ The figures of docs/scale.md; CURATE_PROOF_LABELS takes fewer, CURATE_PROOF_URL 
 
 import json
 import os
-import resource
 import time
 from pathlib import Path
 
 import pytest
 from label_questions import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRUSTED, solved
 from labels_at_scale import EACH, filled_workspace
+from process_tree import peak
 from sqlalchemy import text
 
 LABELS = int(os.environ.get("CURATE_PROOF_LABELS", "10_000_000"))
@@ -34,7 +34,7 @@ def test_ten_million_labels(tmp_path: Path) -> None:
             start = time.perf_counter()
             assert streaming.execute(text(question)).fetchone()
             figures[question] = time.perf_counter() - start
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    memory = peak() / 1024
     print(json.dumps({"labels": LABELS, "peak MiB": memory, **figures}, indent=1))  # noqa: T201 - what it is for
     with workspace.database.reading() as connection:
         stored = connection.execute(text("SELECT policy, count(*) FROM weight GROUP BY policy"))
