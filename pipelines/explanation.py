@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Select, and_, func, select, text
+from sqlalchemy import Select, and_, select, text
 
 from curate.errors import WorkspaceError
 from curate.priors.points import point_trust
@@ -17,7 +17,7 @@ from db import bulk
 from db.views import WEIGHTED_LABELS
 from pipelines.assembly import semantic_settings
 from pipelines.config import Config, make_config
-from pipelines.labels import refuse_bad_weights
+from pipelines.labels import refuse_bad_weights, weighted_round
 from pipelines.registry import PRIORS
 from pipelines.review.told import tell_decision
 from pipelines.workspace import Workspace
@@ -128,11 +128,9 @@ def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
 def _label(
     workspace: Workspace, frame: str, k: int, round_number: int | None, policy: str
 ) -> dict[str, Any]:
-    weight = bulk.table("weight")
+    if round_number is None:
+        round_number = weighted_round(workspace, policy)
     with workspace.database.reading() as connection:
-        if round_number is None:
-            newest = select(func.max(weight.c.round)).where(weight.c.policy == policy)
-            round_number = connection.execute(newest).scalar_one()
         labels = WEIGHTED_LABELS.c
         refuse_bad_weights(connection, round_number or 1, policy, frame)
         key = {"round": round_number, "frame": frame, "k": k, "policy": policy}

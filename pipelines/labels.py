@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from sqlalchemy import BindParameter, Connection, bindparam, or_, select
+from sqlalchemy import BindParameter, Connection, bindparam, func, or_, select
 
 from curate.detections import Detections
 from curate.errors import WorkspaceError
@@ -31,6 +31,17 @@ class FrameLabels:
     labels: Detections
     weights: np.ndarray
     points: np.ndarray | None
+
+
+def weighted_round(workspace: Workspace, policy: str, number: int | None = None) -> int | None:
+    """The round asked for, or the last one; None where the policy has weighted nothing in it."""
+    weight = bulk.table("weight")
+    query = select(func.max(weight.c.round)).where(weight.c.policy == policy)
+    if number is not None:
+        query = query.where(weight.c.round == number)
+    with workspace.database.reading() as connection:
+        found: int | None = connection.execute(query).scalar_one()
+    return found
 
 
 def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterator[FrameLabels]:

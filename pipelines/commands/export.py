@@ -5,7 +5,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from pipelines.commands.options import JsonOption, PolicyOption, RoundOption, WorkspaceOption
+from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption, open_workspace
 from pipelines.commands.stages import run_round_command
 
 
@@ -23,7 +23,10 @@ def export(
         typer.Option(help="File or folder to write; default: in exports/ of the workspace."),
     ] = None,
     policy: PolicyOption = None,
-    round_number: RoundOption = None,
+    round_number: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option("--round", min=1, help="Round; default: the last that the policy weighted."),
+    ] = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -31,21 +34,22 @@ def export(
 
     Example: curate export --format sqlite
     """
-    if file_format == "sqlite" and output is None:
-        run_round_command("export", workspace, round_number, policy, as_json=as_json)
-        return
-    from pipelines.commands.options import open_workspace
+    from pipelines.labels import weighted_round
     from pipelines.registry import EXPORTERS
     from pipelines.rounds import open_round
     from pipelines.stages.export import export_as
 
-    exporter = EXPORTERS.build(file_format, offered={}, options={})
     opened = open_workspace(workspace)
-    path = output or opened.root / "exports" / f"{exporter.name}{exporter.suffix}"
-    context = open_round(opened, round_number)
     chosen = policy or opened.config.run.method
+    number = round_number or weighted_round(opened, chosen)
+    if file_format == "sqlite" and output is None:
+        run_round_command("export", opened, number, policy, as_json=as_json)
+        return
+    exporter = EXPORTERS.build(file_format, offered={}, options={})
+    path = output or opened.root / "exports" / f"{exporter.name}{exporter.suffix}"
+    context = open_round(opened, number)
     labels = export_as(opened, exporter, context.number, chosen, path)
-    typer.echo(f"{labels} labels in {path}")
+    typer.echo(f"{labels} labels of round {context.number} in {path}")
 
 
 def register(app: typer.Typer) -> None:

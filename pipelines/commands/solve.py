@@ -2,7 +2,13 @@
 
 import typer
 
-from pipelines.commands.options import JsonOption, PolicyOption, RoundOption, WorkspaceOption
+from pipelines.commands.options import (
+    JsonOption,
+    PolicyOption,
+    RoundOption,
+    WorkspaceOption,
+    open_workspace,
+)
 from pipelines.commands.stages import run_round_command
 
 
@@ -19,7 +25,7 @@ def solve(
 
     Example: curate solve --policy spsl
     """
-    run_round_command("solve", workspace, round_number, policy, as_json=as_json)
+    run_round_command("solve", open_workspace(workspace), round_number, policy, as_json=as_json)
 
 
 def register(app: typer.Typer) -> None:

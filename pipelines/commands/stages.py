@@ -1,10 +1,13 @@
 """What the commands of single stages have in common."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from pipelines.commands.options import end, open_workspace, print_report
+
+if TYPE_CHECKING:
+    from pipelines.workspace import Workspace
 
 
 def run_frame_command(
@@ -48,21 +51,19 @@ def run_frame_command(
 
 def run_round_command(
     name: str,
-    folder: Path | None,
+    workspace: "Workspace",
     round_number: int | None,
     policy: str | None,
     *,
-    train: Mapping[str, Any] | None = None,
     as_json: bool,
 ) -> None:
-    """Runs a round stage for a policy; `train` changes the settings of that section."""
+    """Runs a round stage for a policy."""
     from pipelines.progress import Bar
     from pipelines.round import stage
     from pipelines.rounds import open_round
     from pipelines.runner import run_round
     from pipelines.stage import RoundStage
 
-    workspace = open_workspace(folder).with_settings("train", **(train or {}))
     found = stage(name)
     if not isinstance(found, RoundStage):
         raise TypeError(name)

@@ -12,6 +12,7 @@ from pipelines.commands.options import (
     RoundOption,
     ThreadsOption,
     WorkspaceOption,
+    open_workspace,
 )
 from pipelines.commands.stages import run_round_command
 
@@ -42,17 +43,11 @@ def train_round(
 
     Example: curate train-round --command "python train.py {labels} {output}"
     """
-    changes = {"threads": threads, "command": command, "labels_format": labels_format}
-    run_round_command(
-        "train-round",
-        workspace,
-        round_number,
-        policy,
-        train={name: value for name, value in changes.items() if value is not None},
-        as_json=as_json,
-    )
-    told = {"command": command, "labels_format": labels_format}
-    _remember(workspace, policy, {name: value for name, value in told.items() if value is not None})
+    given = {"command": command, "labels_format": labels_format}
+    told = {name: value for name, value in given.items() if value is not None}
+    opened = open_workspace(workspace, threads=threads).with_settings("train", **told)
+    run_round_command("train-round", opened, round_number, policy, as_json=as_json)
+    _remember(workspace, policy, told)
 
 
 def _remember(folder: Path | None, policy: str | None, told: Mapping[str, str]) -> None:

@@ -13,6 +13,7 @@ from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
 from pipelines.label_columns import as_rounds, read_columns
+from pipelines.labels import weighted_round
 from pipelines.workspace import SPLITS, Workspace
 
 ORDERS = ("uncertain", "lowest", "changed")
@@ -102,19 +103,14 @@ def _check(workspace: Workspace, wish: Wish) -> None:
 
 def _weighted_round(workspace: Workspace, number: int | None, policy: str) -> int:
     """The round asked for, or the last one; it must have weights of the policy."""
-    weight = bulk.table("weight")
-    query = select(func.max(weight.c.round)).where(weight.c.policy == policy)
-    if number is not None:
-        query = query.where(weight.c.round == number)
-    with workspace.database.reading() as connection:
-        found = connection.execute(query).scalar_one()
+    found = weighted_round(workspace, policy, number)
     if found is None:
         where = "" if number is None else f" --round {number}"
         raise WorkspaceError(
             f"{policy} has weighted no labels{where and f' of round {number}'} yet; "
             f"run `curate solve{where} --policy {policy}`"
         )
-    return int(found)
+    return found
 
 
 def _first(connection: Connection, number: int, policy: str, wish: Wish) -> Asked:

@@ -76,6 +76,21 @@ def test_the_student_of_a_command_teaches_the_next_round(
         assert connection.exec_driver_sql(query).scalar_one() == 18
 
 
+def test_what_a_round_weighted_is_exported_after_its_student_as_before(
+    curate: Curate, exported: Workspace, command: str, tmp_path: Path
+) -> None:
+    """Not the next round's labels, which do not exist yet; asking for them starts no round."""
+    code, _, err = curate("train-round", "--command", command, "-w", exported.root)
+    assert code == 0, err
+    code, out, _ = curate("export", "-w", exported.root)
+    assert (code, out.split()[:2]) == (0, ["round", "1"])
+    path = tmp_path / "labels.csv"
+    code, out, _ = curate("export", "--format", "csv", "--output", path, "-w", exported.root)
+    assert (code, out) == (0, f"18 labels of round 1 in {path}\n")
+    with exported.database.reading() as connection:
+        assert connection.exec_driver_sql("SELECT number FROM round").scalars().all() == [1]
+
+
 def test_a_command_given_by_hand_trains_later_rounds_too(
     curate: Curate, exported: Workspace, command: str
 ) -> None:

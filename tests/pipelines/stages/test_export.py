@@ -66,12 +66,12 @@ def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_pa
     run(workspace)
     folder = ("-w", workspace.root)
     code, out, _ = curate("export", "--format", "kitti", *folder)
-    assert (code, out) == (0, f"18 labels in {workspace.root}/exports/kitti\n")
+    assert (code, out) == (0, f"18 labels of round 1 in {workspace.root}/exports/kitti\n")
     files = list((workspace.root / "exports" / "kitti" / "label_2").iterdir())
     assert sum(len(path.read_text().splitlines()) for path in files) == 18
     copy = tmp_path / "copy.sqlite"
     code, out, _ = curate("export", "--output", copy, *folder)
-    assert (code, out) == (0, f"18 labels in {copy}\n")
+    assert (code, out) == (0, f"18 labels of round 1 in {copy}\n")
     with closing(sqlite3.connect(copy)) as connection:
         assert connection.execute("SELECT count(*) FROM weighted_labels").fetchone() == (18,)
     code, _, err = curate("export", "--format", "yolo", *folder)
