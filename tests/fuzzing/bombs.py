@@ -123,6 +123,26 @@ def _wide_column(path: Path) -> None:
         )
 
 
+def _many_boxes(path: Path) -> None:
+    """The same box three million times."""
+    from pyarrow import parquet
+
+    TARGETS["parquet"].write(path)
+    rows = parquet.read_table(path).take(np.zeros(3_000_000, np.int64))
+    parquet.write_table(rows, path, compression="zstd")
+
+
+def _long_name(path: Path) -> None:
+    """A frame whose name are 300 megabytes of one letter."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    TARGETS["parquet"].write(path)
+    rows = parquet.read_table(path)
+    names = pa.DictionaryArray.from_arrays(np.zeros(len(rows), np.int8), ["a" * 300_000_000])
+    parquet.write_table(rows.set_column(0, "frame", names), path, compression="zstd")
+
+
 def _safetensors(path: Path) -> None:
     path.write_bytes(struct.pack("<Q", 2**40) + b"{}")
 
@@ -136,7 +156,7 @@ def _dotted_heading(path: Path) -> None:
 
 
 _VERTICES = b"element vertex 100"
-BOMBS: Mapping[str, tuple[str, Callable[[Path], None]]] = {
+_BOMBS: Mapping[str, tuple[str, Callable[[Path], None]]] = {
     "a png of a gigapixel": ("png", _png),
     "a png with a piece of four gigabytes": ("png", _png_piece),
     "a map with a piece of four gigabytes": ("saved map", _png_piece),
@@ -158,6 +178,10 @@ BOMBS: Mapping[str, tuple[str, Callable[[Path], None]]] = {
     "labels without end": ("label file", _endless_view),
     "a cell of half a gigabyte": ("label file", _wide_column),
     "a checkpoint's header": ("checkpoint", _safetensors),
+    "a box three million times": ("parquet", _many_boxes),
+    "a name of 300 megabytes": ("parquet", _long_name),
     "a key of many parts": ("description", _dotted_key),
     "a heading of many parts": ("configuration", _dotted_heading),
 }
+# What is read with an extra is there with it.
+BOMBS = {name: bomb for name, bomb in _BOMBS.items() if bomb[0] in TARGETS}

@@ -6,7 +6,8 @@ the frame as it is. Other columns are not read, so the labels that `curate expor
 writes are a record of the predictions they come from.
 
 Only the rows' frames and views are held, as runs within row groups; boxes are read when a frame is
-asked for, a row group at a time, and a bad row fails its frame alone.
+asked for, a row group at a time, and a bad row fails its frame alone. A file that claims more rows
+than boxes can be packed into it is refused.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +28,11 @@ from curate.parquet import load_parquet
 VIEW_COLUMNS = ("view", "flip_y", "rotation_rad", "scale")
 _BOXES = ("score", *BOX_COLUMNS)
 _NEEDED = ("frame", "category", *_BOXES)
+_NAMES = frozenset({"frame", "category"})
 _GROUPS_HELD = 2
+# Boxes do not compress further; what does, unfolds to any size.
+_FEWEST_BYTES_PER_ROW = 4
+_MOST_NAME_BYTES = 256 << 20  # of a column of names in a row group
 
 View = tuple[Similarity, Detections]
 Runs = Mapping[str, list[tuple[int, int, int]]]
@@ -65,6 +70,7 @@ class ParquetRecord:
         if missing:
             raise DataError(f"{path}: no column {', '.join(missing)}; it has {', '.join(names)}")
         _refuse_types(path, file.schema_arrow, wanted)
+        _refuse_unfolding(path, file.metadata)
         return cls(path, bool(own), _runs(path, file))
 
     def frame_ids(self) -> tuple[str, ...]:
@@ -116,7 +122,7 @@ class ParquetRecord:
 def _open(path: Path) -> Any:
     arrow, parquet = load_parquet()
     try:
-        return parquet.ParquetFile(path)
+        return parquet.ParquetFile(path, read_dictionary=sorted(_NAMES))
     except FileNotFoundError:
         raise DataError(f"{path}: no such file of recorded detections") from None
     except (arrow.ArrowException, OSError, UnicodeError) as error:
@@ -132,8 +138,28 @@ def _refuse_types(path: Path, schema: Any, names: Sequence[str]) -> None:
         of = arrow.types
         text = of.is_string(kind) or of.is_large_string(kind) or of.is_integer(kind)
         number = of.is_integer(kind) or of.is_floating(kind) or of.is_boolean(kind)
-        if not (text if name in {"frame", "category"} else number):
+        if not (text if name in _NAMES else number):
             raise DataError(f"{path}: column {name} is of type {kind}")
+
+
+def _refuse_unfolding(path: Path, metadata: Any) -> None:
+    """DataError where a file claims far more than its bytes can hold."""
+    size = path.stat().st_size
+    if metadata.num_rows * _FEWEST_BYTES_PER_ROW > size:
+        raise DataError(
+            f"{path}: {metadata.num_rows} rows in {size} bytes cannot be different boxes"
+        )
+    for number in range(metadata.num_row_groups):
+        group = metadata.row_group(number)
+        for column in map(group.column, range(group.num_columns)):
+            if (
+                column.path_in_schema in _NAMES
+                and column.total_uncompressed_size > _MOST_NAME_BYTES
+            ):
+                raise DataError(
+                    f"{path}: row group {number}: column {column.path_in_schema} unfolds to "
+                    f"{column.total_uncompressed_size} bytes; up to {_MOST_NAME_BYTES} are read"
+                )
 
 
 def _runs(path: Path, file: Any) -> Runs:
@@ -165,12 +191,31 @@ def _read(path: Path, file: Any, number: int, columns: Sequence[str]) -> Mapping
 
 
 def _values(path: Path, number: int, arrow: Any, name: str, column: Any) -> np.ndarray:
-    if column.null_count:
-        raise DataError(f"{path}: row group {number}: {column.null_count} rows have no {name}")
-    kind = arrow.string() if name in {"frame", "category"} else arrow.float64()
-    if arrow.types.is_dictionary(column.type):
+    missing = column.null_count
+    if name in _NAMES:
+        chunks = [_coded(arrow, chunk) for chunk in column.chunks]
+        missing += sum(chunk.dictionary.null_count for chunk in chunks)
+    elif arrow.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
-    return np.asarray(column.cast(kind).to_numpy())
+    if missing:
+        raise DataError(f"{path}: row group {number}: {missing} rows have no {name}")
+    if name in _NAMES:
+        return np.concatenate([np.empty(0, object), *map(_named, chunks)])
+    return np.asarray(column.cast(arrow.float64()).to_numpy())
+
+
+def _coded(arrow: Any, chunk: Any) -> Any:
+    """A chunk of names as numbers of those that it has."""
+    if arrow.types.is_dictionary(chunk.type):
+        return chunk
+    return chunk.cast(arrow.string()).dictionary_encode()
+
+
+def _named(chunk: Any) -> np.ndarray:
+    """(n,) the names; equal ones are one object."""
+    names = np.array([str(name) for name in chunk.dictionary.to_pylist()], dtype=object)
+    named: np.ndarray = names[chunk.indices.to_numpy()]
+    return named
 
 
 def _refuse_views(place: str, told: np.ndarray) -> None:
