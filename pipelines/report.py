@@ -17,6 +17,7 @@ from pipelines.differences import COLUMNS, ChangedLabel, Comparison, Difference
 from pipelines.frame_boxes import chosen_round
 from pipelines.label_columns import read_blocks, read_frame_columns
 from pipelines.label_ranking import RankedLabel, Ranking
+from pipelines.labels import weighted_round
 from pipelines.report_figures import (
     beside_others,
     by_category,
@@ -36,14 +37,14 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
 
     Args:
         workspace: see `Workspace`.
-        round_number: None for the last that has predictions.
+        round_number: None for the last that the policy weighted.
         policy: whose weights; None for the configured one.
 
     Raises:
         WorkspaceError: the policy has weighted nothing in that round.
     """
-    number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
+    number = chosen_round(workspace, round_number or weighted_round(workspace, policy))
     totals = RoundTotals(extent(workspace, number, policy))
     repredicted = is_repredicted(workspace, number)
     doubted, kept = Ranking(_PICTURES), Ranking(_PICTURES)

@@ -16,7 +16,7 @@ from pipelines.commands.options import (
 def report(
     round_number: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option("--round", min=1, help="Round; default: the last with predictions."),
+        typer.Option("--round", min=1, help="Round; default: the last that the policy weighted."),
     ] = None,
     policy: PolicyOption = None,
     workspace: WorkspaceOption = None,

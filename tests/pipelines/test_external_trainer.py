@@ -76,7 +76,7 @@ def test_the_student_of_a_command_teaches_the_next_round(
         assert connection.exec_driver_sql(query).scalar_one() == 18
 
 
-def test_what_a_round_weighted_is_exported_after_its_student_as_before(
+def test_what_a_round_weighted_is_handed_out_after_its_student_as_before(
     curate: Curate, exported: Workspace, command: str, tmp_path: Path
 ) -> None:
     """Not the next round's labels, which do not exist yet; asking for them starts no round."""
@@ -89,6 +89,10 @@ def test_what_a_round_weighted_is_exported_after_its_student_as_before(
     assert (code, out) == (0, f"18 labels of round 1 in {path}\n")
     with exported.database.reading() as connection:
         assert connection.exec_driver_sql("SELECT number FROM round").scalars().all() == [1]
+    code, _, err = curate("predict", "-w", exported.root)
+    assert code == 0, err
+    code, out, _ = curate("report", "-w", exported.root)
+    assert (code, Path(out.split()[-1]).name) == (0, "round-01-pspsl.html")
 
 
 def test_a_command_given_by_hand_trains_later_rounds_too(
