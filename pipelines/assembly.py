@@ -15,8 +15,8 @@ from curate.priors.semantic import SemanticSettings
 from curate.segmenters.base import Segmenter
 from curate.weighting.base import Policy
 from pipelines import registry
-from pipelines.config import Config
-from pipelines.workspace import open_dataset
+from pipelines.workspace.config import Config
+from pipelines.workspace.workspace import open_dataset
 
 Kind = TypeVar("Kind")
 

@@ -19,19 +19,19 @@ from curate.detections import CATEGORIES
 from curate.errors import CurateError, WorkspaceError
 from curate.evaluation import kitti_ap
 from curate.evaluation.kitti_rules import LOOSE_OVERLAPS
+from pipelines.assessment.evaluation import detect_val, val_objects
+from pipelines.assessment.label_quality import label_quality
 from pipelines.commands.options import print_report, print_table
-from pipelines.config import Config, make_config
-from pipelines.evaluation import detect_val, val_objects
-from pipelines.label_quality import label_quality
-from pipelines.progress import Bar, reaching
+from pipelines.engine.progress import Bar, reaching
+from pipelines.engine.rounds import open_round
+from pipelines.engine.runner import run_round
+from pipelines.engine.schedule import run_all
+from pipelines.engine.stage import RoundStage
 from pipelines.round import stage
-from pipelines.rounds import open_round
-from pipelines.runner import run_round
-from pipelines.schedule import run_all
-from pipelines.setup import initialise
-from pipelines.stage import RoundStage
 from pipelines.stages import train_round
-from pipelines.workspace import Workspace
+from pipelines.workspace.config import Config, make_config
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import Workspace
 
 Say = Callable[[str], None]
 
@@ -126,7 +126,7 @@ def run_demo(demo: Demo, say: Say) -> None:
 
 
 def _simulate(demo: Demo, say: Say) -> None:
-    from curate.datasets.synthetic import simulate
+    from curate.simulation import simulate
 
     start = time.perf_counter()
     total = demo.frames + demo.val
@@ -171,7 +171,7 @@ def _train_student(workspace: Workspace, policy: str) -> None:
 
 
 def _print_query(workspace: Workspace) -> None:
-    from pipelines.asking import ask
+    from pipelines.queries.run_query import ask
 
     columns, rows = ask(workspace.database.url, QUERY)
     print_table(columns, rows)
@@ -218,7 +218,7 @@ def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:
 
 
 def _draw(workspace: Workspace, say: Say) -> None:
-    from pipelines.pictures import draw_telling_frame
+    from pipelines.reports.pictures import draw_telling_frame
 
     try:
         pictures = draw_telling_frame(workspace, 1)

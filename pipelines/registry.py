@@ -116,8 +116,8 @@ DATASETS = Registry(
     "dataset",
     "curate.datasets.base:Dataset",
     {
-        "kitti": "curate.datasets.kitti:KittiDataset",
-        "kitti-raw": "curate.datasets.kitti_raw:KittiRawDataset",
+        "kitti": "curate.datasets.kitti.dataset:KittiDataset",
+        "kitti-raw": "curate.datasets.kitti.raw:KittiRawDataset",
         "folder": "curate.datasets.folder:FolderDataset",
         "nuscenes": "curate.datasets.nuscenes:NuScenesDataset",
     },
@@ -184,11 +184,11 @@ EXPORTERS = Registry(
 )
 EXECUTORS = Registry(
     "executor",
-    "pipelines.executors.base:Executor",
+    "pipelines.engine.executors.base:Executor",
     {
-        "serial": "pipelines.executors.serial:SerialExecutor",
-        "process": "pipelines.executors.process:ProcessExecutor",
-        "ray": "pipelines.executors.ray:RayExecutor",
+        "serial": "pipelines.engine.executors.serial:SerialExecutor",
+        "process": "pipelines.engine.executors.process:ProcessExecutor",
+        "ray": "pipelines.engine.executors.ray:RayExecutor",
     },
 )
 EDITORS = Registry(

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
+from pipelines.engine.stage import FrameStage, RoundStage, Stage
 from pipelines.registry import PRIORS
-from pipelines.stage import FrameStage, RoundStage, Stage
 from pipelines.stages import export, predict, repredict, score, solve, train_round
 
 _DETECT: tuple[Stage, ...] = (

@@ -8,8 +8,8 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+from support.paths import ROOT
 
-ROOT = Path(__file__).parent.parent
 # pipelines -> db -> curate, pipelines -> curate; never back.
 MAY_IMPORT = {
     "curate": {"curate"},
@@ -112,8 +112,8 @@ def test_nothing_runs_what_a_file_says() -> None:
         for call in foreign_calls(ast.parse(path.read_text()))
     }
     assert calls == {
-        ("pipelines/executors/process.py", "pickle.loads"),
-        ("pipelines/executors/ray.py", "pickle.loads"),
+        ("pipelines/engine/executors/process.py", "pickle.loads"),
+        ("pipelines/engine/executors/ray.py", "pickle.loads"),
         ("curate/review/editors/cvat.py", "zipfile.ZipFile"),
     }
     readers = {str(path.relative_to(ROOT)) for path in HOUSE if "Unpickler" in path.read_text()}

@@ -22,21 +22,21 @@ from typing import Any
 
 import numpy as np
 
-from curate.datasets.clouds import CLOUD_SUFFIXES, read_cloud
-from curate.datasets.containment import Boundary, check_frame_id
-from curate.datasets.images import read_sized_image
-from curate.datasets.kitti import (
+from curate.datasets.formats.clouds import CLOUD_SUFFIXES, read_cloud
+from curate.datasets.formats.containment import Boundary, check_frame_id
+from curate.datasets.formats.images import read_sized_image
+from curate.datasets.kitti.dataset import (
     IMAGE_SUFFIXES,
     read_bytes,
     read_calibration,
     read_frame_lists,
     visible_files,
 )
-from curate.datasets.kitti_labels import read_objects, to_annotations
+from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
+from curate.files.toml_text import parse_toml
 from curate.frames import Calibration, Frame, FrameFiles
-from curate.toml_text import parse_toml
 
 DESCRIPTION = "dataset.toml"
 _FOLDERS = ("points", "images", "labels", "splits")

@@ -16,9 +16,9 @@ import numpy as np
 from curate.detections import Detections, as_categories
 from curate.detectors.conventions import BoxConvention
 from curate.errors import ConfigError, ModelError, first_line
+from curate.files.onnx_session import are_numbers, open_session, runtime_errors
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
-from curate.onnx_session import are_numbers, open_session, runtime_errors
 
 _KEYS = ("boxes", "scores", "labels")
 

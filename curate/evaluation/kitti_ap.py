@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from curate.datasets.kitti_labels import KittiObjects
+from curate.datasets.kitti.labels import KittiObjects
 from curate.errors import DataError
 from curate.evaluation.kitti_matching import (
     Candidates,

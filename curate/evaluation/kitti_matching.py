@@ -11,7 +11,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numba import njit
 
-from curate.datasets.kitti_labels import DONT_CARE, KittiObjects
+from curate.datasets.kitti.labels import DONT_CARE, KittiObjects
 from curate.geometry.overlap import overlapping_pairs
 
 METRICS = ("image", "bev", "3d")

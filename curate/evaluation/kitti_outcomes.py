@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from curate.datasets.kitti_labels import KittiObjects
+from curate.datasets.kitti.labels import KittiObjects
 from curate.errors import ConfigError
 from curate.evaluation.kitti_ap import check_frames
 from curate.evaluation.kitti_matching import (

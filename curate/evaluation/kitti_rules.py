@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from curate.datasets.kitti_labels import KittiObjects
+from curate.datasets.kitti.labels import KittiObjects
 
 DIFFICULTIES = ("easy", "moderate", "hard")
 MIN_HEIGHTS = (40.0, 25.0, 25.0)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from curate.datasets.kitti_labels import KittiObjects
+from curate.datasets.kitti.labels import KittiObjects
 from curate.evaluation.kitti_rules import COUNTED, DIFFICULTIES, MAX_TRUNCATIONS, label_states
 
 QUANTILES = (0.1, 0.5, 0.9)

@@ -14,10 +14,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from curate.atomic import replace_file
 from curate.errors import ConfigError
 from curate.exporters.base import LabelSet, refuse_link
 from curate.exporters.objects import FrameObjects, frame_objects
+from curate.files.atomic import replace_file
 from curate.frames import Frame
 from curate.geometry.projection import image_rectangles
 

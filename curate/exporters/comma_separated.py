@@ -9,10 +9,10 @@ import io
 from pathlib import Path
 from typing import ClassVar
 
-from curate.atomic import replace_file
 from curate.errors import ConfigError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelSet, refuse_link
 from curate.exporters.objects import refuse_bad_weights
+from curate.files.atomic import replace_file
 
 _HEADER = ",".join(WEIGHTED_LABEL_COLUMNS)
 

@@ -20,7 +20,7 @@ from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
-from curate.datasets.kitti_labels import DONT_CARE, from_detections, write_objects
+from curate.datasets.kitti.labels import DONT_CARE, from_detections, write_objects
 from curate.detections import Detections
 from curate.errors import ConfigError, DataError
 from curate.exporters.base import BOX_COLUMNS, WEIGHTED_LABEL_COLUMNS, LabelSet, Row

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from curate.datasets.kitti_labels import from_detections
+from curate.datasets.kitti.labels import from_detections
 from curate.exporters.base import LabelSet
 from curate.exporters.folder import write_folder, write_pickle
 from curate.exporters.objects import FrameObjects, difficulties, frame_objects

@@ -14,11 +14,11 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from curate.atomic import replace_file
 from curate.datasets.nuscenes.names import detection_name
 from curate.errors import ConfigError, DataError
 from curate.exporters.base import LabelSet, refuse_link
 from curate.exporters.objects import FrameObjects, frame_objects
+from curate.files.atomic import replace_file
 from curate.frames import Calibration
 
 _FORMAT = "curate weighted labels, nuScenes"

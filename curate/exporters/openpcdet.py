@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from curate.datasets.kitti_labels import DONT_CARE, KittiObjects, from_detections
+from curate.datasets.kitti.labels import DONT_CARE, KittiObjects, from_detections
 from curate.exporters.base import LabelSet
 from curate.exporters.folder import write_folder, write_pickle
 from curate.exporters.objects import UNKNOWN, FrameObjects, difficulties, frame_objects

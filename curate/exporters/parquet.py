@@ -12,11 +12,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
-from curate.batches import batched
 from curate.errors import ConfigError, DataError, one_line
 from curate.exporters.base import LabelFileDescription, LabelSet, Row, bad_weight, refuse_link
 from curate.exporters.columns import WEIGHTED_LABELS
-from curate.parquet import load_parquet
+from curate.files.batches import batched
+from curate.files.parquet import load_parquet
 
 FORMAT = "curate weighted labels, Parquet"
 FORMAT_VERSION = "1"

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from curate.atomic import replace_file
+from curate.files.atomic import replace_file
 
 _log = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from curate.atomic import replace_file
 from curate.errors import DataError, one_line
+from curate.files.atomic import replace_file
 
 MANIFEST = "review.json"
 FORMAT = "curate review 1"

@@ -10,8 +10,8 @@ import io
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from curate.atomic import replace_file
 from curate.errors import DataError
+from curate.files.atomic import replace_file
 from curate.review.human_labels import ACCEPTED, REJECTED
 from curate.review.sheet import Sheet
 

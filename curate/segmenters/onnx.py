@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 
 from curate.errors import ConfigError, ModelError
+from curate.files.onnx_session import are_numbers
 from curate.frames import Frame
-from curate.onnx_session import are_numbers
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes
 from curate.segmenters.onnx_images import ImageModel, image_of

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from curate.datasets.images import MOST_PIXELS
+from curate.datasets.formats.images import MOST_PIXELS
 from curate.errors import ConfigError, ModelError, first_line
+from curate.files.onnx_session import open_session, runtime_errors
 from curate.frames import Frame
-from curate.onnx_session import open_session, runtime_errors
 
 # Mean and standard deviation of ImageNet's RGB, with which most published models were trained.
 _IMAGENET = (np.array([0.485, 0.456, 0.406]) * 255, np.array([0.229, 0.224, 0.225]) * 255)

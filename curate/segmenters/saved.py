@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from curate.datasets.images import decode_image
+from curate.datasets.formats.images import decode_image
 from curate.errors import ConfigError, DataError
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap

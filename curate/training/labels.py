@@ -159,6 +159,6 @@ def _numbers(path: Path, frame: str, entries: list[tuple]) -> np.ndarray:
 
 
 def _kitti_reader(root: Path) -> Callable[[str], Frame]:
-    from curate.datasets.kitti import KittiDataset
+    from curate.datasets.kitti.dataset import KittiDataset
 
     return KittiDataset(root).read

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from curate.atomic import replace_file
+from curate.files.atomic import replace_file
 from curate.training.settings import TrainingSettings
 
 _log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from curate.atomic import replace_file
+from curate.files.atomic import replace_file
 
 Colour = tuple[int, int, int]
 

@@ -12,23 +12,23 @@ from pathlib import Path
 import curate
 from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
 from pipelines.assembly import device
+from pipelines.assessment.evaluation import detect_val, val_objects
+from pipelines.assessment.label_quality import label_quality
 from pipelines.bench.grid import Job, looks_at_unlabeled
 from pipelines.bench.metered import Metered
 from pipelines.bench.results import JobResult, LabelFigures, write_result
 from pipelines.bench.settings import Bench
 from pipelines.bench.tables import RULES
-from pipelines.config import write_config
-from pipelines.evaluation import detect_val, val_objects
-from pipelines.label_quality import label_quality
-from pipelines.methods import METHODS
+from pipelines.engine.rounds import newest_checkpoint, open_round
+from pipelines.engine.runner import Report, open_executor, run_frames
+from pipelines.engine.schedule import run_all
+from pipelines.engine.stage import FrameStage
 from pipelines.round import active
-from pipelines.rounds import newest_checkpoint, open_round
-from pipelines.runner import Report, open_executor, run_frames
-from pipelines.schedule import run_all
-from pipelines.setup import initialise
-from pipelines.stage import FrameStage
+from pipelines.stages.methods import METHODS
 from pipelines.stages.pretrain import pretrain
-from pipelines.workspace import CONFIG_NAME, SPLITS, Workspace
+from pipelines.workspace.config import write_config
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import CONFIG_NAME, SPLITS, Workspace
 
 DATABASE = "curate.db"
 

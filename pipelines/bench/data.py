@@ -3,8 +3,8 @@
 from curate.errors import DataError
 from pipelines.bench.running import Say
 from pipelines.bench.settings import SYNTHETIC, Bench
-from pipelines.progress import Progress, reaching
-from pipelines.workspace import open_dataset
+from pipelines.engine.progress import Progress, reaching
+from pipelines.workspace.workspace import open_dataset
 
 
 def make_data(bench: Bench, workers: int, say: Say, progress: Progress) -> None:
@@ -27,7 +27,7 @@ def make_data(bench: Bench, workers: int, say: Say, progress: Progress) -> None:
 def _simulate(
     bench: Bench, frames: int, val: int, workers: int, say: Say, progress: Progress
 ) -> None:
-    from curate.datasets.synthetic import simulate
+    from curate.simulation import simulate
 
     with progress.track("simulate", frames + val) as advance:
         seed, show = bench.settings.data_seed or 0, reaching(advance)

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipelines.bench.settings import Axes
-from pipelines.config import Config
-from pipelines.methods import METHODS
+from pipelines.engine.stage import FrameStage
 from pipelines.registry import POLICIES
 from pipelines.round import active
-from pipelines.stage import FrameStage
+from pipelines.stages.methods import METHODS
+from pipelines.workspace.config import Config
 
 RESULT_FILE = "result.json"
 TRAIN, EVALUATE = "train", "evaluate"

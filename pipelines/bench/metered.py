@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from typing import TextIO
 
 from pipelines.bench.grid import EVALUATE, TRAIN
-from pipelines.progress import Advance
+from pipelines.engine.progress import Advance
+from pipelines.engine.stage import FrameStage
 from pipelines.round import ROUND
-from pipelines.stage import FrameStage
 
 TELL_EVERY_S = 0.5
 _KINDS = {EVALUATE, *(each.name for each in ROUND if isinstance(each, FrameStage))}

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from curate.atomic import replace_file
-from curate.datasets.kitti_labels import from_annotations
+from curate.datasets.kitti.labels import from_annotations
 from curate.evaluation.comparison import PairedDifference
 from curate.evaluation.object_statistics import QUANTILES, object_statistics
+from curate.files.atomic import replace_file
 from curate.viewing.canvas import save_png
 from curate.viewing.curves import Curve, CurvePanel, draw_curves
 from pipelines.bench.results import OVERLAPS, JobResult, read_results
 from pipelines.bench.settings import SYNTHETIC, Bench
 from pipelines.bench.tables import Entry, Finished, Table, Value, all_tables, signed
-from pipelines.methods import METHODS
-from pipelines.workspace import open_dataset
+from pipelines.stages.methods import METHODS
+from pipelines.workspace.workspace import open_dataset
 
 MARKDOWN, NUMBERS, PICTURE = "results.md", "results.json", "curve.png"
 

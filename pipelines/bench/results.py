@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from curate.atomic import replace_file
 from curate.errors import DataError
+from curate.files.atomic import replace_file
 from pipelines.bench.grid import RESULT_FILE, Job
-from pipelines.config import Section
+from pipelines.workspace.config import Section
 
 Levels = tuple[float, float, float]
 OVERLAPS = ("kitti", "loose")

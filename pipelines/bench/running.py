@@ -15,8 +15,8 @@ from pipelines.bench.grid import Job, Sizes
 from pipelines.bench.processes import Told
 from pipelines.bench.results import read_result, read_results
 from pipelines.bench.settings import Bench
-from pipelines.progress import Advance, Progress
-from pipelines.workspace import open_dataset
+from pipelines.engine.progress import Advance, Progress
+from pipelines.workspace.workspace import open_dataset
 
 Say = Callable[[str], None]
 

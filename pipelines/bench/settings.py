@@ -8,11 +8,11 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from curate.atomic import replace_file
 from curate.errors import ConfigError, DataError, WorkspaceError
-from pipelines.config import AtLeastOne, Config, Section, change_setting, make_config
-from pipelines.methods import METHODS, with_method
+from curate.files.atomic import replace_file
 from pipelines.registry import TRAINABLE
+from pipelines.stages.methods import METHODS, with_method
+from pipelines.workspace.config import AtLeastOne, Config, Section, change_setting, make_config
 
 SYNTHETIC = "synthetic"
 SETTINGS_FILE = "bench.json"

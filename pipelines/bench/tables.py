@@ -10,7 +10,7 @@ from curate.evaluation.comparison import PairedDifference, Spread, paired_differ
 from curate.evaluation.kitti_rules import DIFFICULTIES, LOOSE_OVERLAPS, MIN_OVERLAPS
 from pipelines.bench.grid import Job
 from pipelines.bench.results import JobResult, Levels
-from pipelines.methods import METHODS
+from pipelines.stages.methods import METHODS
 
 BASELINE = "baseline"
 TEACHER = "teacher"

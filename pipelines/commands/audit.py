@@ -22,7 +22,7 @@ from pipelines.commands.options import (
 
 if TYPE_CHECKING:
     from curate.evaluation.audit import Audit, Estimate, Figures
-    from pipelines.audit import AuditedRound
+    from pipelines.assessment.audit import AuditedRound
 
 
 def audit(
@@ -67,9 +67,9 @@ def audit(
     from curate.evaluation.reliability import Overlap
     from curate.viewing.canvas import save_png
     from curate.viewing.reliability_diagram import draw_reliability
-    from pipelines.audit import AuditRequest, in_plain_words, picture_path, run_audit
-    from pipelines.progress import Bar
-    from pipelines.stored_audit import store_audit
+    from pipelines.assessment.audit import AuditRequest, in_plain_words, picture_path, run_audit
+    from pipelines.assessment.stored_audit import store_audit
+    from pipelines.engine.progress import Bar
 
     if overlap not in get_args(Overlap):
         raise ConfigError(f"--overlap {overlap}: use bev or 3d")

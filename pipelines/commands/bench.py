@@ -181,7 +181,7 @@ def _axes(grid: dict[str, str | None], stored: "Bench | None") -> Any:
     """The axes of the grid from the words of the command line."""
     from curate.errors import ConfigError
     from pipelines.bench.settings import Axes
-    from pipelines.methods import METHODS as KNOWN
+    from pipelines.stages.methods import METHODS as KNOWN
 
     paper = ",".join(name for name in METHODS.split(",") if name in KNOWN)
     axes: dict[str, Any] = {}
@@ -206,7 +206,7 @@ def _run(bench: "Bench", workers: int, *, quiet: bool) -> None:
     from pipelines.bench.processes import JobProcesses
     from pipelines.bench.running import alone, run_grid
     from pipelines.bench.settings import claim
-    from pipelines.progress import Bar
+    from pipelines.engine.progress import Bar
 
     def say(line: str) -> None:
         typer.echo(line, err=quiet)

@@ -31,7 +31,7 @@ def diff(
     """
     from dataclasses import astuple
 
-    from pipelines.differences import COLUMNS, compare_rounds
+    from pipelines.reports.differences import COLUMNS, compare_rounds
 
     opened = open_workspace(workspace)
     found = compare_rounds(opened, (before, after), policy or opened.config.run.method, limit)

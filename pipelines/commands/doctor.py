@@ -21,7 +21,7 @@ def doctor(
 
     Example: curate doctor 000008
     """
-    from pipelines.examination import examine
+    from pipelines.assessment.doctor import examine
 
     name, findings = examine(open_workspace(workspace), frame)
     if as_json:

@@ -18,9 +18,9 @@ from pipelines.commands.options import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from curate.datasets.kitti_labels import KittiObjects
+    from curate.datasets.kitti.labels import KittiObjects
     from curate.evaluation.kitti_ap import KittiEvaluation
-    from pipelines.workspace import Workspace
+    from pipelines.workspace.workspace import Workspace
 
 OUTCOMES = {"tp": "found", "fn": "missed", "ignored": "ignored"}
 
@@ -110,10 +110,10 @@ def _evaluate_val(
 ) -> "tuple[KittiEvaluation, str]":
     """The evaluation on the val frames, and what to say of it."""
     from curate.errors import WorkspaceError
-    from pipelines.evaluation import detect_val, stored_val, val_objects
-    from pipelines.progress import Bar
-    from pipelines.rounds import newest_checkpoint
-    from pipelines.stored_evaluation import store_evaluation
+    from pipelines.assessment.evaluation import detect_val, stored_val, val_objects
+    from pipelines.assessment.stored_evaluation import store_evaluation
+    from pipelines.engine.progress import Bar
+    from pipelines.engine.rounds import newest_checkpoint
 
     if round_number is not None:
         source = f"round {round_number}"
@@ -138,8 +138,8 @@ def _compare(
     labels: "Sequence[KittiObjects]", results: "Sequence[KittiObjects]"
 ) -> "KittiEvaluation":
     """The evaluation; says what takes so long where it must be compiled first."""
-    from curate.compiled import is_compiled
     from curate.evaluation import kitti_ap, kitti_matching
+    from curate.geometry.compiled import is_compiled
 
     kitti_ap.check_frames(labels, results)  # a fault is told alone
     if not is_compiled(kitti_matching.tally):

@@ -26,7 +26,7 @@ def explain(
 
     Example: curate explain 000008 0
     """
-    from pipelines.explanation import explain_label
+    from pipelines.reports.explanation import explain_label
 
     opened = open_workspace(workspace)
     found = explain_label(opened, frame, k, round_number, policy or opened.config.run.method)

@@ -34,9 +34,9 @@ def export(
 
     Example: curate export --format sqlite
     """
-    from pipelines.labels import weighted_round
+    from pipelines.engine.rounds import open_round
+    from pipelines.labels.by_frame import weighted_round
     from pipelines.registry import EXPORTERS
-    from pipelines.rounds import open_round
     from pipelines.stages.export import export_as
 
     opened = open_workspace(workspace)

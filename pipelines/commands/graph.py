@@ -12,7 +12,7 @@ def graph(
 
     Example: curate graph
     """
-    from pipelines.graph import as_mermaid, as_text
+    from pipelines.engine.graph import as_mermaid, as_text
 
     typer.echo(as_mermaid() if mermaid else as_text())
 

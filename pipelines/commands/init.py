@@ -63,8 +63,8 @@ def init(
     Example: curate init work --root data/simulated --labeled 0.06 --segmenter simulated
     """
     from curate.errors import ConfigError
-    from pipelines.config import change_setting, make_config
-    from pipelines.setup import initialise
+    from pipelines.workspace.config import change_setting, make_config
+    from pipelines.workspace.setup import initialise
 
     if not root.is_dir():
         raise ConfigError(f"--root {root}: no such folder")

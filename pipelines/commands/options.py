@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 if TYPE_CHECKING:
-    from pipelines.runner import Report
-    from pipelines.workspace import Workspace
+    from pipelines.engine.runner import Report
+    from pipelines.workspace.workspace import Workspace
 
 WorkspaceOption = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads this form on every Python
@@ -54,7 +54,7 @@ def open_workspace(
     threads: int | None = None,
 ) -> "Workspace":
     """The workspace, with what the command line changes for this run."""
-    from pipelines.workspace import Workspace
+    from pipelines.workspace.workspace import Workspace
 
     workspace = Workspace.open(folder)
     changes: dict[str, Any] = {}

@@ -21,7 +21,7 @@ def pretrain(
 
     Example: curate pretrain
     """
-    from pipelines.progress import Bar
+    from pipelines.engine.progress import Bar
     from pipelines.stages.pretrain import pretrain as run
 
     report = run(open_workspace(workspace, threads=threads), Bar())

@@ -41,8 +41,8 @@ def query(
     Example: curate query "SELECT frame, k, weight FROM weighted_labels WHERE weight > 0.5"
     """
     from curate.errors import ConfigError
-    from pipelines.asking import ask
-    from pipelines.named_queries import find_query, named_queries
+    from pipelines.queries.named_queries import find_query, named_queries
+    from pipelines.queries.run_query import ask
 
     form = "json" if as_json else "csv" if as_csv else form
     if form not in FORMATS:
@@ -71,7 +71,7 @@ def _database(file: Path | None, workspace: Path | None) -> "URL":
     from sqlalchemy import URL
 
     from curate.errors import ConfigError
-    from pipelines.workspace import database_url
+    from pipelines.workspace.workspace import database_url
 
     if file is None:
         return database_url(workspace)

@@ -30,7 +30,7 @@ def report(
 
     Example: curate report --round 2
     """
-    from pipelines.report import write_report
+    from pipelines.reports.report import write_report
 
     path = write_report(open_workspace(workspace), round_number, policy)
     if as_json:

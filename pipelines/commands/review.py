@@ -15,7 +15,7 @@ from pipelines.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from pipelines.review.taking_back import Taken
+    from pipelines.review.importing import Taken
 
 group = typer.Typer(
     name="review",
@@ -58,10 +58,10 @@ def export_review(
 
     Example: curate review export to-review --count 50 --category Pedestrian,Cyclist
     """
-    from pipelines.progress import Bar
+    from pipelines.engine.progress import Bar
     from pipelines.registry import EDITORS
-    from pipelines.review.asking import Wish, make_sheet
-    from pipelines.review.handing_out import hand_out
+    from pipelines.review.exporting import hand_out
+    from pipelines.review.selection import Wish, make_sheet
 
     editor = EDITORS.build(form, offered={}, options={})
     opened = open_workspace(workspace)
@@ -119,7 +119,7 @@ def import_review(
 
     Example: curate review import to-review --dry-run
     """
-    from pipelines.review.taking_back import take_back
+    from pipelines.review.importing import take_back
 
     taken = take_back(
         open_workspace(workspace),
@@ -142,7 +142,7 @@ def list_reviews(workspace: WorkspaceOption = None, as_json: JsonOption = False)
 
     Example: curate review list
     """
-    from pipelines.review.handing_out import reviews
+    from pipelines.review.exporting import reviews
 
     rows = reviews(open_workspace(workspace))
     if as_json:
@@ -170,7 +170,7 @@ def clear_reviews(
     Example: curate review clear --frames 000012,000017
     """
     from curate.errors import ConfigError
-    from pipelines.review.taking_back import clear
+    from pipelines.review.importing import clear
 
     if not (reviews or frames or everything):
         raise ConfigError("clear: name reviews, --frames, or --all")

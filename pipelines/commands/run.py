@@ -40,9 +40,9 @@ def run(
     """
     from dataclasses import replace
 
-    from pipelines.methods import with_method
-    from pipelines.progress import Bar
-    from pipelines.schedule import run_all
+    from pipelines.engine.progress import Bar
+    from pipelines.engine.schedule import run_all
+    from pipelines.stages.methods import with_method
 
     opened = open_workspace(workspace, executor, workers)
     if method is not None:

@@ -25,8 +25,8 @@ def simulate(
 
     Example: curate simulate data/simulated --frames 400 --seed 0
     """
-    from curate.datasets.synthetic import simulate as run
-    from pipelines.progress import Bar, reaching
+    from curate.simulation import simulate as run
+    from pipelines.engine.progress import Bar, reaching
 
     with Bar().track("simulate", frames) as advance:
         shown = reaching(advance)

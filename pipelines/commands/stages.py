@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from pipelines.commands.options import end, open_workspace, print_report
 
 if TYPE_CHECKING:
-    from pipelines.workspace import Workspace
+    from pipelines.workspace.workspace import Workspace
 
 
 def run_frame_command(
@@ -22,12 +22,12 @@ def run_frame_command(
 ) -> None:
     """Runs frame stages for a split; None stands for the configured priors."""
     from curate.errors import ConfigError
-    from pipelines.progress import Bar
+    from pipelines.engine.progress import Bar
+    from pipelines.engine.rounds import open_round
+    from pipelines.engine.runner import open_executor, run_frames
+    from pipelines.engine.stage import FrameStage
     from pipelines.round import stage
-    from pipelines.rounds import open_round
-    from pipelines.runner import open_executor, run_frames
-    from pipelines.stage import FrameStage
-    from pipelines.workspace import SPLITS
+    from pipelines.workspace.workspace import SPLITS
 
     workspace = open_workspace(folder, executor, workers)
     priors = workspace.config.run.priors
@@ -58,11 +58,11 @@ def run_round_command(
     as_json: bool,
 ) -> None:
     """Runs a round stage for a policy."""
-    from pipelines.progress import Bar
+    from pipelines.engine.progress import Bar
+    from pipelines.engine.rounds import open_round
+    from pipelines.engine.runner import run_round
+    from pipelines.engine.stage import RoundStage
     from pipelines.round import stage
-    from pipelines.rounds import open_round
-    from pipelines.runner import run_round
-    from pipelines.stage import RoundStage
 
     found = stage(name)
     if not isinstance(found, RoundStage):

@@ -22,7 +22,7 @@ def status(
 
     Example: curate status --failed
     """
-    from pipelines.overview import failed_frames, overview
+    from pipelines.reports.status import failed_frames, overview
 
     opened = open_workspace(workspace)
     if failed:

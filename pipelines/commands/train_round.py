@@ -52,8 +52,8 @@ def train_round(
 
 def _remember(folder: Path | None, policy: str | None, told: Mapping[str, str]) -> None:
     """Writes how the next teacher was trained into curate.toml, where later rounds look."""
-    from pipelines.config_file import change_settings
-    from pipelines.workspace import CONFIG_NAME, Workspace
+    from pipelines.workspace.config_file import change_settings
+    from pipelines.workspace.workspace import CONFIG_NAME, Workspace
 
     if not told:
         return

@@ -49,8 +49,8 @@ def view(
     Example: curate view 000008 --round 1 --policy pspsl --output 000008.png
     """
     from curate.errors import ConfigError
-    from pipelines.frame_boxes import chosen_round, labeled_by
-    from pipelines.pictures import draw_view
+    from pipelines.labels.of_one_frame import chosen_round, labeled_by
+    from pipelines.reports.pictures import draw_view
 
     opened = open_workspace(workspace)
     if bool(frames) == every:
@@ -61,7 +61,7 @@ def view(
     if output is not None and (recording is not None or len(names) > 1):
         raise ConfigError("--output is for the picture of one frame; leave it out")
     if recording is not None:
-        from pipelines.recording import record_frames
+        from pipelines.reports.recording import record_frames
 
         path = record_frames(opened, names, number, method, recording)
         paths, found = [path], {"recording": str(path), "frames": len(names)}

@@ -10,8 +10,8 @@ from curate.exporters.label_file import LabelFileFrames
 from curate.firewall.duplicates import HeadHashes, SplitFile, find_duplicates
 from db import bulk
 from pipelines.firewall.finding import Finding
-from pipelines.firewall.record import SplitRecord
-from pipelines.workspace import Workspace, sha256
+from pipelines.workspace.split_record import SplitRecord
+from pipelines.workspace.workspace import Workspace, sha256
 
 _HASHES = "reports/.file-heads.json"
 _AGAIN = "delete it and run `curate export` again"

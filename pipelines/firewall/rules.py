@@ -7,10 +7,10 @@ from curate.errors import DataError
 from curate.exporters.label_file import LabelFileFrames, read_frames
 from pipelines.firewall.files import duplicates, label_files, object_bank
 from pipelines.firewall.finding import Finding, refuse
-from pipelines.firewall.record import SplitRecord
 from pipelines.firewall.splits import recorded_splits, sequences_apart, unchanged_lists
 from pipelines.firewall.truth import copied_truth, predicted_rounds, stored_truth
-from pipelines.workspace import Workspace
+from pipelines.workspace.split_record import SplitRecord
+from pipelines.workspace.workspace import Workspace
 
 
 def check(workspace: Workspace) -> Iterator[Finding]:

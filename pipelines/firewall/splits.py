@@ -4,8 +4,8 @@ from curate.datasets.base import sequences_of
 from curate.exporters.base import named
 from curate.firewall.sequences import straddling
 from pipelines.firewall.finding import Finding
-from pipelines.firewall.record import SplitRecord, changed_lists
-from pipelines.workspace import Workspace
+from pipelines.workspace.split_record import SplitRecord, changed_lists
+from pipelines.workspace.workspace import Workspace
 
 
 def recorded_splits(record: SplitRecord) -> Finding:

@@ -5,14 +5,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from sqlalchemy import func, select
 
-from curate.batches import batched
 from curate.errors import DataError
 from curate.exporters.base import named
+from curate.files.batches import batched
 from curate.firewall.copied_truth import copied_boxes
 from db import bulk
 from pipelines.firewall.finding import Finding
-from pipelines.firewall.record import SplitRecord
-from pipelines.workspace import Workspace
+from pipelines.workspace.split_record import SplitRecord
+from pipelines.workspace.workspace import Workspace
 
 # Before a command, so many frames are compared with label files besides those with a score of 1.
 _SAMPLED_FRAMES = 256

@@ -8,7 +8,7 @@ from typing import Any
 
 from curate.errors import ConfigError
 from pipelines.serving import descriptions
-from pipelines.workspace import Workspace
+from pipelines.workspace.workspace import Workspace
 
 _SETTINGS = {
     "max_returned_rows": 1000,

@@ -5,7 +5,7 @@ from typing import Any
 
 from curate.exporters.columns import WEIGHTED_LABELS
 from db.models import Base
-from pipelines.named_queries import named_queries
+from pipelines.queries.named_queries import named_queries
 
 # What a page adds to the meaning of a column.
 _LEADS_TO = {"frame": "its picture", "k": "why it has its weight"}

@@ -11,7 +11,7 @@ from typing import Any
 from datasette.database import Database
 
 from curate.errors import DatabaseError
-from pipelines.asking import may_read
+from pipelines.queries.run_query import may_read
 
 # What Datasette asks of a file to describe it; none of them changes anything without a value.
 _PRAGMAS = frozenset(

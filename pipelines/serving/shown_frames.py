@@ -10,9 +10,9 @@ from sqlalchemy import and_, select
 from curate.errors import ConfigError
 from curate.viewing.canvas import jpeg
 from db import bulk
-from pipelines.frame_boxes import chosen_round
-from pipelines.pictures import frame_picture
-from pipelines.workspace import Workspace
+from pipelines.labels.of_one_frame import chosen_round
+from pipelines.reports.pictures import frame_picture
+from pipelines.workspace.workspace import Workspace
 
 COLUMNS = (
     "k", "category", "x", "y", "score", "loss", "points", "points_threshold", "rho_diff",
@@ -103,7 +103,7 @@ class FramePages:
         Raises:
             WorkspaceError: the policy has not weighted it.
         """
-        from pipelines.explanation import explain_label
+        from pipelines.reports.explanation import explain_label
 
         found = explain_label(self._workspace, shown.name, k, shown.round, shown.policy)
         return found.as_text()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from curate.errors import ConfigError, WorkspaceError
 from pipelines.serving.application import Served
-from pipelines.workspace import Workspace
+from pipelines.workspace.workspace import Workspace
 
 WORKING, EXPORTED = "workspace", "labels"
 

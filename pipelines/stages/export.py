@@ -17,12 +17,12 @@ from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
+from pipelines.engine.progress import Progress
+from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.firewall.rules import enforce
-from pipelines.labels import refuse_bad_weights
-from pipelines.progress import Progress
-from pipelines.review.human_labels import fingerprint
-from pipelines.stage import Product, RoundContext, RoundJob, Settings
-from pipelines.workspace import Workspace, sha256
+from pipelines.labels.by_frame import refuse_bad_weights
+from pipelines.labels.human_labels import fingerprint
+from pipelines.workspace.workspace import Workspace, sha256
 
 CURRENT = "labels.sqlite"
 _CHUNK = 10_000

@@ -13,10 +13,10 @@ from curate.errors import ModelError
 from curate.frames import Frame
 from curate.geometry.projection import in_view
 from pipelines.assembly import open_detector
-from pipelines.config import Config
-from pipelines.executors.base import FrameJob, FrameRows
-from pipelines.stage import RoundContext, Settings
-from pipelines.workspace import Workspace, open_dataset, sha256
+from pipelines.engine.executors.base import FrameJob, FrameRows
+from pipelines.engine.stage import RoundContext, Settings
+from pipelines.workspace.config import Config
+from pipelines.workspace.workspace import Workspace, open_dataset, sha256
 
 _log = logging.getLogger(__name__)
 

@@ -4,16 +4,16 @@ from sqlalchemy import Connection
 
 from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError, WorkspaceError
-from pipelines import plan
+from pipelines.engine import plan
+from pipelines.engine.progress import Progress
+from pipelines.engine.rounds import is_trainable, register_checkpoint
+from pipelines.engine.runner import Report, run_once
+from pipelines.engine.stage import Product
 from pipelines.firewall.rules import enforce
-from pipelines.methods import METHODS
-from pipelines.progress import Progress
-from pipelines.rounds import is_trainable, register_checkpoint
-from pipelines.runner import Report, run_once
-from pipelines.stage import Product
 from pipelines.stages.export import register_label_file, write_label_file
+from pipelines.stages.methods import METHODS
 from pipelines.stages.train_round import train_with_progress, training_settings
-from pipelines.workspace import Workspace
+from pipelines.workspace.workspace import Workspace
 
 
 def pretrain(workspace: Workspace, progress: Progress) -> Report:

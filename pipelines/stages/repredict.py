@@ -13,11 +13,11 @@ from curate.detectors.base import RecordedViews
 from curate.errors import WorkspaceError
 from curate.geometry.similarity import Similarity
 from pipelines.assembly import consistency_settings
-from pipelines.config import RepredictSection
-from pipelines.executors.base import FrameJob, FrameRows
-from pipelines.stage import RoundContext, Settings
+from pipelines.engine.executors.base import FrameJob, FrameRows
+from pipelines.engine.stage import RoundContext, Settings
 from pipelines.stages.predict import Predict, checked, prediction_rows, visible
-from pipelines.workspace import Workspace
+from pipelines.workspace.config import RepredictSection
+from pipelines.workspace.workspace import Workspace
 
 View = tuple[Similarity, Detections]
 

@@ -17,11 +17,11 @@ from curate.priors.base import Measured, PriorEvidence, columns
 from curate.priors.points import learn_thresholds
 from db import bulk
 from pipelines.assembly import open_prior, point_settings, segmenter_path
-from pipelines.config import Config
-from pipelines.executors.base import FrameJob, FrameRows
+from pipelines.engine.executors.base import FrameJob, FrameRows
+from pipelines.engine.stage import FrameStage, Recall, RoundContext, Settings
 from pipelines.registry import PRIORS
-from pipelines.stage import FrameStage, Recall, RoundContext, Settings
-from pipelines.workspace import Workspace, glance, open_dataset, sha256
+from pipelines.workspace.config import Config
+from pipelines.workspace.workspace import Workspace, glance, open_dataset, sha256
 
 # Where evidence is stored, by the column of its trust; at most one prior fills each.
 TABLES = {"rho_diff": "point_prior", "rho_anno": "semantic_prior"}

@@ -10,11 +10,11 @@ from sqlalchemy import Connection
 from curate.weighting.base import Evidence, Policy, Weights
 from db import bulk, weight_index
 from pipelines.assembly import open_policy
-from pipelines.evidence import LabelKeys, read_evidence, read_memory, solved_fingerprint
-from pipelines.progress import Progress
-from pipelines.review.human_labels import refresh_matches
-from pipelines.stage import Product, RoundContext, RoundJob, Settings
-from pipelines.workspace import Workspace
+from pipelines.engine.progress import Progress
+from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
+from pipelines.labels.evidence import LabelKeys, read_evidence, read_memory, solved_fingerprint
+from pipelines.labels.human_labels import refresh_matches
+from pipelines.workspace.workspace import Workspace
 
 TRUSTED = 0.5  # a label of a greater weight counts as trusted
 

@@ -10,12 +10,12 @@ from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError
 from curate.frames import Frame
 from pipelines.assembly import device
-from pipelines.methods import Method, method_of
-from pipelines.progress import Progress, reaching
-from pipelines.rounds import is_trainable, register_checkpoint
-from pipelines.stage import Product, RoundContext, RoundJob, Settings
+from pipelines.engine.progress import Progress, reaching
+from pipelines.engine.rounds import is_trainable, register_checkpoint
+from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
-from pipelines.workspace import Workspace
+from pipelines.stages.methods import Method, method_of
+from pipelines.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
     from curate.training.settings import TrainingReport, TrainingSettings
@@ -73,7 +73,7 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
 
     if workspace.config.train.command is not None:
         # It asks the graph of stages, which this module is a part of.
-        from pipelines.external_trainer import train_externally
+        from pipelines.stages.external_trainer import train_externally
 
         train_externally(workspace, job, path)
         return Product(f"{workspace.relative(path)}, by your trainer", write)

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.benchmark(timer=cpu_seconds_of_children)
 GROUP = "First answer of the kernels, a whole Python process each"
 IMPORTS = """
 import numpy as np
-from curate.datasets.kitti_labels import KittiObjects
+from curate.datasets.kitti.labels import KittiObjects
 from curate.evaluation.kitti_ap import evaluate
 from curate.geometry.nms import nms_bev
 from curate.geometry.overlap import bev_iou, iou_3d, overlapping_pairs

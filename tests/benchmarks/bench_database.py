@@ -12,11 +12,11 @@ from sqlalchemy import insert, select
 from db import bulk
 from db.columns import reading_columns
 from db.session import BUSY_TIMEOUT_MS, Database
-from pipelines.config import make_config
-from pipelines.progress import Silent
-from pipelines.stage import RoundContext, RoundJob, Teacher
+from pipelines.engine.progress import Silent
+from pipelines.engine.stage import RoundContext, RoundJob, Teacher
 from pipelines.stages import solve
-from pipelines.workspace import Workspace
+from pipelines.workspace.config import make_config
+from pipelines.workspace.workspace import Workspace
 
 FRAMES, EACH = 2000, 50
 ROWS = FRAMES * EACH

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from benchmarks.measuring import cpu_seconds, measure
 from benchmarks.scenes import kitti_frames
+from support.paths import ROOT
 
-from curate.datasets.kitti_labels import write_objects
+from curate.datasets.kitti.labels import write_objects
 from curate.evaluation.kitti_ap import evaluate
 from curate.evaluation.kitti_folders import read_folders
 
@@ -16,7 +17,7 @@ pytestmark = pytest.mark.benchmark(timer=cpu_seconds)
 
 FRAMES = 3769
 GROUP = f"KITTI AP: {FRAMES:,} frames, 3 categories, all metrics, R11 and R40"
-EXAMPLES = Path(__file__).parents[3] / "shared" / "kitti_eval"
+EXAMPLES = ROOT.parent / "shared" / "kitti_eval"
 
 
 @pytest.fixture(scope="module")

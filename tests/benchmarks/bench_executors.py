@@ -6,15 +6,15 @@ import time
 import pytest
 from benchmarks.measuring import measure
 
-from curate.datasets.synthetic import simulate
 from curate.detections import CATEGORIES
-from pipelines.config import make_config
-from pipelines.progress import Silent
+from curate.simulation import simulate
+from pipelines.engine.progress import Silent
+from pipelines.engine.rounds import open_round
+from pipelines.engine.runner import open_executor, run_frames
 from pipelines.round import stage
-from pipelines.rounds import open_round
-from pipelines.runner import open_executor, run_frames
-from pipelines.setup import initialise
-from pipelines.workspace import Workspace
+from pipelines.workspace.config import make_config
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import Workspace
 
 pytestmark = pytest.mark.benchmark(timer=time.perf_counter)
 

@@ -8,19 +8,19 @@ import pytest
 from benchmarks.measuring import cpu_seconds, measure
 from benchmarks.scenes import SIDES, sweep
 
-from curate.datasets.kitti import write_calibration
-from curate.datasets.kitti_labels import from_annotations, write_objects
+from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.labels import from_annotations, write_objects
 from curate.detections import CATEGORIES, Annotations, Detections, as_categories
 from curate.frames import Calibration
 from curate.segmenters.base import SemanticMap
-from pipelines.config import make_config
-from pipelines.executors.serial import SerialExecutor
-from pipelines.progress import Silent
+from pipelines.engine.executors.serial import SerialExecutor
+from pipelines.engine.progress import Silent
+from pipelines.engine.rounds import open_round
+from pipelines.engine.runner import run_frames, run_round
 from pipelines.round import stage
-from pipelines.rounds import open_round
-from pipelines.runner import run_frames, run_round
-from pipelines.setup import initialise
-from pipelines.workspace import Workspace
+from pipelines.workspace.config import make_config
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import Workspace
 
 pytestmark = pytest.mark.benchmark(timer=cpu_seconds)
 

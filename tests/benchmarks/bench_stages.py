@@ -5,16 +5,16 @@ import pytest
 from benchmarks.measuring import cpu_seconds, measure
 from benchmarks.scenes import guesses_around
 
-from curate.datasets.synthetic import simulate
 from curate.detectors.pillars.encoding import encode_points
 from curate.detectors.pillars.presets import PRESETS
+from curate.simulation import simulate
 from curate.weighting.base import Age, Evidence
 from curate.weighting.self_paced import PSPSL
-from pipelines.config import make_config
-from pipelines.executors.base import FrameJob
-from pipelines.setup import initialise
-from pipelines.stage import RoundContext, Teacher
+from pipelines.engine.executors.base import FrameJob
+from pipelines.engine.stage import RoundContext, Teacher
 from pipelines.stages import predict, repredict, score
+from pipelines.workspace.config import make_config
+from pipelines.workspace.setup import initialise
 
 pytestmark = pytest.mark.benchmark(timer=cpu_seconds)
 

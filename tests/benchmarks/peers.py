@@ -15,7 +15,7 @@ Pairs = tuple[np.ndarray, np.ndarray]
 
 def count_with_open3d(points: np.ndarray, boxes: np.ndarray) -> Counter:
     """Open3D's oriented bounding boxes, one after the other."""
-    from curate.datasets.open3d_loader import load
+    from curate.simulation.open3d_loader import load
 
     open3d = load()
     cloud = open3d.utility.Vector3dVector(points[:, :3].astype(np.float64))

@@ -4,9 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from kitti_scenes import random_frames, to_objects
+from support.kitti_scenes import random_frames, to_objects
 
-from curate.datasets.kitti_labels import KittiObjects, read_objects
+from curate.datasets.kitti.labels import KittiObjects, read_objects
 from curate.detections import CATEGORIES, Annotations, Detections, as_categories
 
 SIDES = np.array([[4.0, 1.7, 1.5], [0.8, 0.6, 1.75], [1.8, 0.6, 1.7]])

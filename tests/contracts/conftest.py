@@ -1,9 +1,9 @@
 """Small frames for extensions to work on."""
 
 import pytest
-from toys import write_toy_kitti
+from support.toys import write_toy_kitti
 
-from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.frames import Frame
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from contracts.samples import assert_one_line, assert_same, sample_of
-from dataset_layouts import write_toy_folder, write_toy_raw
-from nuscenes_scenes import write_nuscenes
-from toys import write_toy_kitti
+from support.dataset_layouts import write_toy_folder, write_toy_raw
+from support.nuscenes_scenes import write_nuscenes
+from support.toys import write_toy_kitti
 
 from curate.errors import DataError
 from curate.frames import Frame

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from contracts.samples import assert_one_line, assert_same, sample_of
-from tiny_onnx import tiny_detector
+from support.tiny_onnx import tiny_detector
 
 from curate.detections import CATEGORIES, Detections
 from curate.detectors.base import RecordedViews

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from contracts.samples import assert_one_line, sample_of
-from exported import toy_frame
-from reviews import CYCLIST, small_sheet
+from support.exported import toy_frame
+from support.reviews import CYCLIST, small_sheet
 
 from curate.errors import DataError
 from curate.frames import Frame

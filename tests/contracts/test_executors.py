@@ -5,19 +5,19 @@ from pathlib import Path
 
 import pytest
 from contracts.samples import assert_one_line
-from frame_functions import Deadly, Square
-from stored_rows import dump
-from toys import toy_document, write_toy_kitti
+from support.frame_functions import Deadly, Square
+from support.stored_rows import dump
+from support.toys import toy_document, write_toy_kitti
 
 from curate.errors import CurateError, ModelError
-from pipelines.config import make_config
-from pipelines.executors.base import Executor, FrameJob
-from pipelines.executors.serial import SerialExecutor
-from pipelines.progress import Silent
+from pipelines.engine.executors.base import Executor, FrameJob
+from pipelines.engine.executors.serial import SerialExecutor
+from pipelines.engine.progress import Silent
+from pipelines.engine.schedule import run_all
 from pipelines.registry import EXECUTORS
-from pipelines.schedule import run_all
-from pipelines.setup import initialise
-from pipelines.workspace import Workspace
+from pipelines.workspace.config import make_config
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import Workspace
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +155,7 @@ def finished(home: Path, name: str, executor: str, workers: int) -> Workspace:
     ("name", "workers"),
     [
         *((name, workers) for name in sorted(EXECUTORS.classes) for workers in (1, 3)),
-        ("frame_functions:Shuffled", 1),
+        ("support.frame_functions:Shuffled", 1),
     ],
 )
 def test_the_rows_depend_on_nothing_but_the_seed(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from contracts.samples import assert_one_line, sample_of
 from scipy.spatial.transform import Rotation
-from toys import SIZES
+from support.toys import SIZES
 
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, DataError, LeakageError

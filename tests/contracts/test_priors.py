@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from contracts.samples import assert_same
-from toys import SIZES, ToySegmenter
+from support.toys import SIZES, ToySegmenter
 
 from curate.detections import CATEGORIES, Detections
 from curate.errors import ConfigError

@@ -15,10 +15,10 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from exported import BOXES, toy_labels
-from nuscenes_scenes import sample_token, write_nuscenes
-from reviews import small_sheet
-from toys import IMAGE_SIZE
+from support.exported import BOXES, toy_labels
+from support.nuscenes_scenes import sample_token, write_nuscenes
+from support.reviews import small_sheet
+from support.toys import IMAGE_SIZE
 
 from curate.datasets.nuscenes import NuScenesDataset
 from curate.exporters.coco import CocoExporter

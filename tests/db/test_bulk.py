@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from one_frame import add_one_frame
 from sqlalchemy import BigInteger, Float, Integer, cast, literal, select, text
+from support.one_frame import add_one_frame
 
 from curate.errors import DatabaseError
 from db import bulk, server_columns, weight_index

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
-from older_schema import downgrade
 from sqlalchemy import Connection, inspect
+from support.older_schema import downgrade
 
 from curate.errors import DatabaseError, LeakageError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from older_schema import downgrade
-from one_frame import add_one_frame
 from sqlalchemy import Connection, inspect, select
+from support.older_schema import downgrade
+from support.one_frame import add_one_frame
 
 from db import bulk, weight_index
 from db.session import Database

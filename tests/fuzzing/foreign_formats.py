@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from nuscenes_scenes import into_map, vehicle_pose, write_nuscenes
-from toys import IMAGE_SIZE, toy_calibration
+from support.nuscenes_scenes import into_map, vehicle_pose, write_nuscenes
+from support.toys import IMAGE_SIZE, toy_calibration
 
 from curate.frames import Frame
 

@@ -8,24 +8,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from dataset_layouts import write_cloud
-from exported import toy_labels
 from fuzzing.foreign_formats import FORMATS
-from toys import IMAGE_SIZE, toy_calibration
+from support.dataset_layouts import write_cloud
+from support.exported import toy_labels
+from support.toys import IMAGE_SIZE, toy_calibration
 
-from curate.datasets.clouds import read_cloud
-from curate.datasets.containment import check_frame_id
 from curate.datasets.folder import FolderDataset
-from curate.datasets.images import read_image, read_image_size
-from curate.datasets.kitti import (
+from curate.datasets.formats.clouds import read_cloud
+from curate.datasets.formats.containment import check_frame_id
+from curate.datasets.formats.images import read_image, read_image_size
+from curate.datasets.kitti.dataset import (
     read_calibration,
     read_drives,
     read_frame_list,
     read_points,
     write_calibration,
 )
-from curate.datasets.kitti_labels import read_objects, to_annotations, to_detections
-from curate.datasets.kitti_raw import read_raw_calibration
+from curate.datasets.kitti.labels import read_objects, to_annotations, to_detections
+from curate.datasets.kitti.raw import read_raw_calibration
 from curate.detectors.recorded.answers import Reading
 from curate.detectors.recorded.formats import read_answers
 from curate.detectors.recorded.table import TableRecord
@@ -168,13 +168,13 @@ def _read_folder(path: Path) -> None:
 
 
 def _config(path: Path) -> None:
-    from pipelines.config import Config, write_config
+    from pipelines.workspace.config import Config, write_config
 
     write_config(path, Config.model_validate({"dataset": {"root": "data"}}))
 
 
 def _read_config(path: Path) -> None:
-    from pipelines.workspace import Workspace
+    from pipelines.workspace.workspace import Workspace
 
     read = Workspace.open(path.parent)
     read.database.close()
@@ -234,7 +234,7 @@ def _read_checkpoint(path: Path) -> None:
 
 
 def _onnx(path: Path) -> None:
-    from tiny_onnx import tiny_detector
+    from support.tiny_onnx import tiny_detector
 
     tiny_detector(path)
 

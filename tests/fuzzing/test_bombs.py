@@ -6,11 +6,11 @@ from pathlib import Path
 
 from fuzzing.bombs import BOMBS
 from fuzzing.targets import TARGETS
-from process_tree import forget_peak, peak
+from support.paths import TESTS
+from support.process_tree import forget_peak, peak
 
 # Above what Python with its libraries takes by itself.
 MOST_KIB = 300 << 10
-TESTS = Path(__file__).parent.parent
 
 
 def test_every_bomb_is_refused_and_none_fills_the_memory(tmp_path: Path) -> None:

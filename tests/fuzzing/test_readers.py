@@ -11,7 +11,7 @@ from fuzzing.mutations import mutated
 from fuzzing.targets import TARGETS, Target
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from process_tree import forget_peak, peak
+from support.process_tree import forget_peak, peak
 
 # Few for each reader in the normal run; `make prove` tries many, `make fuzz` goes on.
 EXAMPLES, MANY = 60, 2_000

@@ -4,12 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from pipelines_cli import Curate, in_process
-from toys import toy_document
+from support.pipelines_cli import Curate, in_process
+from support.toys import toy_document
 
-from pipelines.config import make_config
-from pipelines.setup import initialise
-from pipelines.workspace import Workspace
+from pipelines.workspace.config import make_config
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import Workspace
 
 
 @pytest.fixture

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pipelines_cli import Curate
+from support.pipelines_cli import Curate
 
-from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import ConfigError, CurateError, DataError, FramesFailed
 from pipelines.assembly import SHIPPED_SEGMENTER
-from pipelines.progress import Silent
-from pipelines.schedule import run_all
+from pipelines.engine.progress import Silent
+from pipelines.engine.schedule import run_all
 from pipelines.stages import predict
-from pipelines.workspace import Workspace
+from pipelines.workspace.workspace import Workspace
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 

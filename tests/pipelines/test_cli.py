@@ -10,7 +10,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from pipelines_cli import Curate
+from support.pipelines_cli import Curate
 
 from curate.errors import ConfigError, DataError, FramesFailed, WorkspaceError
 from pipelines.commands.options import open_workspace
@@ -26,8 +26,8 @@ def made(curate: Curate, tmp_path: Path, toy_kitti: Path, monkeypatch: pytest.Mo
     folder = tmp_path / "work"
     code, out, err = curate(
         "init", folder, "--root", toy_kitti, "--labeled", "0.25",
-        "--detector", "toys:ToyDetector", "--detector-path", weights,
-        "--segmenter", "toys:ToySegmenter", "--segmenter-path", weights,
+        "--detector", "support.toys:ToyDetector", "--detector-path", weights,
+        "--segmenter", "support.toys:ToySegmenter", "--segmenter-path", weights,
     )  # fmt: skip
     assert code == 0, err
     assert "2 labeled, 6 unlabeled and 4 val frames" in out
@@ -410,7 +410,7 @@ def test_a_category_without_ground_truth_warns_and_uses_the_fallback(
     folder = tmp_path / "fewer"
     curate(
         "init", folder, "--root", toy_kitti, "--labeled", "0.25",
-        "--detector", "toys:ToyDetector", "--detector-path", weights,
+        "--detector", "support.toys:ToyDetector", "--detector-path", weights,
     )  # fmt: skip
     code, _, _ = curate("run", "-w", folder)
     assert code == 0

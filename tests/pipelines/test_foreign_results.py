@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipelines_cli import Curate
+from support.pipelines_cli import Curate
 
-from curate.datasets.kitti import KittiDataset
-from curate.datasets.kitti_labels import from_detections, write_objects
+from curate.datasets.kitti.dataset import KittiDataset
+from curate.datasets.kitti.labels import from_detections, write_objects
 from curate.detections import Detections
 from curate.errors import ConfigError
 

@@ -6,7 +6,7 @@ import sqlite3
 from pathlib import Path
 
 import pytest
-from pipelines_cli import Curate
+from support.pipelines_cli import Curate
 
 pytestmark = pytest.mark.kitti
 

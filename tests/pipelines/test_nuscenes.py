@@ -7,15 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nuscenes_scenes import drawn_boxes, into_map, sample_token, vehicle_pose, write_nuscenes
-from pipelines_cli import Curate
+from support.nuscenes_scenes import (
+    drawn_boxes,
+    into_map,
+    sample_token,
+    vehicle_pose,
+    write_nuscenes,
+)
+from support.pipelines_cli import Curate
 
 from curate.datasets.nuscenes import NuScenesDataset
 from curate.errors import ConfigError, LeakageError
 from curate.geometry.similarity import Similarity
-from pipelines.audit_folds import open_folds
-from pipelines.setup import choose_split
-from pipelines.workspace import Workspace
+from pipelines.assessment.audit_folds import open_folds
+from pipelines.workspace.setup import choose_split
+from pipelines.workspace.workspace import Workspace
 
 SCENES = tuple(f"scene-{number:04d}" for number in (1, 2, 4, 5, 3, 12))
 STEPS = 3

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from curate.datasets.clouds import read_cloud
-from curate.datasets.containment import Boundary, check_frame_id
-from curate.datasets.images import read_image
+from curate.datasets.formats.clouds import read_cloud
+from curate.datasets.formats.containment import Boundary, check_frame_id
+from curate.datasets.formats.images import read_image
 from curate.datasets.nuscenes.annotations import AnnotationTable
 from curate.datasets.nuscenes.keyframes import TO_SENSOR_AXES, Keyframe, read_keyframes
 from curate.datasets.nuscenes.names import CATEGORIES

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curate.datasets.images import MOST_PIXELS
+from curate.datasets.formats.images import MOST_PIXELS
 from curate.datasets.nuscenes.tables import (
     Record,
     count,

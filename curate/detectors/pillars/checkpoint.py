@@ -14,9 +14,9 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from curate.atomic import replace_file
 from curate.detectors.pillars.presets import PRESETS, Preset
 from curate.errors import ModelError, first_line
+from curate.files.atomic import replace_file
 
 FORMAT = "curate-pillars"
 # Version 2 added the estimate of the IoU, version 3 measures heights from the ground.

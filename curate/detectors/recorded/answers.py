@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from curate.datasets.kitti_labels import KittiObjects
+from curate.datasets.kitti.labels import KittiObjects
 from curate.detections import Detections, as_categories
 from curate.errors import DataError, one_line
 from curate.frames import Calibration

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from curate.datasets.kitti_labels import KittiObjects, to_detections
+from curate.datasets.kitti.labels import KittiObjects, to_detections
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded.answers import Answer, Placed, Reading, as_detections
 from curate.detectors.recorded.formats import refuse_unknown_kind, tell_kind

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from curate.datasets.kitti_labels import KittiObjects, read_objects
+from curate.datasets.kitti.labels import KittiObjects, read_objects
 from curate.errors import DataError
 
 

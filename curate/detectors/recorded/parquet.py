@@ -22,8 +22,8 @@ from curate.detections import Detections
 from curate.detectors.recorded.answers import as_detections
 from curate.errors import DataError, one_line
 from curate.exporters.base import BOX_COLUMNS
+from curate.files.parquet import load_parquet
 from curate.geometry.similarity import Similarity
-from curate.parquet import load_parquet
 
 VIEW_COLUMNS = ("view", "flip_y", "rotation_rad", "scale")
 _BOXES = ("score", *BOX_COLUMNS)

@@ -21,10 +21,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from curate.batches import batched
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded.answers import LARGEST
 from curate.errors import DataError, one_line
+from curate.files.batches import batched
 from curate.geometry.similarity import Similarity, wrap_angle
 
 View = tuple[Similarity, Detections]

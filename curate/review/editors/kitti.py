@@ -12,8 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from curate.datasets.kitti import write_calibration
-from curate.datasets.kitti_labels import (
+from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.labels import (
     DONT_CARE,
     RESULT_FIELDS,
     from_detections,

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset_layouts import DRIVE, write_cloud, write_toy_folder, write_toy_raw
-from toys import write_toy_kitti
+from support.dataset_layouts import DRIVE, write_cloud, write_toy_folder, write_toy_raw
+from support.toys import write_toy_kitti
 
-from curate.datasets.clouds import read_cloud
 from curate.datasets.folder import FolderDataset
-from curate.datasets.kitti import KittiDataset, read_calibration
-from curate.datasets.kitti_raw import KittiRawDataset, read_raw_calibration
+from curate.datasets.formats.clouds import read_cloud
+from curate.datasets.kitti.dataset import KittiDataset, read_calibration
+from curate.datasets.kitti.raw import KittiRawDataset, read_raw_calibration
 from curate.errors import DataError
 
 LAYOUTS = {

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nuscenes_scenes import (
+from support.nuscenes_scenes import (
     IMAGE_SIZE,
     MOUNTED,
     QUARTER,

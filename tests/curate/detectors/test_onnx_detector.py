@@ -4,8 +4,8 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from tiny_onnx import tiny_detector
-from toys import toy_calibration
+from support.tiny_onnx import tiny_detector
+from support.toys import toy_calibration
 
 from curate.detections import CATEGORIES
 from curate.detectors.onnx import OnnxDetector

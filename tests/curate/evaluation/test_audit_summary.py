@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-from audited import many_labels, six_labels, small_audit
+from support.audited import many_labels, six_labels, small_audit
 
 from curate.evaluation.audit import audit
 from curate.evaluation.audit_summary import as_numbers, in_words

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toys import toy_calibration
+from support.toys import toy_calibration
 
-from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.detections import CATEGORIES, Detections, as_categories
 from curate.detectors.recorded import RecordedDetector
 from curate.evaluation.examination import examine_detections, examine_frame

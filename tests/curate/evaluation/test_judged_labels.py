@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from audited import six_labels
+from support.audited import six_labels
 
 from curate.detections import Annotations, Detections, as_categories
 from curate.evaluation.judged_labels import (

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kitti_scenes import car, random_frames, to_objects
 from oracles import kitti_devkit
+from support.kitti_scenes import car, random_frames, to_objects
 
-from curate.datasets.kitti_labels import KittiObjects
+from curate.datasets.kitti.labels import KittiObjects
 from curate.errors import DataError
 from curate.evaluation.kitti_ap import FIGURES, evaluate, score_thresholds
 from curate.evaluation.kitti_folders import read_folders

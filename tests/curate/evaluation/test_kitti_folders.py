@@ -1,9 +1,9 @@
 """Folders of label and result files."""
 
 import pytest
-from kitti_scenes import car, to_objects
+from support.kitti_scenes import car, to_objects
 
-from curate.datasets.kitti_labels import write_objects
+from curate.datasets.kitti.labels import write_objects
 from curate.errors import DataError
 from curate.evaluation.kitti_folders import read_folders
 

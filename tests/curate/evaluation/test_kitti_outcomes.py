@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kitti_scenes import car, random_frames, to_objects
 from oracles.kitti_devkit import Frame
+from support.kitti_scenes import car, random_frames, to_objects
 
-from curate.datasets.kitti_labels import KittiObjects
+from curate.datasets.kitti.labels import KittiObjects
 from curate.errors import ConfigError
 from curate.evaluation.kitti_ap import evaluate
 from curate.evaluation.kitti_outcomes import object_outcomes

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from kitti_scenes import car, to_objects
+from support.kitti_scenes import car, to_objects
 
 from curate.evaluation.object_statistics import object_statistics
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from curate.consistency import consistency
-from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.detections import Detections
 from curate.detectors.recorded import RecordedDetector
 from curate.evaluation.reliability import JudgeSettings, auroc, judge, weighted_precision

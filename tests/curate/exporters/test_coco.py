@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from exported import SCORES, WEIGHTS, toy_labels
+from support.exported import SCORES, WEIGHTS, toy_labels
 
 from curate.exporters.coco import CocoExporter
 

@@ -2,7 +2,7 @@
 
 import csv
 
-from exported import toy_labels
+from support.exported import toy_labels
 
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from curate.exporters.comma_separated import CsvExporter

@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from toys import IMAGE_SIZE, toy_calibration
+from support.toys import IMAGE_SIZE, toy_calibration
 
-from curate.datasets.kitti_labels import read_objects, to_detections
+from curate.datasets.kitti.labels import read_objects, to_detections
 from curate.detections import Detections
 from curate.errors import ConfigError, DataError
 from curate.exporters.kitti import WeightedFrame, export_kitti

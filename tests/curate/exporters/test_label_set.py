@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from exported import toy_labels
+from support.exported import toy_labels
 
 from curate.errors import DataError
 

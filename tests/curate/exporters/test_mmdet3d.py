@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from exported import TRUE_BOX, WEIGHTS, toy_labels
+from support.exported import TRUE_BOX, WEIGHTS, toy_labels
 
 from curate.exporters.mmdet3d import MMDet3DExporter
 

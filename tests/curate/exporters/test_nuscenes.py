@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exported import BOXES, SCORES, toy_frame, toy_labels
-from nuscenes_scenes import into_map, sample_token, vehicle_pose, write_nuscenes
+from support.exported import BOXES, SCORES, toy_frame, toy_labels
+from support.nuscenes_scenes import into_map, sample_token, vehicle_pose, write_nuscenes
 
 from curate.datasets.nuscenes import NuScenesDataset
 from curate.detectors.recorded import RecordedDetector

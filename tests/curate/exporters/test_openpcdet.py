@@ -5,7 +5,7 @@ import pickletools
 
 import numpy as np
 import pytest
-from exported import BOXES, SCORES, TRUE_BOX, WEIGHTS, toy_labels
+from support.exported import BOXES, SCORES, TRUE_BOX, WEIGHTS, toy_labels
 
 from curate.exporters.openpcdet import OpenPCDetExporter
 

@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from exported import toy_labels
+from support.exported import toy_labels
 
 from curate.errors import ConfigError, DataError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS

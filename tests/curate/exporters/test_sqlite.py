@@ -6,7 +6,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from exported import toy_labels
+from support.exported import toy_labels
 
 from curate.errors import DataError, LeakageError
 from curate.exporters.base import LabelFileDescription

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exported import BOXES, SCORES, WEIGHTS, toy_labels
+from support.exported import BOXES, SCORES, WEIGHTS, toy_labels
 
 from curate.errors import DataError
 from curate.exporters.st3d import ST3DExporter

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from strategies import box_arrays
+from support.strategies import box_arrays
 
 from curate.geometry.boxes import bev_corners, box_corners
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import suppression
-from strategies import box_arrays
+from support.strategies import box_arrays
 
 from curate.geometry.nms import nms_bev
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import clipping
-from strategies import angles, box_arrays
+from support.strategies import angles, box_arrays
 
 from curate.geometry.overlap import bev_iou, iou_3d, overlapping_pairs, paired_iou_3d
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.containment import contains, first_box
-from strategies import box_arrays
+from support.strategies import box_arrays
 
 from curate.geometry.points_in_boxes import (
     box_of_points,

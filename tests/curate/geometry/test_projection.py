@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from strategies import box_arrays
+from support.strategies import box_arrays
 
-from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.frames import Calibration
 from curate.geometry.boxes import box_corners
 from curate.geometry.projection import image_rectangles, in_view, project_points

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import box_arrays, similarities
+from support.strategies import box_arrays, similarities
 
 from curate.errors import ConfigError
 from curate.geometry.overlap import iou_3d

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from reviews import CAR, CATEGORIES, WALKER, small_sheet
+from support.reviews import CAR, CATEGORIES, WALKER, small_sheet
 
 from curate.errors import DataError
 from curate.review.answer import Answer, EditedBox, check_boxes, read_answer

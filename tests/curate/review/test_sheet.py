@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from reviews import small_sheet
+from support.reviews import small_sheet
 
 from curate.errors import DataError
 from curate.review.sheet import MANIFEST, read_sheet, write_sheet

@@ -1,14 +1,14 @@
 """Tests of the tables of semantic classes."""
 
 import re
-from pathlib import Path
 
 import pytest
+from support.paths import ROOT
 
-from curate.datasets.synthetic.scene import SEMANTIC_CLASSES
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError
 from curate.segmenters.classes import CLASS_MAPS, checked_classes, class_map
+from curate.simulation.scene import SEMANTIC_CLASSES
 
 
 @pytest.mark.parametrize("name", sorted(CLASS_MAPS))
@@ -47,7 +47,7 @@ def test_ids_that_no_map_can_hold_are_refused(one):
 
 def test_the_page_shows_the_tables():
     """docs/segmenters.md names the numbers that are built in."""
-    page = (Path(__file__).parents[3] / "docs" / "segmenters.md").read_text()
+    page = (ROOT / "docs" / "segmenters.md").read_text()
     numbers = r" \| ([\d, ]+)" * 3
     rows = re.findall(rf"^\| `([\w-]+)`.*?{numbers} \|$", page, re.MULTILINE)
     shown = {

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from oracles import run_lengths
-from toys import SIZES, toy_calibration
+from support.toys import SIZES, toy_calibration
 
 from curate.detections import Detections, as_categories
 from curate.errors import ConfigError, DataError

@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from toys import toy_calibration
+from support.toys import toy_calibration
 
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
@@ -298,7 +298,7 @@ def test_options_out_of_range_are_refused(tmp_path, options, message):
 
 def test_deeplab_finds_the_cars_of_a_real_frame(kitti_root):
     """Most pixels of each well visible labelled car are cars; the sky and the road are not."""
-    from curate.datasets.kitti import KittiDataset
+    from curate.datasets.kitti.dataset import KittiDataset
 
     dataset = KittiDataset(kitti_root)
     real, truth = dataset.read("000008", image=True), dataset.annotations("000008")

@@ -7,7 +7,7 @@ import onnx
 import pytest
 from contracts.samples import assert_one_line
 from onnx import TensorProto, helper, numpy_helper
-from toys import toy_calibration
+from support.toys import toy_calibration
 
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame

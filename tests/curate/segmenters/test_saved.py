@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from toys import toy_calibration
+from support.toys import toy_calibration
 
 from curate.errors import ConfigError, DataError
 from curate.frames import Frame

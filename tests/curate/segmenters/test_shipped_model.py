@@ -8,12 +8,12 @@ import onnxruntime
 import pytest
 
 import curate.segmenters
-from curate.datasets.images import decode_image
-from curate.datasets.kitti import KittiDataset
-from curate.datasets.synthetic import SEMANTIC_CLASSES, SEMANTIC_FOLDER, simulate
+from curate.datasets.formats.images import decode_image
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.segmenters.classes import class_map
 from curate.segmenters.onnx import OnnxSegmenter
-from curate.training.segmentation import (
+from curate.simulation import SEMANTIC_CLASSES, SEMANTIC_FOLDER, simulate
+from curate.simulation.segmentation import (
     TEST_SEED,
     TRAIN_SEED,
     SegmentationSettings,

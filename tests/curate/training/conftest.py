@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.exporters.base import LabelFileDescription
 from curate.exporters.sqlite import write_labels
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.detectors.pillars import PillarDetector
 from curate.detectors.pillars.checkpoint import load_checkpoint
 from curate.errors import ConfigError, DataError, ModelError

@@ -75,7 +75,7 @@ def test_titles_are_written():
 @pytest.mark.parametrize("frame_id", ["000008", "000023"])
 def test_real_frames(kitti_root, frame_id):
     """A crowded and a usual frame are drawn whole."""
-    from curate.datasets.kitti import KittiDataset
+    from curate.datasets.kitti.dataset import KittiDataset
     from curate.detectors.recorded import RecordedDetector
 
     dataset = KittiDataset(kitti_root)

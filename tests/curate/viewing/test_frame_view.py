@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from toys import toy_calibration
+from support.toys import toy_calibration
 
 from curate.errors import DataError
 from curate.frames import Frame

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from toys import toy_calibration
+from support.toys import toy_calibration
 
 from curate.geometry.boxes import box_corners
 from curate.geometry.projection import project_points

@@ -6,7 +6,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from toys import toy_calibration
+from support.toys import toy_calibration
 
 from curate.frames import Frame
 from curate.viewing.close_up import LabelShown, draw_close_up

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from audited import many_labels, six_labels, small_audit
+from support.audited import many_labels, six_labels, small_audit
 
 from curate.evaluation.audit import audit
 from curate.evaluation.judged_labels import JudgedLabels

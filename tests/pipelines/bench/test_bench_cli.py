@@ -10,23 +10,23 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
-from bench_results import made_up, make_bench
-from pipelines_cli import Curate
+from support.bench_results import made_up, make_bench
+from support.paths import ROOT
+from support.pipelines_cli import Curate
 
 from curate.errors import CellsFailed, ConfigError, DataError, WorkspaceError
 from db import bulk
-from pipelines import plan
 from pipelines.bench.cell import run_job
 from pipelines.bench.grid import Job, jobs
 from pipelines.bench.metered import Metered
 from pipelines.bench.results import JobResult, read_result, write_result
 from pipelines.bench.settings import Bench, read_bench
-from pipelines.methods import METHODS
-from pipelines.rounds import open_round
-from pipelines.setup import initialise
-from pipelines.workspace import sha256
+from pipelines.engine import plan
+from pipelines.engine.rounds import open_round
+from pipelines.stages.methods import METHODS
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import sha256
 
-ROOT = Path(__file__).parents[3]
 GIVE_UP_S = 3600
 # Two rounds of few steps, snapshots that a kill finds, and labels although nothing was learned yet.
 OPTIONS = (
@@ -222,7 +222,7 @@ def test_a_failing_cell_ends_in_its_own_exit_code(
     curate: Curate, toy_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The rest is told all the same."""
-    from bench_results import ToyJobs
+    from support.bench_results import ToyJobs
 
     def jobs_of(root: Path) -> ToyJobs:
         return ToyJobs(root, lambda job: "no memory" if job.method == "pspsl" else None)

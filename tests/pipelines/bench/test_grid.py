@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
-from bench_results import made_up, make_bench
+from support.bench_results import made_up, make_bench
 
 from pipelines.bench.costs import FIRST_GUESS, OVERHEAD_S, Costs
 from pipelines.bench.grid import Job, Sizes, jobs, waiting, work

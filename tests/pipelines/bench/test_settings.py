@@ -3,11 +3,11 @@
 from pathlib import Path
 
 import pytest
-from bench_results import make_bench
+from support.bench_results import make_bench
 
 from curate.errors import ConfigError, DataError, WorkspaceError
 from pipelines.bench.settings import Axes, Bench, BenchSettings, check_axes, claim, read_bench
-from pipelines.methods import with_method
+from pipelines.stages.methods import with_method
 
 AXES = Axes(methods=("baseline",), ratios=(0.5,), seeds=(0,))
 

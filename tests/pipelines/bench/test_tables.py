@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
-from bench_results import made_up, make_bench
+from support.bench_results import made_up, make_bench
 
 from pipelines.bench.grid import Job
 from pipelines.bench.report import BenchReport, shown

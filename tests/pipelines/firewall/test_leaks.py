@@ -8,15 +8,15 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from pipelines_cli import Curate, in_process
-from toys import toy_document, write_toy_kitti
+from support.pipelines_cli import Curate, in_process
+from support.toys import toy_document, write_toy_kitti
 
-from curate.datasets.kitti import KittiDataset
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import DataError, LeakageError
-from pipelines.config import make_config
-from pipelines.progress import Silent
-from pipelines.schedule import run_all
-from pipelines.setup import initialise
+from pipelines.engine.progress import Silent
+from pipelines.engine.schedule import run_all
+from pipelines.workspace.config import make_config
+from pipelines.workspace.setup import initialise
 
 # So that a training takes no time: it is a program that writes a file.
 TRAINER = 'python3 -c \'import os; open(os.environ["CURATE_OUTPUT"], "w").write("student")\''
@@ -127,7 +127,7 @@ def test_a_changed_list_that_init_was_given(
     listed.write_text("000001\n000003\n")
     curate(
         "init", tmp_path / "work", "--root", toy_kitti, "--labeled", listed,
-        "--detector", "toys:ToyDetector", "--detector-path", tmp_path / "detector.txt",
+        "--detector", "support.toys:ToyDetector", "--detector-path", tmp_path / "detector.txt",
     )  # fmt: skip
     listed.write_text("000001\n000003\n000004\n")
     code, _, err = curate("check", "-w", tmp_path / "work")
@@ -269,7 +269,7 @@ def test_the_same_recording_under_two_names(
     work = tmp_path / "work"
     curate(
         "init", work, "--root", toy_kitti, "--labeled", "0.25",
-        "--detector", "toys:ToyDetector", "--detector-path", tmp_path / "detector.txt",
+        "--detector", "support.toys:ToyDetector", "--detector-path", tmp_path / "detector.txt",
     )  # fmt: skip
     for _ in range(2):  # the second time from remembered hashes
         code, _, err = curate("check", "-w", work)

@@ -4,14 +4,14 @@ import shutil
 from pathlib import Path
 
 import pytest
-from dataset_layouts import DRIVE, write_toy_raw
-from pipelines_cli import Curate, in_process
-from toys import write_toy_kitti
+from support.dataset_layouts import DRIVE, write_toy_raw
+from support.pipelines_cli import Curate, in_process
+from support.toys import write_toy_kitti
 
-from curate.datasets.kitti import KittiDataset
-from curate.datasets.kitti_raw import KittiRawDataset
+from curate.datasets.kitti.dataset import KittiDataset
+from curate.datasets.kitti.raw import KittiRawDataset
 from curate.errors import ConfigError, LeakageError
-from pipelines.setup import choose_split
+from pipelines.workspace.setup import choose_split
 
 
 @pytest.fixture

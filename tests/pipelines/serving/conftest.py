@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 
 import pytest
-from serving import Pages, running, weighted_workspace
+from support.serving import Pages, running, weighted_workspace
 
-from pipelines.workspace import Workspace
+from pipelines.workspace.workspace import Workspace
 
 
 @pytest.fixture(scope="session")

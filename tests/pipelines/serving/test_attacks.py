@@ -5,7 +5,7 @@ import sqlite3
 from pathlib import Path
 
 import pytest
-from serving import Pages
+from support.serving import Pages
 
 pytest.importorskip("datasette", reason="the extra [serve] is not installed")
 

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import WIDTHS, Viewer, chromium
-from serving import Pages
+from support.browser import WIDTHS, Viewer, chromium
+from support.serving import Pages
 
-from pipelines.report import write_report
-from pipelines.workspace import Workspace
+from pipelines.reports.report import write_report
+from pipelines.workspace.workspace import Workspace
 
 
 @pytest.fixture(scope="module")

@@ -4,10 +4,10 @@ import sqlite3
 from pathlib import Path
 
 import pytest
-from serving import running
+from support.serving import running
 
 from pipelines.serving.sources import choose
-from pipelines.workspace import Workspace
+from pipelines.workspace.workspace import Workspace
 
 pytest.importorskip("datasette", reason="the extra [serve] is not installed")
 

@@ -6,13 +6,13 @@ import sqlite3
 import cv2
 import numpy as np
 import pytest
-from serving import Pages
+from support.serving import Pages
 
 from db.models import Base
-from pipelines.asking import ask
-from pipelines.frame_boxes import chosen_round
-from pipelines.named_queries import named_queries
-from pipelines.pictures import frame_picture
+from pipelines.labels.of_one_frame import chosen_round
+from pipelines.queries.named_queries import named_queries
+from pipelines.queries.run_query import ask
+from pipelines.reports.pictures import frame_picture
 
 pytest.importorskip("datasette", reason="the extra [serve] is not installed")
 

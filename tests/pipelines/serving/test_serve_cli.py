@@ -10,14 +10,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from pipelines_cli import Curate
 from sqlalchemy import URL
+from support.paths import ROOT
+from support.pipelines_cli import Curate
 
 from curate.errors import ConfigError, DatabaseError, WorkspaceError
 from pipelines.serving import sources
-from pipelines.workspace import Workspace
-
-ROOT = Path(__file__).parents[3]
+from pipelines.workspace.workspace import Workspace
 
 
 def has_datasette() -> bool:

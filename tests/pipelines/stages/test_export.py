@@ -5,14 +5,14 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from pipelines_cli import Curate
 from sqlalchemy import text
+from support.pipelines_cli import Curate
 
 from curate.errors import ConfigError, DataError, WorkspaceError
 from curate.training.labels import WeightedLabels
-from pipelines.progress import Silent
-from pipelines.schedule import run_all
-from pipelines.workspace import Workspace
+from pipelines.engine.progress import Silent
+from pipelines.engine.schedule import run_all
+from pipelines.workspace.workspace import Workspace
 
 
 def run(workspace: Workspace) -> Path:

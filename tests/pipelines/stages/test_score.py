@@ -6,13 +6,13 @@ import pytest
 from sqlalchemy import text
 
 from curate.errors import ConfigError
-from pipelines.progress import Silent
+from pipelines.engine.progress import Silent
+from pipelines.engine.schedule import run_all
 from pipelines.registry import PRIORS
 from pipelines.round import ROUND, active, stage
-from pipelines.schedule import run_all
-from pipelines.workspace import Workspace
+from pipelines.workspace.workspace import Workspace
 
-OWN = "toys:ToyPrior"
+OWN = "support.toys:ToyPrior"
 
 
 def run(workspace: Workspace) -> dict[str, int]:
@@ -71,14 +71,14 @@ def test_other_maps_in_the_same_folder_are_looked_at_anew(
 
 def test_two_priors_for_one_place_are_refused() -> None:
     """The error names both and the table."""
-    with pytest.raises(ConfigError, match=r"points and toys:ToyPrior.*point_prior"):
+    with pytest.raises(ConfigError, match=r"points and support.toys:ToyPrior.*point_prior"):
         active(("points", OWN))
 
 
 def test_evidence_without_a_place_is_refused() -> None:
     """The error names what can be stored."""
     with pytest.raises(ConfigError, match=r"rho_map.*rho_diff and rho_anno"):
-        active(("toys:UnstorablePrior",))
+        active(("support.toys:UnstorablePrior",))
 
 
 def test_an_unknown_prior_is_refused() -> None:

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pytest
-from label_questions import solved
-from labels_at_scale import EACH, filled_workspace
 from sqlalchemy import text
+from support.label_questions import solved
+from support.labels_at_scale import EACH, filled_workspace
 
 from db import bulk
-from pipelines.workspace import Workspace
+from pipelines.workspace.workspace import Workspace
 
 FRAMES = 10
 

@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from toys import toy_calibration
+from support.toys import toy_calibration
 
-from curate.datasets.kitti import KittiDataset
-from curate.datasets.kitti_labels import from_detections, write_objects
+from curate.datasets.kitti.dataset import KittiDataset
+from curate.datasets.kitti.labels import from_detections, write_objects
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded import RecordedDetector, detector
 from curate.errors import ConfigError, DataError

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from strategies import similarities
+from support.strategies import similarities
 
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded import RecordedDetector

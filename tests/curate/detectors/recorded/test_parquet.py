@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exported import BOXES, CATEGORIES, SCORES, toy_labels
-from toys import IMAGE_SIZE, toy_calibration
+from support.exported import BOXES, CATEGORIES, SCORES, toy_labels
+from support.toys import IMAGE_SIZE, toy_calibration
 
 from curate.detectors.recorded import RecordedDetector, detector
 from curate.errors import ConfigError, DataError

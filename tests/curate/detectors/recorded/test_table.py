@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from toys import toy_calibration
+from support.toys import toy_calibration
 
 from curate.detectors.base import RecordedViews
 from curate.detectors.recorded import RecordedDetector

@@ -1,0 +1,1 @@
+"""File formats of point clouds and images, and checks of their paths."""

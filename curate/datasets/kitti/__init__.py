@@ -1,0 +1,1 @@
+"""KITTI: the object data set, its label text, and the raw recordings."""

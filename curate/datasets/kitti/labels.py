@@ -1,0 +1,326 @@
+"""KITTI's text format of labels and results, and its conversion to boxes in the LiDAR frame.
+
+Source: the KITTI object development kit (Geiger et al., CVPR 2012), readme.txt. One object per
+line: category, truncated, occluded, alpha, left, top, right, bottom (pixels), height, width, length
+(metres), x, y, z of the bottom centre in the rectified camera frame (metres), rotation_y (radians),
+and in result files a 16th field, the score.
+
+The yaw about the LiDAR's z and the rotation_y about the camera's y are taken for opposite turns
+about the same axis, as is usual with KITTI: yaw = -rotation_y - pi/2. The two axes are less than
+one degree apart.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from curate.detections import Annotations, Detections, as_categories
+from curate.errors import DataError
+from curate.files.atomic import replace_file
+from curate.frames import Calibration
+from curate.geometry.projection import image_rectangles
+from curate.geometry.similarity import wrap_angle
+
+DONT_CARE = "DontCare"
+KITTI_CATEGORIES = frozenset(
+    {"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", DONT_CARE}
+)
+"""Every category that KITTI's own label files name."""
+
+LABEL_FIELDS, RESULT_FIELDS = 15, 16
+# Of a field; KITTI's own placeholders reach -1000.
+_LARGEST = 1e6
+
+
+@dataclass(frozen=True)
+class KittiObjects:
+    """The lines of one KITTI label or result file, in the frames of reference of that file.
+
+    Attributes:
+        categories: (n,) str; "DontCare" marks regions that have only a 2D box.
+        truncated: (n,) float64, share of the object outside the image, 0 to 1; -1 unknown.
+        occluded: (n,) int64, KITTI's levels 0 to 3; -1 unknown.
+        alpha: (n,) float64, observation angle in radians.
+        boxes_2d: (n, 4) float64 left, top, right, bottom in pixels.
+        dimensions: (n, 3) float64 height, width, length in metres.
+        locations: (n, 3) float64 bottom centre in the rectified camera frame, metres.
+        rotations_y: (n,) float64 about the camera's y axis, radians.
+        scores: (n,) float64, NaN where the file has none.
+    """
+
+    categories: np.ndarray
+    truncated: np.ndarray
+    occluded: np.ndarray
+    alpha: np.ndarray
+    boxes_2d: np.ndarray
+    dimensions: np.ndarray
+    locations: np.ndarray
+    rotations_y: np.ndarray
+    scores: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.categories)
+
+    def select(self, index: np.ndarray) -> Self:
+        """The objects at `index` (integers or a mask), in that order."""
+        return type(self)(
+            self.categories[index],
+            self.truncated[index],
+            self.occluded[index],
+            self.alpha[index],
+            self.boxes_2d[index],
+            self.dimensions[index],
+            self.locations[index],
+            self.rotations_y[index],
+            self.scores[index],
+        )
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No objects."""
+        return cls(as_categories([]), *_columns(np.zeros((0, RESULT_FIELDS - 1))))
+
+
+def read_objects(
+    path: Path, *, scored: bool = False, known: Collection[str] | None = KITTI_CATEGORIES
+) -> KittiObjects:
+    """The objects of a KITTI label file (15 fields per line) or, if `scored`, result file (16).
+
+    Empty lines are skipped; an empty file holds no objects.
+
+    Args:
+        path: the text file.
+        scored: whether each line ends with a score.
+        known: the category names that may occur; None accepts any.
+
+    Raises:
+        DataError: the file is missing or not text, or a line has too few or too many fields, a
+            field that is not a finite number, an unknown category, or a negative dimension of an
+            object that is not DontCare.
+    """
+    fields = RESULT_FIELDS if scored else LABEL_FIELDS
+    lines = _read_lines(path)
+    rows = [row for row in map(str.split, lines) if row]
+    categories = [row[0] for row in rows]
+    try:
+        values = np.array([float(field) for row in rows for field in row[1:]])
+        values = values.reshape(len(rows), fields - 1)
+    except ValueError:  # not a number, or too many or too few
+        raise _first_fault(path, lines, fields, known) from None
+    if (
+        any(len(row) != fields for row in rows)
+        or not (np.abs(values) <= _LARGEST).all()
+        or (known is not None and not frozenset(known).issuperset(categories))
+        or _has_negative_side(categories, values[:, 7:10])
+    ):
+        raise _first_fault(path, lines, fields, known)
+    return KittiObjects(as_categories(categories), *_columns(values))
+
+
+def write_objects(path: Path, objects: KittiObjects) -> None:
+    """Writes, whole or not at all, a label file, or a result file where the objects have scores.
+
+    KITTI's own files have two decimals. Here alpha, dimensions, location and rotation_y have four,
+    so that a box comes back within 0.1 mm per coordinate, and the score has six; truncation and
+    the 2D box have two.
+
+    Raises:
+        DataError: a number is not finite, or only some objects have scores.
+    """
+    scored = ~np.isnan(objects.scores)
+    if scored.any() and not scored.all():
+        raise DataError(f"{path}: {np.sum(~scored)} of {len(scored)} objects have no score")
+    lines = [
+        _format(objects, index) + (f" {objects.scores[index]:.6f}" if scored[index] else "")
+        for index in range(len(objects))
+    ]
+    for number, line in enumerate(lines, start=1):
+        if "nan" in line or "inf" in line:
+            raise DataError(
+                f"{path}:{number}: refuses to write numbers that are not finite: {line}"
+            )
+    replace_file(path, "".join(f"{line}\n" for line in lines).encode())
+
+
+def to_annotations(objects: KittiObjects, calibration: Calibration) -> Annotations:
+    """The objects as ground truth in the LiDAR frame; boxes of DontCare regions are NaN."""
+    boxes = _boxes_lidar(objects, calibration)
+    boxes[objects.categories == DONT_CARE] = np.nan
+    return Annotations(
+        boxes,
+        objects.categories,
+        objects.truncated,
+        objects.occluded,
+        objects.alpha,
+        objects.boxes_2d,
+    )
+
+
+def to_detections(objects: KittiObjects, calibration: Calibration) -> Detections:
+    """The objects as detections in the LiDAR frame, without DontCare regions."""
+    found = objects.select(objects.categories != DONT_CARE)
+    return Detections(_boxes_lidar(found, calibration), found.scores, found.categories)
+
+
+def from_annotations(annotations: Annotations, calibration: Calibration) -> KittiObjects:
+    """Inverse of `to_annotations`; DontCare regions get KITTI's placeholders (-1, -1000, -10)."""
+    dimensions, locations, rotations_y = _boxes_camera(annotations.boxes, calibration)
+    region = annotations.categories == DONT_CARE
+    dimensions[region], locations[region], rotations_y[region] = -1, -1000, -10
+    return KittiObjects(
+        annotations.categories,
+        annotations.truncated,
+        annotations.occluded,
+        annotations.alpha,
+        annotations.boxes_2d,
+        dimensions,
+        locations,
+        rotations_y,
+        np.full(len(annotations), np.nan),
+    )
+
+
+def from_detections(
+    detections: Detections, calibration: Calibration, image_size: tuple[int, int]
+) -> KittiObjects:
+    """The detections in KITTI's form, in the same order.
+
+    The 2D box is the projected 3D box clipped to the image; a box that does not reach the image
+    gets (-1, -1, -1, -1), which has no height, so that KITTI's evaluation ignores it. Truncation
+    and occlusion are unknown (-1).
+
+    Args:
+        detections: boxes in the LiDAR frame.
+        calibration: of the frame.
+        image_size: (width, height) in pixels.
+    """
+    dimensions, locations, rotations_y = _boxes_camera(detections.boxes, calibration)
+    boxes_2d = image_rectangles(detections.boxes, calibration, image_size)
+    count = len(detections)
+    return KittiObjects(
+        detections.categories,
+        np.full(count, -1.0),
+        np.full(count, -1, dtype=np.int64),
+        wrap_angle(rotations_y - np.arctan2(locations[:, 0], locations[:, 2])),
+        np.where(np.isnan(boxes_2d), -1.0, boxes_2d),
+        dimensions,
+        locations,
+        rotations_y,
+        detections.scores,
+    )
+
+
+def _boxes_lidar(objects: KittiObjects, calibration: Calibration) -> np.ndarray:
+    """(n, 7) centre boxes in the LiDAR frame."""
+    height, width, length = objects.dimensions.T
+    centres = objects.locations.copy()
+    centres[:, 1] -= height / 2  # the camera's y points down
+    to_lidar = np.linalg.inv(calibration.lidar_to_camera)
+    return np.column_stack(
+        [
+            centres @ to_lidar[:3, :3].T + to_lidar[:3, 3],
+            length,
+            width,
+            height,
+            wrap_angle(-objects.rotations_y - np.pi / 2),
+        ]
+    )
+
+
+def _boxes_camera(
+    boxes: np.ndarray, calibration: Calibration
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n, 3) height, width, length; (n, 3) bottom centres; (n,) rotation_y."""
+    to_camera = calibration.lidar_to_camera
+    locations = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
+    locations[:, 1] += boxes[:, 5] / 2
+    return boxes[:, [5, 4, 3]], locations, wrap_angle(-boxes[:, 6] - np.pi / 2)
+
+
+def _columns(values: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The fields of `KittiObjects` after the categories, from (n, 14) or (n, 15) numbers."""
+    scores = values[:, 14] if values.shape[1] > 14 else np.full(len(values), np.nan)
+    return (
+        values[:, 0],
+        values[:, 1].astype(np.int64),
+        values[:, 2],
+        values[:, 3:7],
+        values[:, 7:10],
+        values[:, 10:13],
+        values[:, 13],
+        scores,
+    )
+
+
+def _format(objects: KittiObjects, index: int) -> str:
+    """One label line without the score."""
+    category = objects.categories[index]
+    box_2d = " ".join(f"{pixel:.2f}" for pixel in objects.boxes_2d[index])
+    if category == DONT_CARE:
+        return f"{DONT_CARE} -1 -1 -10 {box_2d} -1 -1 -1 -1000 -1000 -1000 -10"
+    shape = (*objects.dimensions[index], *objects.locations[index], objects.rotations_y[index])
+    return (
+        f"{category} {objects.truncated[index]:.2f} {objects.occluded[index]} "
+        f"{objects.alpha[index]:.4f} {box_2d} {' '.join(f'{number:.4f}' for number in shape)}"
+    )
+
+
+def _read_lines(path: Path) -> list[str]:
+    """The lines of a text file; DataError where there is none."""
+    try:
+        return path.read_bytes().decode("utf-8-sig").splitlines()
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such label file") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: is not a text file (byte {error.start})") from error
+
+
+def _has_negative_side(categories: Sequence[str], dimensions: np.ndarray) -> bool:
+    """Whether an object that is not DontCare has a negative dimension."""
+    if dimensions.min(initial=0) >= 0:
+        return False
+    rows = np.flatnonzero((dimensions < 0).any(axis=1)).tolist()
+    return any(categories[row] != DONT_CARE for row in rows)
+
+
+def _first_fault(
+    path: Path, lines: Sequence[str], fields: int, known: Collection[str] | None
+) -> DataError:
+    """The error for the first bad line of a file that has one."""
+    rows = [(number, line.split()) for number, line in enumerate(lines, start=1)]
+    faults = ((number, _fault(row, fields, known)) for number, row in rows if row)
+    number, fault = next((number, fault) for number, fault in faults if fault)
+    return DataError(f"{path}:{number}: {fault}")
+
+
+def _fault(row: Sequence[str], fields: int, known: Collection[str] | None) -> str | None:
+    """What is wrong with one line, if anything."""
+    if len(row) != fields:
+        kind = "a result line ends with a score and" if fields == RESULT_FIELDS else "a label line"
+        return f"{len(row)} fields, but {kind} has {fields}"
+    if known is not None and row[0] not in known:
+        return f"unknown category {row[0][:40]!r}; known are {', '.join(sorted(known))}"
+    wrong = next(filter(None, map(_wrong_number, row[1:])), None)
+    if wrong:
+        return wrong
+    if row[0] != DONT_CARE and min(map(float, row[8:11])) < 0:
+        return f"negative height, width or length ({' '.join(row[8:11])}) of a {row[0]}"
+    return None
+
+
+def _wrong_number(field: str) -> str | None:
+    """What is wrong with a field that should be a number, if anything."""
+    try:
+        number = float(field)
+    except ValueError:
+        return f"{field[:40]!r} is not a number"
+    if not np.isfinite(number):
+        return f"{field[:40]!r} is not a finite number"
+    if abs(number) > _LARGEST:
+        return f"{field[:40]!r} is beyond {_LARGEST:g}, which nothing in a label can be"
+    return None

@@ -1,6 +1,0 @@
-"""A simulated LiDAR-camera data set in KITTI's format, ray-cast with Open3D."""
-
-from curate.datasets.synthetic.scene import SEMANTIC_CLASSES
-from curate.datasets.synthetic.writer import SEMANTIC_FOLDER, simulate
-
-__all__ = ["SEMANTIC_CLASSES", "SEMANTIC_FOLDER", "simulate"]

@@ -1,0 +1,150 @@
+"""The ground truth of one scene as KITTI defines it.
+
+2D box: the tight box around the whole object's projection, hidden parts included, clipped to the
+image. Truncated: the share of the unclipped 2D box that lies outside the image. Occluded: 0 from
+80 percent visible, 1 from 45, else 2, by the share of the object's pixels within the image that
+nothing hides. Objects of which no pixel is seen are not labelled; tiny, very far or almost hidden
+ones become DontCare regions.
+"""
+
+import numpy as np
+
+from curate.detections import Annotations, as_categories
+from curate.frames import Calibration
+from curate.geometry.similarity import wrap_angle
+from curate.simulation.camera import View
+from curate.simulation.rig import IMAGE_SIZE, CameraRig
+from curate.simulation.scene import Caster, Scene
+
+_NEAR_M = 0.2
+_PROBES = 400  # rays per object that measure its visible share
+_FAR_M = 70.0
+_MIN_HEIGHT_PX = 14.0
+_MIN_VISIBLE_PX = 20
+_MIN_VISIBLE_SHARE = 0.12
+_OCCLUSION_SHARES = (0.8, 0.45)
+
+
+def annotate(scene: Scene, view: View, rig: CameraRig) -> Annotations:
+    """The labels of everything that the camera sees, nearest first, DontCare regions last."""
+    calibration = rig.calibration
+    seen = np.bincount(view.things[view.things > 0], minlength=len(scene.placements) + 1)
+    numbers = [number for number in scene.actors() if seen[number]]
+    if not numbers:
+        return Annotations.empty()
+    outlines = [_outline(scene, number, calibration) for number in numbers]
+    boxes_2d = np.array([inside for inside, _ in outlines])
+    truncated = np.array([1 - _area(inside) / _area(whole) for inside, whole in outlines])
+    shares = _visible_shares(scene, view, rig, numbers, boxes_2d)
+    boxes = np.array([_box(scene, number) for number in numbers])
+    categories = as_categories([scene.placements[number - 1].kind for number in numbers])
+
+    distance = np.hypot(boxes[:, 0], boxes[:, 1])
+    unclear = (distance > _FAR_M) | (boxes_2d[:, 3] - boxes_2d[:, 1] < _MIN_HEIGHT_PX)
+    unclear |= (seen[numbers] < _MIN_VISIBLE_PX) | (shares < _MIN_VISIBLE_SHARE)
+    boxes[unclear] = np.nan
+    found = Annotations(
+        boxes,
+        np.where(unclear, "DontCare", categories),
+        np.where(unclear, -1.0, truncated),
+        np.where(unclear, -1, np.digitize(-shares, -np.array(_OCCLUSION_SHARES))),
+        np.where(unclear, -10.0, _alpha(boxes, calibration)),
+        boxes_2d,
+    )
+    return found.select(np.lexsort((distance, unclear)))
+
+
+def _box(scene: Scene, number: int) -> np.ndarray:
+    """(7,) the tight box around an object, in the LiDAR frame."""
+    placement = scene.placements[number - 1]
+    size = placement.mesh.size * placement.scale
+    centre = placement.position + np.array([0, 0, size[2] / 2])
+    return np.array([*centre, *size, placement.yaw_rad])
+
+
+def _alpha(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """(n,) observation angle: rotation_y less the direction in which the camera sees the box."""
+    matrix = calibration.lidar_to_camera
+    centres = boxes[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
+    rotation_y = -boxes[:, 6] - np.pi / 2
+    alpha: np.ndarray = wrap_angle(rotation_y - np.arctan2(centres[:, 0], centres[:, 2]))
+    return alpha
+
+
+def _outline(scene: Scene, number: int, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """(4,) left, top, right, bottom of the object within the image, and of the whole object.
+
+    The edges of the mesh are clipped to the view as segments in homogeneous coordinates, so that
+    an object that reaches beside or behind the camera gets the box of the part within the image.
+    """
+    matrix = calibration.lidar_to_image
+    corners = scene.thing_vertices(number) @ matrix[:, :3].T + matrix[:, 3]
+    last = np.array(IMAGE_SIZE) - 1.0
+    if corners[:, 2].min() > _NEAR_M:
+        whole = _bounds(corners)
+        if (whole[:2] >= 0).all() and (whole[2:] <= last).all():
+            return whole, whole
+    triangles = corners[scene.placements[number - 1].mesh.triangles]
+    edges = np.stack([triangles, np.roll(triangles, 1, axis=1)], axis=2).reshape(-1, 2, 3)
+    edges = _clip(edges, np.array([[0, 0, 1.0]]), np.array([_NEAR_M]))
+    sides = np.array([[1, 0, 0], [-1, 0, last[0]], [0, 1, 0], [0, -1, last[1]]])
+    inside = _bounds(_clip(edges, sides, np.zeros(4)))
+    return np.clip(inside, 0, np.tile(last, 2)), _bounds(edges)
+
+
+def _clip(edges: np.ndarray, planes: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """The parts of (n, 2, 3) segments where planes @ point >= offset, for every plane."""
+    for plane, offset in zip(planes, offsets, strict=True):
+        side = edges @ plane - offset
+        edges, side = edges[(side >= 0).any(axis=1)], side[(side >= 0).any(axis=1)]
+        span = side[:, 0] - side[:, 1]
+        share = side[:, 0] / np.where(span == 0, 1, span)
+        cut = edges[:, 0] + share[:, None] * (edges[:, 1] - edges[:, 0])
+        edges = np.where((side < 0)[..., None], cut[:, None], edges)
+    return edges
+
+
+def _bounds(homogeneous: np.ndarray) -> np.ndarray:
+    """(4,) left, top, right, bottom in pixels of (..., 3) homogeneous points."""
+    points = homogeneous.reshape(-1, 3)
+    pixels = points[:, :2] / points[:, 2:]
+    return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+
+
+def _area(box_2d: np.ndarray) -> float:
+    return float((box_2d[2] - box_2d[0]) * (box_2d[3] - box_2d[1]))
+
+
+def _visible_shares(
+    scene: Scene, view: View, rig: CameraRig, numbers: list[int], boxes_2d: np.ndarray
+) -> np.ndarray:
+    """(n,) the share of each object's pixels in the image that nothing hides.
+
+    Rays through some pixels of its 2D box, cast into a scene of the actors alone, tell which of
+    them the whole object would cover.
+    """
+    actors = np.isin(scene.things, numbers)
+    rows = np.flatnonzero(actors)
+    alone = Caster(scene.vertices, scene.triangles[rows])
+    pixels = [_probe_pixels(box_2d) for box_2d in boxes_2d]
+    owner = np.repeat(numbers, [len(part) for part in pixels])
+    pixel = np.concatenate(pixels)
+    ray, triangle = alone.all_hits(rig.rays(pixel))
+    covered = np.zeros(len(pixel), dtype=bool)
+    covered[ray[scene.things[rows[triangle]] == owner[ray]]] = True
+    visible = view.things.ravel()[pixel] == owner
+    size = int(max(numbers)) + 1
+    whole = np.bincount(owner[covered | visible], minlength=size)
+    shown = np.bincount(owner[visible], minlength=size)
+    return np.asarray(shown[numbers] / np.maximum(whole[numbers], 1))
+
+
+def _probe_pixels(box_2d: np.ndarray) -> np.ndarray:
+    """Indices of pixels on a grid over a 2D box."""
+    left, top = np.ceil(box_2d[:2]).astype(int)
+    right, bottom = np.floor(box_2d[2:]).astype(int)
+    step = max(1, int(np.sqrt((right - left + 1) * (bottom - top + 1) / _PROBES)))
+    rows, columns = np.meshgrid(
+        np.arange(top, bottom + 1, step), np.arange(left, right + 1, step), indexing="ij"
+    )
+    return np.asarray(rows * IMAGE_SIZE[0] + columns).ravel()

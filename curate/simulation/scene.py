@@ -1,0 +1,141 @@
+"""One scene as a single triangle mesh that rays are cast into (Open3D's RaycastingScene)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from curate.detections import CATEGORIES
+from curate.simulation.materials import palette
+from curate.simulation.meshes import rotation_z
+from curate.simulation.open3d_loader import load
+from curate.simulation.population import Placement, Population
+from curate.simulation.street import Street
+
+SEMANTIC_CLASSES = {"Car": 1, "Pedestrian": 2, "Cyclist": 3}
+"""Class ids of the semantic maps; 0 is everything else."""
+
+GROUND = 0
+"""The number of the ground among the things of a scene; placements count from 1."""
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where rays first meet the scene.
+
+    Attributes:
+        distance: (n,) float32 in units of the ray's direction, inf without a hit.
+        triangle: (n,) int32 rows of the scene's triangles, -1 without a hit.
+    """
+
+    distance: np.ndarray
+    triangle: np.ndarray
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All triangles of a scene; the sensors' origin is the LiDAR.
+
+    Attributes:
+        street: the lie of the land.
+        placements: the things on it, numbered from 1.
+        vertices: (n, 3) float32, LiDAR frame, metres.
+        triangles: (m, 3) uint32.
+        things: (m,) int32, the thing that each triangle belongs to; 0 is the ground.
+        materials: (m,) uint8.
+        colours: (m, 3) float32 RGB, 0 to 1.
+        normals: (m, 3) float32 outward unit normals.
+    """
+
+    street: Street
+    placements: Sequence[Placement]
+    vertices: np.ndarray
+    triangles: np.ndarray
+    things: np.ndarray
+    materials: np.ndarray
+    colours: np.ndarray
+    normals: np.ndarray
+
+    @classmethod
+    def draw(cls, generator: np.random.Generator) -> Self:
+        """A random scene."""
+        street = Street.draw(generator)
+        placements = Population(street, generator).fill()
+        return cls.assemble(street, placements)
+
+    @classmethod
+    def assemble(cls, street: Street, placements: Sequence[Placement]) -> Self:
+        """The scene of a street and the things on it."""
+        ground = street.ground()
+        meshes = [ground, *(placement.mesh for placement in placements)]
+        vertices = [ground.vertices, *(map(_placed_vertices, placements))]
+        colours = [palette()[ground.materials]]
+        colours += [placement.palette[placement.mesh.materials] for placement in placements]
+        offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+        triangles = [mesh.triangles + offset for mesh, offset in zip(meshes, offsets, strict=True)]
+        corners, rows = np.concatenate(vertices), np.concatenate(triangles)
+        return cls(
+            street,
+            placements,
+            corners,
+            rows.astype(np.uint32),
+            np.repeat(np.arange(len(meshes), dtype=np.int32), [len(part) for part in triangles]),
+            np.concatenate([mesh.materials for mesh in meshes]),
+            np.concatenate(colours),
+            _normals(corners, rows),
+        )
+
+    def actors(self) -> list[int]:
+        """The numbers of the things that are cars, pedestrians or cyclists."""
+        numbered = enumerate(self.placements, start=1)
+        return [number for number, placement in numbered if placement.kind in CATEGORIES]
+
+    def thing_classes(self) -> np.ndarray:
+        """(things,) uint8 semantic class of the ground and of each placement."""
+        kinds = ["ground", *(placement.kind for placement in self.placements)]
+        return np.array([SEMANTIC_CLASSES.get(kind, 0) for kind in kinds], dtype=np.uint8)
+
+    def thing_vertices(self, number: int) -> np.ndarray:
+        """(n, 3) vertices of one placement in the LiDAR frame."""
+        return _placed_vertices(self.placements[number - 1])
+
+
+class Caster:
+    """Casts rays into a mesh, on one thread, so that worker processes do not compete."""
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
+        self._open3d: Any = load()
+        self._scene = self._open3d.t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
+
+    def first_hits(self, rays: np.ndarray) -> Hits:
+        """The first hit of (n, 6) float32 rays: origin and direction in the LiDAR frame."""
+        found = self._scene.cast_rays(self._tensor(rays), nthreads=1)
+        # "No hit" is the highest uint32, which is -1 when read as int32.
+        triangle = found["primitive_ids"].numpy().view(np.int32)
+        return Hits(found["t_hit"].numpy(), triangle)
+
+    def all_hits(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Every hit of (n, 6) float32 rays, as rows of rays and rows of triangles."""
+        found = self._scene.list_intersections(self._tensor(rays), nthreads=1)
+        ray, triangle = found["ray_ids"].numpy(), found["primitive_ids"].numpy()
+        return ray.astype(np.int64), triangle.astype(np.int64)
+
+    def _tensor(self, values: np.ndarray) -> Any:
+        return self._open3d.core.Tensor.from_numpy(np.ascontiguousarray(values))
+
+
+def _placed_vertices(placement: Placement) -> np.ndarray:
+    """(n, 3) float32 vertices in the LiDAR frame."""
+    scaled = placement.mesh.vertices * placement.scale.astype(np.float32)
+    turned = scaled @ rotation_z(placement.yaw_rad).T.astype(np.float32)
+    return np.asarray(turned + placement.position.astype(np.float32))
+
+
+def _normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(m, 3) unit normals; zero for triangles without area."""
+    first, second, third = (vertices[triangles[:, corner]] for corner in range(3))
+    across = np.cross(second - first, third - first)
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    return np.asarray(across / np.maximum(length, 1e-12), dtype=np.float32)

@@ -1,0 +1,1 @@
+"""Audits, evaluations and checks against known ground truth."""

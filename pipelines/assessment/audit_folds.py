@@ -1,0 +1,91 @@
+"""Held-out folds of X_l: small workspaces inside the workspace, each with its own database.
+
+The teacher of a fold learns from the other folds; the fold itself is its val split, and made of
+whole sequences where the data set knows them. What a fold has done it keeps, so an audit that was
+killed continues.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from curate.datasets.base import sequences_of
+from curate.errors import ConfigError
+from curate.firewall.sequences import group_by_sequence
+from pipelines.workspace.config import Config, read_config, write_config
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import CONFIG_NAME, Workspace
+
+
+def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
+    """The workspace of every fold, made where it does not exist yet.
+
+    Raises:
+        ConfigError: there are fewer labeled frames, or sequences of them, than folds.
+    """
+    labeled = sorted(workspace.frames("labeled"))
+    if not 2 <= folds <= len(labeled):
+        raise ConfigError(
+            f"--folds {folds}: the {len(labeled)} labeled frames make 2 to {len(labeled)} folds"
+        )
+    seed = workspace.config.run.seed
+    dealt = _dealt(workspace, labeled, folds, np.random.default_rng([seed, folds]))
+    home = workspace.root / "reports" / "audit" / f"{folds}-folds-seed-{seed}"
+    for fold, held_out in enumerate(dealt):
+        root = home / f"fold-{fold + 1}"
+        root.mkdir(parents=True, exist_ok=True)
+        rest = sorted(set(labeled) - set(held_out))
+        lists = [
+            _write_list(root / f"{split}.txt", names)
+            for split, names in (("labeled", rest), ("val", held_out))
+        ]
+        config = _fold_config(workspace)
+        if (root / CONFIG_NAME).exists() and read_config(root / CONFIG_NAME) != config:
+            # Settings of the workspace have changed since; what depends on them becomes stale.
+            write_config(root / CONFIG_NAME, config)
+        yield initialise(root, config, *map(str, lists))
+
+
+def _dealt(
+    workspace: Workspace, labeled: Sequence[str], folds: int, generator: np.random.Generator
+) -> list[list[str]]:
+    """The labeled frames in folds of about the same size; no sequence is in two of them.
+
+    Where frames were split singly all the same, too few sequences are cut here, too.
+    """
+    groups = group_by_sequence(sequences_of(workspace.dataset, labeled), labeled)
+    if len(groups) < folds:
+        if workspace.config.dataset.split_by == "sequence":
+            raise ConfigError(
+                f"--folds {folds}: the labeled frames are of {len(groups)} sequences, which are "
+                "not cut; ask for fewer folds, or label frames of more sequences"
+            )
+        groups = {frame: [frame] for frame in labeled}
+    dealt: list[list[str]] = [[] for _ in range(folds)]
+    for name in generator.permutation(sorted(groups)).tolist():
+        min(dealt, key=len).extend(groups[name])
+    return [sorted(fold) for fold in dealt]
+
+
+def _fold_config(workspace: Workspace) -> Config:
+    """The workspace's settings with absolute paths and the fold's own database."""
+    config = workspace.config
+    detector, segmenter = config.detector.path, config.segmenter.path
+    changes = {
+        "dataset": {"root": config.dataset.root.resolve()},
+        "detector": {"path": detector and (workspace.root / detector).resolve()},
+        "segmenter": {"path": segmenter and segmenter.resolve()},
+        "run": {"database": None},
+    }
+    return config.model_copy(
+        update={
+            section: getattr(config, section).model_copy(update=values)
+            for section, values in changes.items()
+        }
+    )
+
+
+def _write_list(path: Path, names: Sequence[str]) -> Path:
+    path.write_text("".join(f"{name}\n" for name in names))
+    return path

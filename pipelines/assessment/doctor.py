@@ -1,0 +1,105 @@
+"""One frame through the whole chain: data set, detector, augmented views, segmenter."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from curate.detectors.base import RecordedViews
+from curate.errors import ConfigError, CurateError
+from curate.evaluation.examination import Finding, examine_detections, examine_frame
+from curate.frames import Frame
+from pipelines.assembly import open_detector, open_segmenter, wants_views
+from pipelines.engine.rounds import newest_checkpoint
+from pipelines.stages.predict import checked, visible
+from pipelines.workspace.config import Config
+from pipelines.workspace.workspace import Workspace
+
+
+def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Finding]]:
+    """The frame, and what each check says of it; nothing is stored.
+
+    Args:
+        workspace: see `Workspace`.
+        frame_id: None for the first unlabeled frame.
+
+    Raises:
+        ConfigError: the workspace has no such frame.
+    """
+    names = list(workspace.frames("unlabeled", "val", "labeled"))
+    unlabeled = list(workspace.frames("unlabeled"))
+    name = frame_id or next(iter(unlabeled or names), None)
+    if name not in names:
+        raise ConfigError(f"doctor: no frame {name} in {workspace.root}")
+    semantic = "semantic" in workspace.config.run.priors
+    try:
+        frame = workspace.dataset.read(name, image=semantic)
+    except CurateError as error:
+        return name, [Finding("data set", "wrong", str(error))]
+    findings = examine_frame(frame)
+    findings += _guarded("detector", lambda: _detector(workspace, frame))
+    if semantic:
+        findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
+    return name, findings
+
+
+def _guarded(check: str, examined: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:
+    """The findings, or the error that keeps a part of the chain from being examined."""
+    try:
+        return examined()
+    except CurateError as error:
+        return [Finding(check, "wrong", str(error))]
+
+
+def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
+    config = workspace.config
+    detector = open_detector(config, newest_checkpoint(workspace))
+    seen = visible(frame, config)
+    found = detector.predict(seen)
+    findings = examine_detections(seen, found, config.dataset.categories)
+    checked(found, config)
+    if isinstance(detector, RecordedViews):
+        views = detector.views(frame.frame_id)
+        findings.append(
+            Finding("views", "ok", f"{len(views)} recorded augmented copies of this frame")
+            if views
+            else _no_views(config)
+        )
+        for similarity, moved in views:
+            back = examine_detections(
+                seen.with_points(similarity.apply_to_points(seen.points)), moved, ()
+            )
+            findings += [one for one in back if one.check == "boxes" and one.state == "wrong"]
+    return findings
+
+
+def _no_views(config: Config) -> Finding:
+    """A record without a second pass is fine for methods that need none."""
+    if not wants_views(config):
+        return Finding("views", "ok", "none recorded; the priors alone weigh")
+    return Finding(
+        "views",
+        "suspect",
+        "no second pass over augmented copies, so no label has a consistency loss: name passes in "
+        "detector.options, or set solve.self_paced = false",
+    )
+
+
+def _segmenter(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
+    found = open_segmenter(workspace.config).segment(frame)
+    width, height = frame.image_size
+    if found.class_ids.shape != (height, width):
+        shape = list(found.class_ids.shape)
+        message = f"the map is {shape}, the image [{height}, {width}]"
+        return [Finding("segmenter", "wrong", message)]
+    categories = workspace.config.dataset.categories
+    missing = [name for name in categories if name not in found.category_classes]
+    if missing:
+        message = f"no class counts for {', '.join(missing)}; see segmenter.classes"
+        return [Finding("segmenter", "wrong", message)]
+    shares = {
+        name: float(np.isin(found.class_ids, found.category_classes[name]).mean())
+        for name in categories
+    }
+    told = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
+    state = "ok" if any(shares.values()) else "suspect"
+    return [Finding("segmenter", state, f"share of the pixels: {told}")]

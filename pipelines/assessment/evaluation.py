@@ -1,0 +1,80 @@
+"""How good a detector is on the val split, whose ground truth no training has seen."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from curate.datasets.kitti.labels import KittiObjects, from_annotations, from_detections
+from curate.detections import Detections
+from curate.errors import FramesFailed, WorkspaceError
+from pipelines.engine import plan
+from pipelines.engine.executors.base import FrameJob
+from pipelines.engine.progress import Progress
+from pipelines.engine.rounds import peek_round
+from pipelines.engine.runner import open_executor
+from pipelines.engine.stage import FrameStage
+from pipelines.round import stage
+from pipelines.stages.predict import Predict
+from pipelines.workspace.workspace import Workspace
+
+ValObjects = tuple[list[KittiObjects], list[KittiObjects]]
+"""Ground truth and detections of the val frames, frame by frame."""
+
+
+def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str, Detections]:
+    """What a checkpoint finds in the val frames.
+
+    Raises:
+        FramesFailed: the detector failed on some frames.
+    """
+    frames = workspace.frames("val")
+    predict = Predict(workspace.config, path)
+    jobs = [FrameJob(key, name) for name, key in frames.items()]
+    found: dict[str, Detections] = {}
+    with progress.track("evaluate", len(jobs)) as advance, open_executor(workspace) as executor:
+        for outcome in executor.map(predict, jobs):
+            if outcome.error is not None:
+                raise FramesFailed(f"val frame {outcome.job.frame}: {outcome.error}")
+            rows = [row[1:] for row in outcome.rows["prediction"]]
+            found[outcome.job.frame] = Detections.from_rows(rows)
+            advance(1, "")
+    return found
+
+
+def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]:
+    """What a round's teacher found in the val frames, as `curate predict --split val` stored it.
+
+    Raises:
+        WorkspaceError: the round has no predictions for some val frames.
+    """
+    keys = workspace.frames("val")
+    context = peek_round(workspace, round_number)
+    predict = stage("predict")
+    if context is None or not isinstance(predict, FrameStage):
+        raise WorkspaceError(f"round {round_number} has no teacher yet; run `curate run`")
+    states = plan.counts(workspace, context, predict, "val")
+    missing = states.waiting + states.failed
+    if missing:
+        raise WorkspaceError(
+            f"round {round_number} has no predictions for {missing} of {len(keys)} val frames; "
+            f"run `curate predict --split val --round {round_number}`"
+        )
+    stored = workspace.predictions(round_number, list(keys.values()))
+    return {name: stored[key] for name, key in keys.items()}
+
+
+def val_objects(workspace: Workspace, found: Mapping[str, Detections]) -> ValObjects:
+    """Ground truth and detections of the val frames in KITTI's form, in the order of their names.
+
+    Raises:
+        WorkspaceError: there are no val frames.
+    """
+    truth = workspace.ground_truth("val")
+    if not truth:
+        raise WorkspaceError("no val frames; `curate init --val` takes some")
+    labels: list[KittiObjects] = []
+    results: list[KittiObjects] = []
+    for name, annotations in truth.items():
+        frame = workspace.dataset.read(name, points=False)
+        labels.append(from_annotations(annotations, frame.calibration))
+        results.append(from_detections(found[name], frame.calibration, frame.image_size))
+    return labels, results

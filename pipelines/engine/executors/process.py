@@ -1,0 +1,175 @@
+"""All cores of one machine: one process per worker, each with its own model.
+
+Every worker has a pipe of its own, so that it is known which frame was in the hands of a worker
+that the system has killed; `ProcessPoolExecutor` then gives up all that it holds.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+from collections import deque
+from collections.abc import Iterable, Iterator
+from multiprocessing.connection import Connection, wait
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any
+
+from curate.errors import CurateError
+from pipelines.engine.executors.base import (
+    IN_HAND,
+    FrameFunction,
+    FrameJob,
+    JobQueue,
+    Outcome,
+    attempt,
+    open_function,
+)
+
+# How often a look is taken at workers that say nothing: a process that a dead one has forked may
+# hold its pipe open.
+PULSE_S = 5.0
+
+
+class ProcessExecutor:
+    """Works on frames in `workers` spawned processes, which live until `close`."""
+
+    def __init__(self, workers: int = 1) -> None:
+        self.workers = workers
+        self._crew: list[_Worker] = []
+
+    def map(self, function: FrameFunction, jobs: Iterable[FrameJob]) -> Iterator[Outcome]:
+        """One outcome per job, as they end.
+
+        Raises:
+            CurateError: the models cannot be loaded, or workers die while they load them.
+        """
+        queue = JobQueue(jobs, self.workers)
+        packed = pickle.dumps(function)
+        try:
+            while True:
+                self._hand_out(packed, queue)
+                busy = {worker.connection: worker for worker in self._crew if worker.in_hand}
+                if not busy:
+                    return
+                speaking = wait(list(busy), PULSE_S)
+                for connection, worker in busy.items():
+                    if connection in speaking or not worker.process.is_alive():
+                        yield from self._collect(worker, queue)
+        finally:
+            for worker in [worker for worker in self._crew if worker.in_hand]:
+                self._dismiss(worker)
+
+    def close(self) -> None:
+        """Ends the workers."""
+        for worker in self._crew:
+            worker.retire()
+        for worker in list(self._crew):
+            worker.process.join(PULSE_S)
+            self._dismiss(worker)
+
+    def _hand_out(self, packed: bytes, queue: JobQueue) -> None:
+        while (job := queue.take()) is not None:
+            idle = min(self._crew, key=lambda worker: len(worker.in_hand), default=None)
+            if len(self._crew) < self.workers and (idle is None or idle.in_hand):
+                self._crew.append(idle := _Worker())
+            if idle is None or len(idle.in_hand) == IN_HAND:
+                queue.give_back([job])
+                return
+            idle.give(packed, job)
+
+    def _collect(self, worker: "_Worker", queue: JobQueue) -> Iterator[Outcome]:
+        """What a worker answers; what it leaves behind if it is dead."""
+        try:
+            answer = worker.connection.recv() if worker.connection.poll() else EOFError()
+        except (EOFError, OSError) as end:
+            answer = end
+        if isinstance(answer, EOFError | OSError):
+            worker.process.join(PULSE_S)
+            self._dismiss(worker)
+            yield from queue.bury(list(worker.in_hand), worker.end(), opened=worker.opened)
+            return
+        if isinstance(answer, CurateError):
+            raise answer
+        if answer is None:
+            worker.opened = True
+            queue.opened()
+        else:
+            yield Outcome(worker.in_hand.popleft(), *answer)
+
+    def _dismiss(self, worker: "_Worker") -> None:
+        self._crew.remove(worker)
+        worker.connection.close()
+        worker.process.kill()
+        worker.process.join()
+
+
+class _Worker:
+    """A process, and the jobs in its hands in the order in which it works on them."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs,))
+        self.process.start()
+        theirs.close()
+        self.in_hand: deque[FrameJob] = deque()
+        self.opened = False
+        self._packed = b""
+
+    def give(self, packed: bytes, job: FrameJob) -> None:
+        """Hands a job over, and before it the function, where that is another one."""
+        self.in_hand.append(job)
+        with contextlib.suppress(OSError):  # it has died; its end of the pipe will tell
+            if packed != self._packed:
+                self._packed, self.opened = packed, False
+                self.connection.send(packed)
+            self.connection.send(job)
+
+    def retire(self) -> None:
+        """Lets it end by itself, which a model may need to put its things in order."""
+        with contextlib.suppress(OSError):
+            self.connection.send(None)
+
+    def end(self) -> str:
+        """How a dead worker died."""
+        code = self.process.exitcode or 0
+        if code >= 0:
+            return f"with exit code {code}"
+        killed = ", perhaps for lack of memory" if code == -signal.SIGKILL else ""
+        return f"by {signal.Signals(-code).name}{killed}"
+
+
+def _serve(connection: Connection) -> None:
+    """What a worker does all its life."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends us
+    inbox: SimpleQueue[Any] = SimpleQueue()  # the packed function, jobs, None for the end
+    Thread(target=_receive, args=(connection, inbox), daemon=True).start()
+    function: FrameFunction | None = None
+    while (message := inbox.get()) is not None:
+        if isinstance(message, bytes):
+            function = None  # the one before, with its models, makes room first
+            try:
+                function = pickle.loads(message)  # noqa: S301 - from the parent process
+                open_function(function)
+            except CurateError as fault:
+                function = None
+                connection.send(fault)
+            else:
+                connection.send(None)
+        elif function is not None:
+            outcome = attempt(function, message)
+            connection.send((outcome.rows, outcome.error, outcome.seconds))
+
+
+def _receive(connection: Connection, inbox: "SimpleQueue[Any]") -> None:
+    """Empties the pipe, so that the parent never waits while it hands over.
+
+    Where the parent has closed it, or was killed, nobody needs this process any more.
+    """
+    try:
+        while True:
+            inbox.put(connection.recv())
+    except (EOFError, OSError):
+        os._exit(0)

@@ -1,0 +1,149 @@
+"""What a stage is: a named step that reads some tables and writes others."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection
+
+from curate.priors.base import Measured
+from curate.weighting.base import Age
+from pipelines.engine.executors.base import FrameFunction
+from pipelines.engine.progress import Progress
+from pipelines.workspace.workspace import Workspace
+
+Settings = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """The detector that answers in a round.
+
+    Attributes:
+        path: its checkpoint, or the file that the user brought.
+        sha256: of that file.
+    """
+
+    path: Path
+    sha256: str
+
+
+@dataclass(frozen=True)
+class RoundContext:
+    """Which round it is.
+
+    Attributes:
+        number: e, from 1.
+        rounds: E.
+        seed: of the workspace.
+        teacher: see `Teacher`.
+    """
+
+    number: int
+    rounds: int
+    seed: int
+    teacher: Teacher
+
+    @property
+    def age(self) -> Age:
+        """Number and count of rounds, for the policies."""
+        return Age(self.number, self.rounds)
+
+
+@dataclass(frozen=True)
+class RoundJob:
+    """What a round stage works on.
+
+    Attributes:
+        context: the round.
+        policy: whose weights.
+        frames: keys of the unlabeled frames that all earlier stages have finished.
+    """
+
+    context: RoundContext
+    policy: str
+    frames: Sequence[int]
+
+
+@dataclass(frozen=True)
+class Product:
+    """What a round stage has made.
+
+    Attributes:
+        summary: what it did, in a few words.
+        write: stores its rows, in the transaction that also records the stage as done.
+        keys_known: see `db.session.Database.writing`.
+    """
+
+    summary: str
+    write: Callable[[Connection], None]
+    keys_known: bool = False
+
+
+@dataclass(frozen=True)
+class Recall:
+    """How a stage goes on from what it once measured, where only the formula has changed.
+
+    Attributes:
+        reads: tables or sources; together with `settings` all that its measurements depend on.
+        settings: what they depend on beside what it reads.
+        read: the measured columns of some frames, by key.
+        function: what it does with a frame and its measurements, without looking at the frame.
+    """
+
+    reads: tuple[str, ...]
+    settings: Callable[[Workspace, RoundContext], Settings]
+    read: Callable[[Workspace, RoundContext, Sequence[int]], Mapping[int, Measured]]
+    function: Callable[[Workspace, RoundContext], FrameFunction]
+
+
+@dataclass(frozen=True)
+class FrameStage:
+    """A stage that treats every frame alone.
+
+    Attributes:
+        name: of the stage and, with underscores, of its file.
+        command: that runs it.
+        reads: tables or sources; together with `settings` all that its rows depend on.
+        writes: tables.
+        settings: what its rows depend on beside what it reads and recalls.
+        function: what it does with a frame.
+        recall: see `Recall`; None where there is nothing that could be kept.
+    """
+
+    name: str
+    command: str
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    settings: Callable[[Workspace, RoundContext], Settings]
+    function: Callable[[Workspace, RoundContext], FrameFunction]
+    recall: Recall | None = None
+
+
+@dataclass(frozen=True)
+class RoundStage:
+    """A stage that looks at all labels of a round at once, for one policy.
+
+    Attributes:
+        name: of the stage and, with underscores, of its file.
+        command: that runs it.
+        reads: tables or sources.
+        writes: tables or files.
+        settings: what its result depends on beside what it reads; the last argument is the policy.
+        run: does it.
+        file: what it leaves on disk, if anything.
+        guard: what must hold at every start, even where the stage is up to date; raises.
+    """
+
+    name: str
+    command: str
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    settings: Callable[[Workspace, RoundContext, str], Settings]
+    run: Callable[[Workspace, RoundJob, Progress], Product]
+    file: Callable[[Workspace, RoundContext, str], Path] | None = None
+    guard: Callable[[Workspace, RoundContext, str], None] | None = None
+
+
+Stage = FrameStage | RoundStage

@@ -1,0 +1,1 @@
+"""Stored labels and their evidence, read back from the database."""

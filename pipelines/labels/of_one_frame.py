@@ -1,0 +1,170 @@
+"""What is stored of one frame in a round: labels, repredictions and, outside X_u, ground truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy import func, select
+
+from curate.detections import Annotations, Detections
+from curate.errors import ConfigError, WorkspaceError
+from curate.review.human_labels import REJECTED
+from curate.viewing.tags import ShownRepredictions
+from db import bulk
+from db.models import BOX_COLUMNS
+from pipelines.labels.by_frame import refuse_bad_weights
+from pipelines.labels.human_labels import human_boxes
+from pipelines.workspace.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class FrameBoxes:
+    """The boxes of a frame.
+
+    Attributes:
+        split: of the frame.
+        labels: the predictions.
+        weights: (n,) of one policy; 0 where it dropped the label, NaN where it weighted nothing.
+        repredictions: of all views, with the weight of the label that each was matched with.
+        truth: NaN boxes for DontCare; None for frames of X_u.
+        human_boxes: (h, 7) what people decided on; predictions that give way to them are left out
+            of the labels, rejected ones weigh 0.
+    """
+
+    split: str
+    labels: Detections
+    weights: np.ndarray
+    repredictions: ShownRepredictions
+    truth: Annotations | None
+    human_boxes: np.ndarray
+
+    @property
+    def truth_boxes(self) -> np.ndarray | None:
+        """(m, 7) in the LiDAR frame, NaN for DontCare; None for frames of X_u."""
+        return None if self.truth is None else self.truth.boxes
+
+
+def chosen_round(workspace: Workspace, number: int | None) -> int:
+    """A round that has predictions; None asks for the last one.
+
+    Raises:
+        WorkspaceError: there is none, or not that one.
+    """
+    table = bulk.table("prediction")
+    query = select(func.max(table.c.round))
+    if number is not None:
+        query = query.where(table.c.round == number)
+    with workspace.database.reading() as connection:
+        found = connection.execute(query).scalar_one()
+    if found is None:
+        raise WorkspaceError(
+            "no round has predictions yet; run `curate run` or `curate predict`"
+            if number is None
+            else f"round {number} has no predictions; run `curate predict --round {number}`"
+        )
+    return int(found)
+
+
+def labeled_by(workspace: Workspace, round_number: int, policy: str, limit: int) -> list[str]:
+    """The first frames, by name, of which a policy has weighted labels in a round.
+
+    Raises:
+        WorkspaceError: there are none.
+    """
+    frame, weight = bulk.table("frame"), bulk.table("weight")
+    query = (
+        select(frame.c.frame)
+        .join(weight, weight.c.frame_id == frame.c.id)
+        .where(weight.c.round == round_number, weight.c.policy == policy)
+        .distinct()
+        .order_by(frame.c.frame)
+        .limit(limit)
+    )
+    with workspace.database.reading() as connection:
+        names = [row[0] for row in bulk.select(connection, query)]
+    if not names:
+        raise WorkspaceError(
+            f"round {round_number} has no labels weighted by {policy}; "
+            f"run `curate solve --round {round_number} --policy {policy}`"
+        )
+    return names
+
+
+def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) -> FrameBoxes:
+    """The stored boxes of a frame.
+
+    Raises:
+        ConfigError: no frame has that name.
+        DataError: a weight is not in [0, 1].
+    """
+    split, key = _find(workspace, name)
+    labels = workspace.predictions(round_number, [key])[key]
+    weights = _weights(workspace, round_number, (key, name), policy, len(labels))
+    truth = None if split == "unlabeled" else workspace.ground_truth(split)[name]
+    rejected, replaced = _decided(workspace, round_number, key, len(labels))
+    weights[rejected] = 0.0
+    return FrameBoxes(
+        split,
+        labels.select(~replaced),
+        weights[~replaced],
+        _repredictions(workspace, round_number, key, weights),
+        truth,
+        human_boxes(workspace, round_number, key),
+    )
+
+
+def _find(workspace: Workspace, name: str) -> tuple[str, int]:
+    table = bulk.table("frame")
+    query = select(table.c.split, table.c.id).where(table.c.frame == name)
+    with workspace.database.reading() as connection:
+        found = bulk.select(connection, query)
+    if not found:
+        raise ConfigError(f"no frame is named '{name}' here; the table frame lists all of them")
+    return found[0][0], found[0][1]
+
+
+def _weights(
+    workspace: Workspace, round_number: int, frame: tuple[int, str], policy: str, count: int
+) -> np.ndarray:
+    """(count,) by k, of the frame with that key and name."""
+    table = bulk.table("weight")
+    key, name = frame
+    here = (table.c.round == round_number, table.c.policy == policy, table.c.frame_id == key)
+    with workspace.database.reading() as connection:
+        refuse_bad_weights(connection, round_number, policy, name)
+        found = bulk.select(connection, select(table.c.k, table.c.v).where(*here))
+    weights = np.full(count, 0.0 if found else np.nan)
+    for k, v in found:
+        weights[k] = v
+    return weights
+
+
+def _decided(
+    workspace: Workspace, round_number: int, key: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(count,) bool by k: rejected by people, and giving way to a human label's own box."""
+    match, label = bulk.table("human_match"), bulk.table("human_label")
+    same = (label.c.frame_id == match.c.frame_id, label.c.n == match.c.n)
+    query = select(match.c.k, label.c.decision).where(
+        *same, match.c.round == round_number, match.c.frame_id == key
+    )
+    rejected, replaced = np.zeros((2, count), dtype=bool)
+    with workspace.database.reading() as connection:
+        for k, decision in bulk.select(connection, query):
+            (rejected if decision == REJECTED else replaced)[k] = True
+    return rejected, replaced
+
+
+def _repredictions(
+    workspace: Workspace, round_number: int, key: int, weights: np.ndarray
+) -> ShownRepredictions:
+    table = bulk.table("reprediction")
+    query = (
+        select(table.c.matched_k, *(table.c[name] for name in BOX_COLUMNS))
+        .where(table.c.round == round_number, table.c.frame_id == key)
+        .order_by(table.c.view, table.c.k)
+    )
+    with workspace.database.reading() as connection:
+        rows = bulk.select(connection, query)
+    boxes = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 7)
+    own = [0.0 if row[0] is None else float(weights[row[0]]) for row in rows]
+    return ShownRepredictions(boxes, np.array(own, dtype=np.float64))

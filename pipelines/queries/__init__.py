@@ -1,0 +1,1 @@
+"""Read-only SQL: named queries that ship with curate, and how any query is run."""

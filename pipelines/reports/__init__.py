@@ -1,0 +1,1 @@
+"""What people look at: reports, explanations, status, pictures and recordings."""

@@ -1,0 +1,385 @@
+"""Every number behind one weight, and the weight recomputed from them."""
+
+import json
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Select, and_, select, text
+
+from curate.errors import WorkspaceError
+from curate.priors.points import point_trust
+from curate.priors.semantic import semantic_trust
+from curate.weighting.base import Age, Evidence
+from curate.weighting.self_paced import age_parameter, easiness
+from db import bulk
+from db.views import WEIGHTED_LABELS
+from pipelines.assembly import semantic_settings
+from pipelines.labels.by_frame import refuse_bad_weights, weighted_round
+from pipelines.registry import PRIORS
+from pipelines.review.decisions import tell_decision
+from pipelines.workspace.config import Config, make_config
+from pipelines.workspace.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class View:
+    """What one augmented copy said of a label."""
+
+    view: int
+    flip_y: bool
+    rotation_rad: float
+    scale: float
+    score: float | None
+    iou: float | None
+    score_loss: float | None
+    box_loss: float | None
+
+
+@dataclass(frozen=True)
+class AgeParameter:
+    """What Eq. 4 takes: lambda = (e/E) hardest + (1 - e/E) mean, never above the maximum.
+
+    Attributes:
+        round: e.
+        rounds: E.
+        scope: whose losses: of the round, the label's category, or its frame.
+        matched: how many losses these are.
+        hardest: their maximum, or the configured quantile.
+        mean: of the losses.
+        lambda_u: recomputed from these.
+    """
+
+    round: int
+    rounds: int
+    scope: str
+    matched: int
+    hardest: float
+    mean: float
+    lambda_u: float
+
+
+@dataclass(frozen=True)
+class Recomputed:
+    """The numbers of a label, each worked out again from those before it; None where unused."""
+
+    loss: float | None
+    rho_diff: float | None
+    rho_anno: float | None
+    rho_det: float
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A row of `weighted_labels`, the views behind its loss, and the weight recomputed."""
+
+    label: dict[str, Any]
+    views: tuple[View, ...]
+    age: AgeParameter | None
+    evidence: Recomputed
+    recomputed: float | None
+    lines: tuple[str, ...]
+
+    def as_text(self) -> str:
+        """For a person."""
+        return "\n".join(self.lines)
+
+
+def explain_label(
+    workspace: Workspace, frame: str, k: int, round_number: int | None, policy: str
+) -> Explanation:
+    """Why label k of a frame has its weight.
+
+    Raises:
+        WorkspaceError: the policy has not weighted such a label in that round.
+        DataError: a weight of the frame is not in [0, 1].
+    """
+    label = _label(workspace, frame, k, round_number, policy)
+    if label["provenance"] == "human":
+        return _human(workspace, label)
+    return _computed(workspace, label)
+
+
+def _human(workspace: Workspace, label: dict[str, Any]) -> Explanation:
+    """What people decided; with the numbers behind the policy's own weight where they rejected."""
+    told = tell_decision(workspace, label)
+    if label["weight"] == 0 and told.policy_weight is not None:
+        alone = _computed(workspace, {**label, "weight": told.policy_weight})
+        return replace(alone, label=label, lines=(*alone.lines, told.lines[0]))
+    lines = (*_head(_numbers(label)), *told.lines)
+    nothing = Recomputed(None, None, None, math.nan)
+    return Explanation(label, (), None, nothing, None, lines)
+
+
+def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
+    """The numbers behind a policy's weight."""
+    frame, k = label["frame"], label["k"]
+    views = _views(workspace, label["round"], frame, k)
+    config = _stored_config(workspace, label["round"])
+    age = _age(workspace, config, label) if label["lambda_u"] is not None else None
+    evidence = _evidence(config, label, views)
+    alone = not views and not _self_paced(config, label["policy"])
+    recomputed = _weight(label, evidence, age, alone=alone)
+    lines = _lines(config, label, views, age, evidence, recomputed)
+    return Explanation(label, views, age, evidence, recomputed, tuple(lines))
+
+
+def _label(
+    workspace: Workspace, frame: str, k: int, round_number: int | None, policy: str
+) -> dict[str, Any]:
+    if round_number is None:
+        round_number = weighted_round(workspace, policy)
+    with workspace.database.reading() as connection:
+        labels = WEIGHTED_LABELS.c
+        refuse_bad_weights(connection, round_number or 1, policy, frame)
+        key = {"round": round_number, "frame": frame, "k": k, "policy": policy}
+        query = select(WEIGHTED_LABELS).where(*(labels[name] == key[name] for name in key))
+        row = connection.execute(query).fetchone()
+    if row is None:
+        raise WorkspaceError(
+            f"round {round_number or 1} has no label {k} of frame {frame} weighted by {policy}, or "
+            "the policy dropped it; the view weighted_labels lists what there is, see "
+            "`curate query --help`"
+        )
+    return dict(row._mapping)  # noqa: SLF001 - its public name
+
+
+def _stored_config(workspace: Workspace, round_number: int) -> Config:
+    """The settings that the round was last worked on with; curate.toml may say others by now."""
+    table = bulk.table("round")
+    query = select(table.c.config).where(table.c.number == round_number)
+    with workspace.database.reading() as connection:
+        stored = connection.execute(query).scalar_one()
+    return make_config(json.loads(stored), f"settings stored of round {round_number}")
+
+
+def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple[View, ...]:
+    query = text(
+        """
+        SELECT v.view, v.flip_y, v.rotation_rad, v.scale, r.score, r.iou, r.score_loss, r.box_loss
+        FROM reprediction_view AS v JOIN frame AS f ON f.id = v.frame_id
+        LEFT JOIN reprediction AS r ON r.round = v.round AND r.frame_id = v.frame_id
+            AND r.view = v.view AND r.matched_k = :k
+        WHERE v.round = :round AND f.frame = :frame ORDER BY v.view
+        """
+    )
+    with workspace.database.reading() as connection:
+        rows = connection.execute(query, {"round": round_number, "frame": frame, "k": k})
+        return tuple(View(row[0], bool(row[1]), *row[2:]) for row in rows)
+
+
+def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgeParameter | None:
+    """Eq. 4 over the losses that share the label's lambda; None without any."""
+    scope, quantile = _schedule(config, label["policy"])
+    number = bulk.table("round")
+    query = _losses(label, scope)
+    rounds = select(number.c.rounds).where(number.c.number == label["round"])
+    with workspace.database.reading() as connection:
+        losses = np.array([row[0] for row in bulk.select(connection, query)])
+        last = int(connection.execute(rounds).scalar_one())
+    if not len(losses):
+        return None
+    hardest = float(losses.max() if quantile is None else np.quantile(losses, quantile))
+    lambda_u = _lambda(losses, Age(label["round"], last), quantile)
+    mean = float(losses.mean())
+    return AgeParameter(label["round"], last, scope, len(losses), hardest, mean, lambda_u)
+
+
+def _lambda(losses: np.ndarray, age: Age, quantile: float | None) -> float:
+    """Eq. 4 of losses that share their lambda."""
+    zeros = np.zeros(len(losses))
+    evidence = Evidence(zeros.astype(np.int64), zeros.astype(np.str_), score=zeros, loss=losses)
+    return float(age_parameter(evidence, age, quantile=quantile)[0])
+
+
+def _losses(label: dict[str, Any], scope: str) -> Select[tuple[float]]:
+    """The losses that share a label's lambda; the policy saw those that people decided on too."""
+    weight, loss = bulk.table("weight"), bulk.table("consistency")
+    frame, prediction = bulk.table("frame"), bulk.table("prediction")
+    keys = ("round", "frame_id", "k")
+    tables = weight.join(loss, and_(*(loss.c[key] == weight.c[key] for key in keys)))
+    tables = tables.join(prediction, and_(*(prediction.c[key] == weight.c[key] for key in keys)))
+    tables = tables.join(frame, frame.c.id == weight.c.frame_id)
+    places = {"category": prediction.c.category, "frame": frame.c.frame}
+    same = () if scope == "round" else (places[scope] == label[scope],)
+    return select(loss.c.loss).select_from(tables).where(
+        weight.c.round == label["round"], weight.c.policy == label["policy"],
+        frame.c.split == "unlabeled", loss.c.loss.is_not(None), *same,
+    )  # fmt: skip
+
+
+def _schedule(config: Config, policy: str) -> tuple[str, float | None]:
+    """Which labels share one lambda, and the quantile in place of the maximum, of a policy."""
+    section = config.solve
+    options = section.options.get(policy, {})
+    return options.get("scope", section.scope), options.get("quantile", section.quantile)
+
+
+def _evidence(config: Config, label: dict[str, Any], views: tuple[View, ...]) -> Recomputed:
+    """L from the views; the priors from their counts, those of the user as they are stored."""
+    weights = config.repredict.score_weight, config.repredict.box_weight
+    losses = [
+        weights[0] * view.score_loss + weights[1] * view.box_loss
+        for view in views
+        if view.score_loss is not None and view.box_loss is not None
+    ]
+    again = {"points": ("rho_diff", _rho_diff), "semantic": ("rho_anno", _rho_anno)}
+    rho: dict[str, float | None] = {}
+    for prior in config.run.priors:
+        if prior in again:
+            column, formula = again[prior]
+            rho[column] = formula(config, label)
+        else:
+            column = PRIORS.load(prior).rho_column
+            rho[column] = label[column]
+    product = math.prod(value for value in rho.values() if value is not None)
+    loss = sum(losses) / len(losses) if losses else None
+    return Recomputed(loss, rho.get("rho_diff"), rho.get("rho_anno"), product)
+
+
+def _rho_diff(_config: Config, label: dict[str, Any]) -> float | None:
+    """Eq. 8."""
+    if label["points"] is None:
+        return None
+    return float(point_trust(*(np.array(label[name]) for name in ("points", "points_threshold"))))
+
+
+def _rho_anno(config: Config, label: dict[str, Any]) -> float | None:
+    """Eq. 9."""
+    if label["box_pixels"] is None:
+        return None
+    score, mask_pixels, box_pixels = (
+        np.array(label[name]) for name in ("score", "mask_pixels", "box_pixels")
+    )
+    return float(semantic_trust(score, mask_pixels, box_pixels, semantic_settings(config)))
+
+
+def _self_paced(config: Config, policy: str) -> bool:
+    """Whether the policy weighs by the consistency loss."""
+    section = config.solve
+    own = section.options.get(policy, {}).get("self_paced", section.self_paced)
+    return policy != "pspsl" or bool(own)
+
+
+def _weight(
+    label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None, *, alone: bool
+) -> float | None:
+    """The weight by Eqs. 7 and 11; None for policies that do not use them.
+
+    A label that matched has a lambda unless the policy was told to do without: it weighs rho_det,
+    as do all where the priors are `alone`, without a second pass.
+    """
+    if label["policy"] not in {"spsl", "pspsl"}:
+        return None
+    if evidence.loss is None:
+        return evidence.rho_det if alone else 0.0
+    if age is None:
+        return evidence.rho_det
+    v = float(easiness(np.array([evidence.loss]), np.array([age.lambda_u]))[0])
+    return v * (evidence.rho_det if label["policy"] == "pspsl" else 1.0)
+
+
+def _lines(
+    config: Config,
+    label: dict[str, Any],
+    views: tuple[View, ...],
+    age: AgeParameter | None,
+    evidence: Recomputed,
+    recomputed: float | None,
+) -> list[str]:
+    number = _numbers(label)
+    section = config.repredict
+    lines = _head(number)
+    lines += [f"  {_view_line(view)}" for view in views]
+    lines.append(
+        f"  consistency    L = {section.score_weight:g} (-ln s') + {section.box_weight:g} box loss"
+        f", mean over matched views = {number['loss']}"
+        if views
+        else "  consistency    no second pass over augmented copies, so no L"
+    )
+    if label["points"] is not None:
+        lines.append(
+            "  points, Eq. 8  rho_diff = min({points}, {points_threshold}) / {points_threshold} "
+            "= {rho_diff}".format(**number)
+        )
+    if label["box_pixels"] is not None:
+        formula = {
+            "geometric": "sqrt(s S/A)", "product": "s S/A", "arithmetic": "(s + S/A) / 2",
+        }[config.semantic.mean]  # fmt: skip
+        lines.append(
+            f"  semantic, Eq. 9  rho_anno = {formula} with s = {number['score']}, "
+            f"S = {number['mask_pixels']}, A = {number['box_pixels']} pixels = {number['rho_anno']}"
+        )
+    factors = [
+        f"{name} {value:.4f}"
+        for name, value in (("rho_diff", evidence.rho_diff), ("rho_anno", evidence.rho_anno))
+        if value is not None
+    ]
+    lines.append(f"  priors         rho_det = {' * '.join(factors) or '1'} = {number['rho_det']}")
+    lines.append(_age_line(config, label["policy"], age, str(number["lambda_u"])))
+    formulas = {"spsl": "1 - L / lambda, Eq. 7", "pspsl": "rho_det (1 - L / lambda), Eq. 11"}
+    if label["lambda_u"] is None and not _self_paced(config, label["policy"]):
+        formulas["pspsl"] = "rho_det, without the self-paced term"
+    formula = formulas.get(label["policy"], "see curate solve --help")
+    lines.append(f"  policy         {label['policy']}: v = {formula}")
+    lines.append(f"  weight         {number['weight']}")
+    if recomputed is not None:
+        lines.append(f"  recomputed     {_working(label, evidence, age)}{recomputed:.4f}")
+        if not math.isclose(recomputed, label["weight"], abs_tol=1e-6):
+            lines.append("  they differ: settings have changed since; `curate solve` weighs again")
+    return lines
+
+
+def _numbers(label: dict[str, Any]) -> dict[str, Any]:
+    """The columns of a label as they are printed."""
+    return {
+        name: "none" if value is None else f"{value:.4f}" if isinstance(value, float) else value
+        for name, value in label.items()
+    }
+
+
+def _head(number: dict[str, Any]) -> list[str]:
+    """Which label it is, and where."""
+    return [
+        "round {round}, frame {frame}, label {k}: {category}, score {score}".format(**number),
+        "  box            x {x}  y {y}  z {z}  l {length}  w {width}  h {height}  yaw {yaw}".format(
+            **number
+        ),
+    ]
+
+
+def _age_line(config: Config, policy: str, age: AgeParameter | None, stored: str) -> str:
+    """Eq. 4 with its numbers."""
+    if age is None:
+        return f"  age, Eq. 4     lambda = {stored}"
+    _, quantile = _schedule(config, policy)
+    hardest = "max(L)" if quantile is None else f"{quantile:g} quantile of L"
+    return (
+        f"  age, Eq. 4     lambda = (e/E) {hardest} + (1 - e/E) mean(L) = {age.round}/{age.rounds} "
+        f"* {age.hardest:.4f} + {1 - age.round / age.rounds:.4f} * {age.mean:.4f} = {stored}, over "
+        f"{age.matched} matched labels of the {age.scope}"
+    )
+
+
+def _working(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> str:
+    """The equation of the weight with its numbers; empty where nothing is to be worked out."""
+    if age is None or evidence.loss is None:
+        return ""
+    if evidence.loss >= age.lambda_u > 0:
+        return f"L {evidence.loss:.4f} is not below lambda {age.lambda_u:.4f}: "
+    ease = f"1 - {evidence.loss:.4f} / {age.lambda_u:.4f}"
+    return f"{evidence.rho_det:.4f} * ({ease}) = " if label["policy"] == "pspsl" else f"{ease} = "
+
+
+def _view_line(view: View) -> str:
+    how = (
+        f"view {view.view}: {'flipped, ' if view.flip_y else ''}"
+        f"rotated {view.rotation_rad:+.3f} rad, scaled {view.scale:.3f}"
+    )
+    if view.score is None:
+        return f"{how}: no match"
+    return (
+        f"{how}: matched with BEV IoU {view.iou:.3f}, s' {view.score:.4f}, -ln s' "
+        f"{view.score_loss:.4f}, box loss {view.box_loss:.4f}"
+    )

@@ -1,0 +1,151 @@
+"""The figures of a report: what a round's losses, priors and weights are, all labels together."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from sqlalchemy import case, func, select
+
+from curate.viewing.page import ALL, Figure, Section
+from curate.viewing.svg import Mark, histogram
+from db import bulk
+from pipelines.reports.totals import BANDS, SHARES, SHOWN_AGES, RoundTotals, Sums
+from pipelines.workspace.workspace import Workspace
+
+_TOLD = {
+    "weight": "the weight v",
+    "score": "the detector's score s",
+    "rho_diff": "the point prior (Eq. 8)",
+    "rho_anno": "the semantic prior (Eq. 9)",
+    "rho_det": "the product of the priors",
+}
+
+
+def is_repredicted(workspace: Workspace, number: int) -> bool:
+    """Whether the round has a second pass over augmented copies."""
+    view = bulk.table("reprediction_view")
+    query = select(view.c.round).where(view.c.round == number).limit(1)
+    with workspace.database.reading() as connection:
+        return bool(bulk.select(connection, query))
+
+
+def summary(
+    workspace: Workspace, totals: RoundTotals, number: int, *, repredicted: bool
+) -> Section:
+    """The round in a few numbers."""
+    n, kept, trusted = totals.everything.labels, totals.everything.kept, totals.trusted
+    facts = [
+        ("labels", f"{n:,}"),
+        ("unlabeled frames", f"{totals.frames:,}"),
+        ("weight above 0", f"{kept:,} ({kept / n:.1%})"),
+        ("weight above 0.5", f"{trusted:,} ({trusted / n:.1%})"),
+        ("sum of weights", f"{totals.everything.weight:,.1f}"),
+        (
+            "matched again",
+            f"{totals.matched:,} ({totals.matched / n:.1%})" if repredicted else "no second pass",
+        ),
+    ]
+    if len(totals.ages):
+        low, high = float(totals.ages[0]), float(totals.ages[-1])
+        facts.append(("lambda", f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"))
+    facts.append(("age e/E", _age(workspace, number)))
+    note = (
+        f"{n:,} labels in {totals.frames:,} unlabeled frames, {kept:,} with a weight "
+        "above 0; the others mark regions to ignore."
+    )
+    return Section("The round", note, facts=facts)
+
+
+def distributions(totals: RoundTotals) -> Section:
+    """Histograms of losses, priors and weights."""
+    n, loss = totals.everything.labels, totals.histograms["loss"]
+    marks = [Mark(float(value), f"λ {value:.3g}") for value in totals.ages[:SHOWN_AGES]]
+    figures = []
+    if totals.matched:
+        unmatched = (
+            f"the loss of {totals.matched:,} labels; {n - totals.matched:,} without a matched "
+            "reprediction left out"
+        )
+        chart = histogram(loss.counts, loss.edges, "consistency loss L", marks)
+        figures.append(Figure(chart, unmatched))
+    for name in SHARES:
+        found = totals.histograms[name]
+        if not found.above:
+            continue
+        # Most weights are 0: in the same chart they would flatten all others.
+        left_out = f"; {found.zeros:,} labels with 0 left out" if found.zeros else ""
+        chart = histogram(found.counts, found.edges, name)
+        figures.append(Figure(chart, f"{_TOLD[name]} of {found.above:,} labels{left_out}"))
+    return Section("Losses, priors and weights", figures=figures)
+
+
+def by_category(totals: RoundTotals, categories: tuple[str, ...]) -> Section:
+    """A row per category and distance, and the sums.
+
+    Args:
+        totals: see `RoundTotals`.
+        categories: those that come first.
+    """
+    rows = []
+    for category in dict.fromkeys((*categories, *(name for name, _ in totals.cells))):
+        own = {band: totals.cells.get((category, band)) for band in range(len(BANDS) - 1)}
+        found = {band: sums for band, sums in own.items() if sums is not None}
+        if found:
+            rows.append((category, ALL, *_cells(_together(list(found.values())))))
+        rows += [(category, _place(band), *_cells(sums)) for band, sums in found.items()]
+    rows.append((ALL, "", *_cells(totals.everything)))
+    columns = (
+        "category", "distance", "labels", "weight > 0", "share kept", "sum of weights",
+        "mean weight", "mean score",
+    )  # fmt: skip
+    return Section("Labels by category and distance", columns=columns, rows=rows)
+
+
+def beside_others(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:
+    """The policies that weighted the same labels, where there are several."""
+    weight, frame = bulk.table("weight"), bulk.table("frame")
+    above = [func.sum(case((weight.c.v > least, 1), else_=0)) for least in (0, 0.5)]
+    query = (
+        select(weight.c.policy, func.count(), *above, func.sum(weight.c.v), func.avg(weight.c.v))
+        .join(frame, frame.c.id == weight.c.frame_id)
+        .where(weight.c.round == number, frame.c.split == "unlabeled")
+        .group_by(weight.c.policy)
+        .order_by(weight.c.policy)
+    )
+    with workspace.database.reading() as connection:
+        rows = [
+            (f"{row[0]} (this page)" if row[0] == policy else row[0], *map(int, row[1:4]), *row[4:])
+            for row in bulk.select(connection, query)
+        ]
+    if len(rows) > 1:
+        columns = ("policy", "labels", "weight > 0", "weight > 0.5", "sum of weights", "mean")
+        note = "The same labels under every policy that has weighted them in this round."
+        yield Section("Beside other policies", note, columns, rows)
+
+
+def _together(parts: list[Sums]) -> Sums:
+    return Sums(
+        sum(part.labels for part in parts),
+        sum(part.kept for part in parts),
+        sum(part.weight for part in parts),
+        sum(part.score for part in parts),
+    )
+
+
+def _place(band: int) -> str:
+    near, far = BANDS[band], BANDS[band + 1]
+    return f"{near:.0f}-{far:.0f} m" if np.isfinite(far) else f"from {near:.0f} m"
+
+
+def _cells(sums: Sums) -> tuple[int, int, float, float, float, float]:
+    """Labels, kept ones, their share, and the sum and means of weight and score."""
+    n = sums.labels
+    return n, sums.kept, sums.kept / n, sums.weight, sums.weight / n, sums.score / n
+
+
+def _age(workspace: Workspace, number: int) -> str:
+    """The round and of how many it is, as it was made."""
+    table = bulk.table("round")
+    query = select(table.c.rounds).where(table.c.number == number)
+    with workspace.database.reading() as connection:
+        rows = bulk.select(connection, query)
+    return f"{number}/{rows[0][0]}" if rows else str(number)

@@ -1,0 +1,109 @@
+"""Pictures of a frame's weighted labels."""
+
+from pathlib import Path
+
+import numpy as np
+
+from curate.errors import ConfigError, DataError
+from curate.geometry.points_in_boxes import count_points_in_boxes
+from curate.viewing.bird_eye import draw_bird_eye
+from curate.viewing.canvas import save_png
+from curate.viewing.frame_view import draw_frame
+from curate.viewing.overlay import draw_overlay
+from curate.viewing.tags import ShownLabels
+from pipelines.labels.by_frame import FrameLabels, read_labels
+from pipelines.labels.of_one_frame import chosen_round, read_frame
+from pipelines.workspace.workspace import Workspace
+
+
+def draw_telling_frame(workspace: Workspace, round_number: int) -> list[Path]:
+    """A bird's eye view and an image overlay of the frame that shows most of all weights."""
+    policy = workspace.config.run.method
+    frames = list(read_labels(workspace, round_number, policy))
+    shown = max(frames, key=_variety)
+    return draw_labels(workspace, round_number, shown)
+
+
+def draw_view(
+    workspace: Workspace,
+    name: str,
+    round_number: int | None = None,
+    policy: str | None = None,
+    output: Path | None = None,
+) -> Path:
+    """Image and bird's eye view of any frame in one picture; says where it is.
+
+    Args:
+        workspace: see `Workspace`.
+        name: of the frame.
+        round_number: None for the last that has predictions.
+        policy: whose weights; None for the configured one.
+        output: None for a file in the folder `pictures`.
+
+    Raises:
+        ConfigError: no frame has that name, or a picture cannot be written to `output`.
+        WorkspaceError: the round has no predictions.
+    """
+    number = chosen_round(workspace, round_number)
+    policy = policy or workspace.config.run.method
+    picture = frame_picture(workspace, name, number, policy)
+    path = output or workspace.root / "pictures" / f"round-{number:02d}-{name}-{policy}.png"
+    if path.is_dir() or not path.parent.is_dir():
+        raise ConfigError(f"--output {path}: name a file in a folder that exists")
+    save_png(path, picture)
+    return path
+
+
+def frame_picture(workspace: Workspace, name: str, round_number: int, policy: str) -> np.ndarray:
+    """Image and bird's eye view of any frame as (height, width, 3) uint8 RGB.
+
+    Raises:
+        ConfigError: no frame has that name.
+    """
+    found = read_frame(workspace, name, round_number, policy)
+    frame = workspace.dataset.read(name, image=True)
+    counts = count_points_in_boxes(frame.points, found.labels.boxes)
+    labels = ShownLabels(
+        found.labels.boxes, found.labels.categories, found.labels.scores, found.weights, counts
+    )
+    title = f"frame {name} ({found.split}), round {round_number}, weights by {policy}"
+    return draw_frame(
+        frame,
+        labels,
+        found.truth_boxes,
+        found.repredictions,
+        human_boxes=found.human_boxes,
+        title=title,
+    )
+
+
+def draw_labels(workspace: Workspace, round_number: int, shown: FrameLabels) -> list[Path]:
+    """Both pictures of a frame, in the folder `pictures`."""
+    frame = workspace.dataset.read(shown.frame, image=True)
+    if frame.image is None:
+        raise DataError(f"frame {shown.frame}: the data set has no image")
+    labels = ShownLabels(
+        shown.labels.boxes,
+        shown.labels.categories,
+        shown.labels.scores,
+        shown.weights,
+        shown.points,
+    )
+    title = f"frame {shown.frame}, round {round_number}, weights by {workspace.config.run.method}"
+    stem = f"round-{round_number:02d}-{shown.frame}"
+    pictures = {
+        f"{stem}-bird-eye.png": draw_bird_eye(frame.points, labels, title=title),
+        f"{stem}-image.png": draw_overlay(frame.image, frame.calibration, labels, title=title),
+    }
+    folder = workspace.root / "pictures"
+    for name, picture in pictures.items():
+        save_png(folder / name, picture)
+    return [folder / name for name in pictures]
+
+
+def _variety(shown: FrameLabels) -> float:
+    """How much a frame has of both trusted and mistrusted labels, the nearer the better."""
+    near = shown.labels.boxes[:, 0] < 40
+    trusted = (shown.weights[near] > 0.3).sum()
+    mistrusted = (shown.weights[near] < 0.1).sum()
+    return float(min(trusted, mistrusted) + 0.01 * trusted)

@@ -1,0 +1,82 @@
+"""A 3D recording of frames of a round, with what is stored of each label."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import select
+
+from curate.errors import ConfigError
+from curate.geometry.points_in_boxes import count_points_in_boxes
+from curate.viewing.recording import RecordedFrame, load_rerun, write_recording
+from curate.viewing.tags import ShownLabels
+from db import bulk
+from db.views import WEIGHTED_LABELS
+from pipelines.labels.of_one_frame import read_frame
+from pipelines.workspace.workspace import Workspace
+
+EVIDENCE = (
+    "loss", "points_threshold", "rho_diff", "mask_pixels", "box_pixels", "rho_anno", "rho_det",
+    "lambda_u",
+)  # fmt: skip
+
+
+def record_frames(
+    workspace: Workspace, names: Sequence[str], round_number: int, policy: str, output: Path
+) -> Path:
+    """Writes the recording; says where it is.
+
+    Args:
+        workspace: see `Workspace`.
+        names: of the frames, in the order of the time line.
+        round_number: whose predictions.
+        policy: whose weights.
+        output: the .rrd file.
+
+    Raises:
+        ConfigError: rerun is not installed, a frame is unknown, or the file cannot be written.
+    """
+    load_rerun()
+    if output.suffix != ".rrd" or output.is_dir() or not output.parent.is_dir():
+        raise ConfigError(f"--rerun {output}: name an .rrd file in a folder that exists")
+    write_recording(output, _recorded(workspace, names, round_number, policy))
+    return output
+
+
+def _recorded(
+    workspace: Workspace, names: Sequence[str], round_number: int, policy: str
+) -> Iterator[RecordedFrame]:
+    """The frames, one at a time: their points do not fit into memory together."""
+    for name in names:
+        found = read_frame(workspace, name, round_number, policy)
+        frame = workspace.dataset.read(name, image=True)
+        counts = count_points_in_boxes(frame.points, found.labels.boxes)
+        labels = ShownLabels(
+            found.labels.boxes, found.labels.categories, found.labels.scores, found.weights, counts
+        )
+        evidence = {"points": counts.astype(np.float64)}
+        evidence |= _evidence(workspace, name, round_number, policy, len(labels))
+        yield RecordedFrame(
+            frame,
+            labels,
+            evidence,
+            found.repredictions,
+            found.truth_boxes,
+            None if found.truth is None else found.truth.categories,
+            f"frame {name} ({found.split}), round {round_number}, weights by {policy}",
+        )
+
+
+def _evidence(
+    workspace: Workspace, name: str, round_number: int, policy: str, count: int
+) -> dict[str, np.ndarray]:
+    """(count,) by k of each kind of evidence; NaN where there is none."""
+    labels = WEIGHTED_LABELS.c
+    query = select(labels.k, *(labels[column] for column in EVIDENCE)).where(
+        labels.round == round_number, labels.frame == name, labels.policy == policy
+    )
+    table = np.full((count, len(EVIDENCE)), np.nan)
+    with workspace.database.reading() as connection:
+        for k, *values in bulk.select(connection, query):
+            table[k] = values
+    return dict(zip(EVIDENCE, table.T, strict=True))

@@ -1,0 +1,229 @@
+"""The report of a round: one HTML file with figures, changes and the labels worth a look."""
+
+from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import select
+
+from curate.files.atomic import replace_file
+from curate.viewing.close_up import LabelShown, draw_close_up
+from curate.viewing.page import Figure, Section, render_page
+from curate.viewing.svg import share_curve
+from db import bulk
+from db.views import WEIGHTED_LABELS
+from pipelines.labels.by_frame import weighted_round
+from pipelines.labels.columns import read_blocks, read_frame_columns
+from pipelines.labels.human_labels import counts
+from pipelines.labels.of_one_frame import chosen_round
+from pipelines.reports.differences import COLUMNS, ChangedLabel, Comparison, Difference
+from pipelines.reports.figures import (
+    beside_others,
+    by_category,
+    distributions,
+    is_repredicted,
+    summary,
+)
+from pipelines.reports.label_ranking import RankedLabel, Ranking
+from pipelines.reports.totals import RoundTotals, extent
+from pipelines.workspace.workspace import Workspace
+
+_PICTURES = 6
+
+
+def write_report(workspace: Workspace, round_number: int | None, policy: str | None) -> Path:
+    """Writes the report into the folder `reports` and says where.
+
+    Args:
+        workspace: see `Workspace`.
+        round_number: None for the last that the policy weighted.
+        policy: whose weights; None for the configured one.
+
+    Raises:
+        WorkspaceError: the policy has weighted nothing in that round.
+    """
+    policy = policy or workspace.config.run.method
+    number = chosen_round(workspace, round_number or weighted_round(workspace, policy))
+    totals = RoundTotals(extent(workspace, number, policy))
+    repredicted = is_repredicted(workspace, number)
+    doubted, kept = Ranking(_PICTURES), Ranking(_PICTURES)
+    comparison = Comparison(_PICTURES)
+    before = _round_before(workspace, number, policy)
+    rounds = (number,) if before is None else (number, before)
+    for labels, *former in read_blocks(workspace, rounds, policy):
+        score = labels.numbers["score"]
+        totals.add(labels)
+        doubted.add(labels, score - labels.weights)
+        kept.add(labels, np.where(score < 0.5, labels.weights, 0.0))
+        for each in former:
+            comparison.add(each, labels)
+    rejected = _rejected(workspace, number, policy, doubted)
+    sections = [
+        summary(workspace, totals, number, repredicted=repredicted),
+        distributions(totals),
+        by_category(totals, workspace.config.dataset.categories),
+        *beside_others(workspace, number, policy),
+        *(
+            []
+            if before is None
+            else _changes(workspace, comparison.finish((before, number), policy))
+        ),
+        *(
+            _shown(workspace, heading, ranking, rejected, repredicted=repredicted)
+            for heading, ranking in (
+                ("Most doubted: high score, low weight", doubted),
+                ("Kept against a low score: below 0.5, greatest weight", kept),
+            )
+        ),
+        *_reliability(workspace, number, policy),
+    ]
+    title = f"Round {number}, weights by {policy}"
+    note = f"workspace {workspace.root.name}, data set {workspace.config.dataset.kind}"
+    decided = counts(workspace, number)
+    if decided:
+        told = ", ".join(f"{count:,} {name}" for name, count in decided.items())
+        note += f". People decided on some labels, whatever the policy says: {told}."
+    path = workspace.root / "reports" / f"round-{number:02d}-{policy}.html"
+    replace_file(path, render_page(title, note, sections).encode("utf-8"))
+    return path
+
+
+def _round_before(workspace: Workspace, number: int, policy: str) -> int | None:
+    """The round before, where the policy weighted that."""
+    weight = bulk.table("weight")
+    query = select(weight.c.k).where(weight.c.round == number - 1, weight.c.policy == policy)
+    with workspace.database.reading() as connection:
+        return number - 1 if bulk.select(connection, query.limit(1)) else None
+
+
+def _changes(workspace: Workspace, found: Difference) -> Iterator[Section]:
+    """What changed since the round before."""
+    note = (
+        "Matched one to one by BEV IoU; moved: an IoU below 0.7; heavier, lighter: by 0.05 or more."
+    )
+    names = [name.replace("_", " ") for name in COLUMNS]
+    rows = [tuple(row.values()) for row in found.categories]
+    figures = [_changed(workspace, found, each) for each in found.labels]
+    yield Section(f"Since round {found.rounds[0]}", note, names, rows, figures)
+
+
+def _changed(workspace: Workspace, found: Difference, each: ChangedLabel) -> Figure:
+    """One of the most changed labels, with its former box in dashes."""
+    boxes = [
+        _box(workspace, number, found.policy, each.frame, k)
+        for number, k in zip(found.rounds, (each.k_before, each.k_after), strict=True)
+        if k is not None
+    ]
+    label = LabelShown(boxes[-1], each.weight_after, boxes[0] if len(boxes) == 2 else None)
+    caption = (
+        f"{each.change}: {each.category} in frame {each.frame}, weight "
+        f"{each.weight_before:.2f} to {each.weight_after:.2f}"
+    )
+    return _close_up(workspace, each.frame, label, caption)
+
+
+def _rejected(
+    workspace: Workspace, number: int, policy: str, ranking: Ranking
+) -> AbstractSet[tuple[str, int]]:
+    """Frames and numbers of the labels that people rejected, in the frames of a ranking."""
+    labels = WEIGHTED_LABELS.c
+    query = select(labels.frame, labels.k).where(
+        labels.round == number,
+        labels.policy == policy,
+        labels.frame.in_(sorted({each.frame for each in ranking.labels})),
+        labels.provenance == "human",
+        labels.weight == 0,
+    )
+    with workspace.database.reading() as connection:
+        return {(frame, k) for frame, k in bulk.select(connection, query)}
+
+
+def _shown(
+    workspace: Workspace,
+    title: str,
+    ranking: Ranking,
+    rejected: AbstractSet[tuple[str, int]],
+    *,
+    repredicted: bool,
+) -> Section:
+    """Pictures of the labels of a ranking."""
+    figures = [
+        _close_up(
+            workspace,
+            each.frame,
+            LabelShown(each.box, each.numbers["weight"]),
+            _told(each, rejected=(each.frame, each.k) in rejected, repredicted=repredicted),
+        )
+        for each in ranking.labels
+    ]
+    return Section(title, "" if figures else "There is none.", figures=figures)
+
+
+def _told(label: RankedLabel, *, rejected: bool, repredicted: bool) -> str:
+    """What a label is, its numbers, and what took its weight away."""
+    own = label.numbers
+    shown = {"score": "score", "weight": "weight", "loss": "L", "points": "points",
+             "rho_diff": "rho_diff", "rho_anno": "rho_anno"}  # fmt: skip
+    numbers = ", ".join(
+        f"{word} {_figure(own[name])}" for name, word in shown.items() if not np.isnan(own[name])
+    )
+    reasons = {
+        "no reprediction matched it": repredicted and np.isnan(own["loss"]),
+        "its loss is above lambda": own["loss"] >= own["lambda_u"],
+        "no pixel of its category": own["rho_anno"] == 0,
+        "no LiDAR point inside": own["points"] == 0,
+    }
+    if rejected:
+        reasons = {"a person rejected it": True}
+    found = [reason for reason, holds in reasons.items() if holds and own["weight"] <= 0]
+    return f"{label.category} {label.k} in frame {label.frame}: {numbers}" + "".join(
+        f"; {reason}" for reason in found
+    )
+
+
+def _figure(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _reliability(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:
+    """A curve per stored audit of the round."""
+    bins = bulk.table("audit_bin")
+    names = ("frames", "overlap", "mean_weight", "precision", "labels")
+    query = (
+        select(*(bins.c[name] for name in names))
+        .where(bins.c.round == number, bins.c.policy == policy, bins.c.category == "all")
+        .order_by(bins.c.frames, bins.c.overlap, bins.c.low)
+    )
+    with workspace.database.reading() as connection:
+        rows = bulk.select(connection, query)
+    figures = [
+        Figure(
+            _curve([row[2:] for row in rows if row[:2] == kind]),
+            f"audit on {kind[0]}, right by {kind[1]} overlap",
+        )
+        for kind in dict.fromkeys(row[:2] for row in rows)
+    ]
+    if figures:
+        note = (
+            "Share of right labels over their mean weight; on the diagonal it means what it says."
+        )
+        yield Section("Reliability", note, figures=figures)
+
+
+def _curve(rows: Sequence[Sequence[float]]) -> str:
+    table = np.array(rows, dtype=np.float64)
+    table = table[~np.isnan(table).any(axis=1)]
+    return share_curve(table[:, 0], table[:, 1], table[:, 2], "mean weight of the bin")
+
+
+def _box(workspace: Workspace, number: int, policy: str, frame: str, k: int) -> np.ndarray:
+    """(7,) box of a label."""
+    labels = read_frame_columns(workspace, number, policy, frame)
+    box: np.ndarray = labels.boxes[labels.k == k][0]
+    return box
+
+
+def _close_up(workspace: Workspace, name: str, label: LabelShown, caption: str) -> Figure:
+    frame = workspace.dataset.read(name, image=True)
+    return Figure.picture(draw_close_up(frame, label), caption)

@@ -1,0 +1,133 @@
+"""What the labels of a round amount to, summed up block by block in memory that does not grow."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from sqlalchemy import func, select
+
+from db import bulk
+from pipelines.labels.columns import LabelColumns
+from pipelines.workspace.workspace import Workspace
+
+BANDS = (0.0, 20.0, 40.0, 60.0, np.inf)
+"""Edges of the distances from the LiDAR, metres."""
+SHARES = ("weight", "score", "rho_diff", "rho_anno", "rho_det")
+"""Numbers from 0 to 1 of which a histogram is kept."""
+SHOWN_AGES = 4
+LOSS_BINS, SHARE_BINS = 40, 25
+
+
+@dataclass
+class Histogram:
+    """Counts of the values above 0, or from 0 on.
+
+    Attributes:
+        edges: (bins + 1,) rising; a value beyond the last counts in no bar.
+        counts: (bins,).
+        above: how many values are above 0.
+        zeros: how many are 0; the others are NaN.
+        with_zeros: whether zeros count in the bars too.
+    """
+
+    edges: np.ndarray
+    counts: np.ndarray = field(init=False)
+    above: int = 0
+    zeros: int = 0
+    with_zeros: bool = False
+
+    def __post_init__(self) -> None:
+        self.counts = np.zeros(len(self.edges) - 1, dtype=np.int64)
+
+    def add(self, values: np.ndarray) -> None:
+        """(n,) values more."""
+        above, zeros = values > 0, values == 0
+        counted = above | zeros if self.with_zeros else above
+        self.counts += np.histogram(values[counted], self.edges)[0]
+        self.above += int(above.sum())
+        self.zeros += int(zeros.sum())
+
+
+@dataclass
+class Sums:
+    """What some labels amount to."""
+
+    labels: int = 0
+    kept: int = 0
+    weight: float = 0.0
+    score: float = 0.0
+
+    def add(self, weights: np.ndarray, scores: np.ndarray) -> None:
+        """The labels with these (n,) weights and scores more."""
+        self.labels += len(weights)
+        self.kept += int((weights > 0).sum())
+        self.weight += float(weights.sum())
+        self.score += float(scores.sum())
+
+
+@dataclass
+class RoundTotals:
+    """Sums over the labels of a round.
+
+    Attributes:
+        extent: the greatest loss and the least lambda; NaN where there is none.
+        frames: with labels.
+        trusted: labels with a weight above 0.5.
+        ages: the `SHOWN_AGES` least values of lambda and the greatest.
+        everything: sums over all labels.
+        cells: sums by category and place in `BANDS`.
+        histograms: of the loss and of each of `SHARES`, by name.
+    """
+
+    extent: tuple[float, float]
+    frames: int = 0
+    trusted: int = 0
+    ages: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    everything: Sums = field(default_factory=Sums)
+    cells: dict[tuple[str, int], Sums] = field(default_factory=dict)
+    histograms: dict[str, Histogram] = field(init=False)
+
+    def __post_init__(self) -> None:
+        reach = float(np.nanmax((*self.extent, 1e-9))) * 1.02
+        loss = Histogram(np.linspace(0, reach, LOSS_BINS + 1), with_zeros=True)
+        edges = np.linspace(0, 1, SHARE_BINS + 1)
+        self.histograms = {"loss": loss} | {name: Histogram(edges) for name in SHARES}
+
+    @property
+    def matched(self) -> int:
+        """Labels with a loss."""
+        loss = self.histograms["loss"]
+        return loss.above + loss.zeros
+
+    def add(self, labels: LabelColumns) -> None:
+        """The labels of a block of frames more."""
+        weights, scores = labels.weights, labels.numbers["score"]
+        self.frames += len(labels.frame_names)
+        self.trusted += int((weights > 0.5).sum())
+        self.everything.add(weights, scores)
+        ages = labels.numbers["lambda_u"]
+        ages = np.unique([*self.ages, *np.unique(ages[~np.isnan(ages)])])
+        self.ages = np.unique([*ages[:SHOWN_AGES], *ages[-1:]])
+        for name, histogram in self.histograms.items():
+            histogram.add(labels.numbers[name])
+        distance = np.hypot(labels.boxes[:, 0], labels.boxes[:, 1])
+        cell = labels.categories * len(BANDS) + np.digitize(distance, BANDS[1:])
+        for number in np.unique(cell).tolist():
+            category, band = divmod(number, len(BANDS))
+            own = cell == number
+            sums = self.cells.setdefault((labels.category_names[category], band), Sums())
+            sums.add(weights[own], scores[own])
+
+
+def extent(workspace: Workspace, round_number: int, policy: str) -> tuple[float, float]:
+    """The greatest loss and the least lambda of a round; NaN where there is none."""
+    loss, weight = bulk.table("consistency").c, bulk.table("weight").c
+    queries = (
+        select(func.max(loss.loss)).where(loss.round == round_number),
+        select(func.min(weight.lambda_u)).where(
+            weight.round == round_number, weight.policy == policy
+        ),
+    )
+    with workspace.database.reading() as connection:
+        found = [connection.execute(query).scalar_one() for query in queries]
+    greatest, least = (float("nan") if each is None else float(each) for each in found)
+    return greatest, least

@@ -1,0 +1,302 @@
+"""curate review import: what people decided, stored in one transaction or not at all."""
+
+import getpass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import Connection, select
+
+from curate.detections import as_categories
+from curate.errors import ConfigError, DataError, LeakageError
+from curate.review.answer import Answer, Decision, EditedBox, check_boxes, read_answer
+from curate.review.human_labels import (
+    ACCEPTED,
+    ADDED,
+    MOVED,
+    REJECTED,
+    HumanLabels,
+    entangled,
+    superseded,
+)
+from curate.review.sheet import MANIFEST, Sheet, ShownFrame, read_sheet
+from curate.review.table import Words, read_table
+from db import bulk
+from db.models import BOX_COLUMNS
+from pipelines.labels.human_labels import SEEN_COLUMNS, read_human_labels, refresh_all_matches
+from pipelines.registry import EDITORS
+from pipelines.workspace.workspace import SPLITS, Workspace
+
+ALL_FRAMES = "all"
+# How many faults an error names.
+_NAMED = 5
+_SHARED = ("frame_id", "item", "decision", "category", "from_round", *BOX_COLUMNS, *SEEN_COLUMNS)
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What an import did, or would do.
+
+    Attributes:
+        review: its id.
+        frames: with an answer.
+        without_answer: frames of the review that did not come back.
+        accepted, rejected, moved, added: decisions.
+        untouched: boxes on which nothing was said; they stay what they were.
+        replaced: earlier decisions of other reviews about the same objects.
+        changed: whether anything is different from what was stored before.
+        from_round: the decisions count in this round and later ones.
+        dry_run: nothing was stored.
+    """
+
+    review: str
+    frames: int
+    without_answer: int
+    accepted: int
+    rejected: int
+    moved: int
+    added: int
+    untouched: int
+    replaced: int
+    changed: bool
+    from_round: int
+    dry_run: bool
+
+
+def take_back(
+    workspace: Workspace,
+    folder: Path,
+    *,
+    answer: Path | None = None,
+    accept: Collection[str] = (),
+    reviewer: str | None = None,
+    from_round: int | None = None,
+    dry_run: bool = False,
+) -> Taken:
+    """Reads an answer and stores its decisions in place of those of an earlier import of it.
+
+    Args:
+        workspace: see `Workspace`.
+        folder: as it was exported.
+        answer: what the editor wrote, where that lies elsewhere.
+        accept: frames whose unchanged boxes are accepted; "all" for all of them.
+        reviewer: who decided; None for the name of the user.
+        from_round: first round in which the decisions count; None for the reviewed one.
+        dry_run: only says what would be stored.
+
+    Raises:
+        DataError: something is missing, damaged, or of another workspace or review.
+        LeakageError: a frame is not unlabeled.
+        ConfigError: `accept` names no frame of the review.
+    """
+    sheet = read_sheet(folder)
+    keys = _keys(workspace, folder, sheet)
+    answers = _answers(workspace, folder, sheet, answer or folder, accept)
+    first = sheet.round if from_round is None else from_round
+    rows = [
+        _row(keys[each.frame], decision, first) for each in answers for decision in each.decisions
+    ]
+    who = reviewer or _user()
+    with workspace.database.reading() as connection:
+        changed = _stored(connection, sheet.id) != sorted(rows, key=repr)
+        gone = _superseded(connection, sheet.id, rows)
+    if changed and not dry_run:
+        with workspace.database.writing() as connection:
+            _store(connection, sheet.id, rows, who)
+    decided = [decision.decision for each in answers for decision in each.decisions]
+    return Taken(
+        review=sheet.id,
+        frames=len(answers),
+        without_answer=len(sheet.frames) - len(answers),
+        accepted=decided.count(ACCEPTED),
+        rejected=decided.count(REJECTED),
+        moved=decided.count(MOVED),
+        added=decided.count(ADDED),
+        untouched=sum(each.untouched for each in answers),
+        replaced=len(gone),
+        changed=changed,
+        from_round=first,
+        dry_run=dry_run,
+    )
+
+
+def _keys(workspace: Workspace, folder: Path, sheet: Sheet) -> dict[str, int]:
+    """The keys of the frames of a review that this workspace has handed out."""
+    table = bulk.table("review")
+    with workspace.database.reading() as connection:
+        known = bulk.select(connection, select(table.c.id).where(table.c.id == sheet.id))
+    if not known:
+        raise DataError(
+            f"{folder / MANIFEST}: review {sheet.id} was not exported from the workspace "
+            f"{workspace.root}; name its own with --workspace"
+        )
+    everywhere, unlabeled = workspace.frames(*SPLITS), workspace.frames("unlabeled")
+    for shown in sheet.frames:
+        if shown.frame not in everywhere:
+            raise DataError(f"{folder / MANIFEST}: no frame is named '{shown.frame}' here")
+        if shown.frame not in unlabeled:
+            raise LeakageError(
+                f"{folder / MANIFEST}: frame {shown.frame} is not unlabeled any more; "
+                "human labels are for unlabeled frames only"
+            )
+    return unlabeled
+
+
+def _answers(
+    workspace: Workspace, folder: Path, sheet: Sheet, answer: Path, accept: Collection[str]
+) -> list[Answer]:
+    editor = EDITORS.build(sheet.editor, offered={}, options={})
+    edited = editor.read(answer, sheet, partial(workspace.dataset.read, points=False))
+    words = read_table(folder, sheet)
+    names = {shown.frame for shown in sheet.frames}
+    for name in accept:
+        if name not in {*names, ALL_FRAMES}:
+            raise ConfigError(f"--accept: frame '{name}' is not in this review")
+    answers = []
+    for shown in sheet.frames:
+        said = words.get(shown.frame, Words())
+        if shown.frame not in edited and not (said.boxes or said.accept_rest):
+            continue
+        boxes = edited.get(shown.frame, _as_shown(shown))
+        check_boxes(boxes, sheet.categories)
+        rest = said.accept_rest or not {shown.frame, ALL_FRAMES}.isdisjoint(accept)
+        answers.append(read_answer(shown, boxes, said.boxes, accept_rest=rest))
+    _refuse_entangled(answers)
+    return answers
+
+
+def _refuse_entangled(answers: Sequence[Answer]) -> None:
+    """DataError where two objects of an answer lie in each other."""
+    found = []
+    for answer in answers:
+        rows = [_row(0, decision, 1) for decision in answer.decisions]
+        for pair in entangled(_by_frame(rows)[0]) if rows else ():
+            one, other = (_called(answer.decisions[place]) for place in pair)
+            found.append(f"{one} and {other} of frame {answer.frame}")
+    if found:
+        more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        raise DataError(
+            f"two objects cannot lie in each other: reject one of {'; '.join(found[:_NAMED])}{more}"
+        )
+
+
+def _called(decision: Decision) -> str:
+    number = "new box" if decision.number is None else f"box {decision.number}"
+    return f"{number} ({decision.category})"
+
+
+def _as_shown(shown: ShownFrame) -> list[EditedBox]:
+    return [EditedBox(box.category, box.box, shown.frame) for box in shown.boxes]
+
+
+def _row(frame_id: int, decision: Decision, from_round: int) -> bulk.Row:
+    """The columns `_SHARED`."""
+    seen = decision.seen or (None,) * len(SEEN_COLUMNS)
+    word = (decision.number, decision.decision, decision.category, from_round)
+    return (frame_id, *word, *decision.box, *seen)
+
+
+def _stored(connection: Connection, review: str) -> list[bulk.Row]:
+    """What is stored of a review, without who and when."""
+    table = bulk.table("human_label")
+    query = select(*(table.c[name] for name in _SHARED)).where(table.c.review == review)
+    return sorted(bulk.select(connection, query), key=repr)
+
+
+def _superseded(
+    connection: Connection, review: str, rows: Sequence[bulk.Row]
+) -> list[tuple[int, int]]:
+    """Keys of the decisions of other reviews that new ones take the place of."""
+    later = _by_frame(rows)
+    former = read_human_labels(connection, later.keys(), but_of=review)
+    return [
+        (frame_id, n)
+        for frame_id, stored in former.items()
+        for n in stored.n[superseded(stored.labels, later[frame_id])].tolist()
+    ]
+
+
+def _store(connection: Connection, review: str, rows: Sequence[bulk.Row], reviewer: str) -> None:
+    """Puts decisions in place of those of the review's earlier import, and what they overrule."""
+    label, table = bulk.table("human_label"), bulk.table("review")
+    mine = label.c.review == review
+    before = bulk.select(connection, select(label.c.frame_id).where(mine).distinct())
+    gone = _superseded(connection, review, rows)
+    connection.execute(label.delete().where(mine))
+    for frame_id, n in gone:
+        connection.execute(label.delete().where(label.c.frame_id == frame_id, label.c.n == n))
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    frame_ids = {row[0] for row in rows}
+    kept = read_human_labels(connection, frame_ids)
+    taken = {frame_id: set(stored.n.tolist()) for frame_id, stored in kept.items()}
+    bulk.insert(connection, "human_label", [
+        (row[0], _free(taken.setdefault(row[0], set())), "unlabeled", review, row[1], row[2],
+         row[3], row[4], *row[5:], reviewer, now)
+        for row in rows
+    ])  # fmt: skip
+    refresh_all_matches(
+        connection, {row[0] for row in before} | {key for key, _ in gone} | frame_ids
+    )
+    connection.execute(table.update().where(table.c.id == review).values(imported_at=now))
+
+
+def clear(workspace: Workspace, reviews: Collection[str] = (), frames: Collection[str] = ()) -> int:
+    """Forgets human labels, of reviews or of frames or all; the policies' weights count again.
+
+    Returns:
+        How many labels there were.
+
+    Raises:
+        ConfigError: no such review or frame.
+    """
+    label, review = bulk.table("human_label"), bulk.table("review")
+    with workspace.database.writing() as connection:
+        known = {row[0] for row in bulk.select(connection, select(review.c.id))}
+        keys = workspace.frames("unlabeled")
+        for name in {*reviews} - known:
+            raise ConfigError(f"no review {name} here; `curate review list` lists them")
+        for name in {*frames} - keys.keys():
+            raise ConfigError(f"--frames: no unlabeled frame is named '{name}' here")
+        query = select(label.c.frame_id, label.c.n)
+        if reviews:
+            query = query.where(label.c.review.in_(reviews))
+        if frames:
+            query = query.where(label.c.frame_id.in_([keys[name] for name in frames]))
+        gone = bulk.select(connection, query)
+        for frame_id, n in gone:
+            connection.execute(label.delete().where(label.c.frame_id == frame_id, label.c.n == n))
+        refresh_all_matches(connection, {frame_id for frame_id, _ in gone})
+    return len(gone)
+
+
+def _by_frame(rows: Iterable[bulk.Row]) -> Mapping[int, HumanLabels]:
+    """Rows of `_SHARED` as labels."""
+    found: dict[int, list[bulk.Row]] = {}
+    for row in rows:
+        found.setdefault(row[0], []).append(row)
+    return {
+        frame_id: HumanLabels(
+            as_categories([row[2] for row in own]),
+            as_categories([row[3] for row in own]),
+            np.array([row[5:12] for row in own], dtype=np.float64),
+            np.array([row[12:19] for row in own], dtype=np.float64),
+        )
+        for frame_id, own in found.items()
+    }
+
+
+def _free(taken: set[int]) -> int:
+    """The least number that is not taken; takes it."""
+    n = next(n for n in range(len(taken) + 1) if n not in taken)
+    taken.add(n)
+    return n
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return "unknown"

@@ -1,0 +1,1 @@
+"""One project on disk: its folder, its configuration, and its first setup."""

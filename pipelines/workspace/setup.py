@@ -1,0 +1,266 @@
+"""Setting a workspace up: which frames are labeled, and their ground truth."""
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import func, select
+
+from curate.datasets.base import Dataset, sequences_of
+from curate.datasets.formats.containment import check_frame_id
+from curate.detections import Annotations
+from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
+from curate.exporters.base import named
+from curate.files.batches import batched
+from curate.firewall.sequences import choose_sequences, group_by_sequence, straddling
+from curate.segmenters.classes import CLASS_MAPS, class_map
+from db import bulk
+from pipelines import registry
+from pipelines.workspace.config import Config
+from pipelines.workspace.split_record import split_rows
+from pipelines.workspace.workspace import SPLITS, Workspace, open_dataset
+
+_log = logging.getLogger(__name__)
+
+FRAMES_AT_ONCE = 1024
+
+
+@dataclass(frozen=True)
+class Split:
+    """Frame names per split; no frame is in two."""
+
+    labeled: tuple[str, ...]
+    unlabeled: tuple[str, ...]
+    val: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Raises LeakageError where two splits share a frame."""
+        for one, other in (("labeled", "unlabeled"), ("labeled", "val"), ("unlabeled", "val")):
+            shared = sorted(set(getattr(self, one)) & set(getattr(self, other)))
+            if shared:
+                raise LeakageError(f"frames in both {one} and {other}: {', '.join(shared[:5])}")
+
+
+def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
+    """A workspace with its frames and the ground truth of X_l and val.
+
+    Everything is read before anything is written, so a damaged file leaves no half workspace.
+
+    Args:
+        root: the workspace's folder.
+        config: its settings.
+        labeled: share of the training frames, e.g. "0.04", or a file with a frame name per line.
+        val: likewise, of the frames outside the data set's own val list; "" for that list.
+
+    Raises:
+        ConfigError: a share or a list is wrong, or a detector or segmenter is not there.
+        DataError: a label or calibration file of X_l or val is damaged.
+        WorkspaceError: the workspace exists with other frames or settings.
+    """
+    _refuse_absent(config)
+    dataset = open_dataset(config)
+    split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
+    truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
+    workspace = Workspace.create(root, config)
+    stored = Split(*(tuple(workspace.frames(name)) for name in ("labeled", "unlabeled", "val")))
+    if stored == split:
+        return workspace
+    if any((stored.labeled, stored.unlabeled, stored.val)):
+        raise WorkspaceError(
+            f"{workspace.root}: exists with another split of the frames; choose another folder"
+        )
+    lists = {"labeled": labeled, "val": val}
+    files = {name: Path(wish) for name, wish in lists.items() if wish and Path(wish).is_file()}
+    _store(workspace, dataset, split, truth, files)
+    return workspace
+
+
+def _refuse_absent(config: Config) -> None:
+    """ConfigError for a detector or segmenter that nobody knows or whose file is not there."""
+    registry.DETECTORS.refuse_unknown(config.detector.name)
+    registry.SEGMENTERS.refuse_unknown(config.segmenter.name, "none", "simulated")
+    needs_path = {"detector": ("onnx", "recorded"), "segmenter": tuple(registry.SEGMENTERS.classes)}
+    for section, names in needs_path.items():
+        name, path = getattr(config, section).name, getattr(config, section).path
+        if path is None and name in names:
+            raise ConfigError(f"{section} '{name}' needs a path: give --{section}-path")
+        if path is not None and not path.exists():
+            raise ConfigError(f"--{section}-path {path}: no such file")
+    _refuse_undeclared_classes(config)
+
+
+def _refuse_undeclared_classes(config: Config) -> None:
+    """ConfigError where nobody says what the numbers of a segmenter's classes mean."""
+    name, section = config.segmenter.name, config.segmenter
+    if section.classes is not None:
+        class_map(section.classes)
+    elif (
+        name in registry.SEGMENTERS.classes
+        and registry.SEGMENTERS.takes(name, "classes")
+        and "classes" not in section.options
+    ):
+        raise ConfigError(
+            f"segmenter '{name}': say what its class numbers mean: --segmenter-classes "
+            f"{', '.join(CLASS_MAPS)}; or a table of your own: --set "
+            '"segmenter.options.classes={Car=[7]}"'
+        )
+
+
+def choose_split(
+    dataset: Dataset, labeled: str, val: str, seed: int, split_by: str = "sequence"
+) -> Split:
+    """Which frames are labeled, unlabeled and val.
+
+    Where the data set knows sequences, a sequence goes into one split as a whole; `split_by`
+    "frame" draws frames all the same.
+
+    Raises:
+        LeakageError: given lists put a sequence into two splits.
+    """
+    lists = dataset.splits()
+    frames = lists.get("train") or dataset.frame_ids()
+    if not frames:
+        raise DataError("the data set holds no frames; --root should hold velodyne/ or training/")
+    known = sequences_of(dataset, {*frames, *lists.get("val", ())})
+    sequences = known if split_by == "sequence" else {}
+    if known and not sequences:
+        _log.warning(
+            "splitting by frame: near-duplicate frames of one sequence will be in several splits, "
+            "and figures on val frames will look better than they are"
+        )
+    generator = np.random.default_rng(seed)
+    held_out: Sequence[str] = lists.get("val", ())
+    if val:
+        held_out = _choose(dataset, frames, val, generator, "val", sequences)
+    bare = [frame for frame in held_out if not dataset.files(frame).label]
+    if bare:
+        raise ConfigError(
+            f"val frame {bare[0]} has no label file; give --val 0 for no val frames, or a list of "
+            "frames that have one"
+        )
+    pool = [frame for frame in frames if frame not in set(held_out)]
+    chosen = _choose(dataset, pool, labeled, generator, "labeled", sequences)
+    rest = sorted(set(pool) - set(chosen))
+    found = Split(tuple(sorted(chosen)), tuple(rest), tuple(sorted(held_out)))
+    for frame in (*found.labeled, *found.unlabeled, *found.val):
+        check_frame_id(frame)
+    _refuse_straddling(sequences, found)
+    return found
+
+
+def _refuse_straddling(sequences: Mapping[str, str], split: Split) -> None:
+    """LeakageError where a sequence is in two splits."""
+    shared = straddling(sequences, {name: getattr(split, name) for name in SPLITS})
+    for (one, other), names in shared.items():
+        raise LeakageError(
+            f"{len(names)} sequences ({named(names)}) have frames in both {one} and {other}, which "
+            "are near-duplicates of each other: give whole sequences (a list may hold their "
+            "names), or split by frame all the same with --split-by frame"
+        )
+
+
+def _choose(
+    dataset: Dataset,
+    pool: Sequence[str],
+    wish: str,
+    generator: np.random.Generator,
+    split: str,
+    sequences: Mapping[str, str],
+) -> list[str]:
+    """Frames by share or by list, in whole sequences where there are any.
+
+    Only frames with a label file can be chosen.
+    """
+    if Path(wish).is_file():
+        return _listed(dataset, pool, Path(wish), split)
+    try:
+        share = float(wish)
+    except ValueError:
+        share = -1.0
+    if not 0 <= share <= 1:
+        raise ConfigError(f"--{split} {wish}: give a share between 0 and 1, or a file of frame ids")
+    if share == 0:
+        return []
+    with_label = [name for name in sorted(pool) if dataset.files(name).label]
+    count = max(1, round(share * len(pool)))
+    if count > len(with_label):
+        raise ConfigError(
+            f"--{split} {wish} asks for {count} frames, but only {len(with_label)} of {len(pool)} "
+            "have a label file; give a smaller share (0 for none)"
+        )
+    if sequences:
+        groups = group_by_sequence(sequences, pool)
+        whole = {name for name, frames in groups.items() if set(frames) <= set(with_label)}
+        of = [frame for name in sorted(whole) for frame in groups[name]]
+        if not of:
+            raise ConfigError(
+                f"--{split} {wish}: no sequence has a label file for each of its frames; give a "
+                f"list of frames, or split by frame with --split-by frame"
+            )
+        return choose_sequences(sequences, of, count, generator)
+    return list(generator.permutation(with_label)[:count].tolist())
+
+
+def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
+    """The frames that a file names, each once; a sequence of the pool stands for its frames."""
+    try:
+        names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--{split} {path}: no list of frame ids: {error}") from error
+    groups = group_by_sequence(sequences_of(dataset, pool), pool)
+    names = [frame for name in names for frame in groups.get(name, (name,))]
+    unknown = sorted(set(names) - set(pool))
+    if unknown:
+        raise ConfigError(f"--{split} {path}: frame {unknown[0]} is not among the training frames")
+    bare = [name for name in names if not dataset.files(name).label]
+    if bare:
+        raise ConfigError(f"--{split} {path}: frame {bare[0]} has no label file")
+    return names
+
+
+def _store(
+    workspace: Workspace,
+    dataset: Dataset,
+    split: Split,
+    truth: dict[str, Annotations],
+    files: Mapping[str, Path],
+) -> None:
+    table = bulk.table("frame")
+    with workspace.database.writing() as connection:
+        if connection.execute(select(func.count()).select_from(table)).scalar_one():
+            raise WorkspaceError(f"{workspace.root}: another command has just set it up")
+        for rows in batched(_frame_rows(workspace, dataset, split), FRAMES_AT_ONCE):
+            bulk.insert(connection, "frame", rows)
+        chosen = {name: getattr(split, name) for name in SPLITS}
+        bulk.insert(connection, "split_list", split_rows(chosen, dataset.splits(), files))
+        query = select(table.c.frame, table.c.id, table.c.split).where(table.c.split != "unlabeled")
+        keys = {frame: (key, of) for frame, key, of in bulk.select(connection, query)}
+        truth_rows = [
+            row for frame, found in truth.items() for row in _truth_rows(*keys[frame], found)
+        ]
+        bulk.insert(connection, "ground_truth", truth_rows)
+
+
+def _frame_rows(workspace: Workspace, dataset: Dataset, split: Split) -> Iterator[bulk.Row]:
+    """The rows of `frame`, one at a time; not even the path of a label is kept for X_u."""
+    root, kind = workspace.config.dataset.root, workspace.config.dataset.kind
+    for name in SPLITS:
+        for frame in getattr(split, name):
+            found = dataset.files(frame)
+            label = None if name == "unlabeled" else found.label
+            paths = (found.points, found.image, found.calibration, label)
+            relative = [str(p.relative_to(root)) if p else None for p in paths]
+            yield (kind, frame, name, *relative)
+
+
+def _truth_rows(frame_id: int, split: str, found: Annotations) -> list[bulk.Row]:
+    """The rows of `ground_truth`; DontCare regions have no box."""
+    rows = []
+    for k in range(len(found)):
+        box = [None if np.isnan(number) else float(number) for number in found.boxes[k]]
+        kitti = (float(found.truncated[k]), int(found.occluded[k]), float(found.alpha[k]))
+        rectangle = map(float, found.boxes_2d[k])
+        rows.append((frame_id, k, split, str(found.categories[k]), *box, *kitti, *rectangle))
+    return rows

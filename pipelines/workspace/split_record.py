@@ -1,0 +1,133 @@
+"""The lists of frames as `curate init` found and chose them, and whether they are still so."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import select
+
+from curate.errors import ConfigError
+from curate.firewall.split_lists import SplitList, changes
+from db import bulk
+from pipelines.workspace.workspace import SPLITS, Workspace
+
+# Of a data set's own lists, those that decide who may learn from what.
+_OWN_LISTS = ("train", "val")
+
+
+def split_rows(
+    chosen: Mapping[str, Iterable[str]],
+    own: Mapping[str, Iterable[str]],
+    files: Mapping[str, Path],
+) -> list[bulk.Row]:
+    """The rows of `split_list`.
+
+    Args:
+        chosen: the frames of each split.
+        own: the data set's lists.
+        files: the lists that were given by file, by split.
+    """
+    rows: list[tuple[str, str, str | None, Iterable[str]]]
+    rows = [("chosen", name, None, chosen[name]) for name in SPLITS]
+    rows += [("dataset", name, None, own[name]) for name in _OWN_LISTS if name in own]
+    rows += [("file", name, str(path.resolve()), _read(path)) for name, path in files.items()]
+    return [_row(source, name, path, SplitList.of(names)) for source, name, path, names in rows]
+
+
+@dataclass(frozen=True)
+class RecordedList:
+    """A list of frames as init recorded it.
+
+    Attributes:
+        source: "chosen" for a split of the workspace, "dataset" for a list of the data set, "file"
+            for one that init was given.
+        name: of the split or list.
+        path: of the file.
+        sha256: what the frames hashed to.
+        frames: see `SplitList`.
+    """
+
+    source: str
+    name: str
+    path: Path | None
+    sha256: str
+    frames: SplitList
+
+
+@dataclass(frozen=True)
+class SplitRecord:
+    """The splits as they are, and the lists as init recorded them.
+
+    Attributes:
+        splits: names and keys of the frames of each split.
+        lists: what init recorded.
+    """
+
+    splits: Mapping[str, Mapping[str, int]]
+    lists: Sequence[RecordedList]
+
+    @classmethod
+    def read(cls, workspace: Workspace) -> "SplitRecord":
+        """Both from the database."""
+        table = bulk.table("split_list")
+        columns = (table.c[name] for name in ("source", "name", "path", "sha256", "names"))
+        with workspace.database.reading() as connection:
+            rows = bulk.select(connection, select(*columns))
+        lists = [
+            RecordedList(source, name, path and Path(path), digest, SplitList.from_text(names))
+            for source, name, path, digest, names in rows
+        ]
+        return cls({split: workspace.frames(split) for split in SPLITS}, lists)
+
+    @property
+    def split_of(self) -> Mapping[str, str]:
+        """The split of each frame."""
+        return {name: split for split, names in self.splits.items() for name in names}
+
+    @property
+    def damaged(self) -> Sequence[str]:
+        """The recorded lists that do not fit their own hash."""
+        return [
+            f"{found.source} {found.name}"
+            for found in self.lists
+            if found.frames.sha256 != found.sha256
+        ]
+
+    @property
+    def changed(self) -> Mapping[str, str]:
+        """What changed in each split since init; nothing where all is as it was."""
+        return _told(
+            (found.name, found.frames, self.splits.get(found.name, ()))
+            for found in self.lists
+            if found.source == "chosen"
+        )
+
+
+def changed_lists(workspace: Workspace, record: SplitRecord) -> Mapping[str, str]:
+    """What changed in each list outside the workspace; a file that is gone has not changed."""
+    own = workspace.dataset.splits()
+    return _told(
+        (f"the data set's {found.name}", found.frames, own.get(found.name, ()))
+        if found.path is None
+        else (str(found.path), found.frames, _read(found.path))
+        for found in record.lists
+        if found.source == "dataset" or (found.path is not None and found.path.is_file())
+    )
+
+
+def _told(lists: Iterable[tuple[str, SplitList, Iterable[str]]]) -> Mapping[str, str]:
+    """What changed in the lists that did change, by name."""
+    told = {name: changes(before, SplitList.of(now)) for name, before, now in lists}
+    return {name: what for name, what in told.items() if what}
+
+
+def _row(source: str, name: str, path: str | None, names: SplitList) -> bulk.Row:
+    return (source, name, path, len(names), names.sha256, names.text)
+
+
+def _read(path: Path) -> list[str]:
+    """The frames that a file names."""
+    try:
+        return path.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: no list of frame ids: {error}") from error

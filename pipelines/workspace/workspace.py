@@ -1,0 +1,226 @@
+"""A workspace: the folder that holds one project's configuration, database and products."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sqlalchemy import URL, select
+
+from curate.datasets.base import Dataset
+from curate.detections import Annotations, Detections
+from curate.errors import ConfigError, WorkspaceError
+from db import bulk
+from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
+from db.session import Database, parse_url
+from pipelines import registry
+from pipelines.workspace.config import Config, make_config, read_config, write_config
+
+CONFIG_NAME = "curate.toml"
+SPLITS = ("labeled", "unlabeled", "val")
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """An open workspace.
+
+    Attributes:
+        root: its folder, absolute.
+        config: the settings of `curate.toml`, changed by the options of the command line.
+        database: the memory.
+    """
+
+    root: Path
+    config: Config
+    database: Database
+
+    @classmethod
+    def open(cls, folder: Path | None = None) -> "Workspace":
+        """The workspace in `folder`, else in the current folder or the nearest one above it.
+
+        Raises:
+            WorkspaceError: there is none.
+            ConfigError: its configuration is wrong.
+        """
+        root = folder.resolve() if folder else _find(Path.cwd())
+        if not (root / CONFIG_NAME).is_file():
+            raise WorkspaceError(f"{root}: no workspace here; make one with `curate init {root}`")
+        config = _anchored(root, read_config(root / CONFIG_NAME))
+        return cls(root, config, Database(_url(root, config), root))
+
+    @classmethod
+    def create(cls, root: Path, config: Config) -> "Workspace":
+        """A new workspace with an empty database; one with the same settings is opened.
+
+        Raises:
+            WorkspaceError: the folder holds a workspace with other settings.
+        """
+        root = root.resolve()
+        path = root / CONFIG_NAME
+        if path.exists() and read_config(path) != config:
+            raise WorkspaceError(f"{path}: holds other settings; edit it, or choose another folder")
+        for folder in ("checkpoints", "exports", "pictures", "reports"):
+            (root / folder).mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            write_config(path, config)
+        return cls(root, config, Database(_url(root, config), root))
+
+    def with_settings(self, section: str, **changes: Any) -> "Workspace":
+        """The same workspace with other settings in a section, for this command only.
+
+        Raises:
+            ConfigError: a setting is wrong.
+        """
+        changed = {**dict(getattr(self.config, section)), **changes}
+        config = make_config({**dict(self.config), section: changed}, "command line")
+        return replace(self, config=config)
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The data set."""
+        return open_dataset(self.config)
+
+    def relative(self, path: Path) -> str:
+        """A path as it is stored: relative inside the workspace, so that a workspace can move."""
+        path = path.resolve()
+        return str(path.relative_to(self.root) if path.is_relative_to(self.root) else path)
+
+    def frames(self, *splits: str) -> dict[str, int]:
+        """Frame names and their keys, in the order of the names."""
+        frame = bulk.table("frame")
+        query = select(frame.c.frame, frame.c.id).where(frame.c.split.in_(splits))
+        with self.database.reading() as connection:
+            return dict(bulk.select(connection, query.order_by(frame.c.frame)))
+
+    def ground_truth(self, *splits: str) -> dict[str, Annotations]:
+        """The stored ground truth per frame; there is none of unlabeled frames."""
+        truth, frame = bulk.table("ground_truth"), bulk.table("frame")
+        names = ("category", *BOX_COLUMNS, "truncated", "occluded", "alpha", *RECTANGLE_COLUMNS)
+        query = (
+            select(frame.c.frame, *(truth.c[name] for name in names))
+            .join(frame, frame.c.id == truth.c.frame_id)
+            .where(frame.c.split.in_(splits))
+            .order_by(frame.c.frame, truth.c.k)
+        )
+        found: dict[str, list[bulk.Row]] = {name: [] for name in self.frames(*splits)}
+        with self.database.reading() as connection:
+            for name, *row in bulk.select(connection, query):
+                found[name].append(tuple(row))
+        return {name: _annotations(rows) for name, rows in found.items()}
+
+    def predictions(self, round_number: int, frame_ids: Sequence[int]) -> dict[int, Detections]:
+        """The stored predictions of some frames, by frame key, in the order of k."""
+        table = bulk.table("prediction")
+        query = (
+            select(
+                table.c.frame_id,
+                table.c.category,
+                table.c.score,
+                *(table.c[name] for name in (*BOX_COLUMNS, "iou")),
+            )
+            .where(table.c.round == round_number, table.c.frame_id.in_(frame_ids))
+            .order_by(table.c.frame_id, table.c.k)
+        )
+        found: dict[int, list[bulk.Row]] = {key: [] for key in frame_ids}
+        with self.database.reading() as connection:
+            for key, *row in bulk.select(connection, query):
+                found[key].append(tuple(row))
+        return {key: Detections.from_rows(rows) for key, rows in found.items()}
+
+
+def open_dataset(config: Config) -> Dataset:
+    """The data set that a configuration names."""
+    section = config.dataset
+    dataset: Dataset = registry.DATASETS.build(
+        section.kind,
+        section.root,
+        offered={"follow_links": lambda: section.follow_links},
+        options=section.options,
+    )
+    return dataset
+
+
+def sha256(path: Path) -> str:
+    """The hash of a file, or of the files in a folder with their names.
+
+    Raises:
+        ConfigError: there is no such file, or it is a pipe or a device, which may have no end.
+    """
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file")
+    if not (path.is_file() or path.is_dir()):
+        raise ConfigError(f"{path}: is a pipe or a device, no file; name a file or a folder")
+    digest = hashlib.sha256()
+    for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
+        if file != path:
+            digest.update(f"{file.relative_to(path)}\0".encode())
+        with file.open("rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
+
+
+def glance(path: Path) -> str:
+    """What tells that a folder of many large files was changed, without reading them.
+
+    Names, sizes and times of change: files that were copied count as changed.
+    """
+    digest = hashlib.sha256()
+    for file in sorted(p for p in path.rglob("*") if p.is_file()):
+        state = file.stat()
+        told = f"{file.relative_to(path)}\0{state.st_size} {state.st_mtime_ns}\n"
+        digest.update(told.encode())
+    return digest.hexdigest()
+
+
+def _anchored(root: Path, config: Config) -> Config:
+    """The configuration with relative paths taken from the workspace, not the current folder."""
+    changes: dict[str, Any] = {}
+    for name, key in (("dataset", "root"), ("detector", "path"), ("segmenter", "path")):
+        section = getattr(config, name)
+        path = getattr(section, key)
+        if path is not None:
+            changes[name] = section.model_copy(update={key: root / path})
+    return config.model_copy(update=changes)
+
+
+def _find(start: Path) -> Path:
+    for folder in (start, *start.parents):
+        if (folder / CONFIG_NAME).is_file():
+            return folder
+    raise WorkspaceError(
+        f"no {CONFIG_NAME} in {start} or above it; make a workspace with `curate init DIR`, "
+        "or name one with --workspace DIR"
+    )
+
+
+def _url(root: Path, config: Config) -> URL:
+    if config.run.database is not None:
+        return parse_url(config.run.database)
+    # Made from its parts: in a string, a ? or % of the folder's name would mean something else.
+    return URL.create("sqlite", database=str(root / "curate.db"))
+
+
+def _annotations(rows: Sequence[Sequence[Any]]) -> Annotations:
+    if not rows:
+        return Annotations.empty()
+    categories, *numbers = zip(*rows, strict=True)
+    table = np.array(numbers, dtype=np.float64).T
+    return Annotations(
+        boxes=table[:, :7],
+        categories=np.array(categories),
+        truncated=table[:, 7],
+        occluded=table[:, 8].astype(np.int64),
+        alpha=table[:, 9],
+        boxes_2d=table[:, 10:],
+    )
+
+
+def database_url(folder: Path | None) -> URL:
+    """The URL of a workspace's database, without opening or migrating it."""
+    root = folder.resolve() if folder else _find(Path.cwd())
+    if not (root / CONFIG_NAME).is_file():
+        raise WorkspaceError(f"{root}: no workspace here; make one with `curate init {root}`")
+    return _url(root, read_config(root / CONFIG_NAME))

@@ -1,0 +1,128 @@
+"""Point clouds in PCD and PLY: all forms of both, and headers that lie."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from curate.datasets.formats.clouds import read_cloud
+from curate.errors import DataError
+
+POINTS = np.random.default_rng(0).uniform(-50, 50, (40, 4)).astype(np.float32)
+POINTS[:, 3] = np.linspace(0, 1, 40)
+PCD = """# .PCD v0.7
+VERSION 0.7
+FIELDS x y normal z intensity ring
+SIZE 4 4 4 4 4 2
+TYPE F F F F F U
+COUNT 1 1 3 1 1 1
+WIDTH 20
+HEIGHT 2
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 40
+DATA {form}
+"""
+TYPE = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("n", "<f4", 3), ("z", "<f4"), ("i", "<f4"), ("r", "<u2")]
+)
+
+
+def rows() -> np.ndarray:
+    """The points with fields among them that nobody reads."""
+    table = np.zeros(len(POINTS), TYPE)
+    for name, column in zip("xyzi", POINTS.T, strict=True):
+        table[name] = column
+    table["n"], table["r"] = 7, 9
+    return table
+
+
+def packed(content: bytes) -> bytes:
+    """LZF of literals, and of one repetition where the content ends in a run of zeros."""
+    run = len(content) - len(content.rstrip(b"\0"))
+    run = min(run - 1, 264) if run > 4 else 0
+    literal = content[: len(content) - run]
+    out = b"".join(
+        bytes([len(literal[i : i + 32]) - 1]) + literal[i : i + 32]
+        for i in range(0, len(literal), 32)
+    )
+    return out + (bytes([7 << 5, run - 9, 0]) if run >= 9 else b"")
+
+
+def test_pcd_of_text(tmp_path: Path) -> None:
+    """Numbers by line."""
+    lines = [f"{x!r} {y!r} 7 7 7 {z!r} {i!r} 9" for x, y, z, i in POINTS.tolist()]
+    (tmp_path / "a.pcd").write_text(PCD.format(form="ascii") + "\n".join(lines) + "\n")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
+
+
+def test_pcd_of_bytes(tmp_path: Path) -> None:
+    """Row after row."""
+    content = PCD.format(form="binary").encode() + rows().tobytes()
+    (tmp_path / "a.pcd").write_bytes(content)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
+    (tmp_path / "a.pcd").write_bytes(content[:-1])
+    with pytest.raises(DataError, match=r"claims 40 points .* truncated"):
+        read_cloud(tmp_path / "a.pcd")
+
+
+def test_pcd_compressed(tmp_path: Path) -> None:
+    """Field after field, literals and repetitions."""
+    table = rows()
+    table["r"] = 0
+    plain = b"".join(table[name].tobytes() for name in TYPE.names)
+    content = packed(plain)
+    assert len(content) < len(plain) + len(plain) // 32
+    head = PCD.format(form="binary_compressed").encode()
+    whole = head + struct.pack("<II", len(content), len(plain)) + content
+    (tmp_path / "a.pcd").write_bytes(whole)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
+    for damaged in (
+        whole[:-3],
+        head + struct.pack("<II", len(content), 2**32 - 1) + content,
+        head + struct.pack("<II", len(content), len(plain)) + b"\xff" * len(content),
+        head,
+    ):
+        (tmp_path / "a.pcd").write_bytes(damaged)
+        with pytest.raises(DataError, match="compressed points"):
+            read_cloud(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_ply_of_bytes(tmp_path: Path, order: str) -> None:
+    """In both byte orders, with an element before the vertices and properties of other types."""
+    kind = [("x", "f8"), ("r", "u1"), ("y", "f8"), ("z", "f8"), ("intensity", "f4")]
+    table = np.zeros(40, [(name, order + of) for name, of in kind])
+    for name, column in zip(("x", "y", "z", "intensity"), POINTS.T, strict=True):
+        table[name] = column
+    form = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    types = {"f8": "double", "u1": "uchar", "f4": "float32"}
+    head = f"ply\nformat {form} 1.0\ncomment made\nelement camera 2\nproperty int id\n"
+    head += "element vertex 40\n" + "".join(f"property {types[of]} {name}\n" for name, of in kind)
+    head += "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_bytes(head.encode() + bytes(8) + table.tobytes())
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), POINTS)
+
+
+@pytest.mark.parametrize(
+    "claim",
+    ["element vertex 999999999999", "element vertex 41", "element vertex -1", "element x 1"],
+)
+def test_a_header_that_lies_costs_nothing(tmp_path: Path, claim: str) -> None:
+    """It is refused by the bytes that are there."""
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    for form in ("ascii", "binary_little_endian"):
+        head = f"ply\nformat {form} 1.0\n{claim}\n{names}end_header\n".encode()
+        body = b"1 2 3 0.5\n" * 40 if form == "ascii" else POINTS.tobytes()
+        (tmp_path / "a.ply").write_bytes(head + body)
+        with pytest.raises(DataError, match=r"a\.ply"):
+            read_cloud(tmp_path / "a.ply")
+
+
+def test_a_point_farther_than_any_lidar_sees(tmp_path: Path) -> None:
+    """Maps over the points would fill the memory; coordinates on a map are no LiDAR's."""
+    points = POINTS.copy()
+    points[3, 0] = 4.5e6
+    np.save(tmp_path / "a.npy", points)
+    with pytest.raises(DataError, match=r"point 3 is 4\.5e\+06 m away"):
+        read_cloud(tmp_path / "a.npy")

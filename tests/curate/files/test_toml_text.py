@@ -1,0 +1,48 @@
+"""TOML that would take the memory or the time is refused; everything else is read as it is."""
+
+import tomllib
+
+import pytest
+
+from curate.files.toml_text import MOST_CHARACTERS, MOST_PARTS, parse_toml
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{'a.' * 15_000}a = 1",
+        f"[{'a.' * 15_000}a]",
+        "x = {" + '"a" . ' * 15_000 + "a = 1}",
+        "#" * (MOST_CHARACTERS + 1),
+    ],
+)
+def test_what_grows_by_its_square_is_refused(text: str) -> None:
+    """Keys of many parts, however they are written, and texts without end."""
+    with pytest.raises(ValueError, match="more than"):
+        parse_toml(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{'a.' * (MOST_PARTS - 1)}a = 1",
+        f"x = [{'0.5, ' * 1000}]",
+        f"x = '{'A sentence of words. ' * 1000}'",
+        f"x = '''{chr(10).join(['1.5'] * 1000)}'''",
+    ],
+)
+def test_ordinary_documents_are_read(text: str) -> None:
+    """Points in numbers and sentences make no key."""
+    assert parse_toml(text) == tomllib.loads(text)
+
+
+@pytest.mark.parametrize("text", ["a" * 1_000_000, "'" * 999_999, '"' * 999_999, "a\t" * 400_000])
+def test_the_look_itself_takes_no_time(text: str) -> None:
+    """It ends, where a pattern that goes back and forth would not."""
+    with pytest.raises(tomllib.TOMLDecodeError):
+        parse_toml(text)
+
+
+def test_a_mark_in_front_of_the_text_is_no_part_of_it() -> None:
+    """Some editors write one."""
+    assert parse_toml("\ufeffa = 1\n") == {"a": 1}

@@ -1,0 +1,188 @@
+"""Tests of the simulated data set on disk: determinism, resuming, refusals."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.paths import ROOT
+
+from curate.datasets.kitti.dataset import KittiDataset, read_calibration
+from curate.errors import ConfigError, DataError
+from curate.simulation import simulate
+from curate.simulation.rig import CameraRig
+
+FRAMES, SEED = 8, 5  # of the fixture `simulated`
+FOLDERS = {"velodyne", "image_2", "semantic_2", "calib", "label_2"}
+
+
+def contents(root, frames):
+    """The bytes of every file of some frames."""
+    return {
+        path.relative_to(root): path.read_bytes()
+        for number in frames
+        for path in sorted((root / "training").glob(f"*/{number:06d}.*"))
+    }
+
+
+def test_the_kitti_reader_reads_it(simulated):
+    """Frames, splits, points, image and labels, as of any KITTI folder."""
+    dataset = KittiDataset(simulated)
+    names = tuple(f"{number:06d}" for number in range(FRAMES))
+    assert dataset.frame_ids() == names
+    assert dataset.splits() == {"train": names[:6], "val": names[6:], "trainval": names}
+    frame = dataset.read("000003", image=True)
+    assert 20_000 < len(frame.points) < 40_000
+    assert frame.image_size == (1242, 375)
+    assert frame.image.shape == (375, 1242, 3)
+    assert len(dataset.annotations("000003")) > 0
+
+
+def test_calibration_is_in_kittis_form_and_differs_between_frames(simulated):
+    """R0_rect is a rotation and no identity, and no two frames share a rig."""
+    rigs = [CameraRig.draw(np.random.default_rng([SEED, number, 2])) for number in range(2)]
+    for number, rig in enumerate(rigs):
+        found = read_calibration(simulated / "training" / "calib" / f"{number:06d}.txt")
+        np.testing.assert_allclose(found.projection, rig.projection, atol=1e-9)
+        np.testing.assert_allclose(
+            found.lidar_to_camera, rig.calibration.lidar_to_camera, atol=1e-9
+        )
+        np.testing.assert_allclose(rig.rectification @ rig.rectification.T, np.eye(3), atol=1e-12)
+        assert np.abs(rig.rectification - np.eye(3)).max() > 1e-3
+    assert not np.allclose(rigs[0].projection, rigs[1].projection)
+
+
+def test_workers_and_the_number_of_frames_change_nothing(simulated, tmp_path):
+    """Frame i is the same bytes, made by two processes in a data set of three frames."""
+    simulate(tmp_path / "other", 3, SEED, workers=2)
+    expected = contents(simulated, range(3))
+    assert len(expected) == 3 * len(FOLDERS)
+    assert contents(tmp_path / "other", range(3)) == expected
+
+
+def test_another_seed_gives_another_world(simulated, tmp_path):
+    """No file of a frame is the same under another seed."""
+    simulate(tmp_path / "other", 1, SEED + 1, workers=1)
+    ours, theirs = contents(tmp_path / "other", [0]), contents(simulated, [0])
+    assert all(ours[name] != theirs[name] for name in theirs)
+
+
+def test_a_killed_simulation_goes_on(simulated, tmp_path):
+    """After SIGKILL no worker stays, whole frames are kept, and the rest comes out the same."""
+    root = tmp_path / "killed"
+    code = f"""
+from pathlib import Path
+from curate.simulation import simulate
+simulate(Path({str(root)!r}), {FRAMES}, {SEED}, workers=2)
+"""
+    running = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
+    labels = root / "training" / "label_2"
+    wait_until(lambda: len(list(labels.glob("*.txt"))) >= 2 or running.poll() is not None)
+    children = Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
+    os.kill(running.pid, signal.SIGKILL)
+    assert running.wait() == -signal.SIGKILL
+    wait_until(lambda: not any(is_running(int(child)) for child in children))
+    assert not (root / "ImageSets").exists()
+    finished = {path: path.stat().st_mtime_ns for path in labels.glob("*.txt")}
+    assert 2 <= len(finished) < FRAMES
+
+    steps = []
+    simulate(root, FRAMES, SEED, workers=1, progress=lambda *step: steps.append(step))
+    assert steps[0] == (len(finished), FRAMES)
+    assert steps[-1] == (FRAMES, FRAMES)
+    assert all(path.stat().st_mtime_ns == then for path, then in finished.items())
+    assert contents(root, range(FRAMES)) == contents(simulated, range(FRAMES))
+    assert not list(root.rglob("*.partial"))
+
+
+def test_a_script_without_main_guard_is_told_so(tmp_path):
+    """In the last line, without a page from every worker; nothing hangs."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from pathlib import Path\nfrom curate.simulation import simulate\n"
+        f"simulate(Path({str(tmp_path / 'data')!r}), 3, {SEED}, workers=2)\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    ended = subprocess.run(
+        [sys.executable, script], env=environment, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 1
+    assert 'outside of `if __name__ == "__main__":`' in ended.stderr.splitlines()[-1]
+    assert ended.stderr.count("Traceback") == 1
+
+
+def test_a_frame_that_lost_a_file_is_made_again(simulated, tmp_path):
+    """A label without its image is no whole frame."""
+    simulate(tmp_path / "data", 1, SEED, workers=1)
+    (tmp_path / "data" / "training" / "image_2" / "000000.png").unlink()
+    simulate(tmp_path / "data", 1, SEED, workers=1)
+    assert contents(tmp_path / "data", [0]) == contents(simulated, [0])
+
+
+@pytest.mark.parametrize("change", [{"seed": SEED + 1}, {"frames": FRAMES + 1}, {"val_frames": 1}])
+def test_a_directory_of_another_simulation_is_refused(simulated, change):
+    """One line that names both settings, and nothing is written."""
+    settings = {"frames": FRAMES, "seed": SEED} | change
+    with pytest.raises(ConfigError, match=f"seed={SEED}") as caught:
+        simulate(simulated, **settings, workers=1)
+    assert "\n" not in str(caught.value)
+    assert len(KittiDataset(simulated).frame_ids()) == FRAMES
+
+
+def test_foreign_data_is_never_written_over(tmp_path):
+    """A folder with training/ but no simulation.json belongs to someone else."""
+    (tmp_path / "training").mkdir()
+    with pytest.raises(DataError, match="was not simulated"):
+        simulate(tmp_path, 1, 0, workers=1)
+
+
+def test_a_place_that_cannot_be_written_is_reported(tmp_path):
+    """One line that names the directory."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="file: cannot be written"):
+        simulate(tmp_path / "file", 1, 0, workers=1)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"seed": 1}'])
+def test_a_damaged_settings_file_is_reported(tmp_path, text):
+    """One line that names the file."""
+    (tmp_path / "simulation.json").write_text(text)
+    with pytest.raises(DataError, match=r"simulation\.json: is damaged"):
+        simulate(tmp_path, 1, 0, workers=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"frames": 0}, "frames must be"),
+        ({"seed": -1}, "seed must not"),
+        ({"val_frames": 4}, "val_frames must be"),
+        ({"workers": 0}, "workers must be"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(tmp_path, arguments, message):
+    """Before anything is written."""
+    with pytest.raises(ConfigError, match=message):
+        simulate(tmp_path / "data", **({"frames": 4, "seed": 0, "workers": 1} | arguments))
+    assert not (tmp_path / "data").exists()
+
+
+def wait_until(happened, seconds=600):
+    """Polls until something happened; fails the test if it does not."""
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def is_running(pid):
+    """Whether a process exists and is no zombie."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"

@@ -1,0 +1,99 @@
+"""docs/training.md: its example runs, and the data set needs nothing of the engine."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.paths import ROOT
+from support.toys import SIZES, write_toy_kitti
+
+from curate.exporters.base import LabelFileDescription
+from curate.exporters.sqlite import write_labels
+from pipelines.registry import EXPORTERS
+
+PAGE = ROOT / "docs" / "training.md"
+# As on a machine where somebody else's db.py and pipelines.py come first.
+BLOCKED = "import sys\nsys.modules['db'] = sys.modules['pipelines'] = None\n"
+
+
+@pytest.fixture
+def labels(tmp_path: Path) -> Path:
+    """A labeled frame with a car, an unlabeled one with three labels of weight 0 to 1."""
+    root = tmp_path / "kitti"
+    write_toy_kitti(root, frames=2)
+    files = [
+        tuple(f"training/{folder}/{name}.{suffix}" for folder, suffix in
+              (("velodyne", "bin"), ("image_2", "png"), ("calib", "txt")))
+        for name in ("000000", "000001")
+    ]  # fmt: skip
+    evidence = (0.9, 0.1, 9, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "detector", "pspsl")
+    path = tmp_path / "labels.sqlite"
+    write_labels(
+        path,
+        description=LabelFileDescription("kitti", root, tuple(SIZES), 1, "pspsl", "1"),
+        frames=[("000000", "labeled", *files[0]), ("000001", "unlabeled", *files[1])],
+        ground_truth=[("000000", 0, "Car", 12.0, 1.0, -0.8, *SIZES["Car"], 0.3, 0.0, 0)],
+        labels=[
+            (1, "000001", k, "Car", 8.0 + 6 * k, 0.0, -0.8, *SIZES["Car"], 0.1, *evidence, k / 2)
+            for k in range(3)
+        ],
+    )
+    return path
+
+
+def run(code: str, *arguments: object) -> str:
+    """What a Python without db and pipelines prints."""
+    ended = subprocess.run(
+        [sys.executable, "-c", BLOCKED + code, *map(str, arguments)],
+        capture_output=True, text=True, check=False, cwd=PAGE.parent.parent,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+def test_the_torch_data_set_needs_neither_db_nor_pipelines(labels: Path) -> None:
+    """From the file to weights in a user's own training script."""
+    code = (
+        "import sys, pathlib\n"
+        "from torch.utils.data import DataLoader\n"
+        "from curate.training.labels import WeightedLabels\n"
+        "data = WeightedLabels(pathlib.Path(sys.argv[1]))\n"
+        "loader = DataLoader(data, batch_size=2, collate_fn=list)\n"
+        "print([s.weights.tolist() for batch in loader for s in batch])\n"
+    )
+    assert run(code, labels) == "[[1.0], [0.0, 0.5, 1.0]]\n"
+
+
+def test_the_plain_pytorch_example_learns(labels: Path, tmp_path: Path) -> None:
+    """It runs as it is printed, its loss falls, and it leaves its checkpoint."""
+    example = re.search(r"<!-- plain pytorch.*?```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert example is not None
+    printed = run(example[1], labels, tmp_path / "student.pt")
+    losses = [float(line.rpartition(" ")[2]) for line in printed.splitlines()]
+    assert len(losses) == 3
+    assert losses == sorted(losses, reverse=True)
+    assert (tmp_path / "student.pt").stat().st_size > 0
+
+
+def test_the_example_lets_v_count(labels: Path) -> None:
+    """No gradient in the region of a label with v = 0; half of it where v is half."""
+    example = re.search(r"<!-- plain pytorch.*?```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert example is not None
+    definitions = example[1].partition("torch.manual_seed")[0]
+    check = (
+        "found, codes, weight = targets(labels[1])\n"
+        "answer = torch.zeros(1600, 7, requires_grad=True)\n"
+        "weighted_loss(answer, found, codes, weight, 1).backward()\n"
+        "slopes = [answer.grad[(cells - torch.tensor([x, 0.5])).norm(dim=1).argmin(), 0].item()\n"
+        "          for x in (8.5, 14.5, 20.5, 35.5)]\n"
+        "print(slopes)\n"
+    )
+    assert run(definitions + check, labels) == "[0.0, -0.25, -0.5, 0.5]\n"
+
+
+def test_every_format_is_described() -> None:
+    """And nothing that is not registered."""
+    named = set(re.findall(r"^\| `(\w+)` \|", PAGE.read_text(), re.MULTILINE))
+    assert named == set(EXPORTERS.classes)

@@ -1,0 +1,278 @@
+"""`curate evaluate`: the official figures, bad input in one line, outcomes in SQL."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.pipelines_cli import Curate
+from support.toys import toy_calibration, toy_document
+
+from curate.datasets.kitti.dataset import write_calibration
+from curate.errors import ConfigError, DataError, WorkspaceError
+from pipelines.workspace.config import make_config
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import Workspace
+
+LINE = "Car 0.00 0 0.50 100 100 180 160 1.5 1.6 4.0 0.0 1.7 20.0 0.3"
+MISSED = "SELECT frame, k, category, iou FROM evaluation WHERE outcome = 'fn'"
+
+
+@pytest.fixture
+def workspace(tmp_path: Path, toy_kitti: Path, weights_file: Path) -> Workspace:
+    """The toy workspace seen by a sharper camera, in which no object is too low to count."""
+    calibration = toy_calibration()
+    sharp = np.diag([10.0, 10.0, 1.0]) @ calibration.projection
+    for frame in range(12):
+        write_calibration(
+            toy_kitti / "training" / "calib" / f"{frame:06d}.txt",
+            replace(calibration, projection=sharp),
+        )
+        image = np.zeros((400, 1200, 3), dtype=np.uint8)
+        cv2.imwrite(str(toy_kitti / "training" / "image_2" / f"{frame:06d}.png"), image)
+    config = make_config(toy_document(toy_kitti, weights_file), "test")
+    return initialise(tmp_path / "work", config, "0.25", "")
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path]:
+    """Labels and results of two frames: a car that is found, and nothing."""
+    labels, results = tmp_path / "label_2", tmp_path / "results"
+    for folder, line in ((labels, LINE), (results, f"{LINE} 0.5")):
+        folder.mkdir()
+        (folder / "000001.txt").write_text(line + "\n")
+        (folder / "000002.txt").write_text("")
+    return labels, results
+
+
+def evaluate(curate: Curate, folders: tuple[Path, Path], *more: object) -> tuple[int, str, str]:
+    """The command on two folders."""
+    return curate("evaluate", "--labels", folders[0], "--results", folders[1], *more)
+
+
+def test_it_prints_what_the_official_program_prints(curate: Curate, kitti_eval_root: Path) -> None:
+    """The oracle's shape, to 1e-4 for categories with 41 objects or more."""
+    code, out, _ = evaluate(
+        curate, (kitti_eval_root / "label_2", kitti_eval_root / "results"), "--json"
+    )
+    assert code == 0
+    found, expected = json.loads(out), json.loads((kitti_eval_root / "expected.json").read_text())
+    for table in ("AP_R40", "AP_R11"):
+        for category, by_figure in expected[table].items():
+            for figure, values in by_figure.items():
+                for d, value in enumerate(values):
+                    if found["objects"][category][d] >= 41:
+                        ours = found[table][category][figure][d]
+                        assert ours == pytest.approx(value, abs=1e-4), (table, category, figure)
+
+
+def test_it_shows_r40_and_r11_side_by_side(curate: Curate, folders: tuple[Path, Path]) -> None:
+    """And the recall; a found car is exactly 100."""
+    code, out, _ = evaluate(curate, folders)
+    assert code == 0
+    lines = {tuple(line.split()[:2]): line.split()[2:] for line in out.splitlines() if line.strip()}
+    assert lines[("Car", "3d")] == ["100.00"] * 6
+    assert lines[("Car", "aos")] == ["100.00"] * 6
+    assert "recall 3d > 0.7" in out
+
+
+def test_a_first_evaluation_says_that_it_is_compiled(
+    curate: Curate, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one line beside the figures, which stay JSON."""
+    monkeypatch.setattr("curate.geometry.compiled.is_compiled", lambda _kernel: False)
+    code, out, err = evaluate(curate, folders, "--json")
+    assert (code, err) == (0, "compiling the evaluation, once: this takes some ten seconds\n")
+    assert json.loads(out)["objects"]["Car"]
+
+
+def test_a_list_names_the_frames_to_compare(
+    curate: Curate, folders: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Labels of a whole data set, results of its val split."""
+    (folders[0] / "000003.txt").write_text(LINE + "\n")
+    assert evaluate(curate, folders)[0] == DataError.exit_code
+    (tmp_path / "val.txt").write_text("000001\r\n000002\r\n")
+    code, out, _ = evaluate(curate, folders, "--frames", tmp_path / "val.txt", "--json")
+    assert code == 0
+    assert json.loads(out)["objects"]["Car"] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\x00"])
+def test_a_list_of_frames_without_frames_is_refused(
+    curate: Curate, folders: tuple[Path, Path], tmp_path: Path, content: bytes
+) -> None:
+    """In one line that names the file."""
+    (tmp_path / "val.txt").write_bytes(content)
+    code, _, err = evaluate(curate, folders, "--frames", tmp_path / "val.txt")
+    assert code == DataError.exit_code
+    assert "val.txt: " in err
+    assert err.count("\n") == 1
+
+
+def test_a_checkpoint_that_is_not_there_is_one_line(curate: Curate, workspace: Workspace) -> None:
+    """Whatever the detector would make of it."""
+    code, _, err = curate("evaluate", "-w", workspace.root, "--checkpoint", "nowhere")
+    assert code == WorkspaceError.exit_code
+    assert err == "error: --checkpoint nowhere: no such file\n"
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "place", "message"),
+    [
+        ("results/000001.txt", LINE, "000001.txt:1", "15 fields"),
+        ("results/000001.txt", f"{LINE} 0.5\n{LINE} 0.5 1", "000001.txt:2", "17 fields"),
+        ("results/000001.txt", f"{LINE} nan", "000001.txt:1", "'nan' is not a finite number"),
+        ("results/000001.txt", f"{LINE} high", "000001.txt:1", "'high' is not a number"),
+        (
+            "results/000001.txt",
+            f"\n{LINE.replace('1.5 1.6', '1.5 -1.6')} 0.5",
+            "000001.txt:2",
+            "negative height, width or length",
+        ),
+        ("results/000001.txt", f"Ship{LINE[3:]} 0.5", "000001.txt:1", "unknown category 'Ship'"),
+        ("label_2/000001.txt", f"{LINE} 0.5", "000001.txt:1", "16 fields"),
+        ("results/000009.txt", f"{LINE} 0.5", "label_2/000009.txt", "no label file"),
+    ],
+)
+def test_bad_files_end_in_one_line_that_names_the_place(
+    curate: Curate, tmp_path: Path, folders: tuple[Path, Path],
+    file: str, text: str, place: str, message: str,
+) -> None:  # fmt: skip
+    """File, line and fault; nothing on standard output."""
+    (tmp_path / file).write_text(text + "\n")
+    code, out, err = evaluate(curate, folders)
+    assert (code, out) == (DataError.exit_code, "")
+    assert place in err
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_a_missing_result_file_is_no_empty_one(curate: Curate, folders: tuple[Path, Path]) -> None:
+    """A partial run is not scored as a whole one; the remedy is named."""
+    (folders[1] / "000002.txt").unlink()
+    code, _, err = evaluate(curate, folders)
+    assert code == DataError.exit_code
+    assert "results/000002.txt: no result file for frame 000002; write an empty one" in err
+
+
+@pytest.mark.parametrize("empty", [(0,), (1,), (0, 1)])
+def test_no_detections_or_no_ground_truth_is_zero(
+    curate: Curate, folders: tuple[Path, Path], empty: tuple[int, ...]
+) -> None:
+    """On either side or on both: 0 in every figure, never NaN, and the count of objects."""
+    for side in empty:
+        (folders[side] / "000001.txt").write_text("")
+    code, out, _ = evaluate(curate, folders, "--json")
+    assert code == 0
+    found = json.loads(out, parse_constant=pytest.fail)
+    assert found["AP_R40"]["Car"]["3d"] == found["AP_R11"]["Car"]["image"] == [0, 0, 0]
+    assert found["objects"]["Car"] == [1 - (0 in empty)] * 3
+    assert evaluate(curate, folders)[0] == 0
+
+
+def test_equal_scores_enter_together(curate: Curate, folders: tuple[Path, Path]) -> None:
+    """Their order does not matter: with a false one of the same score, half is right."""
+    far = LINE.replace("0.0 1.7 20.0", "9.0 1.7 40.0").replace("100 100 180 160", "300 100 380 160")
+    answers = []
+    for lines in ([LINE, far], [far, LINE]):
+        (folders[1] / "000001.txt").write_text("".join(f"{line} 0.5\n" for line in lines))
+        answers.append(json.loads(evaluate(curate, folders, "--json")[1]))
+    assert answers[0] == answers[1]
+    assert answers[0]["AP_R40"]["Car"]["3d"] == [50, 50, 50]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--labels", "label_2"), "--labels and --results go together"),
+        (("--results", "results"), "--labels and --results go together"),
+        (("--labels", "label_2", "--results", "results", "--store"), "--store needs a workspace"),
+        (("--round", "1", "--checkpoint", "x"), "--round or --checkpoint"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(
+    curate: Curate, arguments: tuple[str, ...], message: str
+) -> None:
+    """Before anything is opened."""
+    code, _, err = curate("evaluate", *arguments)
+    assert code == ConfigError.exit_code
+    assert message in err
+
+
+def test_a_round_without_val_predictions_names_the_command(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """A one-line error."""
+    curate("predict", "-w", workspace.root)
+    code, _, err = curate("evaluate", "--round", "1", "-w", workspace.root)
+    assert code == WorkspaceError.exit_code
+    assert "curate predict --split val --round 1" in err
+
+
+def test_the_missed_objects_can_be_asked_for(curate: Curate, workspace: Workspace) -> None:
+    """Of a round's val predictions: found and missed add up, as the recall says; then replaced."""
+    curate("predict", "--split", "val", "-w", workspace.root)
+    for _ in range(2):
+        code, out, _ = curate("evaluate", "--round", "1", "--store", "-w", workspace.root)
+        assert code == 0
+    assert "stored as source 'round 1'" in out
+    figures = json.loads(curate("evaluate", "--round", "1", "--json", "-w", workspace.root)[1])
+    missed = ask(curate, workspace, MISSED)
+    found = ask(curate, workspace, "SELECT * FROM evaluation WHERE outcome = 'tp'")
+    objects = [row for row in found if row["side"] == "object"]
+    for category, overlap in (("Car", "0.7"), ("Pedestrian", "0.5"), ("Cyclist", "0.5")):
+        tp = sum(row["category"] == category for row in objects)
+        fn = sum(row["category"] == category for row in missed)
+        assert tp + fn == figures["objects"][category][2]
+        assert 100 * tp / (tp + fn) == pytest.approx(figures["recall_3d"][category][overlap][2])
+    assert missed
+    assert objects
+    assert all(row["iou"] <= 0.7 for row in missed)
+    sql = "SELECT ap_r40 FROM evaluation_ap WHERE figure = '3d' AND category = 'Cyclist'"
+    stored = [row["ap_r40"] for row in ask(curate, workspace, sql)]
+    assert sorted(stored) == pytest.approx(sorted(figures["AP_R40"]["Cyclist"]["3d"]))
+
+
+def test_outcomes_carry_the_boxes_they_are_about(curate: Curate, workspace: Workspace) -> None:
+    """Of ground truth and of predictions; matches point at each other."""
+    curate("predict", "--split", "val", "-w", workspace.root)
+    curate("evaluate", "--round", "1", "--store", "-w", workspace.root)
+    rows = ask(curate, workspace, "SELECT * FROM evaluation")
+    truth = workspace.ground_truth("val")
+    stored = workspace.predictions(1, list(workspace.frames("val").values()))
+    for row in rows:
+        own = truth[row["frame"]] if row["side"] == "object" else None
+        own = own or stored[workspace.frames("val")[row["frame"]]]
+        assert np.allclose([row["x"], row["length"], row["yaw"]], own.boxes[row["k"]][[0, 3, 6]])
+        assert row["category"] == own.categories[row["k"]]
+        if row["matched_k"] is not None:
+            other = {"object": "detection", "detection": "object"}[row["side"]]
+            [match] = [
+                each
+                for each in rows
+                if (each["frame"], each["side"], each["k"])
+                == (row["frame"], other, row["matched_k"])
+            ]
+            assert (match["matched_k"], match["iou"]) == (row["k"], row["iou"])
+
+
+def test_a_checkpoint_is_stored_under_its_path(
+    curate: Curate, workspace: Workspace, weights_file: Path
+) -> None:
+    """Beside the round's."""
+    curate("predict", "--split", "val", "-w", workspace.root)
+    curate("evaluate", "--round", "1", "--store", "-w", workspace.root)
+    code, _, err = curate("evaluate", "--store", "-w", workspace.root)
+    assert (code, err) == (0, "")
+    sql = "SELECT source, count(*) AS n FROM evaluation GROUP BY source ORDER BY source"
+    rows = ask(curate, workspace, sql)
+    assert [row["source"] for row in rows] == sorted([str(weights_file), "round 1"])
+    assert rows[0]["n"] == rows[1]["n"]
+
+
+def ask(curate: Curate, workspace: Workspace, sql: str) -> list[dict]:
+    """The rows of a query."""
+    return json.loads(curate("query", sql, "--json", "-w", workspace.root)[1])

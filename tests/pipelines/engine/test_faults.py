@@ -1,0 +1,242 @@
+"""Faults of the machine, made for real: each ends in one line, and nothing is lost."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.pipelines_cli import Curate
+from support.process_tree import environment, start, workers
+from support.stored_rows import dump
+
+from curate.errors import CurateError, DatabaseError
+from db import session
+from pipelines.engine.progress import Silent
+from pipelines.engine.schedule import run_all
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import Workspace
+
+LOCK = """
+import sqlite3, sys, time
+connection = sqlite3.connect(sys.argv[1], isolation_level=None)
+connection.execute("BEGIN IMMEDIATE")
+print("locked", flush=True)
+time.sleep(float(sys.argv[2]))
+"""
+# A clock that was set back by ten years, for everything that asks the C library.
+CLOCK = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <sys/time.h>
+#include <time.h>
+#define BACK (10L * 365 * 86400)
+int clock_gettime(clockid_t id, struct timespec *now) {
+    int (*real)(clockid_t, struct timespec *) = dlsym(RTLD_NEXT, "clock_gettime");
+    int code = real(id, now);
+    if (id == CLOCK_REALTIME) now->tv_sec -= BACK;
+    return code;
+}
+int gettimeofday(struct timeval *now, void *zone) {
+    struct timespec time;
+    int code = clock_gettime(CLOCK_REALTIME, &time);
+    now->tv_sec = time.tv_sec; now->tv_usec = time.tv_nsec / 1000;
+    return code;
+}
+time_t time(time_t *out) {
+    struct timespec now;
+    clock_gettime(CLOCK_REALTIME, &now);
+    if (out) *out = now.tv_sec;
+    return now.tv_sec;
+}
+"""
+
+
+@pytest.fixture
+def whole(tmp_path: Path, workspace: Workspace) -> list[tuple]:
+    """What a run stores that nothing disturbs."""
+    other = initialise(tmp_path / "whole", workspace.config, "0.25", "")
+    list(run_all(other, None, Silent()))
+    return dump(other)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of four megabytes of our own."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if shutil.which("mount") is None or not _mount("-t", "tmpfs", "-o", "size=4m", "tmpfs", folder):
+        pytest.skip("a disk of our own needs the right to mount a tmpfs")
+    yield folder
+    subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+def _mount(*arguments: object) -> bool:
+    return not subprocess.run(
+        ["mount", *map(str, arguments)], check=False, capture_output=True
+    ).returncode
+
+
+def refuse_traceback(code: int, err: str, *codes: int) -> None:
+    """One line, and the exit code of its class."""
+    assert code in codes, err
+    assert err.count("\n") == 1, err
+    assert err.startswith("error: ")
+
+
+@pytest.mark.parametrize("free_kb", [0, 16, 64, 160])
+def test_a_full_disk_costs_nothing_but_time(
+    curate: Curate, workspace: Workspace, whole: list[tuple], small_disk: Path, free_kb: int
+) -> None:
+    """It fills up sooner or later in the run; with room again the run ends as if it never had."""
+    tight = initialise(small_disk / "work", workspace.config, "0.25", "")
+    tight.database.close()
+    ballast = small_disk / "ballast"
+    free = os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_bsize
+    ballast.write_bytes(b"\0" * max(0, free - free_kb * 1024))
+    code, _, err = curate("run", "-w", tight.root)
+    refuse_traceback(code, err, CurateError.exit_code, DatabaseError.exit_code, 3)
+    assert "space" in err or "full" in err
+    ballast.unlink()
+    assert curate("run", "-w", tight.root)[0] == 0
+    assert dump(tight) == whole
+
+
+def test_a_read_only_workspace_is_said_to_be_one(
+    curate: Curate, workspace: Workspace, small_disk: Path
+) -> None:
+    """What only reads still answers, where SQLite can."""
+    fixed = initialise(small_disk / "work", workspace.config, "0.25", "")
+    fixed.database.close()
+    assert _mount("-o", "remount,ro", small_disk)
+    for command in ("predict", "run", "status"):
+        code, _, err = curate(command, "-w", fixed.root)
+        refuse_traceback(code, err, DatabaseError.exit_code)
+        assert "curate.db" in err
+        assert "writ" in err
+    assert _mount("-o", "remount,rw", small_disk)
+    assert curate("run", "-w", fixed.root)[0] == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_corrupted_database_is_detected_and_the_remedy_named(
+    curate: Curate, workspace: Workspace, seed: int
+) -> None:
+    """Whatever pages are overwritten, a command works or ends in one line; never a traceback."""
+    list(run_all(workspace, None, Silent()))
+    _checkpoint(workspace)
+    path = workspace.root / "curate.db"
+    pages = bytearray(path.read_bytes())
+    generator = np.random.default_rng(seed)
+    for page in generator.choice(len(pages) // 4096 - 1, 20, replace=False) + 1:
+        pages[page * 4096 : page * 4096 + 200] = generator.bytes(200)
+    path.write_bytes(pages)
+    codes = set()
+    for command in (("run",), ("status",), ("solve", "--policy", "uniform"), ("export",)):
+        code, _, err = curate(*command, "-w", workspace.root)
+        if code:
+            refuse_traceback(code, err, DatabaseError.exit_code)
+            assert "curate.db" in err
+            assert "restore" in err
+        codes.add(code)
+    assert DatabaseError.exit_code in codes
+
+
+def _checkpoint(workspace: Workspace) -> None:
+    """Everything lies in the one file."""
+    with workspace.database.engine.connect() as connection:
+        connection.exec_driver_sql("COMMIT")
+        connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
+    workspace.database.close()
+
+
+@pytest.mark.skipif(not Path("/proc/locks").exists(), reason="the system does not tell who locks")
+def test_a_locked_database_says_who_holds_it(
+    curate: Curate, workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By process and command line; when it is gone, the command goes on."""
+    monkeypatch.setattr(session, "BUSY_TIMEOUT_MS", 300)
+    holder = _lock(workspace, 600)
+    code, _, err = curate("predict", "-w", workspace.root)
+    refuse_traceback(code, err, DatabaseError.exit_code)
+    assert f"process {holder.pid} ({sys.executable} -c" in err
+    holder.kill()
+    holder.wait()
+    assert curate("predict", "-w", workspace.root)[0] == 0
+
+
+def test_a_locked_database_is_waited_for(curate: Curate, workspace: Workspace) -> None:
+    """A lock that is given up within half a minute is no error."""
+    holder = _lock(workspace, 1)
+    assert curate("predict", "-w", workspace.root)[0] == 0
+    assert holder.wait() == 0
+
+
+def _lock(workspace: Workspace, seconds: float) -> subprocess.Popen:
+    arguments = [sys.executable, "-c", LOCK, workspace.root / "curate.db", str(seconds)]
+    holder = subprocess.Popen(arguments, stdout=subprocess.PIPE)
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == b"locked\n"
+    return holder
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="workers are found in /proc")
+def test_workers_that_the_kernel_kills_cost_nothing(
+    workspace: Workspace, whole: list[tuple]
+) -> None:
+    """SIGKILL for one worker after the other; the command ends well, with every frame."""
+    running = start("run", "-w", workspace.root, "--workers", 2, TOY_DELAY_S="0.3")
+    killed: set[int] = set()
+    while running.poll() is None and len(killed) < 3:
+        fresh = [pid for pid in workers(running.pid) if pid not in killed]
+        if fresh and any(row[0] == "task" for row in dump(workspace)):  # work has begun
+            os.kill(fresh[0], 9)
+            killed.add(fresh[0])
+        time.sleep(0.2)
+    _, err = running.communicate()
+    assert running.returncode == 0, err
+    assert "failed" not in err
+    assert killed
+    assert dump(workspace) == whole
+
+
+def test_a_clock_that_was_set_back_changes_nothing(
+    workspace: Workspace, whole: list[tuple], tmp_path: Path
+) -> None:
+    """Half of the work now, the other half ten years ago."""
+    if shutil.which("cc") is None:
+        pytest.skip("another clock needs a C compiler")
+    (tmp_path / "clock.c").write_text(CLOCK)
+    library = tmp_path / "clock.so"
+    flags = ["-shared", "-fPIC", "-o", str(library), str(tmp_path / "clock.c"), "-ldl"]
+    subprocess.run(["cc", *flags], check=True)
+    shifted = environment(LD_PRELOAD=str(library))
+    code = "import time; print(time.gmtime().tm_year)"
+    year = subprocess.run(
+        [sys.executable, "-c", code], env=shifted, check=True, capture_output=True
+    ).stdout
+    assert int(year) < time.gmtime().tm_year - 8
+    for command, more in (("predict", {}), ("run", {"LD_PRELOAD": str(library)})):
+        running = start(command, "-w", workspace.root, **more)
+        _, err = running.communicate()
+        assert running.returncode == 0, err
+    assert dump(workspace) == whole
+
+
+def test_a_workspace_that_was_moved_goes_on_where_it_was(
+    curate: Curate, workspace: Workspace, whole: list[tuple], tmp_path: Path
+) -> None:
+    """Nothing that was done is done again."""
+    assert curate("predict", "-w", workspace.root)[0] == 0
+    workspace.database.close()
+    moved = tmp_path / "elsewhere" / "it"
+    moved.parent.mkdir()
+    workspace.root.rename(moved)
+    code, out, err = curate("run", "-w", moved)
+    assert (code, err) == (0, "")
+    assert "0 frames done, 0 rows, 6 already done" in out
+    assert dump(Workspace.open(moved)) == whole

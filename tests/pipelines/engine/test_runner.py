@@ -1,0 +1,259 @@
+"""The runner: what is done once, what becomes stale, and what a failure costs."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support import toys
+from support.stored_rows import dump
+
+from curate.errors import WorkspaceError
+from curate.priors.points import PointPrior
+from curate.priors.semantic import SemanticPrior
+from pipelines.engine import plan
+from pipelines.engine.executors.serial import SerialExecutor
+from pipelines.engine.progress import Silent
+from pipelines.engine.rounds import open_round
+from pipelines.engine.runner import Report, run_frames, run_round
+from pipelines.engine.schedule import run_all
+from pipelines.round import ROUND, stage
+from pipelines.workspace.workspace import Workspace
+
+ENGINES = ("sqlite", "postgresql")
+NewWorkspace = Callable[[Path], Workspace]
+FRAME_STAGES = ("predict", "repredict", "points", "semantic")
+
+
+def count(workspace: Workspace, table: str) -> int:
+    """Rows of a table."""
+    with workspace.database.reading() as connection:
+        return connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar_one()
+
+
+def run(workspace: Workspace) -> dict[str, int]:
+    """Runs everything; frames (or round stages) done anew, by stage."""
+    return {report.stage: report.done for report in run_all(workspace, None, Silent())}
+
+
+def with_setting(workspace: Workspace, section: str, **changes: object) -> Workspace:
+    """The workspace after an edit of curate.toml."""
+    return workspace.with_settings(section, **changes)
+
+
+def test_a_run_fills_every_table(workspace: Workspace) -> None:
+    """Three labels per unlabeled frame go through all stages."""
+    assert run(workspace) == dict.fromkeys(FRAME_STAGES, 6) | {"solve": 1, "export": 1}
+    for table in ("prediction", "consistency", "point_prior", "semantic_prior", "weight"):
+        assert count(workspace, table) == 18
+    assert count(workspace, "weighted_labels") == 18
+
+
+def test_a_second_run_does_nothing(workspace: Workspace) -> None:
+    """What is up to date is not done again."""
+    run(workspace)
+    before = dump(workspace)
+    assert set(run(workspace).values()) == {0}
+    assert dump(workspace) == before
+
+
+@pytest.mark.parametrize(
+    ("section", "changes", "redone"),
+    [
+        ("points", {"statistic": "mean"}, {"points", "solve", "export"}),
+        ("semantic", {"mean": "product"}, {"semantic", "solve", "export"}),
+        ("solve", {"scope": "frame"}, {"solve", "export"}),
+        ("repredict", {"views": 2}, {"repredict", "solve", "export"}),
+        ("detector", {"minimum_score": 0.5}, {*FRAME_STAGES, "solve", "export"}),
+        ("run", {"workers": 2}, set()),
+    ],
+)
+def test_a_changed_setting_redoes_its_stage_and_what_follows(
+    workspace: Workspace, section: str, changes: dict, redone: set
+) -> None:
+    """And nothing else: a changed prior does not run the detector."""
+    run(workspace)
+    done = run(with_setting(workspace, section, **changes))
+    assert {name for name, frames in done.items() if frames} == redone
+
+
+def test_what_left_with_its_prediction_is_made_again(workspace: Workspace) -> None:
+    """Predictions made anew take evidence and weights with them, and their tasks as well."""
+    run(workspace)
+    before = dump(workspace)
+    tried = with_setting(workspace, "detector", minimum_score=0.5)
+    run_frames(tried, open_round(tried, 1), stage("predict"), SerialExecutor(), Silent())
+    assert count(workspace, "weight") == 0
+    run(workspace)
+    assert dump(workspace) == before
+
+
+@pytest.mark.parametrize(
+    ("section", "changes", "prior", "rates"),
+    [
+        ("semantic", {"mean": "product"}, "semantic", True),
+        ("semantic", {"outside": "drop"}, "semantic", True),
+        ("points", {"statistic": "fixed", "fixed": 31.0}, "points", True),
+        ("segmenter", {"classes": "coco"}, "semantic", False),
+    ],
+)
+def test_another_formula_is_applied_to_what_was_measured(
+    workspace: Workspace, another: NewWorkspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    section: str, changes: dict, prior: str, rates: bool,
+) -> None:  # fmt: skip
+    """No point or pixel is counted again, and the rows are those of a run from the start."""
+    run(workspace)
+    whole = another(tmp_path / "whole")
+    run(with_setting(whole, section, **changes))
+    measured: list[str] = []
+    for kind in (PointPrior, SemanticPrior):
+        monkeypatch.setattr(kind, "measure", counted(kind.measure, measured))
+    monkeypatch.setattr(toys.ToySegmenter, "segment", counted(toys.ToySegmenter.segment, measured))
+    assert run(with_setting(workspace, section, **changes))[prior] == 6
+    assert bool(measured) is not rates
+    assert dump(workspace) == dump(whole)
+
+
+def counted(method, calls: list[str]):
+    """The method, which also leaves its name in a list."""
+
+    def call(*arguments):
+        calls.append(method.__qualname__)
+        return method(*arguments)
+
+    return call
+
+
+def test_a_frame_that_failed_is_measured_however_the_formula_changes(
+    workspace: Workspace, toy_kitti: Path
+) -> None:
+    """What was never measured cannot be recalled."""
+    name = next(iter(workspace.frames("unlabeled")))
+    path = toy_kitti / "training" / "image_2" / f"{name}.png"
+    whole = path.read_bytes()
+    run_frames_of(workspace, "predict")
+    path.write_bytes(whole[:-30])
+    assert run_frames_of(workspace, "semantic").failed == 1
+    changed = with_setting(workspace, "semantic", mean="product")
+    assert run_frames_of(changed, "semantic").failed == 1
+    path.write_bytes(whole)
+    assert run_frames_of(changed, "semantic").done == 1
+    assert count(workspace, "semantic_prior") == 18
+
+
+def run_frames_of(workspace: Workspace, name: str) -> Report:
+    """One frame stage of the first round."""
+    context = open_round(workspace, 1)
+    return run_frames(workspace, context, stage(name), SerialExecutor(), Silent())
+
+
+def test_another_detector_makes_everything_stale(workspace: Workspace, weights_file: Path) -> None:
+    """The teacher's hash is part of every fingerprint."""
+    run(workspace)
+    weights_file.write_text("# another")
+    assert all(run(workspace).values())
+
+
+def test_a_frame_whose_model_raises_is_recorded_and_costs_no_other_frame(
+    workspace: Workspace, weights_file: Path
+) -> None:
+    """One line in its task; the others go on to the end, and it is tried again next time."""
+    poisoned = next(iter(workspace.frames("unlabeled")))
+    weights_file.write_text(poisoned)
+    reports = {report.stage: report for report in run_all(workspace, None, Silent())}
+    assert reports["predict"].failed == 1
+    assert reports["predict"].done == 5
+    [(frame, error)] = reports["predict"].errors
+    assert frame == poisoned
+    assert error == (
+        f"frame {poisoned}: RuntimeError: CUDA error: an illegal memory access was encountered"
+    )
+    assert count(workspace, "weight") == 15
+    context = open_round(workspace, 1)
+    again = run_frames(workspace, context, stage("predict"), SerialExecutor(), Silent())
+    assert (again.failed, again.kept) == (1, 5)
+
+
+def test_a_mended_frame_joins_the_others(workspace: Workspace, toy_kitti: Path) -> None:
+    """A damaged file fails its frame; after it is mended only that frame is worked on."""
+    name = next(iter(workspace.frames("unlabeled")))
+    path = toy_kitti / "training" / "velodyne" / f"{name}.bin"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-3])
+    reports = {report.stage: report for report in run_all(workspace, None, Silent())}
+    assert "truncated" in reports["predict"].errors[0][1]
+    path.write_bytes(whole)
+    assert run(workspace) == dict.fromkeys(FRAME_STAGES, 1) | {"solve": 1, "export": 1}
+    assert count(workspace, "weight") == 18
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda home, name: (home / "calib" / f"{name}.txt").unlink(), "calib"),
+        (lambda home, name: (home / "image_2" / f"{name}.png").write_bytes(b"no png"), "image_2"),
+        (lambda home, name: (home / "velodyne" / f"{name}.bin").write_bytes(b"\x00" * 17), "velo"),
+        (
+            lambda home, name: (home / "velodyne" / f"{name}.bin").write_bytes(
+                b"\x00\x00\xc0\x7f" * 4
+            ),
+            "NaN",
+        ),
+    ],
+)
+def test_a_damaged_file_fails_its_frame_with_one_line(
+    workspace: Workspace, toy_kitti: Path, damage, message: str
+) -> None:
+    """The line names the file; no other frame is lost."""
+    name = next(iter(workspace.frames("unlabeled")))
+    damage(toy_kitti / "training", name)
+    reports = list(run_all(workspace, None, Silent()))
+    [error] = {error for report in reports for _, error in report.errors}
+    assert message in error
+    assert name in error
+    assert "\n" not in error
+    assert count(workspace, "weight") == 15
+
+
+def test_an_empty_sweep_is_empty_in_every_stage(workspace: Workspace, toy_kitti: Path) -> None:
+    """No points, no labels, no failure."""
+    name = next(iter(workspace.frames("unlabeled")))
+    (toy_kitti / "training" / "velodyne" / f"{name}.bin").write_bytes(b"")
+    reports = {report.stage: report for report in run_all(workspace, None, Silent())}
+    assert [reports[name].empty for name in FRAME_STAGES] == [1] * 4
+    assert count(workspace, "weight") == 15
+
+
+def test_solve_refuses_to_weigh_half_a_round(workspace: Workspace) -> None:
+    """It says which command is missing."""
+    context = open_round(workspace, 1)
+    run_frames(workspace, context, stage("predict"), SerialExecutor(), Silent())
+    with pytest.raises(WorkspaceError, match=r"repredict: 6 frames.*curate repredict"):
+        run_round(workspace, context, stage("solve"), "pspsl", Silent())
+
+
+def test_policies_stand_side_by_side(workspace: Workspace) -> None:
+    """Solving for another policy leaves the first one's weights as they are."""
+    run(workspace)
+    context = open_round(workspace, 1)
+    before = [row for row in dump(workspace) if row[0] == "weight"]
+    run_round(workspace, context, stage("solve"), "uniform", Silent())
+    after = [row for row in dump(workspace) if row[0] == "weight"]
+    assert set(before) < set(after)
+    assert len(after) == 36
+
+
+def test_every_stage_reads_what_exists_before_it(workspace: Workspace) -> None:
+    """The DAG's edges go one way: inputs are sources or written by an earlier stage."""
+    known = {"frame", "ground_truth", "teacher"}
+    for each in ROUND:
+        assert set(each.reads) <= known
+        known |= set(each.writes)
+
+
+def test_fingerprints_do_not_depend_on_where_the_data_lies(workspace: Workspace) -> None:
+    """A data set that moved is not worked on again."""
+    context = open_round(workspace, 1)
+    moved = with_setting(workspace, "dataset", root=Path("/elsewhere"))
+    assert plan.fingerprints(moved, context, "pspsl") == plan.fingerprints(
+        workspace, context, "pspsl"
+    )

@@ -1,0 +1,115 @@
+"""Two `curate` processes on one database, on either engine."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.paths import TESTS
+from support.pipelines_cli import Curate
+from support.toys import arrival
+
+from curate.errors import DatabaseError
+from db import bulk
+from pipelines.engine.rounds import open_round
+from pipelines.workspace.workspace import Workspace
+
+ENGINES = ("sqlite", "postgresql")
+LONGEST_WAIT_S = 120
+
+
+@pytest.fixture
+def gate(tmp_path: Path) -> Path:
+    """While this file is there, detectors wait."""
+    path = tmp_path / "gate"
+    path.touch()
+    return path
+
+
+def started(workspace: Workspace, gate: Path, *command: str) -> subprocess.Popen:
+    """A process of its own, whose detector waits at the gate."""
+    path = f"{TESTS}:{TESTS.parent}"
+    return subprocess.Popen(
+        [sys.executable, "-m", "pipelines", *command, "-w", str(workspace.root)],
+        env=os.environ | {"PYTHONPATH": path, "TOY_GATE": str(gate)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def owner(workspace: Workspace, number: int) -> str | None:
+    """What somebody is told who wants to work on a round; None where it is free."""
+    try:
+        with workspace.database.claiming_round(number, None, "a question"):
+            return None
+    except DatabaseError as refusal:
+        return str(refusal)
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen | None = None) -> None:
+    """Returns once it holds; fails where the process ends before."""
+    end = time.monotonic() + LONGEST_WAIT_S
+    while not condition():
+        assert process is None or process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < end
+        time.sleep(0.1)  # who asks for an owner holds the claim for a moment
+
+
+def labels(workspace: Workspace, number: int) -> list[tuple]:
+    """The predictions of a round, without its number."""
+    table = bulk.table("prediction")
+    with workspace.database.reading() as connection:
+        return sorted(
+            row[1:] for row in bulk.select(connection, table.select()) if row[0] == number
+        )
+
+
+def test_stages_of_one_round_do_not_collide(
+    workspace: Workspace, curate: Curate, gate: Path
+) -> None:
+    """The second is refused in one line that names the first; a killed owner is none any more."""
+    first = started(workspace, gate, "predict")
+    wait_until(arrival(gate, first.pid).exists, first)
+    assert f"process {first.pid} " in (owner(workspace, 1) or "")
+    for command in (["predict"], ["repredict"], ["solve"]):
+        code, _, err = curate(*command, "-w", workspace.root)
+        assert code == DatabaseError.exit_code
+        assert err.startswith("error: round 1 is being worked on by predict, process")
+        assert err.count("\n") == 1
+    first.kill()
+    first.communicate()
+    # A server notices the end of a killed client only a little later.
+    wait_until(lambda: owner(workspace, 1) is None)
+    assert curate("predict", "-w", workspace.root)[0] == 0
+    assert len(labels(workspace, 1)) == 18
+
+
+def test_different_rounds_run_side_by_side(workspace: Workspace, gate: Path) -> None:
+    """Both at work at the same moment, and both with the rows of a run alone."""
+    both = {
+        number: started(workspace, gate, "predict", "--round", str(number)) for number in (1, 2)
+    }
+    for number, process in both.items():
+        wait_until(arrival(gate, process.pid).exists, process)
+        assert owner(workspace, number) is not None
+    assert [process.poll() for process in both.values()] == [None, None]
+    gate.unlink()
+    messages = [process.communicate()[1] for process in both.values()]
+    assert [process.returncode for process in both.values()] == [0, 0], messages
+    assert len(labels(workspace, 1)) == 18
+    assert labels(workspace, 1) == labels(workspace, 2)
+
+
+def test_settings_of_a_round_at_work_are_not_changed(workspace: Workspace) -> None:
+    """What is recorded of a round is what its owner works with."""
+    open_round(workspace, 1)
+    changed = workspace.with_settings("detector", minimum_score=0.5)
+    with workspace.database.claiming_round(1, None, "predict"):
+        open_round(workspace, 1)
+        with pytest.raises(DatabaseError, match="round 1 is being worked on by predict"):
+            open_round(changed, 1)
+    open_round(changed, 1)

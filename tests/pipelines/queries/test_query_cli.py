@@ -1,0 +1,131 @@
+"""curate query: the questions that ship with the project, the forms of an answer, other files."""
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+from support.pipelines_cli import Curate
+
+from curate.errors import ConfigError
+from pipelines.queries.named_queries import named_queries
+from pipelines.workspace.workspace import Workspace
+
+ENGINES = ("sqlite", "postgresql")
+QUERIES = named_queries()
+
+
+@pytest.fixture
+def weighted(curate: Curate, workspace: Workspace) -> Path:
+    """A toy workspace with weights and an exported file."""
+    code, _, err = curate("run", "-w", workspace.root)
+    assert code == 0, err
+    return workspace.root
+
+
+def test_every_named_query_is_described_and_answered(curate: Curate, weighted: Path) -> None:
+    """On the working database; on the exported file too where it says so, with the same rows."""
+    exported = weighted / "exports" / "labels.sqlite"
+    for name, query in QUERIES.items():
+        assert query.description, name
+        assert not query.sql.startswith("--"), name
+        code, out, err = curate("query", "--named", name, "--json", "-w", weighted)
+        assert (code, err) == (0, ""), name
+        answer = json.loads(out)
+        code, out, err = curate("query", "--named", name, "--json", "--file", exported)
+        if query.exported:
+            assert (code, err) == (0, ""), name
+            if name != "splits":  # an exported file has no val frames
+                assert _rounded(json.loads(out)) == _rounded(answer), name
+        else:
+            assert code == ConfigError.exit_code, f"{name} works on the exported file: say so"
+
+
+def _rounded(rows: list[dict]) -> list[dict]:
+    """Sums in another order differ in their last digits."""
+    return [
+        {key: round(value, 9) if isinstance(value, float) else value for key, value in row.items()}
+        for row in rows
+    ]
+
+
+def test_the_answers_are_those_of_the_labels(curate: Curate, weighted: Path) -> None:
+    """Kept labels add up to those of the view; frames fall into their splits."""
+    kept = "sum(CASE WHEN weight > 0 THEN 1 ELSE 0 END) AS kept"
+    sql = f"SELECT count(*) AS n, {kept}, max(lambda_u) AS age FROM weighted_labels"
+    [whole] = json.loads(curate("query", sql, "--json", "-w", weighted)[1])
+
+    def ask(name: str) -> list[dict]:
+        return json.loads(curate("query", "--named", name, "--format", "json", "-w", weighted)[1])
+
+    assert whole["n"] == 18
+    assert sum(row["labels"] for row in ask("kept")) == whole["n"]
+    assert sum(row["kept"] for row in ask("kept")) == whole["kept"] > 0
+    assert {row["distance"] for row in ask("kept")} <= {"00-20 m", "20-40 m"}
+    assert [row["greatest_lambda"] for row in ask("age")] == [whole["age"]]
+    assert {row["split"]: row["frames"] for row in ask("splits")} == {
+        "labeled": 2, "unlabeled": 6, "val": 4,
+    }  # fmt: skip
+    assert all(row["score"] >= 0.5 and row["weight"] < 0.2 for row in ask("doubted"))
+
+
+def test_missed_objects_are_listed_after_an_evaluation(curate: Curate, weighted: Path) -> None:
+    """Each missed object of `evaluate --store`, once."""
+    code, _, err = curate("evaluate", "--store", "-w", weighted)
+    assert code == 0, err
+    sql = "SELECT count(*) AS n FROM evaluation_object WHERE side = 'object' AND outcome = 'fn'"
+    [missed] = json.loads(curate("query", sql, "--json", "-w", weighted)[1])
+    rows = json.loads(curate("query", "--named", "missed", "--json", "-w", weighted)[1])
+    assert len(rows) == missed["n"]
+    assert json.loads(curate("query", "--named", "precision", "--json", "-w", weighted)[1])
+
+
+def test_the_list_names_every_query(curate: Curate) -> None:
+    """Without a workspace, in every form."""
+    code, out, _ = curate("query", "--list")
+    assert code == 0
+    assert all(name in out for name in QUERIES)
+    rows = list(csv.DictReader(io.StringIO(curate("query", "--list", "--format", "csv")[1])))
+    assert [row["name"] for row in rows] == list(QUERIES)
+    assert json.loads(curate("query", "--list", "--json")[1])[0]["name"] == rows[0]["name"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--named", "nothing"], "use one of age,"),
+        (["--format", "xml", "SELECT 1"], "table, csv, json"),
+        ([], "give one of"),
+        (["SELECT 1", "--named", "age"], "give one of"),
+        (["SELECT 1", "--file", "gone.sqlite"], "curate export"),
+    ],
+)
+def test_a_wrong_call_names_the_remedy(
+    curate: Curate, workspace: Workspace, arguments: list[str], word: str
+) -> None:
+    """One line, and the exit code of a wrong argument."""
+    code, out, err = curate("query", *arguments, "-w", workspace.root)
+    assert (code, out) == (ConfigError.exit_code, "")
+    assert word in err
+    assert err.count("\n") == 1
+
+
+def test_the_exported_file_can_only_be_read(curate: Curate, weighted: Path) -> None:
+    """As the working database."""
+    exported = weighted / "exports" / "labels.sqlite"
+    code, _, err = curate("query", "DELETE FROM label", "--file", exported)
+    assert code == ConfigError.exit_code
+    assert "read-only" in err
+
+
+def test_a_huge_value_is_refused(curate: Curate, workspace: Workspace, engine: str) -> None:
+    """A server, too, would make a gigabyte where it is asked to."""
+    huge = {
+        "sqlite": "replace(hex(zeroblob(999999)), '0', 'long')",
+        "postgresql": "repeat('x', 5000000)",
+    }
+    sql = f"SELECT {huge[engine]} AS value"
+    code, _, err = curate("query", sql, "-w", workspace.root)
+    assert code == ConfigError.exit_code
+    assert err == "error: query: string or blob too big\n"

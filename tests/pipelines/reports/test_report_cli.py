@@ -1,0 +1,78 @@
+"""curate report: one file that stands alone."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+from support.pipelines_cli import Curate
+
+from curate.errors import WorkspaceError
+from pipelines.workspace.workspace import Workspace
+
+
+class Headings(HTMLParser):
+    """The h2 of a page, and its links."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found, self.links, self.inside = [], [], False
+
+    def handle_starttag(self, tag, attrs) -> None:
+        """Collects links."""
+        self.inside = tag == "h2"
+        self.links += [value for key, value in attrs if key in {"src", "href"}]
+
+    def handle_data(self, data) -> None:
+        """Collects headings."""
+        if self.inside:
+            self.found.append(data)
+        self.inside = False
+
+
+def read(path: Path) -> tuple[list[str], str]:
+    """Headings and text of a report that loads nothing."""
+    text = path.read_text(encoding="utf-8")
+    reader = Headings()
+    reader.feed(text)
+    assert all(link.startswith("data:image/jpeg;base64,") for link in reader.links)
+    assert reader.links
+    assert not re.search(r"https?://|url\(|@import|<script", text)
+    assert len(text) < 5_000_000
+    return reader.found, text
+
+
+def test_a_report_tells_a_round_its_changes_and_its_audit(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """The first round has no changes; an audit brings the curve."""
+    root = workspace.root
+    for number in (1, 2):
+        for command in ("predict", "repredict", "score", "solve"):
+            assert curate(command, "--round", number, "-w", root)[0] == 0
+    code, out, err = curate("report", "--round", 1, "-w", root)
+    assert (code, err) == (0, "")
+    first = Path(out.removeprefix("report: ").strip())
+    assert first == root / "reports" / "round-01-pspsl.html"
+    headings, text = read(first)
+    assert [heading.split()[0] for heading in headings] == [
+        "The", "Losses,", "Labels", "Most", "Kept"
+    ]  # fmt: skip
+    assert "18 labels in 6 unlabeled frames" in text
+    assert "λ" in text
+    assert curate("solve", "--round", 2, "--policy", "uniform", "-w", root)[0] == 0
+    assert curate("audit", "--round", 2, "--replicates", 10, "-w", root)[0] == 0
+    second = Path(json.loads(curate("report", "--json", "-w", root)[1])["report"])
+    headings, text = read(second)
+    assert "Since round 1" in headings
+    assert "Beside other policies" in headings
+    assert text.count("(this page)") == 1
+    assert "Reliability" in headings
+
+
+def test_without_weights_the_remedy_is_named(curate: Curate, workspace: Workspace) -> None:
+    """One line."""
+    assert curate("predict", "-w", workspace.root)[0] == 0
+    code, _, err = curate("report", "-w", workspace.root)
+    assert code == WorkspaceError.exit_code
+    assert "curate solve --round 1 --policy pspsl" in err

@@ -1,0 +1,256 @@
+"""Trainers of the user's: what they are told, what is checked, who teaches the next round."""
+
+import hashlib
+import json
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+from support.pipelines_cli import Curate
+
+from curate.errors import ConfigError, TrainerFailed, WorkspaceError
+from pipelines.engine.progress import Silent
+from pipelines.engine.rounds import find_teacher, open_round
+from pipelines.engine.runner import run_round
+from pipelines.engine.schedule import run_all
+from pipelines.round import stage
+from pipelines.stages.external_trainer import split_command
+from pipelines.workspace.workspace import Workspace
+
+TRAINER = """
+import os, sqlite3, sys
+labels, output, number = sys.argv[1:4]
+assert os.environ["CURATE_LABELS"] == labels and os.environ["CURATE_OUTPUT"] == output
+weights = sqlite3.connect(labels).execute("SELECT weight FROM weighted_labels").fetchall()
+print(f"round {number}: {len(weights)} labels from", os.environ["CURATE_TEACHER"], flush=True)
+# The toy detector takes it for a list of frames that it fails on.
+open(output, "w").write(f"student-{number}")
+"""
+
+
+@pytest.fixture
+def command(tmp_path: Path) -> str:
+    """A trainer in a few lines of Python, in a folder with a space."""
+    script = tmp_path / "my trainer" / "train.py"
+    script.parent.mkdir()
+    script.write_text(TRAINER)
+    return f"{shlex.join([sys.executable, str(script)])} {{labels}} {{output}} {{round}}"
+
+
+@pytest.fixture
+def exported(workspace: Workspace) -> Workspace:
+    """A workspace with a brought detector, whose first round has ended with its export."""
+    list(run_all(workspace, None, Silent()))
+    return workspace
+
+
+def python(code: str) -> str:
+    """A command that runs some Python."""
+    return shlex.join([sys.executable, "-c", code])
+
+
+def checkpoints(workspace: Workspace) -> list[tuple]:
+    """Rounds, policies, paths and hashes."""
+    with workspace.database.reading() as connection:
+        query = "SELECT round, policy, path, sha256 FROM checkpoint ORDER BY round"
+        return [tuple(row) for row in connection.exec_driver_sql(query)]
+
+
+def test_the_student_of_a_command_teaches_the_next_round(
+    curate: Curate, exported: Workspace, command: str
+) -> None:
+    """It gets the labels, and its file is stored with its hash."""
+    code, out, err = curate("train-round", "--command", command, "-w", exported.root, "--json")
+    assert code == 0, err
+    assert json.loads(out)[0]["done"] == 1
+    path = exported.root / "checkpoints" / "round-01-pspsl.txt"
+    assert path.read_text() == "student-1"
+    digest = hashlib.sha256(hashlib.sha256(b"student-1").digest()).hexdigest()
+    assert checkpoints(exported)[1] == (1, "pspsl", "checkpoints/round-01-pspsl.txt", digest)
+    assert find_teacher(exported, 2)[1].path == path
+    code, _, err = curate("predict", "-w", exported.root)
+    assert code == 0, err
+    with exported.database.reading() as connection:
+        query = "SELECT count(*) FROM prediction WHERE round = 2"
+        assert connection.exec_driver_sql(query).scalar_one() == 18
+
+
+def test_what_a_round_weighted_is_handed_out_after_its_student_as_before(
+    curate: Curate, exported: Workspace, command: str, tmp_path: Path
+) -> None:
+    """Not the next round's labels, which do not exist yet; asking for them starts no round."""
+    code, _, err = curate("train-round", "--command", command, "-w", exported.root)
+    assert code == 0, err
+    code, out, _ = curate("export", "-w", exported.root)
+    assert (code, out.split()[:2]) == (0, ["round", "1"])
+    path = tmp_path / "labels.csv"
+    code, out, _ = curate("export", "--format", "csv", "--output", path, "-w", exported.root)
+    assert (code, out) == (0, f"18 labels of round 1 in {path}\n")
+    with exported.database.reading() as connection:
+        assert connection.exec_driver_sql("SELECT number FROM round").scalars().all() == [1]
+    code, _, err = curate("predict", "-w", exported.root)
+    assert code == 0, err
+    code, out, _ = curate("report", "-w", exported.root)
+    assert (code, Path(out.split()[-1]).name) == (0, "round-01-pspsl.html")
+
+
+def test_a_command_given_by_hand_trains_later_rounds_too(
+    curate: Curate, exported: Workspace, command: str
+) -> None:
+    """It stands in curate.toml once it has trained, so that no other trainer takes its place."""
+    path = exported.root / "curate.toml"
+    path.write_text("# mine\n" + path.read_text())
+    before = path.read_text()
+    curate("train-round", "--command", python("raise SystemExit(1)"), "-w", exported.root)
+    assert path.read_text() == before
+    code, _, err = curate("train-round", "--command", command, "-w", exported.root)
+    assert code == 0
+    assert err.splitlines()[-1] == ("curate.toml: [train] now says command, for later rounds too")
+    assert path.read_text().startswith("# mine\n")
+    told = Workspace.open(exported.root)
+    assert told.config == exported.with_settings("train", command=command).config
+    done = [(each.round, each.stage) for each in run_all(told, 2, Silent()) if each.done]
+    assert (1, "train-round") not in done
+    assert (2, "train-round") in done
+    assert find_teacher(told, 3)[1].path.read_text() == "student-2"
+
+
+def test_a_student_that_teaches_nobody_is_trained_by_any_command(
+    curate: Curate, exported: Workspace, command: str
+) -> None:
+    """The student of another policy leaves curate.toml as it is."""
+    before = (exported.root / "curate.toml").read_text()
+    for name in ("solve", "export"):
+        assert curate(name, "--policy", "uniform", "-w", exported.root)[0] == 0
+    code, _, err = curate(
+        "train-round", "--policy", "uniform", "--command", command, "-w", exported.root
+    )
+    assert (code, "now says" in err) == (0, False)
+    assert (exported.root / "curate.toml").read_text() == before
+
+
+def test_what_the_trainer_prints_is_streamed(
+    capfd: pytest.CaptureFixture, exported: Workspace, command: str
+) -> None:
+    """To standard error, so that JSON stays JSON."""
+    told = exported.with_settings("train", command=command)
+    run_round(told, open_round(told, 1), stage("train-round"), "pspsl", Silent())
+    output = capfd.readouterr()
+    assert output.out == ""
+    assert f"round 1: 18 labels from {exported.config.detector.path}" in output.err
+
+
+def test_a_configured_command_trains_in_every_round(workspace: Workspace, command: str) -> None:
+    """`curate run` then has several rounds with a brought detector, and a second run does none."""
+    told = workspace.with_settings("train", command=command)
+    reports = list(run_all(told, 2, Silent()))
+    assert [report.round for report in reports if report.stage == "train-round"] == [1, 2]
+    assert find_teacher(told, 2)[1].path.read_text() == "student-1"
+    assert find_teacher(told, 3)[1].path.read_text() == "student-2"
+    assert {report.done for report in run_all(told, 2, Silent())} == {0}
+    other = told.with_settings("train", command=command + " again")
+    again = [report.stage for report in run_all(other, 1, Silent()) if report.done]
+    assert again == ["train-round"]
+
+
+def test_without_a_student_a_configured_command_has_no_next_teacher(
+    workspace: Workspace, command: str
+) -> None:
+    """The brought detector does not answer in a round that a student should teach."""
+    told = workspace.with_settings("train", command=command)
+    with pytest.raises(WorkspaceError, match="round 2 has no teacher yet; run `curate train-r"):
+        find_teacher(told, 2)
+    assert find_teacher(workspace, 2)[1].path == workspace.config.detector.path
+
+
+def test_labels_come_in_the_format_that_is_asked_for(curate: Curate, exported: Workspace) -> None:
+    """Exported beside the SQLite file."""
+    code = (
+        "import os, shutil; path = os.environ['CURATE_LABELS'];"
+        "shutil.copy(path + '/ps_label_e0.pkl', os.environ['CURATE_OUTPUT'])"
+    )
+    ended, _, err = curate(
+        "train-round", "--command", python(code), "--labels-format", "st3d", "-w", exported.root
+    )
+    assert ended == 0, err
+    assert (exported.root / "exports" / "round-01-pspsl-st3d" / "ps_label_e0.pkl").is_file()
+
+
+@pytest.mark.parametrize(
+    ("code", "fault"),
+    [
+        ("import sys; sys.exit(3)", "ended with exit code 3"),
+        ("import os; os.kill(os.getpid(), 9)", "ended with signal 9"),
+        ("pass", "was not written, though the trainer ended well"),
+        ("import os; open(os.environ['CURATE_OUTPUT'], 'w')", "is empty, though"),
+        ("import os; os.mkdir(os.environ['CURATE_OUTPUT'])", "is empty, though"),
+    ],
+)
+def test_a_trainer_that_fails_is_one_line_and_an_exit_code(
+    curate: Curate, exported: Workspace, command: str, code: str, fault: str
+) -> None:
+    """Nothing is registered, and a former student stays as it was."""
+    curate("train-round", "--command", command, "--round", 1, "-w", exported.root)
+    before = checkpoints(exported)
+    ended, _, err = curate(
+        "train-round", "--command", python(code), "--round", 1, "-w", exported.root
+    )
+    assert ended == TrainerFailed.exit_code
+    assert fault in err
+    assert err.count("\n") == 1
+    assert checkpoints(exported) == before
+    assert (exported.root / "checkpoints" / "round-01-pspsl.txt").read_text() == "student-1"
+
+
+def test_a_killed_training_goes_on_from_what_it_left(curate: Curate, exported: Workspace) -> None:
+    """The trainer finds its own file again; one that does not touch it has not trained."""
+    code = (
+        "import os, sys; path = os.environ['CURATE_OUTPUT']; done = os.path.exists(path);"
+        "open(path, 'a').write('half '); sys.exit(0 if done else 1)"
+    )
+    arguments = ("train-round", "--command", python(code), "--round", 1, "-w", exported.root)
+    assert curate(*arguments)[0] == TrainerFailed.exit_code
+    idle = ("train-round", "--command", python("pass"), "--round", 1, "-w", exported.root)
+    ended, _, err = curate(*idle)
+    assert ended == TrainerFailed.exit_code
+    assert "is left from an earlier run" in err
+    assert curate(*arguments)[0] == 0
+    assert (exported.root / "checkpoints" / "round-01-pspsl.txt").read_text() == "half half "
+
+
+def test_labels_that_are_not_exported_are_refused(
+    curate: Curate, workspace: Workspace, command: str
+) -> None:
+    """Before the trainer starts; so are those that are older than their weights."""
+    list(run_all(workspace, None, Silent()))
+    (workspace.root / "exports" / "round-01-pspsl.sqlite").unlink()
+    ended, _, err = curate("train-round", "--command", command, "-w", workspace.root)
+    assert ended == WorkspaceError.exit_code
+    assert "run `curate export --round 1`" in err
+
+
+@pytest.mark.parametrize(
+    ("command", "fault"),
+    [
+        ("", "is empty; name a program"),
+        ("python 'train.py", "mend its quotes"),
+        ("no-such-program {labels}", "no-such-program cannot be started"),
+    ],
+)
+def test_a_command_that_is_none_is_refused(
+    curate: Curate, exported: Workspace, command: str, fault: str
+) -> None:
+    """In one line."""
+    ended, _, err = curate("train-round", "--command", command, "-w", exported.root)
+    assert ended == ConfigError.exit_code
+    assert fault in err
+    assert err.count("\n") == 1
+
+
+def test_no_shell_reads_the_command() -> None:
+    """What a shell would act on stays text, values stay within their argument, once."""
+    values = {"labels": "/my data/{round}; rm -rf", "round": "1"}
+    assert split_command("t --in={labels} '{other}' $HOME && {round", values) == [
+        "t", "--in=/my data/{round}; rm -rf", "{other}", "$HOME", "&&", "{round",
+    ]  # fmt: skip

@@ -1,0 +1,276 @@
+"""Methods by one word, and what that word does to a run."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.paths import ROOT
+from support.pipelines_cli import Curate
+
+from curate.detectors.pillars.checkpoint import load_checkpoint
+from curate.errors import ConfigError, WorkspaceError
+from pipelines.engine import plan
+from pipelines.engine.executors.serial import SerialExecutor
+from pipelines.engine.progress import Silent
+from pipelines.engine.rounds import find_teacher, open_round
+from pipelines.engine.runner import run_frames, run_round
+from pipelines.engine.schedule import run_all
+from pipelines.engine.stage import FrameStage
+from pipelines.labels.evidence import read_memory
+from pipelines.registry import POLICIES
+from pipelines.round import stage
+from pipelines.stages.methods import METHODS, method_named, method_of, with_method
+from pipelines.workspace.config import Config, make_config, write_config
+from pipelines.workspace.setup import initialise
+from pipelines.workspace.workspace import Workspace, sha256
+
+NAMES = [
+    "baseline", "uda", "uda-cl", "sess", "3dioumatch", "spsl", "pspsl", "threshold", "st3d",
+    "hssda",
+]  # fmt: skip
+
+
+def rows(workspace: Workspace, sql: str) -> list[tuple]:
+    """The answer to a question."""
+    with workspace.database.reading() as connection:
+        return [tuple(row) for row in connection.exec_driver_sql(sql)]
+
+
+def run(workspace: Workspace) -> Workspace:
+    """Brings everything up to date."""
+    list(run_all(workspace, None, Silent()))
+    return workspace
+
+
+def solved(workspace: Workspace, number: int, policy: str) -> None:
+    """Brings a round up to a policy's weights."""
+    context = open_round(workspace, number)
+    for name in ("predict", "repredict", "points", "semantic"):
+        found = stage(name)
+        assert isinstance(found, FrameStage)
+        run_frames(workspace, context, found, SerialExecutor(), Silent())
+    run_round(workspace, context, stage("solve"), policy, Silent())
+
+
+def test_the_methods_are_the_ones_that_are_compared() -> None:
+    """Each is a registered policy of the same name, with a note of one line."""
+    assert list(METHODS) == NAMES
+    for name, method in METHODS.items():
+        assert method.policy == name
+        assert name in POLICIES.classes
+        assert method.note
+        assert "\n" not in method.note
+    assert [name for name in NAMES if METHODS[name].teacher == "ema"] == [
+        "sess", "3dioumatch", "hssda",
+    ]  # fmt: skip
+
+
+def test_the_page_of_methods_is_complete() -> None:
+    """Each has its row, with its teacher."""
+    page = (ROOT / "docs" / "methods.md").read_text()
+    found = {row[1].strip(" `"): row[3].strip() for row in map(_cells, page.splitlines()) if row}
+    words = {"student": "student", "ema": "average"}
+    assert {name: words[method.teacher] for name, method in METHODS.items()} == {
+        name: found.get(name) for name in NAMES
+    }
+
+
+def _cells(line: str) -> list[str]:
+    return line.split("|") if line.count("|") == 6 else []
+
+
+def test_a_method_is_one_word_in_the_configuration(tmp_path: Path) -> None:
+    """Teacher and meaning of a weight of 0 follow from it, unless they are set."""
+    config = make_config({"dataset": {"root": tmp_path}}, "test")
+    assert config.run.method == "pspsl"
+    assert method_of(config, "pspsl") == METHODS["pspsl"]
+    averaged = with_method(config, "sess")
+    assert (averaged.run.method, method_of(averaged, "sess").teacher) == ("sess", "ema")
+    assert averaged.model_copy(update={"run": config.run}) == config
+    own = {"teacher": "student", "zero_weight": "ignore"}
+    own_config = make_config({"dataset": {"root": tmp_path}, "train": own}, "test")
+    found = method_of(with_method(own_config, "sess"), "sess")
+    assert (found.policy, found.teacher, found.zero_weight) == ("sess", "student", "ignore")
+    assert method_named("mylab.rules:Mine").teacher == method_named("uniform").teacher == "student"
+
+
+def test_only_bands_of_doubt_are_ignored() -> None:
+    """ST3D and HSSDA drop what they hold to be nothing; elsewhere a weight of 0 says so."""
+    assert [name for name in NAMES if METHODS[name].zero_weight == "ignore"] == ["st3d", "hssda"]
+
+
+def test_an_unknown_method_names_the_known_ones(curate: Curate, workspace: Workspace) -> None:
+    """In one line, before anything runs."""
+    with pytest.raises(ConfigError, match="'sass': use one of baseline, uda, uda-cl, sess"):
+        with_method(workspace.config, "sass")
+    code, _, err = curate("run", "--method", "sass", "--workspace", workspace.root)
+    assert code == ConfigError.exit_code
+    assert err.count("\n") == 1
+    assert rows(workspace, "SELECT * FROM prediction") == []
+
+
+def test_the_old_place_of_the_word_is_answered_with_the_new_one(tmp_path: Path) -> None:
+    """A curate.toml of an earlier version says what to write."""
+    with pytest.raises(ConfigError, match=r'write method = "spsl" in \[run\]'):
+        make_config({"dataset": {"root": tmp_path}, "solve": {"policy": "spsl"}}, "curate.toml")
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "3dioumatch"])
+def test_every_method_runs_by_its_word(curate: Curate, workspace: Workspace, name: str) -> None:
+    """`curate run --method` weighs and exports under that name; curate.toml stays as it is."""
+    code, _, err = curate("run", "--method", name, "--workspace", workspace.root)
+    assert code == 0, err
+    policies = rows(workspace, "SELECT DISTINCT policy FROM weight")
+    assert policies == [(name,)]
+    assert (workspace.root / "exports" / f"round-01-{name}.sqlite").is_file()
+    assert 'method = "pspsl"' in (workspace.root / "curate.toml").read_text()
+
+
+def test_a_detector_without_iou_cannot_be_filtered_by_it(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """3DIoUMatch says so in one line."""
+    code, _, err = curate("run", "--method", "3dioumatch", "--workspace", workspace.root)
+    assert code == ConfigError.exit_code
+    assert "18 of 18 labels have no estimate of their IoU" in err
+
+
+def test_a_dropped_label_is_not_exported(curate: Curate, workspace: Workspace) -> None:
+    """It has no row of that policy; one of another policy beside it stays."""
+    options = {"st3d": {"keep": 0.9, "ignore": 0.5}}
+    dropping = workspace.with_settings("solve", options=options)
+    solved(dropping, 1, "st3d")
+    solved(dropping, 1, "uda")
+    scores = {
+        row[:3]: row[3]
+        for row in rows(workspace, "SELECT round, frame_id, k, score FROM prediction")
+    }
+    weights = {
+        row[:3]: row[3]
+        for row in rows(workspace, "SELECT round, frame_id, k, v FROM weight WHERE policy = 'st3d'")
+    }
+    assert weights == {key: float(s >= 0.9) for key, s in scores.items() if s >= 0.5}
+    assert 0 < len(weights) < len(scores)
+    assert len(rows(workspace, "SELECT * FROM weight WHERE policy = 'uda'")) == len(scores)
+    frame_id, k = next(key[1:] for key in scores if key not in weights)
+    frame = rows(workspace, f"SELECT frame FROM frame WHERE id = {frame_id}")[0][0]
+    code, _, err = curate("explain", frame, k, "--policy", "st3d", "-w", workspace.root)
+    assert code == WorkspaceError.exit_code
+    assert "the policy dropped it" in err
+
+
+def test_a_policy_remembers_the_round_before(workspace: Workspace) -> None:
+    """What it did not drop there; a round that it has not weighed is asked for by name."""
+    with pytest.raises(WorkspaceError, match="curate solve --policy st3d --round 1"):
+        solved(workspace, 2, "st3d")
+    solved(workspace, 1, "st3d")
+    solved(workspace, 2, "st3d")
+    memory = read_memory(workspace, 1, "st3d")
+    kept = "SELECT v, score FROM weight JOIN prediction USING (round, frame_id, k) WHERE round = 1"
+    assert len(memory.v) == len(rows(workspace, kept)) > 0
+    assert memory.boxes.shape == (len(memory.v), 7)
+    assert np.isnan(memory.iou).all()
+
+
+def test_what_is_remembered_makes_stale_what_it_decided(workspace: Workspace) -> None:
+    """Weighing the first round otherwise redoes the second for the policy that looked back."""
+    for policy in ("st3d", "uda"):
+        solved(workspace, 1, policy)
+        solved(workspace, 2, policy)
+    changed = workspace.with_settings("repredict", views=2)
+    solved(changed, 1, "st3d")
+    context = open_round(workspace, 2)
+    solve = stage("solve")
+    assert plan.round_state(workspace, context, solve, "st3d") == "stale"
+    assert plan.round_state(workspace, context, solve, "uda") == "done"
+
+
+@pytest.mark.parametrize("priors", [("points",), ("semantic",), ()])
+def test_each_prior_can_be_asked_alone(workspace: Workspace, priors: Sequence[str]) -> None:
+    """rho_det is then the one that was asked, or 1."""
+    alone = run(workspace.with_settings("run", priors=priors))
+    found = rows(alone, "SELECT rho_diff, rho_anno, rho_det, weight FROM weighted_labels")
+    assert len(found) == 18
+    for diff, anno, det, weight in found:
+        assert det == pytest.approx({("points",): diff, ("semantic",): anno, (): 1.0}[priors])
+        assert weight <= det
+
+
+ABLATIONS = [
+    ("semantic", {"mean": "product"}), ("semantic", {"mean": "arithmetic"}),
+    ("solve", {"scope": "category"}), ("solve", {"scope": "frame"}), ("solve", {"quantile": 0.5}),
+    ("solve", {"self_paced": False}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("section", "flag"), ABLATIONS, ids=str)
+def test_every_ablation_of_the_weights_is_a_flag(
+    curate: Curate, workspace: Workspace, section: str, flag: dict
+) -> None:
+    """It changes weights, and `explain` still recomputes them."""
+    question = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
+    before = rows(run(workspace), question)
+    document = workspace.config.model_dump(mode="json")
+    document[section] |= flag
+    changed = Config.model_validate(document)
+    write_config(workspace.root / "curate.toml", changed)
+    after = rows(run(replace(workspace, config=changed)), question)
+    assert before != after
+    frame, k, weight = max(after, key=lambda row: row[2])
+    _, out, _ = curate("explain", frame, k, "--json", "-w", workspace.root)
+    assert json.loads(out)["recomputed"] == pytest.approx(weight)
+
+
+def trained(
+    workspace: Workspace, tmp_path: Path, tiny: str, name: str, **train: object
+) -> Workspace:
+    """A workspace of its own where a tiny detector was trained for two rounds of a method."""
+    document = workspace.config.model_dump(mode="json") | {"detector": {}}
+    config = make_config(document | {"run": {"rounds": 2, "method": name}}, "test")
+    own = initialise(tmp_path / f"{name}-{len(train)}", config, "0.25", "")
+    settings = {"preset": tiny, "pretrain_steps": 5, "round_steps": 3} | train
+    section = own.config.train.model_copy(update=settings)  # the tiny preset is no user's
+    return run(replace(own, config=own.config.model_copy(update={"train": section})))
+
+
+def test_an_averaged_teacher_teaches_the_next_round(
+    workspace: Workspace, tmp_path: Path, tiny: str
+) -> None:
+    """The same first teacher and labels; what is registered is the average, not the student."""
+    averaged = trained(workspace, tmp_path, tiny, "sess")
+    plain = trained(workspace, tmp_path, tiny, "sess", teacher="student")
+    first, second = ([find_teacher(of, n)[1] for of in (averaged, plain)] for n in (1, 2))
+    for name, array in load_checkpoint(first[0].path).weights.items():
+        np.testing.assert_array_equal(array, load_checkpoint(first[1].path).weights[name])
+    apart = [load_checkpoint(of.path).weights["answer.weight"] for of in second]
+    assert np.abs(apart[0] - apart[1]).max() > 0
+    path = averaged.root / "checkpoints" / "round-01-sess.safetensors"
+    assert second[0].path == path
+    assert second[0].sha256 == sha256(path)
+
+
+def test_students_of_two_methods_do_not_meet(
+    workspace: Workspace, tmp_path: Path, tiny: str
+) -> None:
+    """Each has a checkpoint of its own name; they share the first teacher, which is kept."""
+    own = trained(workspace, tmp_path, tiny, "spsl")
+    kept = [own.root / "checkpoints" / f"round-{n}.safetensors" for n in ("00", "01-spsl")]
+    before = [sha256(path) for path in kept]
+    run(replace(own, config=with_method(own.config, "sess")))
+    assert [sha256(path) for path in kept] == before
+    registered = rows(own, "SELECT round, policy, path FROM checkpoint WHERE round = 1 ORDER BY 2")
+    assert registered == [
+        (1, name, f"checkpoints/round-01-{name}.safetensors") for name in ("sess", "spsl")
+    ]
+
+
+def test_a_wrong_option_of_the_trainer_is_an_error_of_one_line(
+    workspace: Workspace, tmp_path: Path, tiny: str
+) -> None:
+    """It names the option and where it stands."""
+    with pytest.raises(ConfigError, match=r"train\.options.*'setps'") as info:
+        trained(workspace, tmp_path, tiny, "baseline", options={"setps": 4})
+    assert "\n" not in str(info.value)

@@ -1,0 +1,77 @@
+"""A workspace with settings of one command."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from curate.errors import ConfigError, WorkspaceError
+from db.session import parse_url
+from pipelines.engine.rounds import (
+    find_teacher,
+    newest_checkpoint,
+    open_round,
+    peek_round,
+    register_checkpoint,
+)
+from pipelines.workspace.config import read_config
+from pipelines.workspace.workspace import Workspace, sha256
+
+
+def test_settings_of_a_command_change_their_section_alone(workspace: Workspace) -> None:
+    """The other sections are the very same objects."""
+    changed = workspace.with_settings("run", workers=3)
+    assert changed.config.run == workspace.config.run.model_copy(update={"workers": 3})
+    assert changed.config.dataset is workspace.config.dataset
+
+
+def test_a_wrong_setting_of_a_command_is_named(workspace: Workspace) -> None:
+    """In one line, with where it was said."""
+    with pytest.raises(ConfigError, match=r"^command line: run\.workers: .* greater than") as found:
+        workspace.with_settings("run", workers=0)
+    assert "\n" not in str(found.value)
+
+
+def test_a_pipe_in_the_place_of_a_file_is_refused(tmp_path: Path) -> None:
+    """Reading it would never end; nor would a device's."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for place in (pipe, Path("/dev/zero")):
+        with pytest.raises(ConfigError, match="is a pipe or a device"):
+            sha256(place)
+        with pytest.raises(ConfigError, match="a pipe or a device"):
+            read_config(place)
+
+
+def test_a_checkpoint_that_became_a_pipe_counts_as_gone(workspace: Workspace) -> None:
+    """The message says how to make it anew."""
+    path = workspace.root / "checkpoints" / "teacher"
+    path.write_bytes(b"")
+    with workspace.database.writing() as connection:
+        register_checkpoint(connection, workspace, 1, workspace.config.run.method, path)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(WorkspaceError, match="the checkpoint is gone; run `curate train-round"):
+        find_teacher(workspace, 2)
+
+
+def test_a_checkpoint_that_was_exchanged_does_not_answer(workspace: Workspace) -> None:
+    """Its answers would stand as those of the one that was made; once that is back, all is well."""
+    path = workspace.root / "checkpoints" / "teacher"
+    path.write_bytes(b"made")
+    with workspace.database.writing() as connection:
+        register_checkpoint(connection, workspace, 1, workspace.config.run.method, path)
+    assert open_round(workspace, 2).teacher.path == path
+    path.write_bytes(b"another")
+    for ask in (lambda: open_round(workspace, 2), lambda: newest_checkpoint(workspace)):
+        with pytest.raises(WorkspaceError, match=r"has changed since .* run `curate train-round"):
+            ask()
+    assert peek_round(workspace, 2) is not None
+    path.write_bytes(b"made")
+    assert newest_checkpoint(workspace) == path
+
+
+def test_a_zero_byte_in_the_address_of_a_database() -> None:
+    """Drivers raise errors of their own for it."""
+    with pytest.raises(ConfigError, match=r"run\.database: no URL"):
+        parse_url("sqlite:////tmp/a\0b")

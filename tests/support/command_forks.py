@@ -1,0 +1,88 @@
+"""Commands forked from a process that has loaded everything, so that a kill meets their work."""
+
+import contextlib
+import multiprocessing
+import os
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+
+class CommandForks:
+    """A process that forks a child for every command; it never opens a database that is tested."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs,))
+        self._process.start()
+        theirs.close()
+        self._connection.recv()
+
+    def start(self, arguments: Sequence[object], environment: Mapping[str, str]) -> int:
+        """`curate ARGUMENTS`, started; the key of its process."""
+        self._connection.send((list(map(str, arguments)), dict(environment)))
+        return self._connection.recv()
+
+    def end(self, pid: int) -> int:
+        """Waits for a command: its exit code, -9 where it was killed."""
+        self._connection.send(pid)
+        return self._connection.recv()
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._connection.close()
+        self._process.join()
+
+
+def _serve(connection: Connection) -> None:
+    _warm_up()
+    connection.send("ready")
+    with contextlib.suppress(EOFError):
+        while True:
+            message = connection.recv()
+            if isinstance(message, int):
+                connection.send(os.waitstatus_to_exitcode(os.waitpid(message, 0)[1]))
+            elif pid := os.fork():
+                connection.send(pid)
+            else:
+                _become(*message)
+
+
+def _warm_up() -> None:
+    """Runs all stages once: modules are loaded then, and kernels compiled."""
+    from pipelines.engine.progress import Silent
+    from pipelines.engine.schedule import run_all
+    from pipelines.workspace.config import make_config
+    from pipelines.workspace.setup import initialise
+    from support.toys import toy_document, write_toy_kitti
+
+    with tempfile.TemporaryDirectory() as name:
+        home = Path(name)
+        write_toy_kitti(home / "kitti", frames=3, val=1)
+        (home / "detector.txt").write_text("")
+        document = toy_document(home / "kitti", home / "detector.txt")
+        workspace = initialise(home / "work", make_config(document, "test"), "0.5", "")
+        list(run_all(workspace, None, Silent()))
+        workspace.database.close()
+
+
+def _become(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
+    """Is the command from here on, with nobody to listen to it."""
+    from pipelines.cli import main
+
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nowhere, stream)
+    os.environ.update(environment)
+    sys.argv = ["curate", *arguments]
+    code = 1
+    try:
+        main()
+        code = 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    finally:
+        os._exit(code)

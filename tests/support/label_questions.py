@@ -1,0 +1,30 @@
+"""The common questions about labels, and a workspace whose labels are weighed."""
+
+from collections.abc import Sequence
+
+from pipelines.engine.progress import Silent
+from pipelines.engine.stage import RoundContext, RoundJob, Teacher
+from pipelines.stages import solve
+from pipelines.workspace.workspace import Workspace
+
+COUNTS = "SELECT policy, category, labels, trusted FROM label_count WHERE round = 1"
+TRUSTED = "SELECT * FROM weighted_labels WHERE round = 1 AND weight > 0.5 AND category = 'Car'"
+HEAVIEST = TRUSTED + " AND policy = 'pspsl' ORDER BY weight DESC"
+FRAME = "SELECT * FROM weighted_labels WHERE frame = '000007'"
+FRAME_OF_ROUND = FRAME + " AND round = 1 AND policy = 'pspsl' ORDER BY k"
+
+
+def solved(
+    workspace: Workspace,
+    policy: str = "pspsl",
+    rounds: int = 3,
+    frames: Sequence[int] | None = None,
+) -> Workspace:
+    """The workspace with a policy's weights of some frames or all, as `curate solve` makes them."""
+    if frames is None:
+        frames = list(workspace.frames("unlabeled").values())
+    context = RoundContext(1, rounds, 0, Teacher(workspace.root, ""))
+    product = solve.run(workspace, RoundJob(context, policy, frames), Silent())
+    with workspace.database.writing(keys_known=product.keys_known) as connection:
+        product.write(connection)
+    return workspace

@@ -1,0 +1,27 @@
+"""All that a run has stored, in an order that does not depend on when it was written."""
+
+from sqlalchemy import select
+
+from db import bulk
+from db.models import Base
+from pipelines.workspace.workspace import Workspace
+
+# Keys that the database draws, and times: two equal runs differ in them.
+CHANCE = {"id", "seconds", "created_at", "imported_at", "decided_at"}
+# What was asked for, not what came out: it names executor and paths.
+SETTINGS = {"config"}
+
+
+def dump(workspace: Workspace) -> list[tuple]:
+    """Every row of every table as (table, *values), floats to the last bit."""
+    rows = []
+    with workspace.database.reading() as connection:
+        for table in Base.metadata.sorted_tables:
+            columns = [column for column in table.columns if column.name not in CHANCE | SETTINGS]
+            found = bulk.select(connection, select(*columns))
+            rows += sorted(((table.name, *map(_exact, row)) for row in found), key=repr)
+    return rows
+
+
+def _exact(value: object) -> object:
+    return value.hex() if isinstance(value, float) else value

@@ -1,0 +1,192 @@
+"""A toy world for tests of the pipeline: small frames in KITTI's layout and an honest detector."""
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.labels import from_annotations, write_objects
+from curate.detections import Annotations, Detections
+from curate.frames import Calibration, Frame
+from curate.priors.base import Measured
+from curate.segmenters.base import SemanticMap
+
+IMAGE_SIZE = (120, 40)
+SIZES = {"Car": (4.0, 1.8, 1.6), "Pedestrian": (0.8, 0.6, 1.7), "Cyclist": (1.8, 0.6, 1.7)}
+# The toy detector recognises a category by the brightness of its points.
+INTENSITIES = {"Car": 0.9, "Pedestrian": 0.8, "Cyclist": 0.7}
+
+
+def toy_calibration() -> Calibration:
+    """A camera at the LiDAR's origin that looks along x."""
+    projection = np.array([[60.0, 0, 60, 0], [0, 60, 20, 0], [0, 0, 1, 0]])
+    lidar_to_camera = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    return Calibration(projection, lidar_to_camera)
+
+
+def write_toy_kitti(root: Path, frames: int, val: int = 0, *, labels: bool = True) -> None:
+    """Frames 000000.. with one object per category, each a cloud of equally bright points."""
+    for folder in ("velodyne", "image_2", "calib", "label_2"):
+        (root / "training" / folder).mkdir(parents=True, exist_ok=True)
+    names = [f"{i:06d}" for i in range(frames)]
+    for i, name in enumerate(names):
+        _write_frame(root / "training", name, np.random.default_rng(i), labels=labels)
+    (root / "ImageSets").mkdir(exist_ok=True)
+    (root / "ImageSets" / "train.txt").write_text("\n".join(names[: frames - val]) + "\n")
+    (root / "ImageSets" / "val.txt").write_text("\n".join(names[frames - val :]) + "\n")
+
+
+def toy_document(root: Path, weights_file: Path) -> dict:
+    """The settings of a toy workspace."""
+    return {
+        "dataset": {"root": root},
+        "detector": {"name": "support.toys:ToyDetector", "path": weights_file},
+        "segmenter": {"name": "support.toys:ToySegmenter", "path": weights_file},
+    }
+
+
+def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: bool) -> None:
+    import cv2
+
+    categories = np.array(list(SIZES))
+    boxes = np.array([
+        [rng.uniform(8, 25), rng.uniform(-4, 4), -0.8, *SIZES[c], rng.uniform(-3, 3)]
+        for c in categories
+    ])  # fmt: skip
+    boxes[:, 1] += np.array([-6, 0, 6])
+    ground = rng.uniform([2, -20, -1.7, 0], [40, 20, -1.7, 0.5], (400, 4))
+    points = [ground]
+    for box, category in zip(boxes, categories, strict=True):
+        inside = rng.uniform(-0.45, 0.45, (int(rng.integers(20, 60)), 3)) * box[3:6]
+        turn = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]])
+        inside[:, :2] = inside[:, :2] @ turn
+        brightness = np.full(len(inside), INTENSITIES[category])
+        points.append(np.column_stack([inside + box[:3], brightness]))
+    np.concatenate(points).astype(np.float32).tofile(folder / "velodyne" / f"{name}.bin")
+    image = rng.integers(0, 255, (IMAGE_SIZE[1], IMAGE_SIZE[0], 3), dtype=np.uint8)
+    cv2.imwrite(str(folder / "image_2" / f"{name}.png"), image)
+    write_calibration(folder / "calib" / f"{name}.txt", toy_calibration())
+    if labels:
+        nothing = np.zeros(3)
+        truth = Annotations(
+            boxes, categories, nothing, nothing.astype(np.int64), nothing,
+            np.tile([0.0, 0, 100, 39], (3, 1)),
+        )  # fmt: skip
+        write_objects(
+            folder / "label_2" / f"{name}.txt", from_annotations(truth, toy_calibration())
+        )
+
+
+def dawdle() -> None:
+    """Lets a test stop the process in the middle of its work, or hold it at a gate: a file.
+
+    A process that has come to the gate leaves another file beside it, by its number.
+    """
+    time.sleep(float(os.environ.get("TOY_DELAY_S", "0")))
+    gate = Path(os.environ.get("TOY_GATE", "/no gate"))
+    while gate.exists():
+        arrival(gate, os.getpid()).touch()
+        time.sleep(0.02)
+
+
+def arrival(gate: Path, process: int) -> Path:
+    """The file that a process leaves at a gate."""
+    return gate.with_name(f"{gate.name}-{process}")
+
+
+class ToyDetector:
+    """Finds the bright clouds; its score is the share of 60 points that it saw.
+
+    Args:
+        path: a file; a frame whose name is written in it raises.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.poison = set(Path(path).read_text().split())
+
+    def predict(self, frame: Frame) -> Detections:
+        """One box per category."""
+        dawdle()
+        if frame.frame_id in self.poison:
+            raise RuntimeError("CUDA error: an illegal memory access\nwas encountered")
+        found = []
+        for category, intensity in INTENSITIES.items():
+            cloud = frame.points[np.abs(frame.points[:, 3] - intensity) < 0.01, :3]
+            if len(cloud):
+                found.append((category, min(len(cloud) / 60, 1.0), cloud.mean(axis=0)))
+        boxes = [[*centre, *SIZES[category], 0.0] for category, _, centre in found]
+        return Detections(
+            np.array(boxes, dtype=np.float64).reshape(-1, 7),
+            np.array([score for _, score, _ in found], dtype=np.float64),
+            np.array([category for category, _, _ in found], dtype=np.str_),
+        )
+
+
+class ToySegmenter:
+    """Sees a car in every pixel of the left half, a person in the right half."""
+
+    needs_image = True
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def segment(self, frame: Frame) -> SemanticMap:
+        """The semantic map."""
+        dawdle()
+        width, height = frame.image_size
+        class_ids = np.ones((height, width), dtype=np.uint8)
+        class_ids[:, width // 2 :] = 2
+        return SemanticMap(class_ids, {"Car": (1,), "Pedestrian": (2,), "Cyclist": (1, 2)})
+
+
+@dataclass(frozen=True)
+class ToyEvidence:
+    """What the toy prior says: columns of the point prior's table."""
+
+    points: np.ndarray
+    points_threshold: np.ndarray
+    rho_diff: np.ndarray
+
+    @property
+    def rho(self) -> np.ndarray:
+        """(n,) rho_diff."""
+        return self.rho_diff
+
+
+@dataclass(frozen=True)
+class ToyPrior:
+    """A user's own prior in the place of the point prior: it counts all points of the frame.
+
+    Attributes:
+        plenty: so many are enough.
+    """
+
+    plenty: float = 1000.0
+    name: ClassVar[str] = "toy"
+    rho_column: ClassVar[str] = "rho_diff"
+    measured_columns: ClassVar[tuple[str, ...]] = ("points",)
+    needs_image: ClassVar[bool] = False
+
+    def measure(self, frame: Frame, detections: Detections) -> Measured:
+        """The points of the frame, for each label."""
+        return {"points": np.full(len(detections), len(frame.points))}
+
+    def rate(self, detections: Detections, measured: Measured) -> ToyEvidence:
+        """Their share of plenty."""
+        points = measured["points"]
+        rho = np.minimum(points / self.plenty, 1.0)
+        return ToyEvidence(points, np.full(len(detections), self.plenty), rho)
+
+    def score(self, frame: Frame, detections: Detections) -> ToyEvidence:
+        """Both."""
+        return self.rate(detections, self.measure(frame, detections))
+
+
+class UnstorablePrior(ToyPrior):
+    """A prior whose trust has no place in the tables."""
+
+    rho_column: ClassVar[str] = "rho_map"
