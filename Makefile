@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: venv demo test prove fuzz bench lint docs clean
+.PHONY: venv demo test prove fuzz fuzz-random bench lint docs clean
 
 venv: $(READY)
 
@@ -16,6 +16,10 @@ test: $(READY)
 
 prove: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# `make test` tries the same examples every time; this tries new ones with every run.
+fuzz-random: $(READY)
+	$(BIN)/python -m pytest tests/fuzzing --hypothesis-profile=random
 
 # Coverage-guided, where atheris is installed: make fuzz READER="label file" SECONDS=600
 READER ?= labels
@@ -38,7 +42,7 @@ lint: $(READY)
 	$(BIN)/mypy curate db pipelines
 
 docs: $(READY)
-	$(BIN)/python -m pipelines.reference
+	$(BIN)/python -m docs.generate
 
 clean:
 	rm -rf $(VENV) demo
@@ -53,5 +57,5 @@ $(READY): pyproject.toml constraints.txt
 		|| $(BIN)/pip install -q -c constraints.txt torch==2.13.0+cpu 2>/dev/null \
 		|| echo "The index offers no CPU build of torch; installing the general one."
 	$(BIN)/pip install -q -c constraints.txt -e '.[test,lint,postgres,serve,browser,nuscenes]'
-	@$(BIN)/python -c 'from curate.datasets.open3d_loader import load; load()'
+	@$(BIN)/python -c 'from curate.simulation.open3d_loader import load; load()'
 	@touch $@

@@ -5,18 +5,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import postgres_server
 import pytest
 from hypothesis import HealthCheck, settings
-from toys import write_toy_kitti
+from support import postgres_server
+from support.paths import ROOT
+from support.toys import write_toy_kitti
 
 from db.session import Database
 
-ROOT = Path(__file__).parent.parent
-
+# The default run tries the same examples everywhere and every time; `make fuzz-random` tries others.
 # How long an example takes says nothing on a busy machine.
-settings.register_profile("curate", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("curate")
+settings.register_profile(
+    "same", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.register_profile("random", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("same")
 
 
 def _shared(variable: str, name: str) -> Path:
