@@ -1,6 +1,6 @@
-"""The one bulk reader and writer: tuples in, tuples out, no objects in between."""
+"""The one bulk reader and writer: named columns in, columns or tuples out."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain
 from itertools import count as count_from
@@ -27,35 +27,14 @@ def table(name: str) -> Table:
     return Base.metadata.tables[name]
 
 
-def columns(name: str) -> tuple[str, ...]:
-    """The columns of a table, in the order in which `insert` expects their values.
-
-    A surrogate key is not among them: the database draws it.
-    """
-    return tuple(column.name for column in table(name).columns if column.name != "id")
+def insert_rows(connection: Connection, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Insert a few rows, each a mapping from column to value; what is left out is null."""
+    if rows:
+        connection.execute(table(name).insert(), list(rows))
 
 
-def insert(connection: Connection, name: str, rows: Iterable[Row]) -> None:
-    """Inserts rows; every value of the table in its column order, see `columns`."""
-    rows = list(rows)
-    if not rows:
-        return
-    names = columns(name)
-    if on_server(connection):
-        columns_of = zip(names, zip(*rows, strict=True), strict=True)
-        server_columns.insert(connection, table(name), dict(columns_of))
-        return
-    marks = f"({', '.join('?' * len(names))})"
-    for start, end, count in _statements(len(rows), _rows_per_statement(len(names))):
-        parts = (rows[i : i + count] for i in range(start, end, count))
-        connection.exec_driver_sql(
-            _insertion(name, names, [marks] * count),
-            [tuple(chain.from_iterable(part)) for part in parts],
-        )
-
-
-def insert_columns(connection: Connection, name: str, values: Mapping[str, Any]) -> None:
-    """Inserts rows that are given as columns: no tuple is made of them where it can be spared.
+def insert(connection: Connection, name: str, values: Mapping[str, Any]) -> None:
+    """Insert rows that are given as columns: no tuple is made of them where it can be spared.
 
     Args:
         connection: to the database.
@@ -70,6 +49,8 @@ def insert_columns(connection: Connection, name: str, values: Mapping[str, Any])
     values = {c: v.tolist() if isinstance(v, np.ndarray) else v for c, v in values.items()}
     fixed = {column: value for column, value in values.items() if not isinstance(value, list)}
     varying = {column: value for column, value in values.items() if column not in fixed}
+    if not any(varying.values()):
+        return
     length, width = len(next(iter(varying.values()))), len(varying)
     # The values of all columns, row by row.
     flat: list[Any] = [None] * (length * width)

@@ -13,8 +13,8 @@ import db.models
 from curate.errors import CurateError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db.models import Base
-from pipelines.engine.graph import as_mermaid
 from pipelines.queries.named_queries import named_queries
+from pipelines.round import round_graph
 from pipelines.workspace.config import Config, write_config
 
 ROOT = Path(__file__).parent.parent
@@ -25,7 +25,7 @@ _DAG = re.compile(r"(<!-- dag -->\n).*?(<!-- /dag -->)", re.DOTALL)
 def references() -> Mapping[Path, str]:
     """What every generated file should hold."""
     readme = ROOT / "README.md"
-    dag = f"```mermaid\n{as_mermaid()}\n```\n"
+    dag = f"```mermaid\n{round_graph().as_mermaid()}\n```\n"
     return {
         ROOT / "docs" / "cli.md": cli_page(),
         ROOT / "docs" / "schema.md": schema_page(),

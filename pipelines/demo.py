@@ -21,13 +21,12 @@ from curate.evaluation import kitti_ap
 from curate.evaluation.kitti_rules import LOOSE_OVERLAPS
 from pipelines.assessment.evaluation import detect_val, val_objects
 from pipelines.assessment.label_quality import label_quality
-from pipelines.commands.options import print_report, print_table
 from pipelines.engine.progress import Bar, reaching
 from pipelines.engine.rounds import open_round
 from pipelines.engine.runner import run_round
 from pipelines.engine.schedule import run_all
-from pipelines.engine.stage import RoundStage
-from pipelines.round import stage
+from pipelines.reports.terminal import print_report, print_table
+from pipelines.round import graph_of, open_plan
 from pipelines.stages import train_round
 from pipelines.workspace.config import Config, make_config
 from pipelines.workspace.setup import initialise
@@ -94,13 +93,14 @@ def run_demo(demo: Demo, say: Say) -> None:
     workspace = workspace.with_settings(
         "run", workers=demo.processes, executor="process" if demo.processes > 1 else "serial"
     )
+    graph = graph_of(workspace)
     counts = [len(workspace.frames(split)) for split in ("labeled", "unlabeled", "val")]
     say("\n2. The teacher learns from few labels, guesses, and its guesses are weighed.")
     say(
         "   {} labeled, {} unlabeled, {} val frames; segmentation: the shipped ONNX".format(*counts)
     )
     say("   model, trained on other simulated images (never the renderer's truth).\n")
-    for report in run_all(workspace, demo.rounds, Bar(), train=False):
+    for report in run_all(workspace, graph, demo.rounds, Bar(), train=False):
         print_report(report)
     _weigh_for_others(workspace)
     say("\n   Ask for any weight in SQL:\n")
@@ -108,7 +108,7 @@ def run_demo(demo: Demo, say: Say) -> None:
     _print_query(workspace)
     say("3. Students learn, all from the teacher and for as long as it did.\n")
     _train_students(workspace, demo)
-    for report in run_all(workspace, demo.rounds, Bar()):
+    for report in run_all(workspace, graph, demo.rounds, Bar()):
         if report.done:
             print_report(report)
     for policy, how in {workspace.config.run.method: LEARNED, **OTHERS}.items():
@@ -145,12 +145,11 @@ def _simulate(demo: Demo, say: Say) -> None:
 
 def _weigh_for_others(workspace: Workspace) -> None:
     """Weights of other policies beside those of the configured one, for the first round."""
-    context = open_round(workspace, 1)
+    plan = open_plan(workspace, 1)
     for name, policies in (("solve", (*JUDGED, *OTHERS)), ("export", tuple(OTHERS))):
         for policy in dict.fromkeys(policies):
-            found = stage(name)
-            if isinstance(found, RoundStage) and policy != workspace.config.run.method:
-                run_round(workspace, context, found, policy, Bar())
+            if policy != workspace.config.run.method:
+                run_round(plan, name, policy, Bar())
 
 
 def _train_students(workspace: Workspace, demo: Demo) -> None:

@@ -1,12 +1,29 @@
-"""The round as a DAG on one screen; a stage depends on those that write what it reads."""
+"""The round as a graph on one screen; a stage depends on those that write what it reads."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-from pipelines.engine.stage import FrameStage, RoundStage, Stage
-from pipelines.registry import PRIORS
-from pipelines.stages import export, predict, repredict, score, solve, train_round
+from pipelines.engine.graph import Graph
+from pipelines.engine.plan import Plan
+from pipelines.engine.rounds import is_trainable, open_round
+from pipelines.engine.stage import FirstStage, FrameStage, RoundStage, Stage
+from pipelines.stages import export, predict, pretrain, repredict, score, solve, train_round
+from pipelines.workspace.config import DEFAULT_PRIORS
+from pipelines.workspace.workspace import Workspace
 
-_DETECT: tuple[Stage, ...] = (
+_FIRST = (
+    FirstStage(
+        "pretrain",
+        command="pretrain",
+        reads=("frame", "ground_truth"),
+        writes=("teacher",),
+        settings=pretrain.settings,
+        run=pretrain.run,
+        file=pretrain.file,
+        guard=pretrain.guard,
+    ),
+)
+_DETECT = (
     FrameStage(
         "predict",
         command="predict",
@@ -24,14 +41,15 @@ _DETECT: tuple[Stage, ...] = (
         function=repredict.function,
     ),
 )
-_DECIDE: tuple[Stage, ...] = (
+_DECIDE = (
     RoundStage(
         "solve",
         command="solve",
-        reads=("prediction", "consistency", "point_prior", "semantic_prior"),
+        reads=("prediction", "consistency"),
         writes=("weight",),
         settings=solve.settings,
         run=solve.run,
+        check=solve.check,
     ),
     RoundStage(
         "export",
@@ -52,45 +70,30 @@ _DECIDE: tuple[Stage, ...] = (
         run=train_round.run,
         file=train_round.file,
         guard=export.guard,
+        needs=("export",),
     ),
 )
-ROUND = (*_DETECT, *map(score.stage, PRIORS.classes), *_DECIDE)
 
 
-def stage(name: str) -> Stage:
-    """The stage of that name, or the one that asks the prior of that name."""
-    return next((stage for stage in ROUND if stage.name == name), None) or score.stage(name)
-
-
-def active(priors: Sequence[str]) -> tuple[Stage, ...]:
-    """The stages of a round in which only some priors are asked.
+def round_graph(priors: Sequence[str] = DEFAULT_PRIORS, *, pretrained: bool = True) -> Graph:
+    """Return the graph with some priors, and with or without the training of the first teacher.
 
     Raises:
-        ConfigError: there is no such prior, or no place for its evidence.
+        ConfigError: if there is no such prior, or its evidence cannot be stored.
     """
-    return (*_DETECT, *score.stages(priors), *_DECIDE)
+    first: tuple[Stage, ...] = _FIRST if pretrained else ()
+    scores = score.stages(priors)
+    evidence = tuple(table for stage in scores for table in stage.writes)
+    solve_stage, *others = _DECIDE
+    waiting = replace(solve_stage, reads=(*solve_stage.reads, *evidence))
+    return Graph((*first, *_DETECT, *scores, waiting, *others))
 
 
-def frames_before(of: Stage, priors: Sequence[str]) -> tuple[FrameStage, ...]:
-    """The active frame stages whose rows a stage needs, directly or through others."""
-    stages = active(priors)
-    needed = set(of.reads)
-    found: list[FrameStage] = []
-    for other in reversed(stages[: stages.index(of)]):
-        if needed & set(other.writes):
-            needed |= set(other.reads)
-            if isinstance(other, FrameStage):
-                found.insert(0, other)
-    return tuple(found)
+def graph_of(workspace: Workspace) -> Graph:
+    """Return the graph of a workspace; it has pretrain where its detector can be trained."""
+    return round_graph(workspace.config.run.priors, pretrained=is_trainable(workspace))
 
 
-def unaffected(of: FrameStage, priors: Sequence[str]) -> tuple[str, ...]:
-    """The stages whose rows of a frame stay where a stage's own are made anew.
-
-    All that is known of a frame hangs on its predictions and leaves with them. Priors that are
-    stored in the same table take each other's place.
-    """
-    if "prediction" in of.writes:
-        return ()
-    known = {stage.name: stage for stage in (*ROUND, *active(priors))}
-    return tuple(name for name, other in known.items() if not set(of.writes) & set(other.writes))
+def open_plan(workspace: Workspace, number: int | None = None, rounds: int | None = None) -> Plan:
+    """Return the plan of a round, see `open_round`."""
+    return Plan(workspace, open_round(workspace, number, rounds), graph_of(workspace))

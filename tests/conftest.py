@@ -13,7 +13,7 @@ from support.toys import write_toy_kitti
 
 from db.session import Database
 
-# The default run tries the same examples everywhere and every time; `make fuzz-random` tries others.
+# The default run tries the same examples every time; `make fuzz-random` tries others.
 # How long an example takes says nothing on a busy machine.
 settings.register_profile(
     "same", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]

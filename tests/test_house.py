@@ -4,6 +4,7 @@ import ast
 import subprocess
 import tomllib
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from itertools import chain
 from pathlib import Path
 
@@ -16,6 +17,19 @@ MAY_IMPORT = {
     "db": {"db", "curate"},
     "pipelines": {"pipelines", "db", "curate"},
 }
+# The rooms of each package, from the ground up: a room imports only rooms before it.
+LAYERS = {
+    "curate": (
+        "errors", "files", "frames", "geometry", "detections", "consistency", "datasets",
+        "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters", "detectors",
+        "firewall", "viewing", "review", "training",
+    ),
+    "pipelines": (
+        "registry", "workspace", "assembly", "engine", "labels", "firewall", "review", "stages",
+        "round", "assessment", "queries", "reports", "serving", "bench", "demo", "commands", "cli",
+        "__main__",
+    ),
+}  # fmt: skip
 HOUSE = sorted(path for folder in MAY_IMPORT for path in (ROOT / folder).rglob("*.py"))
 
 
@@ -35,6 +49,62 @@ def test_imports_go_one_way(path: Path) -> None:
     folder = path.relative_to(ROOT).parts[0]
     own = {name.split(".")[0] for name in imports(path)} & set(MAY_IMPORT)
     assert own <= MAY_IMPORT[folder]
+
+
+def module_name(path: Path) -> str:
+    """The dotted name of a file's module."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def import_graph() -> dict[str, set[str]]:
+    """The modules of the house that each module imports, deferred imports included."""
+    modules = {module_name(path): path for path in HOUSE}
+    graph: dict[str, set[str]] = {name: set() for name in modules}
+    for name, path in modules.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            found = []
+            if isinstance(node, ast.Import):
+                found = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                # What is imported from a package may be one of its modules.
+                inner = [f"{node.module}.{alias.name}" for alias in node.names]
+                found = [each if each in modules else node.module for each in inner]
+            graph[name] |= {each for each in found if each in modules and each != name}
+    return graph
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    """There is no circle, imports inside functions included."""
+    try:
+        TopologicalSorter(import_graph()).prepare()
+    except CycleError as circle:
+        pytest.fail(" -> ".join(circle.args[1]))
+
+
+def test_rooms_import_only_rooms_below_them() -> None:
+    """Every room has its place in the layers, and no arrow points upwards."""
+    upward = []
+    for name, imported in import_graph().items():
+        for other in imported:
+            package, room, other_room = name.split(".")[0], room_of(name), room_of(other)
+            if package != other.split(".")[0] or package not in LAYERS or room == other_room:
+                continue
+            layers = LAYERS[package]
+            if "" in (room, other_room) or layers.index(other_room) > layers.index(room):
+                upward.append(f"{name} -> {other}")
+    assert upward == []
+
+
+def room_of(module: str) -> str:
+    """The folder or file of a module within its package; "" for the package itself."""
+    return module.partition(".")[2].partition(".")[0]
+
+
+def test_only_the_planned_rooms_stand_in_the_house() -> None:
+    """A new file or folder at the top of a package needs a place in the layers."""
+    for package, layers in LAYERS.items():
+        own = [path for path in HOUSE if path.relative_to(ROOT).parts[0] == package]
+        assert {room_of(module_name(path)) for path in own} - {""} == set(layers)
 
 
 def test_curate_stands_alone() -> None:

@@ -23,14 +23,13 @@ from curate.weighting.base import Evidence
 from db import bulk
 from pipelines.assembly import open_policy
 from pipelines.assessment.audit_folds import open_folds
-from pipelines.engine import plan
+from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
-from pipelines.engine.rounds import is_trainable, open_round
-from pipelines.engine.runner import Report, open_executor, run_frames
-from pipelines.engine.stage import FrameStage, RoundContext
+from pipelines.engine.rounds import is_trainable
+from pipelines.engine.runner import Report, open_executor, run_first, run_frames
+from pipelines.engine.stage import RoundContext
 from pipelines.labels.evidence import read_evidence
-from pipelines.round import active
-from pipelines.stages.pretrain import pretrain
+from pipelines.round import graph_of, open_plan
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
@@ -123,10 +122,10 @@ def run_audit(
         tell(report)
 
     parts, contexts = [], []
-    for of, context, split, done in _places(workspace, request, progress, note):
-        failed = _run_stages(of, context, split, progress, done)
-        parts.append(_judge(of, context, split, request, failed))
-        contexts.append(context)
+    for plan, split, done in _places(workspace, request, progress, note):
+        failed = _run_stages(plan, split, progress, done)
+        parts.append(_judge(plan, split, request, failed))
+        contexts.append(plan.context)
     judged = JudgedLabels.joined([part for part, _ in parts])
     weights = {
         name: np.concatenate([weights[name] for _, weights in parts]) for name in request.names
@@ -182,10 +181,10 @@ def _check(workspace: Workspace, request: AuditRequest) -> None:
 
 def _places(
     workspace: Workspace, request: AuditRequest, progress: Progress, note: Tell
-) -> Iterator[tuple[Workspace, RoundContext, str, Tell]]:
-    """The workspaces, rounds and splits to audit, and who is told of the stages there."""
+) -> Iterator[tuple[Plan, str, Tell]]:
+    """The rounds and splits to audit, and who is told of the stages there."""
     if not request.folds:
-        yield workspace, open_round(workspace, request.round_number), request.split, note
+        yield open_plan(workspace, request.round_number), request.split, note
         return
     for number, fold in enumerate(open_folds(workspace, request.folds), start=1):
         place = f" {number}/{request.folds}"
@@ -193,38 +192,32 @@ def _places(
         def done(report: Report, place: str = place) -> None:
             note(replace(report, stage=report.stage + place))
 
-        if is_trainable(fold):
-            done(pretrain(fold, progress))
-        yield fold, open_round(fold, 1), "val", done
+        for first in graph_of(fold).first_stages:
+            done(run_first(fold, first, progress))
+        yield open_plan(fold, 1), "val", done
 
 
-def _run_stages(
-    workspace: Workspace, context: RoundContext, split: str, progress: Progress, done: Tell
-) -> set[str]:
+def _run_stages(plan: Plan, split: str, progress: Progress, done: Tell) -> set[str]:
     """Brings every frame stage up to date; the frames that failed in one."""
     failed: set[str] = set()
-    with open_executor(workspace) as executor:
-        for stage in active(workspace.config.run.priors):
-            if isinstance(stage, FrameStage):
-                report = run_frames(workspace, context, stage, executor, progress, split=split)
-                failed |= {frame for frame, _ in report.errors}
-                done(report)
+    with open_executor(plan.workspace) as executor:
+        for stage in plan.graph.frames_stages:
+            report = run_frames(plan, stage, executor, progress, split)
+            failed |= {frame for frame, _ in report.errors}
+            done(report)
     return failed
 
 
 def _judge(
-    workspace: Workspace,
-    context: RoundContext,
-    split: str,
-    request: AuditRequest,
-    failed: set[str],
+    plan: Plan, split: str, request: AuditRequest, failed: set[str]
 ) -> tuple[JudgedLabels, dict[str, np.ndarray]]:
     """The labels of a split with what the truth says of them, and their weights."""
+    workspace, context = plan.workspace, plan.context
     # By key, as the evidence is ordered.
     frames = sorted(
         (key, name) for name, key in workspace.frames(split).items() if name not in failed
     )
-    complete = plan.complete_frames(workspace, context, split)
+    complete = plan.complete_frames(plan.graph.of_rounds("solve"), split)
     _, evidence = read_evidence(workspace, context.number, complete)
     judged = judge_frames(
         _frames(workspace, context, split, frames, complete),

@@ -6,14 +6,13 @@ from pathlib import Path
 from curate.datasets.kitti.labels import KittiObjects, from_annotations, from_detections
 from curate.detections import Detections
 from curate.errors import FramesFailed, WorkspaceError
-from pipelines.engine import plan
 from pipelines.engine.executors.base import FrameJob
+from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import peek_round
 from pipelines.engine.runner import open_executor
-from pipelines.engine.stage import FrameStage
-from pipelines.round import stage
-from pipelines.stages.predict import Predict
+from pipelines.round import graph_of
+from pipelines.stages.predict import Predict, as_detections
 from pipelines.workspace.workspace import Workspace
 
 ValObjects = tuple[list[KittiObjects], list[KittiObjects]]
@@ -33,9 +32,9 @@ def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str
     with progress.track("evaluate", len(jobs)) as advance, open_executor(workspace) as executor:
         for outcome in executor.map(predict, jobs):
             if outcome.error is not None:
-                raise FramesFailed(f"val frame {outcome.job.frame}: {outcome.error}")
-            rows = [row[1:] for row in outcome.rows["prediction"]]
-            found[outcome.job.frame] = Detections.from_rows(rows)
+                raise FramesFailed(f"val {outcome.job.title}: {outcome.error}")
+            for frame, rows in zip(outcome.job.frames, outcome.rows, strict=True):
+                found[frame.frame] = as_detections(rows["prediction"])
             advance(1, "")
     return found
 
@@ -48,10 +47,10 @@ def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]
     """
     keys = workspace.frames("val")
     context = peek_round(workspace, round_number)
-    predict = stage("predict")
-    if context is None or not isinstance(predict, FrameStage):
+    if context is None:
         raise WorkspaceError(f"round {round_number} has no teacher yet; run `curate run`")
-    states = plan.counts(workspace, context, predict, "val")
+    plan = Plan(workspace, context, graph_of(workspace))
+    states = plan.counts(plan.graph.of_frames("predict"), "val")
     missing = states.waiting + states.failed
     if missing:
         raise WorkspaceError(

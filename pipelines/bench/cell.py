@@ -19,13 +19,11 @@ from pipelines.bench.metered import Metered
 from pipelines.bench.results import JobResult, LabelFigures, write_result
 from pipelines.bench.settings import Bench
 from pipelines.bench.tables import RULES
-from pipelines.engine.rounds import newest_checkpoint, open_round
-from pipelines.engine.runner import Report, open_executor, run_frames
+from pipelines.engine.rounds import newest_checkpoint
+from pipelines.engine.runner import Report, open_executor, run_first, run_frames
 from pipelines.engine.schedule import run_all
-from pipelines.engine.stage import FrameStage
-from pipelines.round import active
+from pipelines.round import graph_of, open_plan
 from pipelines.stages.methods import METHODS
-from pipelines.stages.pretrain import pretrain
 from pipelines.workspace.config import write_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import CONFIG_NAME, SPLITS, Workspace
@@ -49,7 +47,8 @@ def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
     if job.method is None:
         reports = _share(workspace, progress)
     else:
-        reports = list(run_all(workspace, None, progress, evidence=looks_at_unlabeled(job)))
+        graph, evidence = graph_of(workspace), looks_at_unlabeled(job)
+        reports = list(run_all(workspace, graph, None, progress, evidence=evidence))
     found = _evaluate(workspace, newest_checkpoint(workspace), progress)
     result = JobResult(
         ratio=job.ratio,
@@ -83,15 +82,12 @@ def _prepared(bench: Bench, job: Job) -> Workspace:
 
 def _share(workspace: Workspace, progress: Metered) -> list[Report]:
     """The teacher, and what round 1 asks of it whatever the method."""
-    reports = [pretrain(workspace, progress)]
-    context = open_round(workspace, 1)
+    firsts = graph_of(workspace).first_stages
+    reports = [run_first(workspace, first, progress) for first in firsts]
+    plan = open_plan(workspace, 1)
     with open_executor(workspace) as executor:
-        reports += [
-            run_frames(workspace, context, stage, executor, progress)
-            for stage in active(workspace.config.run.priors)
-            if isinstance(stage, FrameStage)
-        ]
-    return reports
+        stages = plan.graph.frames_stages
+        return [*reports, *(run_frames(plan, stage, executor, progress) for stage in stages)]
 
 
 def _copied(bench: Bench, job: Job) -> Workspace:

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipelines.bench.settings import Axes
-from pipelines.engine.stage import FrameStage
 from pipelines.registry import POLICIES
-from pipelines.round import active
+from pipelines.round import round_graph
 from pipelines.stages.methods import METHODS
 from pipelines.workspace.config import Config
 
@@ -104,4 +103,4 @@ def work(job: Job, config: Config, sizes: Sizes) -> Mapping[str, int]:
 
 def frame_stages(config: Config) -> Iterator[str]:
     """The stages that go through the frames of X_u."""
-    return (each.name for each in active(config.run.priors) if isinstance(each, FrameStage))
+    return (stage.name for stage in round_graph(config.run.priors).frames_stages)

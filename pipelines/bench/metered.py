@@ -8,11 +8,10 @@ from typing import TextIO
 
 from pipelines.bench.grid import EVALUATE, TRAIN
 from pipelines.engine.progress import Advance
-from pipelines.engine.stage import FrameStage
-from pipelines.round import ROUND
+from pipelines.registry import PRIORS
+from pipelines.round import round_graph
 
 TELL_EVERY_S = 0.5
-_KINDS = {EVALUATE, *(each.name for each in ROUND if isinstance(each, FrameStage))}
 
 
 class Metered:
@@ -24,6 +23,8 @@ class Metered:
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
+        graph = round_graph(tuple(PRIORS.classes))
+        self._kinds = {EVALUATE, *(stage.name for stage in graph.frames_stages)}
         self._measured: dict[str, tuple[int, float]] = {}
 
     @property
@@ -34,7 +35,7 @@ class Metered:
     @contextmanager
     def track(self, what: str, total: int) -> Iterator[Advance]:  # noqa: ARG002
         """Yields a function that counts; a training's name is that of its checkpoint."""
-        kind = what if what in _KINDS else TRAIN
+        kind = what if what in self._kinds else TRAIN
         begun: float | None = None
         told, units, untold = time.monotonic(), 0, 0
 

@@ -15,10 +15,8 @@ from pipelines.commands.options import (
     WorkspaceOption,
     end,
     open_workspace,
-    print_json,
-    print_report,
-    print_table,
 )
+from pipelines.reports.terminal import print_json, print_report, print_table
 
 if TYPE_CHECKING:
     from curate.evaluation.audit import Audit, Estimate, Figures
@@ -68,7 +66,7 @@ def audit(
     from curate.viewing.canvas import save_png
     from curate.viewing.reliability_diagram import draw_reliability
     from pipelines.assessment.audit import AuditRequest, in_plain_words, picture_path, run_audit
-    from pipelines.assessment.stored_audit import store_audit
+    from pipelines.assessment.store import store_audit
     from pipelines.engine.progress import Bar
 
     if overlap not in get_args(Overlap):

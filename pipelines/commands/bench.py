@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pipelines.commands.options import JsonOption, print_json, print_table
+from pipelines.commands.options import JsonOption
+from pipelines.reports.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from pipelines.bench.report import BenchReport

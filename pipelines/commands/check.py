@@ -14,8 +14,9 @@ def check(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> Non
     Example: curate check
     """
     from curate.errors import LeakageError
-    from pipelines.commands.options import open_workspace, print_json
+    from pipelines.commands.options import open_workspace
     from pipelines.firewall.rules import check as check_all
+    from pipelines.reports.terminal import print_json
 
     findings = []
     for finding in check_all(open_workspace(workspace)):

@@ -4,14 +4,8 @@ from typing import Annotated
 
 import typer
 
-from pipelines.commands.options import (
-    JsonOption,
-    PolicyOption,
-    WorkspaceOption,
-    open_workspace,
-    print_json,
-    print_table,
-)
+from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption, open_workspace
+from pipelines.reports.terminal import print_json, print_table
 
 
 def diff(

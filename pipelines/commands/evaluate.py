@@ -11,9 +11,8 @@ from pipelines.commands.options import (
     WorkersOption,
     WorkspaceOption,
     open_workspace,
-    print_json,
-    print_table,
 )
+from pipelines.reports.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -111,7 +110,7 @@ def _evaluate_val(
     """The evaluation on the val frames, and what to say of it."""
     from curate.errors import WorkspaceError
     from pipelines.assessment.evaluation import detect_val, stored_val, val_objects
-    from pipelines.assessment.stored_evaluation import store_evaluation
+    from pipelines.assessment.store import store_evaluation
     from pipelines.engine.progress import Bar
     from pipelines.engine.rounds import newest_checkpoint
 

@@ -10,8 +10,8 @@ from pipelines.commands.options import (
     RoundOption,
     WorkspaceOption,
     open_workspace,
-    print_json,
 )
+from pipelines.reports.terminal import print_json
 
 
 def explain(

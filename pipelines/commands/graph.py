@@ -12,9 +12,10 @@ def graph(
 
     Example: curate graph
     """
-    from pipelines.engine.graph import as_mermaid, as_text
+    from pipelines.round import round_graph
 
-    typer.echo(as_mermaid() if mermaid else as_text())
+    found = round_graph()
+    typer.echo(found.as_mermaid() if mermaid else found.as_text())
 
 
 def register(app: typer.Typer) -> None:

@@ -8,8 +8,8 @@ from pipelines.commands.options import (
     WorkspaceOption,
     end,
     open_workspace,
-    print_report,
 )
+from pipelines.reports.terminal import print_report
 
 
 def pretrain(
@@ -21,13 +21,21 @@ def pretrain(
 
     Example: curate pretrain
     """
+    from curate.errors import ConfigError
     from pipelines.engine.progress import Bar
-    from pipelines.stages.pretrain import pretrain as run
+    from pipelines.engine.runner import run_first
+    from pipelines.round import graph_of
 
-    report = run(open_workspace(workspace, threads=threads), Bar())
+    opened = open_workspace(workspace, threads=threads)
+    firsts = list(graph_of(opened).first_stages)
+    if not firsts:
+        raise ConfigError(
+            f"detector '{opened.config.detector.name}' needs no pretraining; run `curate predict`"
+        )
+    reports = [run_first(opened, first, Bar()) for first in firsts]
     if not as_json:
-        print_report(report)
-    end([report], as_json=as_json)
+        print_report(reports[0])
+    end(reports, as_json=as_json)
 
 
 def register(app: typer.Typer) -> None:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pipelines.commands.options import JsonOption, WorkspaceOption, print_json_rows, print_table
+from pipelines.commands.options import JsonOption, WorkspaceOption
+from pipelines.reports.terminal import print_json_rows, print_table
 
 if TYPE_CHECKING:
     from sqlalchemy import URL

@@ -5,14 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from pipelines.commands.options import (
-    JsonOption,
-    PolicyOption,
-    WorkspaceOption,
-    open_workspace,
-    print_json,
-    print_table,
-)
+from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption, open_workspace
+from pipelines.reports.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from pipelines.review.importing import Taken

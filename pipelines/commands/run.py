@@ -11,8 +11,8 @@ from pipelines.commands.options import (
     WorkspaceOption,
     end,
     open_workspace,
-    print_report,
 )
+from pipelines.reports.terminal import print_report
 
 
 def run(
@@ -42,13 +42,14 @@ def run(
 
     from pipelines.engine.progress import Bar
     from pipelines.engine.schedule import run_all
+    from pipelines.round import graph_of
     from pipelines.stages.methods import with_method
 
     opened = open_workspace(workspace, executor, workers)
     if method is not None:
         opened = replace(opened, config=with_method(opened.config, method))
     reports = []
-    for report in run_all(opened, rounds, Bar()):
+    for report in run_all(opened, graph_of(opened), rounds, Bar()):
         reports.append(report)
         if not as_json:
             print_report(report)

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.commands.options import end, open_workspace, print_report
+from pipelines.commands.options import end, open_workspace
+from pipelines.reports.terminal import print_report
 
 if TYPE_CHECKING:
     from pipelines.workspace.workspace import Workspace
@@ -23,10 +24,8 @@ def run_frame_command(
     """Runs frame stages for a split; None stands for the configured priors."""
     from curate.errors import ConfigError
     from pipelines.engine.progress import Bar
-    from pipelines.engine.rounds import open_round
     from pipelines.engine.runner import open_executor, run_frames
-    from pipelines.engine.stage import FrameStage
-    from pipelines.round import stage
+    from pipelines.round import open_plan
     from pipelines.workspace.workspace import SPLITS
 
     workspace = open_workspace(folder, executor, workers)
@@ -37,15 +36,17 @@ def run_frame_command(
     unknown = [name for name in names if name not in (*priors, "predict", "repredict")]
     if unknown:
         raise ConfigError(f"--prior {unknown[0]}: not among run.priors {list(priors)}")
-    context = open_round(workspace, round_number)
+    plan = open_plan(workspace, round_number)
+    wanted = [plan.graph.of_frames(name) for name in names]
+    for stage in wanted:
+        if stage.check:
+            stage.check(workspace)
     reports = []
     with open_executor(workspace) as work:
-        for name in names:
-            found = stage(name)
-            if isinstance(found, FrameStage):
-                reports.append(run_frames(workspace, context, found, work, Bar(), split=split))
-                if not as_json:
-                    print_report(reports[-1])
+        for stage in wanted:
+            reports.append(run_frames(plan, stage, work, Bar(), split))
+            if not as_json:
+                print_report(reports[-1])
     end(reports, as_json=as_json)
 
 
@@ -59,16 +60,11 @@ def run_round_command(
 ) -> None:
     """Runs a round stage for a policy."""
     from pipelines.engine.progress import Bar
-    from pipelines.engine.rounds import open_round
     from pipelines.engine.runner import run_round
-    from pipelines.engine.stage import RoundStage
-    from pipelines.round import stage
+    from pipelines.round import open_plan
 
-    found = stage(name)
-    if not isinstance(found, RoundStage):
-        raise TypeError(name)
-    context = open_round(workspace, round_number)
-    report = run_round(workspace, context, found, policy or workspace.config.run.method, Bar())
+    plan = open_plan(workspace, round_number)
+    report = run_round(plan, name, policy or workspace.config.run.method, Bar())
     if not as_json:
         print_report(report)
     end([report], as_json=as_json)

@@ -5,13 +5,8 @@ from typing import Annotated, Optional
 
 import typer
 
-from pipelines.commands.options import (
-    JsonOption,
-    PolicyOption,
-    WorkspaceOption,
-    open_workspace,
-    print_json,
-)
+from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption, open_workspace
+from pipelines.reports.terminal import print_json
 
 
 def view(

@@ -12,15 +12,18 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Select, and_, false, func, not_, or_, select
 
+from curate.datasets.base import sequences_of
 from curate.errors import WorkspaceError
+from curate.firewall.sequences import group_by_sequence
 from db import bulk
 from pipelines.assembly import open_policy
-from pipelines.engine.stage import FrameStage, RoundContext, RoundStage
-from pipelines.round import active, frames_before, stage
+from pipelines.engine.graph import Graph
+from pipelines.engine.stage import FirstStage, FramesStage, FrameStage, RoundContext, RoundStage
 from pipelines.workspace.workspace import Workspace
 
 FINISHED = ("done", "empty")
@@ -38,7 +41,22 @@ class Counts:
 
 
 @dataclass(frozen=True)
-class Once:
+class WaitingFrame:
+    """A frame to work on.
+
+    Attributes:
+        key: of the frame.
+        name: of the frame.
+        empty: whether an earlier stage found nothing in it.
+    """
+
+    key: int
+    name: str
+    empty: bool
+
+
+@dataclass(frozen=True)
+class TaskKey:
     """The key of the task of a stage that is done once, not per frame.
 
     Attributes:
@@ -58,211 +76,282 @@ class Once:
         return (*(task.c[name] == value for name, value in mine.items()), task.c.frame_id.is_(None))
 
 
-def fingerprints(workspace: Workspace, context: RoundContext, policy: str) -> dict[str, str]:
-    """The current fingerprint of every active stage of a round.
+@dataclass(frozen=True)
+class Plan:
+    """What is to be done in a round. Fingerprints are computed once per plan.
 
-    A round stage's fingerprint here says what its frames must have gone through; `state` adds which
-    frames these were.
+    Attributes:
+        workspace: see `Workspace`.
+        context: the round.
+        graph: the stages.
     """
-    known: dict[str, str] = {
-        "frame": workspace.config.dataset.kind,
-        "ground_truth": digest(sorted(workspace.frames("labeled"))),
-        "teacher": context.teacher.sha256,
-    }
-    prints: dict[str, str] = {}
-    for each in active(workspace.config.run.priors):
-        settings = (
-            each.settings(workspace, context)
-            if isinstance(each, FrameStage)
-            else each.settings(workspace, context, policy)
-        )
-        inputs = [known[name] for name in each.reads if name in known]
-        prints[each.name] = digest([each.name, settings, inputs])
-        if isinstance(each, FrameStage) and each.recall:
-            inputs = [known[name] for name in each.recall.reads]
-            measured = digest([each.name, each.recall.settings(workspace, context), inputs])
-            prints[each.name] = f"{measured}.{prints[each.name]}"
-        known |= dict.fromkeys(each.writes, prints[each.name])
-    return prints
 
+    workspace: Workspace
+    context: RoundContext
+    graph: Graph
 
-def waiting_frames(
-    workspace: Workspace, context: RoundContext, of: FrameStage, split: str, *, measured: bool
-) -> Iterator[tuple[int, str, bool]]:
-    """Frames to work on: key, name, and whether an earlier stage found them empty.
-
-    They are those of the split that all earlier stages have finished and this one has not, or not
-    with its current fingerprint. They are read page by page: what becomes of them meanwhile changes
-    nothing in those that follow. With `measured` they are those whose stored measurements still
-    hold, else the others.
-    """
-    prints = fingerprints(workspace, context, workspace.config.run.method)
-    frame = bulk.table("frame")
-    query, holds = _waiting(workspace, context, of, split, prints)
-    query = query.where(holds if measured else not_(holds)).order_by(frame.c.id)
-    ends = select(func.min(frame.c.id), func.max(frame.c.id)).where(frame.c.split == split)
-    with workspace.database.reading() as connection:
-        [(lowest, highest)] = bulk.select(connection, ends)
-    if lowest is None:
-        return
-    for first in range(lowest, highest + 1, PAGE):
-        page = query.where(frame.c.id.between(first, first + PAGE - 1))
-        with workspace.database.reading() as connection:
-            found = bulk.select(connection, page)
-        for key, name, empty in found:
-            yield key, name, bool(empty)
-
-
-def count_waiting(workspace: Workspace, context: RoundContext, of: FrameStage, split: str) -> int:
-    """How many frames are to be worked on."""
-    prints = fingerprints(workspace, context, workspace.config.run.method)
-    query, _ = _waiting(workspace, context, of, split, prints)
-    with workspace.database.reading() as connection:
-        found = bulk.select(connection, select(func.count()).select_from(query.subquery()))
-    return int(found[0][0])
-
-
-def _waiting(
-    workspace: Workspace,
-    context: RoundContext,
-    of: FrameStage,
-    split: str,
-    prints: Mapping[str, str],
-) -> tuple[Select[Any], ColumnElement[bool]]:
-    """The query for the frames to work on, and the condition that their measurements still hold."""
-    frame = bulk.table("frame")
-    own = bulk.table("task").alias("own")
-    source = frame.outerjoin(own, _task_of(own, context, of.name))
-    empty: list[ColumnElement[bool]] = [false()]
-    for other in frames_before(of, workspace.config.run.priors):
-        task = bulk.table("task").alias(f"task_{other.name}")
-        finished = (task.c.fingerprint == prints[other.name], task.c.state.in_(FINISHED))
-        source = source.join(task, and_(_task_of(task, context, other.name), *finished))
-        empty.append(task.c.state == "empty")
-    current = prints[of.name]
-    holds = and_(
-        own.c.id.is_not(None),
-        func.coalesce(own.c.state, "") == "done",
-        func.coalesce(own.c.fingerprint, "").startswith(current.partition(".")[0] + "."),
-    )
-    undone = or_(own.c.id.is_(None), own.c.fingerprint != current, own.c.state.not_in(FINISHED))
-    query = select(frame.c.id, frame.c.frame, or_(*empty)).select_from(source)
-    return query.where(frame.c.split == split, undone), holds
-
-
-def counts(workspace: Workspace, context: RoundContext, of: FrameStage, split: str) -> Counts:
-    """How far a stage is with a split."""
-    prints = fingerprints(workspace, context, workspace.config.run.method)
-    frame, own = bulk.table("frame"), bulk.table("task").alias("own")
-    mine = and_(_task_of(own, context, of.name), own.c.fingerprint == prints[of.name])
-    query = (
-        select(own.c.state, func.count())
-        .select_from(frame.outerjoin(own, mine))
-        .where(frame.c.split == split)
-        .group_by(own.c.state)
-    )
-    with workspace.database.reading() as connection:
-        found: dict[str | None, int] = dict(bulk.select(connection, query))
-    done, empty, failed, waiting = (found.get(key, 0) for key in ("done", "empty", "failed", None))
-    return Counts(done, empty, failed, waiting)
-
-
-def _task_of(task: Any, context: RoundContext, stage_name: str) -> ColumnElement[bool]:
-    """The join of a frame with its task of a stage."""
-    return and_(
-        task.c.round == context.number,
-        task.c.stage == stage_name,
-        task.c.frame_id == bulk.table("frame").c.id,
-    )
-
-
-def complete_frames(
-    workspace: Workspace, context: RoundContext, split: str = "unlabeled"
-) -> list[int]:
-    """The frames of a split that every stage before solve has finished, with at least one label.
-
-    Raises:
-        WorkspaceError: some frames wait; failed ones do not count as waiting, they are left out.
-    """
-    prints = fingerprints(workspace, context, workspace.config.run.method)
-    needed = frames_before(stage("solve"), workspace.config.run.priors)
-    frames = workspace.frames(split).values()
-    with workspace.database.reading() as connection:
-        states = {
-            other.name: _states(connection, context.number, other.name, prints[other.name])
-            for other in needed
+    @cached_property
+    def _sources(self) -> dict[str, str]:
+        """The fingerprints of what no stage of a round writes."""
+        return {
+            "frame": self.workspace.config.dataset.kind,
+            "ground_truth": digest(sorted(self.workspace.frames("labeled"))),
+            "teacher": self.context.teacher.sha256,
         }
-    failed = {key for of in states.values() for key, state in of.items() if state == "failed"}
-    for other in needed:
-        missing = sum(key not in states[other.name] and key not in failed for key in frames)
-        if missing:
-            raise WorkspaceError(
-                f"{other.name}: {missing} frames of round {context.number} are not done with the "
-                f"current settings; run `curate {other.command}`, or `curate run` for all stages"
-            )
-    return [key for key in frames if all(of.get(key) == "done" for of in states.values())]
+
+    @cached_property
+    def _of_frames(self) -> dict[str, str]:
+        """The fingerprints of the stages of frames."""
+        known, prints = dict(self._sources), {}
+        for stage in self.graph.frames_stages:
+            settings = stage.settings(self.workspace, self.context)
+            prints[stage.name] = _fingerprint(stage.name, settings, stage.reads, known)
+            if isinstance(stage, FrameStage) and stage.recall:
+                settings = stage.recall.settings(self.workspace, self.context)
+                measured = _fingerprint(stage.name, settings, stage.recall.reads, known)
+                prints[stage.name] = f"{measured}.{prints[stage.name]}"
+            known |= dict.fromkeys(stage.writes, prints[stage.name])
+        return prints
+
+    @cached_property
+    def _by_policy(self) -> dict[str, dict[str, str]]:
+        return {}
+
+    def fingerprints(self, policy: str) -> Mapping[str, str]:
+        """Return the current fingerprint of every stage of the round.
+
+        A round stage's fingerprint here says what its frames must have gone through;
+        `round_fingerprint` adds which frames these were.
+        """
+        if policy not in self._by_policy:
+            known, prints = dict(self._sources), dict(self._of_frames)
+            for stage in self.graph.stages:
+                if isinstance(stage, FirstStage):
+                    continue
+                if isinstance(stage, RoundStage):
+                    settings = stage.settings(self.workspace, self.context, policy)
+                    prints[stage.name] = _fingerprint(stage.name, settings, stage.reads, known)
+                known |= dict.fromkeys(stage.writes, prints[stage.name])
+            self._by_policy[policy] = prints
+        return self._by_policy[policy]
+
+    def fingerprint(self, stage: FramesStage) -> str:
+        """Return the current fingerprint of a stage of frames."""
+        return self._of_frames[stage.name]
+
+    def waiting_frames(
+        self, of: FrameStage, split: str, *, measured: bool
+    ) -> Iterator[WaitingFrame]:
+        """The frames to work on.
+
+        They are those of the split that all earlier stages have finished and this one has not, or
+        not with its current fingerprint. They are read page by page: what becomes of them meanwhile
+        changes nothing in those that follow. With `measured` they are those whose stored
+        measurements still hold, else the others.
+        """
+        frame = bulk.table("frame")
+        query, holds = self._waiting(of, split)
+        query = query.where(holds if measured else not_(holds)).order_by(frame.c.id)
+        ends = select(func.min(frame.c.id), func.max(frame.c.id)).where(frame.c.split == split)
+        with self.workspace.database.reading() as connection:
+            [(lowest, highest)] = bulk.select(connection, ends)
+        if lowest is None:
+            return
+        for first in range(lowest, highest + 1, PAGE):
+            page = query.where(frame.c.id.between(first, first + PAGE - 1))
+            with self.workspace.database.reading() as connection:
+                found = bulk.select(connection, page)
+            for key, name, empty in found:
+                yield WaitingFrame(key, name, bool(empty))
+
+    def waiting_sequences(
+        self, of: FramesStage, split: str
+    ) -> Iterator[tuple[str, list[WaitingFrame]]]:
+        """The sequences to work on, each with all its frames in the order of their names.
+
+        They are those with a frame that waits, where no frame still waits for an earlier stage. A
+        frame that failed in an earlier stage is left out of its sequence.
+        """
+        waiting = {frame.name for frame in self._frames(of, split, undone=True)}
+        ready = {frame.name: frame for frame in self._frames(of, split, undone=False)}
+        failed = self._failed_before(of, split)
+        names = self.workspace.frames(split)
+        sequences = sequences_of(self.workspace.dataset, names)
+        for sequence, members in group_by_sequence(sequences, names).items():
+            wanted = sorted(name for name in members if name not in failed)
+            if waiting & set(wanted) and all(name in ready for name in wanted):
+                yield sequence, [ready[name] for name in wanted]
+
+    def count_waiting(self, of: FramesStage, split: str) -> int:
+        """Return how many frames are to be worked on."""
+        query, _ = self._waiting(of, split)
+        with self.workspace.database.reading() as connection:
+            found = bulk.select(connection, select(func.count()).select_from(query.subquery()))
+        return int(found[0][0])
+
+    def counts(self, of: FramesStage, split: str) -> Counts:
+        """Return how far a stage is with a split."""
+        frame, own = bulk.table("frame"), bulk.table("task").alias("own")
+        mine = and_(self._task_of(own, of), own.c.fingerprint == self.fingerprint(of))
+        query = (
+            select(own.c.state, func.count())
+            .select_from(frame.outerjoin(own, mine))
+            .where(frame.c.split == split)
+            .group_by(own.c.state)
+        )
+        with self.workspace.database.reading() as connection:
+            found: dict[str | None, int] = dict(bulk.select(connection, query))
+        done, empty, failed, waiting = (
+            found.get(key, 0) for key in ("done", "empty", "failed", None)
+        )
+        return Counts(done, empty, failed, waiting)
+
+    def complete_frames(self, of: RoundStage, split: str = "unlabeled") -> list[int]:
+        """Return the frames that all stages before a round stage have finished, with a label.
+
+        Raises:
+            WorkspaceError: if frames wait; failed ones do not wait, they are left out.
+        """
+        needed = self.graph.before(of)
+        frames = self.workspace.frames(split).values()
+        with self.workspace.database.reading() as connection:
+            states = {other: self._states(connection, other) for other in needed}
+        failed = {key for each in states.values() for key, at in each.items() if at == "failed"}
+        for other in needed:
+            missing = sum(key not in states[other] and key not in failed for key in frames)
+            if missing:
+                raise WorkspaceError(
+                    f"{other.name}: {missing} frames of round {self.context.number} are not done "
+                    f"with the current settings; run `curate {other.command}`, or `curate run` for "
+                    "all stages"
+                )
+        return [key for key in frames if all(at.get(key) == "done" for at in states.values())]
+
+    def frames_to_weigh(self, of: RoundStage, policy: str) -> list[int]:
+        """Return the complete frames; none while some wait for a policy that uses no label of them.
+
+        Raises:
+            WorkspaceError: if frames wait whose labels the policy uses.
+        """
+        try:
+            return self.complete_frames(of)
+        except WorkspaceError:
+            if open_policy(self.workspace.config, policy).uses_unlabeled:
+                raise
+            return []
+
+    def round_fingerprint(self, of: RoundStage, policy: str, frames: Sequence[int]) -> str:
+        """Return the fingerprint of a round stage together with the frames that it would see."""
+        return digest([self.fingerprints(policy)[of.name], list(frames)])
+
+    def round_state(self, of: RoundStage, policy: str) -> str:
+        """Return the state of a round stage.
+
+        It is "done", "stale", or "waiting" for its first run or its input.
+        """
+        what = TaskKey(self.context.number, of.name, policy)
+        query = select(bulk.table("task").c.fingerprint).where(*what.conditions())
+        with self.workspace.database.reading() as connection:
+            stored = bulk.select(connection, query)
+        if not stored:
+            return "waiting"
+        try:
+            frames = self.frames_to_weigh(of, policy)
+        except WorkspaceError:
+            return "stale"
+        current = self.round_fingerprint(of, policy, frames)
+        file = of.file(self.workspace, self.context, policy) if of.file else None
+        return "done" if stored == [(current,)] and (file is None or file.exists()) else "stale"
+
+    def require(self, of: RoundStage, policy: str) -> None:
+        """Check that the round stages which a stage needs are up to date.
+
+        Raises:
+            WorkspaceError: if one is not; the message names the command that runs it.
+        """
+        for name in of.needs:
+            other = self.graph.of_rounds(name)
+            if self.round_state(other, policy) != "done":
+                number = self.context.number
+                chosen = "" if policy == self.workspace.config.run.method else f" --policy {policy}"
+                raise WorkspaceError(
+                    f"{of.name}: {name} of round {number} for policy {policy} is missing or older "
+                    f"than its input; run `curate {other.command} --round {number}{chosen}`"
+                )
+
+    def _waiting(self, of: FramesStage, split: str) -> tuple[Select[Any], ColumnElement[bool]]:
+        """The query for the frames to work on, and the condition that measurements still hold."""
+        query, own = self._ready(of, split)
+        current = self.fingerprint(of)
+        holds = and_(
+            own.c.id.is_not(None),
+            func.coalesce(own.c.state, "") == "done",
+            func.coalesce(own.c.fingerprint, "").startswith(current.partition(".")[0] + "."),
+        )
+        undone = or_(own.c.id.is_(None), own.c.fingerprint != current, own.c.state.not_in(FINISHED))
+        return query.where(undone), holds
+
+    def _ready(self, of: FramesStage, split: str) -> tuple[Select[Any], Any]:
+        """The query for the frames that all earlier stages have finished, and their own tasks."""
+        frame = bulk.table("frame")
+        own = bulk.table("task").alias("own")
+        source = frame.outerjoin(own, self._task_of(own, of))
+        empty: list[ColumnElement[bool]] = [false()]
+        for other in self.graph.before(of):
+            task = bulk.table("task").alias(f"task_{other.name}")
+            finished = (task.c.fingerprint == self.fingerprint(other), task.c.state.in_(FINISHED))
+            source = source.join(task, and_(self._task_of(task, other), *finished))
+            empty.append(task.c.state == "empty")
+        query = select(frame.c.id, frame.c.frame, or_(*empty)).select_from(source)
+        return query.where(frame.c.split == split), own
+
+    def _frames(self, of: FramesStage, split: str, *, undone: bool) -> list[WaitingFrame]:
+        """The frames that all earlier stages have finished; with `undone` those that wait."""
+        query = self._waiting(of, split)[0] if undone else self._ready(of, split)[0]
+        with self.workspace.database.reading() as connection:
+            found = bulk.select(connection, query)
+        return [WaitingFrame(key, name, bool(empty)) for key, name, empty in found]
+
+    def _failed_before(self, of: FramesStage, split: str) -> set[str]:
+        """The frames that failed in an earlier stage."""
+        with self.workspace.database.reading() as connection:
+            states = [self._states(connection, other) for other in self.graph.before(of)]
+        failed = {key for each in states for key, state in each.items() if state == "failed"}
+        return {name for name, key in self.workspace.frames(split).items() if key in failed}
+
+    def _states(self, connection: Connection, of: FramesStage) -> Mapping[int, str]:
+        """The state of each frame's task that carries the current fingerprint."""
+        task = bulk.table("task")
+        query = select(task.c.frame_id, task.c.state).where(
+            task.c.round == self.context.number,
+            task.c.stage == of.name,
+            task.c.fingerprint == self.fingerprint(of),
+            task.c.frame_id.is_not(None),
+        )
+        return dict(bulk.select(connection, query))
+
+    def _task_of(self, task: Any, of: FramesStage) -> ColumnElement[bool]:
+        """The join of a frame with its task of a stage."""
+        return and_(
+            task.c.round == self.context.number,
+            task.c.stage == of.name,
+            task.c.frame_id == bulk.table("frame").c.id,
+        )
 
 
-def frames_to_weigh(workspace: Workspace, context: RoundContext, policy: str) -> list[int]:
-    """The complete frames; none while some wait for a policy that uses no label of theirs.
-
-    Raises:
-        WorkspaceError: frames wait whose labels the policy uses.
-    """
-    try:
-        return complete_frames(workspace, context)
-    except WorkspaceError:
-        if open_policy(workspace.config, policy).uses_unlabeled:
-            raise
-        return []
-
-
-def round_fingerprint(
-    workspace: Workspace, context: RoundContext, of: RoundStage, policy: str, frames: Sequence[int]
-) -> str:
-    """The fingerprint of a round stage together with the frames that it would see."""
-    return digest([fingerprints(workspace, context, policy)[of.name], list(frames)])
-
-
-def round_state(workspace: Workspace, context: RoundContext, of: RoundStage, policy: str) -> str:
-    """The state of a round stage: "done", "stale", or "waiting" for its first run or its input."""
-    what = Once(context.number, of.name, policy)
-    query = select(bulk.table("task").c.fingerprint).where(*what.conditions())
-    with workspace.database.reading() as connection:
-        stored = bulk.select(connection, query)
-    if not stored:
-        return "waiting"
-    try:
-        frames = frames_to_weigh(workspace, context, policy)
-    except WorkspaceError:
-        return "stale"
-    current = round_fingerprint(workspace, context, of, policy, frames)
-    file = of.file(workspace, context, policy) if of.file else None
-    return "done" if stored == [(current,)] and (file is None or file.exists()) else "stale"
-
-
-def is_current(workspace: Workspace, what: Once, fingerprint: str) -> bool:
-    """Whether it has been done with all that it depends on."""
+def is_current(workspace: Workspace, what: TaskKey, fingerprint: str) -> bool:
+    """Return whether it has been done with all that it depends on."""
     query = select(bulk.table("task").c.fingerprint).where(*what.conditions())
     with workspace.database.reading() as connection:
         return bulk.select(connection, query) == [(fingerprint,)]
 
 
-def _states(
-    connection: Connection, round_number: int, stage: str, fingerprint: str
-) -> Mapping[int, str]:
-    """The state of each frame's task that carries the fingerprint."""
-    task = bulk.table("task")
-    query = select(task.c.frame_id, task.c.state).where(
-        task.c.round == round_number,
-        task.c.stage == stage,
-        task.c.fingerprint == fingerprint,
-        task.c.frame_id.is_not(None),
-    )
-    return dict(bulk.select(connection, query))
+def _fingerprint(name: str, settings: Any, reads: Sequence[str], known: Mapping[str, str]) -> str:
+    """The hash of a stage's settings and of the fingerprints of what it reads."""
+    return digest([name, settings, [known[each] for each in reads if each in known]])
 
 
 def digest(value: Any) -> str:
-    """A hash of a value made of plain types."""
+    """Return a hash of a value made of plain types."""
     text = json.dumps(value, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -2,32 +2,32 @@
 
 from collections.abc import Iterator
 
-from pipelines.assembly import open_policy, open_segmenter
+from pipelines.engine.graph import Graph
+from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
-from pipelines.engine.rounds import is_student_trained, is_trainable, open_round
-from pipelines.engine.runner import Report, open_executor, run_frames, run_round
-from pipelines.engine.stage import FrameStage
-from pipelines.registry import PRIORS
-from pipelines.round import active
-from pipelines.stages.pretrain import pretrain
+from pipelines.engine.rounds import is_student_trained, open_round
+from pipelines.engine.runner import Report, open_executor, run_first, run_frames, run_round
+from pipelines.engine.stage import FramesStage, RoundStage
 from pipelines.workspace.workspace import Workspace
 
 
 def run_all(
     workspace: Workspace,
+    graph: Graph,
     rounds: int | None,
     progress: Progress,
     *,
     train: bool = True,
     evidence: bool = True,
 ) -> Iterator[Report]:
-    """Brings every stage of every round up to date, and says what each did as it ends.
+    """Bring every stage of every round up to date, and report what each did as it ends.
 
-    A detector that the user brings is trained only by the user's own command (`train.command`);
-    without it, it has one round, without train-round.
+    An external detector is trained only by the user's own command (`train.command`); without it,
+    it has one round, without a student.
 
     Args:
         workspace: see `Workspace`.
+        graph: the stages.
         rounds: E; None for the configured number.
         progress: see `Progress`.
         train: whether students are trained; without them only the first round can be run.
@@ -36,19 +36,28 @@ def run_all(
     """
     trained = train and is_student_trained(workspace)
     policy = workspace.config.run.method
-    # What is wrong with these is better known before hours of work.
-    open_policy(workspace.config, policy)
-    if evidence and any(PRIORS.takes(name, "segmenter") for name in workspace.config.run.priors):
-        open_segmenter(workspace.config)
-    if is_trainable(workspace):
-        yield pretrain(workspace, progress)
+    check_stages(workspace, graph, policy, evidence=evidence)
+    for first in graph.first_stages:
+        yield run_first(workspace, first, progress)
     total = (rounds or workspace.config.run.rounds) if trained else 1
     with open_executor(workspace) as executor:
         for number in range(1, total + 1):
-            context = open_round(workspace, number, rounds)
-            for stage in active(workspace.config.run.priors):
-                if isinstance(stage, FrameStage):
-                    if evidence:
-                        yield run_frames(workspace, context, stage, executor, progress)
-                elif trained or stage.name != "train-round":
-                    yield run_round(workspace, context, stage, policy, progress)
+            plan = Plan(workspace, open_round(workspace, number, rounds), graph)
+            for stage in graph.stages:
+                if isinstance(stage, FramesStage) and evidence:
+                    yield run_frames(plan, stage, executor, progress)
+                if isinstance(stage, RoundStage) and (trained or "student" not in stage.writes):
+                    yield run_round(plan, stage.name, policy, progress)
+
+
+def check_stages(workspace: Workspace, graph: Graph, policy: str, *, evidence: bool = True) -> None:
+    """Check what can be known to be wrong with the stages' settings before any work.
+
+    Raises:
+        CurateError: if a stage could not work.
+    """
+    for stage in graph.stages:
+        if isinstance(stage, RoundStage) and stage.check:
+            stage.check(workspace, policy)
+        if evidence and isinstance(stage, FramesStage) and stage.check:
+            stage.check(workspace)

@@ -9,7 +9,7 @@ from sqlalchemy import Connection
 
 from curate.priors.base import Measured
 from curate.weighting.base import Age
-from pipelines.engine.executors.base import FrameFunction
+from pipelines.engine.executors.base import FrameFunction, SequenceFunction
 from pipelines.engine.progress import Progress
 from pipelines.workspace.workspace import Workspace
 
@@ -99,6 +99,31 @@ class Recall:
 
 
 @dataclass(frozen=True)
+class FirstStage:
+    """A stage that is done once in a workspace, before the first round.
+
+    Attributes:
+        name: of the stage and, with underscores, of its file.
+        command: that runs it.
+        reads: tables or sources.
+        writes: tables or files.
+        settings: all that its result depends on.
+        run: does it.
+        file: what it leaves on disk.
+        guard: what must hold at every start, even where the stage is up to date; raises.
+    """
+
+    name: str
+    command: str
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    settings: Callable[[Workspace], Any]
+    run: Callable[[Workspace, Progress], Product]
+    file: Callable[[Workspace], Path]
+    guard: Callable[[Workspace], None]
+
+
+@dataclass(frozen=True)
 class FrameStage:
     """A stage that treats every frame alone.
 
@@ -110,6 +135,7 @@ class FrameStage:
         settings: what its rows depend on beside what it reads and recalls.
         function: what it does with a frame.
         recall: see `Recall`; None where there is nothing that could be kept.
+        check: what can be known before the first frame to be wrong with its settings; raises.
     """
 
     name: str
@@ -119,6 +145,32 @@ class FrameStage:
     settings: Callable[[Workspace, RoundContext], Settings]
     function: Callable[[Workspace, RoundContext], FrameFunction]
     recall: Recall | None = None
+    check: Callable[[Workspace], None] | None = None
+
+
+@dataclass(frozen=True)
+class SequenceStage:
+    """A stage that looks at all frames of a sequence together, planned and resumed per sequence.
+
+    A frame of no known sequence is a sequence of its own. Frames that failed before are left out.
+
+    Attributes:
+        name: of the stage and, with underscores, of its file.
+        command: that runs it.
+        reads: tables or sources; together with `settings` all that its rows depend on.
+        writes: tables.
+        settings: what its rows depend on beside what it reads.
+        function: what it does with a sequence.
+        check: what can be known before the first frame to be wrong with its settings; raises.
+    """
+
+    name: str
+    command: str
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    settings: Callable[[Workspace, RoundContext], Settings]
+    function: Callable[[Workspace, RoundContext], SequenceFunction]
+    check: Callable[[Workspace], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -134,6 +186,8 @@ class RoundStage:
         run: does it.
         file: what it leaves on disk, if anything.
         guard: what must hold at every start, even where the stage is up to date; raises.
+        needs: round stages that must be up to date for the same policy before this one runs.
+        check: what can be known before any work to be wrong with its settings; raises.
     """
 
     name: str
@@ -144,6 +198,10 @@ class RoundStage:
     run: Callable[[Workspace, RoundJob, Progress], Product]
     file: Callable[[Workspace, RoundContext, str], Path] | None = None
     guard: Callable[[Workspace, RoundContext, str], None] | None = None
+    needs: tuple[str, ...] = ()
+    check: Callable[[Workspace, str], None] | None = None
 
 
-Stage = FrameStage | RoundStage
+FramesStage = FrameStage | SequenceStage
+"""A stage whose rows belong to frames."""
+Stage = FirstStage | FrameStage | SequenceStage | RoundStage

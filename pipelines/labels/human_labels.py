@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, select
@@ -84,12 +85,12 @@ def refresh_matches(
     for batch in batched(sorted(frame_ids or ()), _ASKED_AT_ONCE):
         connection.execute(gone.where(match.c.frame_id.in_(batch)))
     labels = read_human_labels(connection, frame_ids, until_round=round_number)
-    rows: list[bulk.Row] = []
+    rows: list[dict[str, Any]] = []
     for batch in batched(labels, _ASKED_AT_ONCE):
         predictions = _predictions(connection, round_number, batch)
         for frame_id, predicted in predictions.items():
             rows += _match_rows(round_number, frame_id, predicted, labels[frame_id])
-    bulk.insert(connection, "human_match", rows)
+    bulk.insert_rows(connection, "human_match", rows)
     return len(rows)
 
 
@@ -158,10 +159,15 @@ def _predictions(
 
 def _match_rows(
     round_number: int, frame_id: int, predicted: Sequence[bulk.Row], stored: StoredLabels
-) -> Iterable[bulk.Row]:
+) -> Iterable[dict[str, Any]]:
     boxes = np.array([row[2:] for row in predicted], dtype=np.float64)
     spoken = speak_for(boxes, as_categories([row[1] for row in predicted]), stored.labels)
     for place in np.flatnonzero(spoken.label >= 0).tolist():
-        n = int(stored.n[spoken.label[place]])
-        what = (predicted[place][0], n, float(spoken.iou[place]), int(spoken.leads[place]))
-        yield (round_number, frame_id, *what)
+        yield {
+            "round": round_number,
+            "frame_id": frame_id,
+            "k": predicted[place][0],
+            "n": int(stored.n[spoken.label[place]]),
+            "iou": float(spoken.iou[place]),
+            "leads": int(spoken.leads[place]),
+        }

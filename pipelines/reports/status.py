@@ -7,10 +7,10 @@ from sqlalchemy import select, text
 
 from curate.errors import WorkspaceError
 from db import bulk
-from pipelines.engine import plan
-from pipelines.engine.rounds import find_teacher, is_student_trained, is_trainable, peek_round
-from pipelines.engine.stage import FrameStage, RoundContext, RoundStage
-from pipelines.round import active
+from pipelines.engine.plan import Plan
+from pipelines.engine.rounds import find_teacher, is_student_trained, peek_round
+from pipelines.engine.stage import FirstStage, FramesStage, RoundStage
+from pipelines.round import graph_of
 from pipelines.workspace.workspace import Workspace
 
 COLUMNS = ("round", "stage", "split", "policy", "state", "done", "empty", "failed", "waiting")
@@ -27,17 +27,19 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
     # A detector that the user brings needs no pretraining, and has students only by a command:
     # nothing would ever come of these rows.
     trained = is_student_trained(workspace)
-    rows: list[tuple[Any, ...]] = [_pretrain_row(workspace)] if is_trainable(workspace) else []
+    graph = graph_of(workspace)
+    rows = [_first_row(workspace, first) for first in graph.first_stages]
     for number in numbers:
         context = peek_round(workspace, number)
         if context is None:
             rows.append((number, "predict", "unlabeled", "", "no teacher", 0, 0, 0, 0))
             continue
-        for stage in active(workspace.config.run.priors):
-            if isinstance(stage, FrameStage):
-                rows += _frame_rows(workspace, context, stage)
-            elif trained or stage.name != "train-round":
-                rows += _round_rows(workspace, context, stage)
+        plan = Plan(workspace, context, graph)
+        for stage in graph.stages:
+            if isinstance(stage, FramesStage):
+                rows += _frame_rows(plan, stage)
+            elif isinstance(stage, RoundStage) and (trained or "student" not in stage.writes):
+                rows += _round_rows(plan, stage)
     return COLUMNS, rows
 
 
@@ -49,39 +51,35 @@ def failed_frames(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, 
         return columns, [tuple(row) for row in connection.execute(query)]
 
 
-def _pretrain_row(workspace: Workspace) -> tuple[Any, ...]:
+def _first_row(workspace: Workspace, stage: FirstStage) -> tuple[Any, ...]:
     try:
         find_teacher(workspace, 1)
     except WorkspaceError:
-        return (0, "pretrain", "labeled", "", "waiting", 0, 0, 0, 1)
-    return (0, "pretrain", "labeled", "", "done", 1, 0, 0, 0)
+        return (0, stage.name, "labeled", "", "waiting", 0, 0, 0, 1)
+    return (0, stage.name, "labeled", "", "done", 1, 0, 0, 0)
 
 
-def _frame_rows(
-    workspace: Workspace, context: RoundContext, stage: FrameStage
-) -> Iterator[tuple[Any, ...]]:
+def _frame_rows(plan: Plan, stage: FramesStage) -> Iterator[tuple[Any, ...]]:
     for split in ("unlabeled", "val", "labeled"):
-        found = plan.counts(workspace, context, stage, split)
+        found = plan.counts(stage, split)
         touched = found.done + found.empty + found.failed
         if split != "unlabeled" and not touched:
             continue
         state = "done" if not found.waiting else ("waiting" if not touched else "partly")
         yield (
-            context.number, stage.name, split, "", state,
+            plan.context.number, stage.name, split, "", state,
             found.done, found.empty, found.failed, found.waiting,
         )  # fmt: skip
 
 
-def _round_rows(
-    workspace: Workspace, context: RoundContext, stage: RoundStage
-) -> Iterator[tuple[Any, ...]]:
-    task = bulk.table("task")
+def _round_rows(plan: Plan, stage: RoundStage) -> Iterator[tuple[Any, ...]]:
+    workspace, context, task = plan.workspace, plan.context, bulk.table("task")
     query = select(task.c.variant).where(
         task.c.round == context.number, task.c.stage == stage.name, task.c.frame_id.is_(None)
     )
     with workspace.database.reading() as connection:
         policies = {row[0] for row in bulk.select(connection, query)}
     for policy in sorted(policies | {workspace.config.run.method}):
-        state = plan.round_state(workspace, context, stage, policy)
+        state = plan.round_state(stage, policy)
         done = int(state == "done")
         yield (context.number, stage.name, "", policy, state, done, 0, 0, 1 - done)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, select
@@ -34,6 +35,9 @@ ALL_FRAMES = "all"
 # How many faults an error names.
 _NAMED = 5
 _SHARED = ("frame_id", "item", "decision", "category", "from_round", *BOX_COLUMNS, *SEEN_COLUMNS)
+
+LabelRow = dict[str, Any]
+"""The columns `_SHARED` of a row of `human_label`."""
 
 
 @dataclass(frozen=True)
@@ -192,22 +196,23 @@ def _as_shown(shown: ShownFrame) -> list[EditedBox]:
     return [EditedBox(box.category, box.box, shown.frame) for box in shown.boxes]
 
 
-def _row(frame_id: int, decision: Decision, from_round: int) -> bulk.Row:
+def _row(frame_id: int, decision: Decision, from_round: int) -> LabelRow:
     """The columns `_SHARED`."""
     seen = decision.seen or (None,) * len(SEEN_COLUMNS)
-    word = (decision.number, decision.decision, decision.category, from_round)
-    return (frame_id, *word, *decision.box, *seen)
+    what = (frame_id, decision.number, decision.decision, decision.category, from_round)
+    return dict(zip(_SHARED, (*what, *decision.box, *seen), strict=True))
 
 
-def _stored(connection: Connection, review: str) -> list[bulk.Row]:
+def _stored(connection: Connection, review: str) -> list[LabelRow]:
     """What is stored of a review, without who and when."""
     table = bulk.table("human_label")
     query = select(*(table.c[name] for name in _SHARED)).where(table.c.review == review)
-    return sorted(bulk.select(connection, query), key=repr)
+    rows = bulk.select(connection, query)
+    return sorted((dict(zip(_SHARED, row, strict=True)) for row in rows), key=repr)
 
 
 def _superseded(
-    connection: Connection, review: str, rows: Sequence[bulk.Row]
+    connection: Connection, review: str, rows: Sequence[LabelRow]
 ) -> list[tuple[int, int]]:
     """Keys of the decisions of other reviews that new ones take the place of."""
     later = _by_frame(rows)
@@ -219,7 +224,7 @@ def _superseded(
     ]
 
 
-def _store(connection: Connection, review: str, rows: Sequence[bulk.Row], reviewer: str) -> None:
+def _store(connection: Connection, review: str, rows: Sequence[LabelRow], reviewer: str) -> None:
     """Puts decisions in place of those of the review's earlier import, and what they overrule."""
     label, table = bulk.table("human_label"), bulk.table("review")
     mine = label.c.review == review
@@ -229,14 +234,15 @@ def _store(connection: Connection, review: str, rows: Sequence[bulk.Row], review
     for frame_id, n in gone:
         connection.execute(label.delete().where(label.c.frame_id == frame_id, label.c.n == n))
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    frame_ids = {row[0] for row in rows}
+    frame_ids = {row["frame_id"] for row in rows}
     kept = read_human_labels(connection, frame_ids)
     taken = {frame_id: set(stored.n.tolist()) for frame_id, stored in kept.items()}
-    bulk.insert(connection, "human_label", [
-        (row[0], _free(taken.setdefault(row[0], set())), "unlabeled", review, row[1], row[2],
-         row[3], row[4], *row[5:], reviewer, now)
-        for row in rows
-    ])  # fmt: skip
+    everywhere = {
+        "split": "unlabeled", "review": review, "reviewer": reviewer, "decided_at": now
+    }  # fmt: skip
+    numbers = [_free(taken.setdefault(row["frame_id"], set())) for row in rows]
+    new = [{**row, "n": n, **everywhere} for row, n in zip(rows, numbers, strict=True)]
+    bulk.insert_rows(connection, "human_label", new)
     refresh_all_matches(
         connection, {row[0] for row in before} | {key for key, _ in gone} | frame_ids
     )
@@ -272,17 +278,17 @@ def clear(workspace: Workspace, reviews: Collection[str] = (), frames: Collectio
     return len(gone)
 
 
-def _by_frame(rows: Iterable[bulk.Row]) -> Mapping[int, HumanLabels]:
-    """Rows of `_SHARED` as labels."""
-    found: dict[int, list[bulk.Row]] = {}
+def _by_frame(rows: Iterable[LabelRow]) -> Mapping[int, HumanLabels]:
+    """The labels of each frame."""
+    found: dict[int, list[LabelRow]] = {}
     for row in rows:
-        found.setdefault(row[0], []).append(row)
+        found.setdefault(row["frame_id"], []).append(row)
     return {
         frame_id: HumanLabels(
-            as_categories([row[2] for row in own]),
-            as_categories([row[3] for row in own]),
-            np.array([row[5:12] for row in own], dtype=np.float64),
-            np.array([row[12:19] for row in own], dtype=np.float64),
+            as_categories([row["decision"] for row in own]),
+            as_categories([row["category"] for row in own]),
+            np.array([[row[name] for name in BOX_COLUMNS] for row in own], dtype=np.float64),
+            np.array([[row[name] for name in SEEN_COLUMNS] for row in own], dtype=np.float64),
         )
         for frame_id, own in found.items()
     }

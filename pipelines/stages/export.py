@@ -77,7 +77,8 @@ def register_label_file(
     """Stores the hash of a label file in place of an earlier one's."""
     table, name = bulk.table("label_file"), workspace.relative(path)
     connection.execute(table.delete().where(table.c.path == name))
-    bulk.insert(connection, "label_file", [(name, round_number, policy, sha256(path))])
+    row = {"path": name, "round": round_number, "policy": policy, "sha256": sha256(path)}
+    bulk.insert_rows(connection, "label_file", [row])
 
 
 def write_label_file(workspace: Workspace, path: Path, round_number: int, policy: str) -> int:

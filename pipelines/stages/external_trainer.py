@@ -13,11 +13,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from curate.errors import ConfigError, TrainerFailed, WorkspaceError
-from pipelines.engine import plan
-from pipelines.engine.stage import RoundJob, RoundStage
+from curate.errors import ConfigError, TrainerFailed
+from pipelines.engine.stage import RoundJob
 from pipelines.registry import EXPORTERS
-from pipelines.round import stage
 from pipelines.stages import export
 from pipelines.workspace.workspace import Workspace
 
@@ -32,7 +30,6 @@ def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
 
     Raises:
         ConfigError: the command cannot be taken apart or started.
-        WorkspaceError: the labels are not exported.
         TrainerFailed: it ended with an error, or without having written the output.
     """
     draft = output.parent / "training" / output.name
@@ -78,20 +75,7 @@ def _filled(argument: str, values: dict[str, str]) -> str:
 
 
 def _labels(workspace: Workspace, job: RoundJob) -> Path:
-    """The exported labels in the format that the trainer wants.
-
-    Raises:
-        WorkspaceError: they are missing or older than their weights.
-    """
-    exported = stage("export")
-    if (
-        not isinstance(exported, RoundStage)
-        or plan.round_state(workspace, job.context, exported, job.policy) != "done"
-    ):
-        raise WorkspaceError(
-            f"the labels of round {job.context.number} weighted by {job.policy} are not exported, "
-            f"or older than their weights; run `curate export --round {job.context.number}`"
-        )
+    """The exported labels in the format that the trainer wants."""
     path = export.file(workspace, job.context, job.policy)
     name = workspace.config.train.labels_format
     if name == "sqlite":

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from curate.detections import Detections
 from curate.errors import ModelError
 from curate.frames import Frame
 from curate.geometry.projection import in_view
+from db.models import BOX_COLUMNS
 from pipelines.assembly import open_detector
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
@@ -36,8 +38,7 @@ class Predict:
     def __call__(self, job: FrameJob) -> FrameRows:
         """The rows of `prediction`."""
         found = self.detect(job.frame)
-        rows = zip(prediction_rows(found), _or_none(found.iou), strict=True)
-        return {"prediction": [(k, *row, iou) for k, (row, iou) in enumerate(rows)]}
+        return {"prediction": {**detection_columns(found), "iou": _or_none(found.iou)}}
 
     def detect(self, frame_id: str) -> Detections:
         """The boxes of a frame, by falling score."""
@@ -98,10 +99,20 @@ def _warn_once(name: str, ours: tuple[str, ...]) -> None:
     )
 
 
-def prediction_rows(found: Detections) -> list[tuple[object, ...]]:
-    """Category, score and box of each detection."""
-    columns = [found.categories.tolist(), found.scores.tolist(), *found.boxes.T.tolist()]
-    return list(zip(*columns, strict=True))
+def detection_columns(found: Detections) -> dict[str, list[Any]]:
+    """Return number, category, score and box of each detection as the database names them."""
+    return {
+        "k": list(range(len(found))),
+        "category": found.categories.tolist(),
+        "score": found.scores.tolist(),
+        **dict(zip(BOX_COLUMNS, found.boxes.T.tolist(), strict=True)),
+    }
+
+
+def as_detections(columns: Mapping[str, Sequence[Any]]) -> Detections:
+    """Return the detections behind the columns of `prediction`."""
+    names = ("category", "score", *BOX_COLUMNS, "iou")
+    return Detections.from_rows(list(zip(*(columns[name] for name in names), strict=True)))
 
 
 def _or_none(numbers: np.ndarray) -> list[float | None]:

@@ -1,7 +1,7 @@
 """repredict: l' = A^-1 f(A(x); w), and how far it disagrees with l (the loss L of Eqs. 4 to 11)."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from curate.geometry.similarity import Similarity
 from pipelines.assembly import consistency_settings
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
-from pipelines.stages.predict import Predict, checked, prediction_rows, visible
+from pipelines.stages.predict import Predict, checked, detection_columns, visible
 from pipelines.workspace.config import RepredictSection
 from pipelines.workspace.workspace import Workspace
 
@@ -38,15 +38,19 @@ class Repredict(Predict):
         settings = consistency_settings(self.config)
         losses = [consistency(job.predictions, found, settings) for _, found in views]
         return {
-            "reprediction_view": [
-                (v, int(a.flip_y), a.rotation_rad, a.scale) for v, (a, _) in enumerate(views)
-            ],
-            "reprediction": [
-                (v, *row)
-                for v, ((_, found), loss) in enumerate(zip(views, losses, strict=True))
-                for row in _reprediction_rows(found, loss)
-            ],
-            "consistency": _consistency_rows(losses, len(job.predictions)),
+            "reprediction_view": {
+                "view": list(range(len(views))),
+                "flip_y": [int(a.flip_y) for a, _ in views],
+                "rotation_rad": [a.rotation_rad for a, _ in views],
+                "scale": [a.scale for a, _ in views],
+            },
+            "reprediction": _below(
+                [
+                    _reprediction_columns(view, found, loss)
+                    for view, ((_, found), loss) in enumerate(zip(views, losses, strict=True))
+                ]
+            ),
+            "consistency": _consistency_columns(losses, len(job.predictions)),
         }
 
     def views(self, frame_id: str) -> list[View]:
@@ -95,25 +99,41 @@ def function(workspace: Workspace, context: RoundContext) -> Repredict:
     return Repredict(predict, context.seed, context.number)
 
 
-def _reprediction_rows(found: Detections, loss: Consistency) -> list[tuple[Any, ...]]:
-    """The rows of one view, each with what matched it."""
-    matched = {int(i): k for k, i in enumerate(loss.matched) if i >= 0}
-    rows: list[tuple[Any, ...]] = []
-    for i, (category, score, *box) in enumerate(prediction_rows(found)):
-        k = matched.get(i)
-        match: tuple[Any, ...] = (None,) * 4
-        if k is not None:
-            match = (k, *(float(of[k]) for of in (loss.iou, loss.score_loss, loss.box_loss)))
-        rows.append((i, category, score, *match, *box))
-    return rows
+def _reprediction_columns(view: int, found: Detections, loss: Consistency) -> dict[str, list[Any]]:
+    """The columns of one view, each reprediction with what it was matched with."""
+    matched: list[int | None] = [None] * len(found)
+    for k, i in enumerate(loss.matched.tolist()):
+        if i >= 0:
+            matched[i] = k
+    of_match = {"iou": loss.iou, "score_loss": loss.score_loss, "box_loss": loss.box_loss}
+    return {
+        "view": [view] * len(found),
+        **detection_columns(found),
+        "matched_k": matched,
+        **{
+            name: [None if k is None else float(values[k]) for k in matched]
+            for name, values in of_match.items()
+        },
+    }
 
 
-def _consistency_rows(losses: Sequence[Consistency], count: int) -> list[tuple[Any, ...]]:
-    """A row per label; without any view each says that there is no evidence."""
-    if not losses:
-        return [(k, None, 0, 0) for k in range(count)]
-    mean = mean_over_views(losses)
-    return [
-        (k, None if np.isnan(loss) else float(loss), len(losses), int(matched))
-        for k, (loss, matched) in enumerate(zip(mean.loss, mean.views_matched, strict=True))
-    ]
+def _below(parts: Sequence[Mapping[str, list[Any]]]) -> dict[str, list[Any]]:
+    """The columns of several views below each other."""
+    names = parts[0] if parts else ()
+    return {name: [value for part in parts for value in part[name]] for name in names}
+
+
+def _consistency_columns(losses: Sequence[Consistency], count: int) -> dict[str, list[Any]]:
+    """The columns of the labels; without any view each says that there is no evidence."""
+    loss: list[float | None] = [None] * count
+    matched = [0] * count
+    if losses:
+        mean = mean_over_views(losses)
+        loss = [None if np.isnan(each) else each for each in mean.loss.tolist()]
+        matched = mean.views_matched.tolist()
+    return {
+        "k": list(range(count)),
+        "loss": loss,
+        "views": [len(losses)] * count,
+        "matched_views": matched,
+    }

@@ -16,7 +16,7 @@ from curate.errors import ConfigError, WorkspaceError
 from curate.priors.base import Measured, PriorEvidence, columns
 from curate.priors.points import learn_thresholds
 from db import bulk
-from pipelines.assembly import open_prior, point_settings, segmenter_path
+from pipelines.assembly import open_prior, open_segmenter, point_settings, segmenter_path
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import FrameStage, Recall, RoundContext, Settings
 from pipelines.registry import PRIORS
@@ -56,8 +56,9 @@ class Score:
 
     def rows(self, evidence: PriorEvidence) -> FrameRows:
         """The evidence as rows."""
-        numbers = zip(*(column.tolist() for column in columns(evidence).values()), strict=True)
-        return {TABLES[self.prior.rho_column]: [(k, *row) for k, row in enumerate(numbers)]}
+        found = {name: column.tolist() for name, column in columns(evidence).items()}
+        count = len(evidence.rho)
+        return {TABLES[self.prior.rho_column]: {"k": list(range(count)), **found}}
 
 
 class Rate(Score):
@@ -95,6 +96,7 @@ def stage(name: str) -> FrameStage:
             read=partial(_read_measured, name),
             function=partial(_function, Rate, name),
         ),
+        check=partial(_check, name),
     )
 
 
@@ -127,6 +129,12 @@ def table_of(name: str) -> str:
             f"prior '{name}' answers {column}, but only {' and '.join(TABLES)} can be stored"
         )
     return TABLES[column]
+
+
+def _check(name: str, workspace: Workspace) -> None:
+    """ConfigError where the segmenter of a prior that needs one cannot be opened."""
+    if PRIORS.takes(name, "segmenter"):
+        open_segmenter(workspace.config)
 
 
 def _settings(name: str, workspace: Workspace, _context: RoundContext) -> Settings:

@@ -35,6 +35,15 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
     }
 
 
+def check(workspace: Workspace, policy: str) -> None:
+    """Check that the policy can be made with its settings.
+
+    Raises:
+        ConfigError: if it cannot.
+    """
+    open_policy(workspace.config, policy)
+
+
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     """The policy's weights of the round."""
     context, policy = job.context, job.policy
@@ -60,7 +69,7 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
         former = bulk.table("label_count").c
         mine = (former.round == context.number, former.policy == policy)
         connection.execute(former.policy.table.delete().where(*mine))
-        bulk.insert(connection, "label_count", counts)
+        bulk.insert_rows(connection, "label_count", counts)
         refresh_matches(connection, context.number)
         bulk.refresh_statistics(connection)
 
@@ -114,7 +123,7 @@ def _replace(
         end = int(np.searchsorted(frame_id, last, side="right"))
         connection.execute(weight.delete().where(*former, weight.c.frame_id <= last))
         block = {name: values[start:end] for name, values in columns.items()}
-        bulk.insert_columns(connection, "weight", {**mine, **block})
+        bulk.insert(connection, "weight", {**mine, **block})
         former[len(mine) :] = [weight.c.frame_id > last]
     connection.execute(weight.delete().where(*former))
 
@@ -131,17 +140,21 @@ def _columns(keys: LabelKeys, weights: Weights, evidence: Evidence) -> dict[str,
     }
 
 
-def _counts(round_number: int, policy: str, keys: LabelKeys, weights: Weights) -> list[bulk.Row]:
+def _counts(
+    round_number: int, policy: str, keys: LabelKeys, weights: Weights
+) -> list[dict[str, Any]]:
     """The rows of `label_count`."""
     kept, size = ~weights.dropped, len(keys.category_names)
     category, v = keys.category[kept], weights.v[kept]
-    columns = [
-        np.bincount(category[chosen], minlength=size).tolist()
-        for chosen in (slice(None), v > 0, v > TRUSTED)
-    ]
-    columns.append(np.bincount(category, weights=v, minlength=size).tolist())
+    counts = {
+        "labels": np.bincount(category, minlength=size),
+        "kept": np.bincount(category[v > 0], minlength=size),
+        "trusted": np.bincount(category[v > TRUSTED], minlength=size),
+        "weight": np.bincount(category, weights=v, minlength=size),
+    }
     return [
-        (round_number, policy, name, *row)
-        for name, row in zip(keys.category_names, zip(*columns, strict=True), strict=True)
-        if row[0]
+        {"round": round_number, "policy": policy, "category": name}
+        | {column: values[i].item() for column, values in counts.items()}
+        for i, name in enumerate(keys.category_names)
+        if counts["labels"][i]
     ]

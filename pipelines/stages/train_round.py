@@ -14,6 +14,7 @@ from pipelines.engine.progress import Progress, reaching
 from pipelines.engine.rounds import is_trainable, register_checkpoint
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
+from pipelines.stages.external_trainer import train_externally
 from pipelines.stages.methods import Method, method_of
 from pipelines.workspace.workspace import Workspace
 
@@ -72,9 +73,6 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
         register_checkpoint(connection, workspace, job.context.number, job.policy, path)
 
     if workspace.config.train.command is not None:
-        # It asks the graph of stages, which this module is a part of.
-        from pipelines.stages.external_trainer import train_externally
-
         train_externally(workspace, job, path)
         return Product(f"{workspace.relative(path)}, by your trainer", write)
     if not is_trainable(workspace):

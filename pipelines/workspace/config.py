@@ -27,6 +27,8 @@ AtLeastOne = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Options = dict[str, Any]
 
+DEFAULT_PRIORS = ("points", "semantic")
+
 
 def _each_once(names: tuple[str, ...]) -> tuple[str, ...]:
     repeated = sorted({name for name in names if names.count(name) > 1})
@@ -152,7 +154,7 @@ class RunSection(Section):
     method: str = "pspsl"  # see docs/methods.md
     rounds: AtLeastOne = 3
     seed: Seed = 0
-    priors: Annotated[tuple[str, ...], AfterValidator(_each_once)] = ("points", "semantic")
+    priors: Annotated[tuple[str, ...], AfterValidator(_each_once)] = DEFAULT_PRIORS
     prior_options: dict[str, Options] = {}  # of your own priors, by name
     executor: str = "serial"  # or process, ray; see docs/scale.md
     executor_options: dict[str, Options] = {}  # by executor, e.g. executor_options.ray.num_gpus = 1

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from sqlalchemy import func, select
@@ -17,6 +18,7 @@ from curate.files.batches import batched
 from curate.firewall.sequences import choose_sequences, group_by_sequence, straddling
 from curate.segmenters.classes import CLASS_MAPS, class_map
 from db import bulk
+from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
 from pipelines.workspace.config import Config
 from pipelines.workspace.split_record import split_rows
@@ -232,35 +234,49 @@ def _store(
         if connection.execute(select(func.count()).select_from(table)).scalar_one():
             raise WorkspaceError(f"{workspace.root}: another command has just set it up")
         for rows in batched(_frame_rows(workspace, dataset, split), FRAMES_AT_ONCE):
-            bulk.insert(connection, "frame", rows)
+            bulk.insert_rows(connection, "frame", rows)
         chosen = {name: getattr(split, name) for name in SPLITS}
-        bulk.insert(connection, "split_list", split_rows(chosen, dataset.splits(), files))
+        bulk.insert_rows(connection, "split_list", split_rows(chosen, dataset.splits(), files))
         query = select(table.c.frame, table.c.id, table.c.split).where(table.c.split != "unlabeled")
         keys = {frame: (key, of) for frame, key, of in bulk.select(connection, query)}
         truth_rows = [
             row for frame, found in truth.items() for row in _truth_rows(*keys[frame], found)
         ]
-        bulk.insert(connection, "ground_truth", truth_rows)
+        bulk.insert_rows(connection, "ground_truth", truth_rows)
 
 
-def _frame_rows(workspace: Workspace, dataset: Dataset, split: Split) -> Iterator[bulk.Row]:
+def _frame_rows(workspace: Workspace, dataset: Dataset, split: Split) -> Iterator[dict[str, Any]]:
     """The rows of `frame`, one at a time; not even the path of a label is kept for X_u."""
     root, kind = workspace.config.dataset.root, workspace.config.dataset.kind
     for name in SPLITS:
         for frame in getattr(split, name):
             found = dataset.files(frame)
             label = None if name == "unlabeled" else found.label
-            paths = (found.points, found.image, found.calibration, label)
-            relative = [str(p.relative_to(root)) if p else None for p in paths]
-            yield (kind, frame, name, *relative)
+            paths = {
+                "points_path": found.points,
+                "image_path": found.image,
+                "calibration_path": found.calibration,
+                "label_path": label,
+            }
+            relative = {key: str(p.relative_to(root)) if p else None for key, p in paths.items()}
+            yield {"dataset": kind, "frame": frame, "split": name, **relative}
 
 
-def _truth_rows(frame_id: int, split: str, found: Annotations) -> list[bulk.Row]:
+def _truth_rows(frame_id: int, split: str, found: Annotations) -> list[dict[str, Any]]:
     """The rows of `ground_truth`; DontCare regions have no box."""
     rows = []
     for k in range(len(found)):
         box = [None if np.isnan(number) else float(number) for number in found.boxes[k]]
-        kitti = (float(found.truncated[k]), int(found.occluded[k]), float(found.alpha[k]))
-        rectangle = map(float, found.boxes_2d[k])
-        rows.append((frame_id, k, split, str(found.categories[k]), *box, *kitti, *rectangle))
+        row = {
+            "frame_id": frame_id,
+            "k": k,
+            "split": split,
+            "category": str(found.categories[k]),
+            "truncated": float(found.truncated[k]),
+            "occluded": int(found.occluded[k]),
+            "alpha": float(found.alpha[k]),
+        }
+        row |= zip(BOX_COLUMNS, box, strict=True)
+        row |= zip(RECTANGLE_COLUMNS, found.boxes_2d[k].tolist(), strict=True)
+        rows.append(row)
     return rows

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import select
 
@@ -19,7 +20,7 @@ def split_rows(
     chosen: Mapping[str, Iterable[str]],
     own: Mapping[str, Iterable[str]],
     files: Mapping[str, Path],
-) -> list[bulk.Row]:
+) -> list[dict[str, Any]]:
     """The rows of `split_list`.
 
     Args:
@@ -121,8 +122,15 @@ def _told(lists: Iterable[tuple[str, SplitList, Iterable[str]]]) -> Mapping[str,
     return {name: what for name, what in told.items() if what}
 
 
-def _row(source: str, name: str, path: str | None, names: SplitList) -> bulk.Row:
-    return (source, name, path, len(names), names.sha256, names.text)
+def _row(source: str, name: str, path: str | None, names: SplitList) -> dict[str, Any]:
+    return {
+        "source": source,
+        "name": name,
+        "path": path,
+        "frames": len(names),
+        "sha256": names.sha256,
+        "names": names.text,
+    }
 
 
 def _read(path: Path) -> list[str]:

@@ -8,6 +8,7 @@ import pytest
 from benchmarks.measuring import OURS, measure
 from benchmarks.rows import frame_rows, prediction_rows
 from sqlalchemy import insert, select
+from support.stored_tuples import COLUMNS, store
 
 from db import bulk
 from db.columns import reading_columns
@@ -35,8 +36,8 @@ def template(tmp_path_factory):
     config = make_config({"dataset": {"root": root}}, "benchmark")
     workspace = Workspace.create(root / "work", config)
     with workspace.database.writing() as connection:
-        bulk.insert(connection, "frame", frame_rows(FRAMES))
-        bulk.insert(connection, "round", [(1, 3, None, "{}", "0", 0)])
+        store(connection, "frame", frame_rows(FRAMES))
+        store(connection, "round", [(1, 3, None, "{}", "0", 0)])
     workspace.database.close()
     return workspace
 
@@ -73,7 +74,7 @@ def write_bare(path, rows):
     """sqlite3's executemany in one transaction."""
     connection = bare_connection(path)
     marks = ", ".join("?" * len(rows[0]))
-    names = ", ".join(f'"{name}"' for name in bulk.columns("prediction"))
+    names = ", ".join(f'"{name}"' for name in COLUMNS["prediction"])
     connection.execute("BEGIN IMMEDIATE")
     connection.executemany(f"INSERT INTO prediction ({names}) VALUES ({marks})", rows)
     connection.execute("COMMIT")
@@ -83,13 +84,13 @@ def write_bare(path, rows):
 def write_ours(database, rows):
     """`db.bulk.insert` in one transaction."""
     with database.writing() as connection:
-        bulk.insert(connection, "prediction", rows)
+        store(connection, "prediction", rows)
     database.close()
 
 
 def write_core(database, rows):
     """SQLAlchemy Core with a dictionary per row."""
-    names = bulk.columns("prediction")
+    names = COLUMNS["prediction"]
     with database.writing() as connection:
         connection.execute(
             insert(bulk.table("prediction")),
@@ -131,7 +132,7 @@ def bench_read(benchmark, name, copies, predictions):
     """All rows with all columns, as tuples."""
     path = copies()
     write_bare(path, predictions)
-    names = bulk.columns("prediction")
+    names = COLUMNS["prediction"]
     database, bare = Database(f"sqlite:///{path}"), bare_connection(path)
 
     def ours():
@@ -191,9 +192,9 @@ def solvable(template, predictions, tmp_path_factory):
         "semantic_prior": [(*key, 5, 10, rho) for key, rho in zip(keys, rhos[1], strict=True)],
     }
     with workspace.database.writing() as connection:
-        bulk.insert(connection, "prediction", predictions)
+        store(connection, "prediction", predictions)
         for table, rows in evidence.items():
-            bulk.insert(connection, table, rows)
+            store(connection, table, rows)
     return workspace
 
 

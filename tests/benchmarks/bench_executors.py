@@ -9,9 +9,8 @@ from benchmarks.measuring import measure
 from curate.detections import CATEGORIES
 from curate.simulation import simulate
 from pipelines.engine.progress import Silent
-from pipelines.engine.rounds import open_round
 from pipelines.engine.runner import open_executor, run_frames
-from pipelines.round import stage
+from pipelines.round import open_plan
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
@@ -66,9 +65,8 @@ def bench_predict(benchmark, prepared, executor, workers):
     with open_executor(prepared().with_settings("run", **settings)) as work:
 
         def predict(workspace):
-            report = run_frames(
-                workspace, open_round(workspace, 1), stage("predict"), work, Silent()
-            )
+            plan = open_plan(workspace, 1)
+            report = run_frames(plan, plan.graph.of_frames("predict"), work, Silent())
             assert report.done + report.empty == FRAMES - 1, report.errors
 
         predict(prepared())  # starts the workers, which load their models

@@ -7,17 +7,13 @@ import numpy as np
 import pytest
 from benchmarks.measuring import cpu_seconds, measure
 from benchmarks.scenes import SIDES, sweep
+from support import rounds
 
 from curate.datasets.kitti.dataset import write_calibration
 from curate.datasets.kitti.labels import from_annotations, write_objects
 from curate.detections import CATEGORIES, Annotations, Detections, as_categories
 from curate.frames import Calibration
 from curate.segmenters.base import SemanticMap
-from pipelines.engine.executors.serial import SerialExecutor
-from pipelines.engine.progress import Silent
-from pipelines.engine.rounds import open_round
-from pipelines.engine.runner import run_frames, run_round
-from pipelines.round import stage
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
@@ -117,10 +113,9 @@ def write_frame(home, name, generator, boxes):
 
 def run_stage(workspace, name):
     """Brings a stage up to date for all frames."""
-    context, found = open_round(workspace, 1), stage(name)
+    report = rounds.run_stage(workspace, name)
     if name == "solve":
-        return run_round(workspace, context, found, "pspsl", Silent())
-    report = run_frames(workspace, context, found, SerialExecutor(), Silent())
+        return report
     assert (report.failed, report.done) == (0, FRAMES - 1), report.errors
     return report
 

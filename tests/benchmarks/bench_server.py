@@ -5,6 +5,7 @@ import pytest
 from benchmarks.measuring import OURS, measure
 from benchmarks.rows import frame_rows, prediction_rows
 from sqlalchemy import insert, select
+from support.stored_tuples import COLUMNS, store
 
 from db import bulk
 from db.session import Database
@@ -21,8 +22,8 @@ def database(postgres):
     """A database on a server of the run's own, with frames and a round, but no predictions."""
     database = Database(postgres.new_database())
     with database.writing() as connection:
-        bulk.insert(connection, "frame", frame_rows(FRAMES))
-        bulk.insert(connection, "round", [(1, 3, None, "{}", "0", 0)])
+        store(connection, "frame", frame_rows(FRAMES))
+        store(connection, "round", [(1, 3, None, "{}", "0", 0)])
     yield database
     database.close()
 
@@ -35,12 +36,12 @@ def predictions():
 
 def write_ours(connection, rows):
     """COPY, its binary form made of columns."""
-    bulk.insert(connection, "prediction", rows)
+    store(connection, "prediction", rows)
 
 
 def write_copy(connection, rows):
     """COPY, its text form made row by row."""
-    names = ", ".join(f'"{name}"' for name in bulk.columns("prediction"))
+    names = ", ".join(f'"{name}"' for name in COLUMNS["prediction"])
     with connection.connection.cursor().copy(f"COPY prediction ({names}) FROM STDIN") as copy:
         for row in rows:
             copy.write_row(row)
@@ -48,7 +49,7 @@ def write_copy(connection, rows):
 
 def write_many(connection, rows):
     """The driver's executemany, which sends the rows without waiting for each answer."""
-    names = bulk.columns("prediction")
+    names = COLUMNS["prediction"]
     quoted, marks = ", ".join(f'"{name}"' for name in names), ", ".join(["%s"] * len(names))
     statement = f"INSERT INTO prediction ({quoted}) VALUES ({marks})"
     connection.connection.cursor().executemany(statement, rows)
@@ -56,7 +57,7 @@ def write_many(connection, rows):
 
 def write_core(connection, rows):
     """SQLAlchemy Core with a dictionary per row, a thousand of them in a statement."""
-    names = bulk.columns("prediction")
+    names = COLUMNS["prediction"]
     values = [dict(zip(names, row, strict=True)) for row in rows]
     connection.execute(insert(bulk.table("prediction")), values)
 
@@ -104,7 +105,7 @@ def bench_server_read(benchmark, name, database, predictions):
     emptied = "TRUNCATE prediction CASCADE"
     with database.writing() as connection:
         connection.exec_driver_sql(emptied)
-        bulk.insert(connection, "prediction", predictions)
+        store(connection, "prediction", predictions)
         bulk.refresh_statistics(connection)
     table = bulk.table("prediction").c
     query = select(table.score).order_by(table.round, table.frame_id, table.k)
@@ -119,4 +120,4 @@ def bench_server_read(benchmark, name, database, predictions):
 
     read = ours if name == OURS else rows
     found = measure(benchmark, read, group=READ, name=name, amount=ROWS, unit="rows")
-    assert found.tolist() == [row[bulk.columns("prediction").index("score")] for row in predictions]
+    assert found.tolist() == [row[COLUMNS["prediction"].index("score")] for row in predictions]

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from db import bulk
-
 
 def frame_rows(count):
     """Unlabeled frames, the rows of `frame`."""
@@ -19,11 +17,8 @@ def prediction_rows(frames, each):
     generator = np.random.default_rng(0)
     boxes, scores = generator.normal(0, 10, (count, 7)).tolist(), generator.random(count).tolist()
     categories = generator.choice(["Car", "Pedestrian", "Cyclist"], count).tolist()
-    place = {name: position for position, name in enumerate(bulk.columns("prediction"))}
-    rows = []
-    for i, (box, score, category) in enumerate(zip(boxes, scores, categories, strict=True)):
-        row = [1, 1 + i // each, i % each, *[None] * (len(place) - 3)]
-        row[place["category"]], row[place["score"]] = category, score
-        row[place["x"] : place["yaw"] + 1] = box
-        rows.append(tuple(row))
-    return rows
+    labels = enumerate(zip(boxes, scores, categories, strict=True))
+    return [
+        (1, 1 + i // each, i % each, category, score, *box, None)
+        for i, (box, score, category) in labels
+    ]

@@ -6,14 +6,13 @@ from pathlib import Path
 import pytest
 from contracts.samples import assert_one_line
 from support.frame_functions import Deadly, Square
+from support.rounds import run_workspace
 from support.stored_rows import dump
 from support.toys import toy_document, write_toy_kitti
 
 from curate.errors import CurateError, ModelError
 from pipelines.engine.executors.base import Executor, FrameJob
 from pipelines.engine.executors.serial import SerialExecutor
-from pipelines.engine.progress import Silent
-from pipelines.engine.schedule import run_all
 from pipelines.registry import EXECUTORS
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
@@ -65,10 +64,10 @@ def test_every_job_has_one_outcome(executor: Executor) -> None:
     assert sorted(outcome.job.frame_id for outcome in found) == list(range(50))
     for key, outcome in outcomes.items():
         if key % 7 == 3:
-            assert outcome.rows == {}
+            assert outcome.rows == ()
             assert outcome.error == f"frame {key:06d}: ValueError: three lines {key} long"
         else:
-            assert (outcome.rows, outcome.error) == ({"squares": [(key**2,)]}, None)
+            assert (outcome.rows, outcome.error) == (({"squares": {"value": [key**2]}},), None)
 
 
 def test_a_broken_model_ends_the_run_in_its_own_words(executor: Executor) -> None:
@@ -122,7 +121,7 @@ def test_a_frame_that_kills_every_worker_fails_alone(crew: Executor, tmp_path: P
     assert sorted(outcome.job.frame_id for outcome in found) == list(range(50))
     failed = {outcome.job.frame_id: outcome for outcome in found if outcome.error is not None}
     assert sorted(failed) == [5, 6]
-    assert failed[5].rows == {}
+    assert failed[5].rows == ()
     assert failed[5].error.startswith("frame 000005: its worker died 2 times, ")
     assert_one_line(Exception(failed[5].error))
 
@@ -147,7 +146,7 @@ def finished(home: Path, name: str, executor: str, workers: int) -> Workspace:
     document = toy_document(home / "kitti", home / "detector.txt")
     document["run"] = {"executor": executor, "workers": workers}
     workspace = initialise(home / name, make_config(document, "test"), "0.1", "")
-    list(run_all(workspace, None, Silent()))
+    run_workspace(workspace)
     return workspace
 
 

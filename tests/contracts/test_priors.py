@@ -58,7 +58,9 @@ def test_evidence_fits_its_table(prior, frames, count: int) -> None:
     """A value per label and column of the table, in its order; counts are whole numbers."""
     found = prior.score(frames[0], labels(count))
     table = bulk.table(TABLES[prior.rho_column])
-    assert list(columns(found)) == [name for name in bulk.columns(table.name) if name not in KEY]
+    assert list(columns(found)) == [
+        column.name for column in table.columns if column.name not in KEY
+    ]
     for name, column in columns(found).items():
         assert column.shape == (count,), name
         kind = "iu" if table.c[name].type.python_type is int else "f"

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import BigInteger, Float, Integer, cast, literal, select, text
 from support.one_frame import add_one_frame
+from support.stored_tuples import COLUMNS, store
 
 from curate.errors import DatabaseError
 from db import bulk, server_columns, weight_index
@@ -31,7 +32,7 @@ def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
             (1, 1, k, f"é{k}\t\\N\n", k / 7, *[k / 3] * 7, k / 9 if k % 2 else None)
             for k in range(COUNT)
         ]
-        bulk.insert(connection, "prediction", rows)
+        store(connection, "prediction", rows)
     return database
 
 
@@ -42,10 +43,10 @@ def test_rows_and_columns_are_stored_alike(database: Database, count: int) -> No
     rows = [(1, 1, k, "Car", k / 7777, *[k / 3] * 7, None) for k in keys]
     weights = [(1, 1, k, "spsl", k / 3 if k % 2 else None, k / 7777, k / 9999) for k in keys]
     with database.writing() as connection:
-        bulk.insert(connection, "prediction", rows)
+        store(connection, "prediction", rows)
         columns = [[row[i] for row in weights] for i in range(7)]
-        values = dict(zip(bulk.columns("weight"), columns, strict=True))
-        bulk.insert_columns(connection, "weight", values | {"round": 1, "policy": "spsl"})
+        values = dict(zip(COLUMNS["weight"], columns, strict=True))
+        bulk.insert(connection, "weight", values | {"round": 1, "policy": "spsl"})
         table = bulk.table("prediction")
         found = bulk.select(connection, select(table).where(table.c.k >= 1000).order_by(table.c.k))
         assert found == rows
@@ -101,7 +102,7 @@ def test_numbers_of_every_kind_go_in_and_come_out(database: Database) -> None:
     count = len(INFINITE)
     columns = _weights(count + 1) | {"lambda_u": [*INFINITE, None], "v": [*INFINITE, 1]}
     with database.writing() as connection:
-        bulk.insert_columns(connection, "weight", columns)
+        bulk.insert(connection, "weight", columns)
     assert _stored(database, "k", "lambda_u") == [*enumerate(INFINITE), (count, None)]
     table = bulk.table("weight").c
     with database.reading() as connection:
@@ -122,7 +123,7 @@ def test_arrays_are_columns_too(database: Database) -> None:
         "v": np.float32([0.5, 0.25, 1]),
     }
     with database.writing() as connection:
-        bulk.insert_columns(connection, "weight", columns)
+        bulk.insert(connection, "weight", columns)
     assert _stored(database, "k", "lambda_u", "rho_det", "v") == [
         (0, 0.1, None, 0.5), (1, None, None, 0.25), (2, 3.0, None, 1.0)
     ]  # fmt: skip
@@ -132,7 +133,7 @@ def test_columns_of_nothing(database: Database) -> None:
     """No rows go in, none come out."""
     table = bulk.table("weight").c
     with database.writing() as connection:
-        bulk.insert_columns(connection, "weight", _weights(0))
+        bulk.insert(connection, "weight", _weights(0))
         assert bulk.numbers(connection, select(table.v)).tolist() == []
         assert bulk.integers(connection, select(table.k)).dtype == np.int64
 
@@ -149,7 +150,7 @@ def test_any_rows_are_stored_as_they_are(database: Database, rows: list[tuple], 
         patch.setattr(server_columns, "BLOCK_ROWS", block)
         table = bulk.table("prediction")
         connection.execute(table.delete())
-        bulk.insert(connection, "prediction", stored)
+        store(connection, "prediction", stored)
         assert bulk.select(connection, select(table).order_by(table.c.k)) == stored
 
 
@@ -210,7 +211,7 @@ def test_rows_that_the_table_refuses_are_one_line(database: Database, wrong: dic
     if wrong.get("v") == [0.5, "heavy"] and database.engine.dialect.name == "sqlite":
         pytest.skip("SQLite's columns take values of any type")
     with pytest.raises(DatabaseError) as raised, database.writing() as connection:
-        bulk.insert_columns(connection, "weight", _weights(2) | wrong)
+        bulk.insert(connection, "weight", _weights(2) | wrong)
     assert "\n" not in str(raised.value)
     assert _stored(database, "k") == []
 
@@ -224,7 +225,7 @@ def test_a_server_says_what_is_no_integer_of_its_own(database: Database, k: obje
         pytest.raises(DatabaseError, match=r"integer|smallint|bigint|numeric"),
         database.writing() as connection,
     ):
-        bulk.insert_columns(connection, "weight", _weights(2) | {"k": [1, k]})
+        bulk.insert(connection, "weight", _weights(2) | {"k": [1, k]})
 
 
 def test_texts_too_long_for_a_matrix_go_row_by_row(
@@ -235,7 +236,7 @@ def test_texts_too_long_for_a_matrix_go_row_by_row(
     rows = [(1, 1, k, name, 0.5, *[1.0] * 7, None) for k, name in ((50, "a"), (51, "b" * 99))]
     table = bulk.table("prediction")
     with database.writing() as connection:
-        bulk.insert(connection, "prediction", rows)
+        store(connection, "prediction", rows)
         found = select(table).where(table.c.k >= 50).order_by(table.c.k)
         assert bulk.select(connection, found) == rows
 
@@ -243,7 +244,7 @@ def test_texts_too_long_for_a_matrix_go_row_by_row(
 def test_statistics_are_those_of_the_rows_just_written(database: Database) -> None:
     """Before anybody else can see them, and without waiting for one who samples the table too."""
     with database.writing() as connection:
-        bulk.insert_columns(connection, "weight", _weights(COUNT))
+        bulk.insert(connection, "weight", _weights(COUNT))
         bulk.refresh_statistics(connection)
         if database.engine.dialect.name == "sqlite":
             query = "SELECT stat FROM sqlite_stat1 WHERE tbl = 'weight' AND idx = 'weight'"
@@ -271,7 +272,7 @@ def labels(tmp_path: Path) -> Database:
     with database.writing() as connection:
         add_one_frame(connection)
         rows = [(1, 1, k, "Car", 0.5, *[1.0] * 7, None) for k in range(COUNT)]
-        bulk.insert(connection, "prediction", rows)
+        store(connection, "prediction", rows)
     return database
 
 
@@ -289,7 +290,7 @@ def test_rows_get_new_values_along_their_key(labels: Database, count: int) -> No
     with labels.writing() as connection:
         for policy in ("aside", "spsl"):
             shuffled = {"k": order, "v": [k / COUNT for k in order], "policy": policy}
-            bulk.insert_columns(connection, "weight", _weights(COUNT) | shuffled)
+            bulk.insert(connection, "weight", _weights(COUNT) | shuffled)
     before = _of_policy(labels, "aside")
     with labels.writing() as connection:
         new["v"] = falling / COUNT
@@ -323,7 +324,7 @@ def test_only_the_very_same_rows_get_new_values(
 ) -> None:
     """More, fewer, others, another order or another frame are told."""
     with labels.writing() as connection:
-        bulk.insert_columns(connection, "weight", _weights(4))
+        bulk.insert(connection, "weight", _weights(4))
     values = {"frame_id": np.full(len(k), frame_id), "k": np.array(k), "v": np.ones(len(k))}
     with labels.writing() as connection:
         assert not bulk.update_columns(connection, "weight", SPSL, KEYS, values)
@@ -333,7 +334,7 @@ def test_new_values_that_the_table_refuses_are_one_line(labels: Database) -> Non
     """And the rows are as they were; the next values are drawn from the start."""
     keys = {"frame_id": np.ones(COUNT, np.int64), "k": np.arange(COUNT)}
     with labels.writing() as connection:
-        bulk.insert_columns(connection, "weight", _weights(COUNT))
+        bulk.insert(connection, "weight", _weights(COUNT))
     before = _of_policy(labels, "spsl")
     missing = {"v": np.where(np.arange(COUNT) == 9, np.nan, 0.25)}
     with pytest.raises(DatabaseError, match="NOT NULL") as raised, labels.writing() as connection:

@@ -13,6 +13,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import Connection, inspect
 from support.older_schema import downgrade
+from support.stored_tuples import COLUMNS, store
 
 from curate.errors import DatabaseError, LeakageError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
@@ -38,7 +39,7 @@ def sqlite_database(tmp_path: Path) -> Database:
 
 def _frame(database: Database, split: str) -> int:
     with database.writing() as connection:
-        bulk.insert(connection, "frame", [("kitti", f"f-{split}", split, "p", "i", "c", None)])
+        store(connection, "frame", [("kitti", f"f-{split}", split, "p", "i", "c", None)])
         query = f"SELECT id FROM frame WHERE split = '{split}'"
         return connection.exec_driver_sql(query).scalar_one()
 
@@ -197,7 +198,7 @@ def test_ground_truth_of_an_unlabeled_frame_cannot_be_stored(
     """Whatever split the row claims, the frame's own split decides."""
     frame_id = _frame(database, "unlabeled")
     with pytest.raises((LeakageError, DatabaseError)), database.writing() as connection:
-        bulk.insert(connection, "ground_truth", [_truth(frame_id, claimed)])
+        store(connection, "ground_truth", [_truth(frame_id, claimed)])
 
 
 def test_ground_truth_is_refused_with_foreign_keys_switched_off(
@@ -207,7 +208,7 @@ def test_ground_truth_is_refused_with_foreign_keys_switched_off(
     frame_id = _frame(sqlite_database, "unlabeled")
     with sqlite3.connect(tmp_path / "curate.db") as raw:
         raw.execute("PRAGMA foreign_keys = OFF")
-        marks = ", ".join("?" * len(bulk.columns("ground_truth")))
+        marks = ", ".join("?" * len(COLUMNS["ground_truth"]))
         with pytest.raises(sqlite3.IntegrityError, match="unlabeled frame"):
             raw.execute(f"INSERT INTO ground_truth VALUES ({marks})", _truth(frame_id, "labeled"))
 
@@ -216,7 +217,7 @@ def test_a_labeled_frame_with_ground_truth_cannot_become_unlabeled(database: Dat
     """The key of the ground truth holds the split."""
     frame_id = _frame(database, "labeled")
     with database.writing() as connection:
-        bulk.insert(connection, "ground_truth", [_truth(frame_id, "labeled")])
+        store(connection, "ground_truth", [_truth(frame_id, "labeled")])
     with pytest.raises(DatabaseError), database.writing() as connection:
         connection.exec_driver_sql("UPDATE frame SET split = 'unlabeled'")
 
@@ -225,13 +226,13 @@ def test_an_unlabeled_frame_has_no_label_path(database: Database) -> None:
     """Not even the path of a label file is stored for X_u."""
     row = ("kitti", "x", "unlabeled", "p", "i", "c", "label_2/x.txt")
     with pytest.raises(DatabaseError), database.writing() as connection:
-        bulk.insert(connection, "frame", [row])
+        store(connection, "frame", [row])
 
 
 def test_a_transaction_is_kept_whole_or_not_at_all(database: Database) -> None:
     """An error takes back what the transaction had written."""
     with pytest.raises(ZeroDivisionError), database.writing() as connection:
-        bulk.insert(connection, "frame", [("kitti", "x", "val", "p", "i", "c", None)])
+        store(connection, "frame", [("kitti", "x", "val", "p", "i", "c", None)])
         raise ZeroDivisionError
     with database.reading() as connection:
         assert connection.exec_driver_sql("SELECT count(*) FROM frame").scalar_one() == 0
@@ -241,9 +242,9 @@ def test_evidence_leaves_with_its_prediction(database: Database) -> None:
     """Deleting a frame's predictions deletes what was found out about them."""
     frame_id = _frame(database, "unlabeled")
     with database.writing() as connection:
-        bulk.insert(connection, "round", [(1, 1, None, "{}", "0", 0)])
-        bulk.insert(connection, "prediction", [(1, frame_id, 0, "Car", 0.5, *[1.0] * 7, None)])
-        bulk.insert(connection, "weight", [(1, frame_id, 0, "spsl", 1.0, 1.0, 0.5)])
+        store(connection, "round", [(1, 1, None, "{}", "0", 0)])
+        store(connection, "prediction", [(1, frame_id, 0, "Car", 0.5, *[1.0] * 7, None)])
+        store(connection, "weight", [(1, frame_id, 0, "spsl", 1.0, 1.0, 0.5)])
         bulk.delete_frames(connection, "prediction", 1, [frame_id])
         assert connection.exec_driver_sql("SELECT count(*) FROM weight").scalar_one() == 0
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from sqlalchemy import func, select, text
+from support.stored_tuples import store
 
 from curate.errors import DatabaseError
 from db import bulk, columns, sqlite_columns
@@ -104,7 +105,7 @@ def test_a_database_answers_by_whatever_is_there(
     monkeypatch.setattr(sqlite_columns, "available", lambda: reachable)
     with database.writing() as connection:
         rows = [("it's", f"{i}", "val", "p", "i", "c", None) for i in range(3)]
-        bulk.insert(connection, "frame", rows)
+        store(connection, "frame", rows)
     frame = bulk.table("frame").c
     query = select(frame.id).where(frame.dataset == "it's").order_by(frame.id.desc())
     with (

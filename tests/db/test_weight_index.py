@@ -8,6 +8,7 @@ import pytest
 from sqlalchemy import Connection, inspect, select
 from support.older_schema import downgrade
 from support.one_frame import add_one_frame
+from support.stored_tuples import store
 
 from db import bulk, weight_index
 from db.session import Database
@@ -24,15 +25,15 @@ def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
     with database.writing() as connection:
         add_one_frame(connection)
         rows = [(1, 1, k, "Car", 0.5, *[1.0] * 7, None) for k in range(20)]
-        bulk.insert(connection, "prediction", rows)
+        store(connection, "prediction", rows)
         for policy in POLICIES:
             _weigh(connection, policy)
     return database
 
 
 def _weigh(connection: Connection, policy: str) -> None:
-    bulk.insert(connection, "weight", [(1, 1, k, policy, None, 1.0, k / 20) for k in range(20)])
-    bulk.insert(connection, "label_count", [(1, policy, "Car", 20, 19, 9, 9.5)])
+    store(connection, "weight", [(1, 1, k, policy, None, 1.0, k / 20) for k in range(20)])
+    store(connection, "label_count", [(1, policy, "Car", 20, 19, 9, 9.5)])
 
 
 def _indices(database: Database) -> set[str]:

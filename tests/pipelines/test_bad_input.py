@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from support.pipelines_cli import Curate
+from support.rounds import run_workspace
 
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import ConfigError, CurateError, DataError, FramesFailed
 from pipelines.assembly import SHIPPED_SEGMENTER
-from pipelines.engine.progress import Silent
-from pipelines.engine.schedule import run_all
 from pipelines.stages import predict
 from pipelines.workspace.workspace import Workspace
 
@@ -193,6 +192,6 @@ def test_a_wrong_segmenter_is_told_before_any_work(
     """Not after hours of predictions; without the semantic prior nobody misses it."""
     wrong = workspace.with_settings("segmenter", **settings)
     with pytest.raises(CurateError, match=message):
-        next(run_all(wrong, 1, Silent()))
+        run_workspace(wrong, 1)
     points_alone = wrong.with_settings("run", priors=("points",))
-    assert next(run_all(points_alone, 1, Silent())).done
+    assert run_workspace(points_alone, 1)[0].done

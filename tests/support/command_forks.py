@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from support.rounds import run_workspace
+
 
 class CommandForks:
     """A process that forks a child for every command; it never opens a database that is tested."""
@@ -53,8 +55,6 @@ def _serve(connection: Connection) -> None:
 
 def _warm_up() -> None:
     """Runs all stages once: modules are loaded then, and kernels compiled."""
-    from pipelines.engine.progress import Silent
-    from pipelines.engine.schedule import run_all
     from pipelines.workspace.config import make_config
     from pipelines.workspace.setup import initialise
     from support.toys import toy_document, write_toy_kitti
@@ -65,7 +65,7 @@ def _warm_up() -> None:
         (home / "detector.txt").write_text("")
         document = toy_document(home / "kitti", home / "detector.txt")
         workspace = initialise(home / "work", make_config(document, "test"), "0.5", "")
-        list(run_all(workspace, None, Silent()))
+        run_workspace(workspace)
         workspace.database.close()
 
 

@@ -30,7 +30,7 @@ class Square:
         """One row."""
         if job.frame_id % 7 == 3:
             raise ValueError(f"three\nlines {job.frame_id}\nlong")
-        return {"squares": [(job.frame_id**2,)]}
+        return {"squares": {"value": [job.frame_id**2]}}
 
 
 @dataclass
@@ -60,7 +60,7 @@ class Deadly(Square):
         if job.frame_id in self.always or (job.frame_id in self.once and not died.exists()):
             died.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return {"squares": [(job.frame_id**2,)]}
+        return {"squares": {"value": [job.frame_id**2]}}
 
 
 class Shuffled:
@@ -101,4 +101,4 @@ class Slow:
         node = ray.get_runtime_context().get_node_id()
         (self.folder / f"{job.frame}-{uuid.uuid4()}").touch()
         time.sleep(self.seconds)
-        return {"nodes": [(node,)]}
+        return {"nodes": {"name": [node]}}

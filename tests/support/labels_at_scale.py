@@ -10,6 +10,7 @@ from sqlalchemy.schema import CreateIndex, DropIndex
 from db import bulk
 from pipelines.workspace.config import make_config
 from pipelines.workspace.workspace import Workspace
+from support.stored_tuples import COLUMNS, store
 
 EACH = 50  # labels per frame
 BATCH_FRAMES = 2000
@@ -24,8 +25,8 @@ def filled_workspace(root: Path, frames: int, database: str | None = None) -> Wo
     document = {"dataset": {"root": root}, "run": run}
     workspace = Workspace.create(root, make_config(document, "test"))
     with workspace.database.writing() as connection:
-        bulk.insert(connection, "frame", _frames(frames))
-        bulk.insert(connection, "round", [(1, 3, None, "{}", "0", 0)])
+        store(connection, "frame", _frames(frames))
+        store(connection, "round", [(1, 3, None, "{}", "0", 0)])
     # An index by value that exists while millions of rows come makes each of them a seek.
     indices = sorted(bulk.table("prediction").indexes, key=lambda index: str(index.name))
     with workspace.database.writing() as connection:
@@ -37,7 +38,7 @@ def filled_workspace(root: Path, frames: int, database: str | None = None) -> Wo
         keys = _keys(first, min(first + BATCH_FRAMES, drawn + 1))
         with workspace.database.writing() as connection:
             for table, rows in _evidence(generator, keys):
-                bulk.insert(connection, table, rows)
+                store(connection, table, rows)
     for first in range(drawn, frames, drawn):
         with workspace.database.writing() as connection:
             for statement in _copies(first, min(drawn, frames - first)):
@@ -79,7 +80,7 @@ def _copies(first: int, count: int) -> Iterator[str]:
     """Statements that repeat the first frames behind others; no weight comes twice."""
     shrunk = {name: f"{name} * {1 - 1e-9 * first!r}" for name in ("loss", "rho_diff", "score")}
     for name in ("prediction", "consistency", "point_prior", "semantic_prior"):
-        chosen = {column: column for column in bulk.columns(name)}
+        chosen = {column: column for column in COLUMNS[name]}
         chosen |= {column: shrunk[column] for column in shrunk if column in chosen}
         chosen["frame_id"] = f"frame_id + {first}"
         yield (

@@ -2,10 +2,10 @@
 
 from sqlalchemy import Connection
 
-from db import bulk
+from support.stored_tuples import store
 
 
 def add_one_frame(connection: Connection) -> None:
     """Into an empty database; both have the key 1."""
-    bulk.insert(connection, "frame", [("kitti", "x", "unlabeled", "p", "i", "c", None)])
-    bulk.insert(connection, "round", [(1, 1, None, "{}", "0", 0)])
+    store(connection, "frame", [("kitti", "x", "unlabeled", "p", "i", "c", None)])
+    store(connection, "round", [(1, 1, None, "{}", "0", 0)])

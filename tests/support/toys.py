@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.dataset import KittiDataset, write_calibration
 from curate.datasets.kitti.labels import from_annotations, write_objects
 from curate.detections import Annotations, Detections
 from curate.frames import Calibration, Frame
@@ -190,3 +190,16 @@ class UnstorablePrior(ToyPrior):
     """A prior whose trust has no place in the tables."""
 
     rho_column: ClassVar[str] = "rho_map"
+
+
+class ToySequences(KittiDataset):
+    """A KITTI data set in which three neighbouring frames are a sequence."""
+
+    @staticmethod
+    def sequence_name(frame_id: str) -> str:
+        """The sequence of a frame."""
+        return f"drive-{int(frame_id) // 3:04d}"
+
+    def sequence_of(self, frame_id: str) -> str:
+        """See `curate.datasets.base.Sequenced`."""
+        return self.sequence_name(frame_id)

@@ -22,8 +22,8 @@ IN_HAND = 2
 # So many more workers than there are may die in a row while they load their models.
 SPARE_OPENINGS = 2
 
-# Rows by table, each without its first two columns, round and frame_id.
-FrameRows = Mapping[str, list[tuple[Any, ...]]]
+FrameRows = Mapping[str, Mapping[str, Sequence[Any]]]
+"""The rows of one frame: by table its columns of one length, without `round` and `frame_id`."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,37 @@ class FrameJob:
     predictions: Detections | None = None
     measured: Mapping[str, np.ndarray] | None = None
 
+    @property
+    def frames(self) -> "tuple[FrameJob, ...]":
+        """Itself."""
+        return (self,)
+
+    @property
+    def title(self) -> str:
+        """Its name in messages."""
+        return f"frame {self.frame}"
+
+
+@dataclass(frozen=True)
+class SequenceJob:
+    """A sequence to work on: its frames in their order.
+
+    Attributes:
+        name: of the sequence.
+        frames: all its frames, each with its predictions.
+    """
+
+    name: str
+    frames: tuple[FrameJob, ...]
+
+    @property
+    def title(self) -> str:
+        """Its name in messages."""
+        return f"sequence {self.name}"
+
+
+Job = FrameJob | SequenceJob
+
 
 class FrameFunction(Protocol):
     """What a stage does with one frame; travels to workers, so it is small until `open`."""
@@ -55,23 +86,46 @@ class FrameFunction(Protocol):
         ...
 
 
+class SequenceFunction(Protocol):
+    """What a stage does with one sequence; travels to workers, so it is small until `open`."""
+
+    def open(self) -> None:
+        """Loads the models and the data set; a failure here ends the run."""
+        ...
+
+    def __call__(self, job: SequenceJob) -> Sequence[FrameRows]:
+        """The rows of each of its frames in order; a failure here is the sequence's alone."""
+        ...
+
+
+JobFunction = FrameFunction | SequenceFunction
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a frame: rows, or an error in one line."""
+    """What became of a job.
 
-    job: FrameJob
-    rows: FrameRows
+    Attributes:
+        job: what was worked on.
+        rows: of each of its frames, in their order; nothing where it failed.
+        error: in one line, where it failed.
+        seconds: that it took.
+    """
+
+    job: Job
+    rows: Sequence[FrameRows]
     error: str | None
     seconds: float
 
 
 class Executor(Protocol):
-    """Maps a function over frames; yields outcomes in any order, holding a bounded number.
+    """Maps a function over frames or sequences; yields outcomes in any order.
 
-    A worker that dies costs the frame in its hands one more try and no other frame anything.
+    It holds a bounded number of jobs.
+    A worker that dies costs the job in its hands one more try and no other job anything.
     """
 
-    def map(self, function: FrameFunction, jobs: Iterable[FrameJob]) -> Iterator[Outcome]:
+    def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
         """One outcome per job.
 
         Raises:
@@ -87,18 +141,18 @@ class Executor(Protocol):
 class JobQueue:
     """Jobs to hand out: first those that a dead worker has left, then the next of all."""
 
-    def __init__(self, jobs: Iterable[FrameJob], workers: int) -> None:
+    def __init__(self, jobs: Iterable[Job], workers: int) -> None:
         self._openings = workers + SPARE_OPENINGS
         self._next = iter(jobs)
-        self._again: deque[FrameJob] = deque()
-        self._deaths: Counter[int] = Counter()
+        self._again: deque[Job] = deque()
+        self._deaths: Counter[str] = Counter()
         self._dead_openings = 0
 
-    def take(self) -> FrameJob | None:
+    def take(self) -> Job | None:
         """The next job; None where there is none."""
         return self._again.popleft() if self._again else next(self._next, None)
 
-    def give_back(self, jobs: Iterable[FrameJob]) -> None:
+    def give_back(self, jobs: Iterable[Job]) -> None:
         """Takes jobs back that nobody has begun."""
         self._again.extend(jobs)
 
@@ -106,7 +160,7 @@ class JobQueue:
         """A worker has loaded its models."""
         self._dead_openings = 0
 
-    def bury(self, in_hand: Sequence[FrameJob], reason: str, *, opened: bool) -> Iterator[Outcome]:
+    def bury(self, in_hand: Sequence[Job], reason: str, *, opened: bool) -> Iterator[Outcome]:
         """Takes back what a dead worker had in hand; a frame that was tried too often has failed.
 
         Args:
@@ -129,16 +183,15 @@ class JobQueue:
         begun, rest = in_hand[:1], in_hand[1:]
         self.give_back(rest)
         for job in begun:
-            self._deaths[job.frame_id] += 1
-            if self._deaths[job.frame_id] < TRIES:
+            self._deaths[job.title] += 1
+            if self._deaths[job.title] < TRIES:
                 self._again.appendleft(job)
             else:
-                yield Outcome(
-                    job, {}, f"frame {job.frame}: its worker died {TRIES} times, {reason}", 0.0
-                )
+                error = f"{job.title}: its worker died {TRIES} times, {reason}"
+                yield Outcome(job, (), error, 0.0)
 
 
-def open_function(function: FrameFunction) -> None:
+def open_function(function: JobFunction) -> None:
     """Loads what a function needs, and turns whatever goes wrong into one line.
 
     Raises:
@@ -155,15 +208,20 @@ def open_function(function: FrameFunction) -> None:
         ) from fault
 
 
-def attempt(function: FrameFunction, job: FrameJob) -> Outcome:
-    """Works on one frame and turns whatever goes wrong into its recorded failure."""
+def attempt(function: Any, job: Job) -> Outcome:
+    """Works on one job and turns whatever goes wrong into its recorded failure."""
     start = time.perf_counter()
+    rows: Sequence[FrameRows] = ()
+    error = None
     try:
-        rows, error = function(job), None
+        found = function(job)
+        rows = (found,) if isinstance(job, FrameJob) else tuple(found)
+        if len(rows) != len(job.frames):
+            error, rows = f"{job.title}: {len(rows)} results for {len(job.frames)} frames", ()
     except CurateError as fault:
-        rows, error = {}, str(fault)
+        error = str(fault)
     except Exception as fault:
-        # A user's model may raise anything; it costs this frame, never the run.
-        logger.debug("frame %s failed", job.frame, exc_info=True)
-        rows, error = {}, f"frame {job.frame}: {type(fault).__name__}: {one_line(fault, 500)}"
+        # A user's model may raise anything; it costs this job, never the run.
+        logger.debug("%s failed", job.title, exc_info=True)
+        error = f"{job.title}: {type(fault).__name__}: {one_line(fault, 500)}"
     return Outcome(job, rows, error, time.perf_counter() - start)

@@ -19,8 +19,8 @@ from typing import Any
 from curate.errors import CurateError
 from pipelines.engine.executors.base import (
     IN_HAND,
-    FrameFunction,
-    FrameJob,
+    Job,
+    JobFunction,
     JobQueue,
     Outcome,
     attempt,
@@ -39,7 +39,7 @@ class ProcessExecutor:
         self.workers = workers
         self._crew: list[_Worker] = []
 
-    def map(self, function: FrameFunction, jobs: Iterable[FrameJob]) -> Iterator[Outcome]:
+    def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
         """One outcome per job, as they end.
 
         Raises:
@@ -114,11 +114,11 @@ class _Worker:
         self.process = context.Process(target=_serve, args=(theirs,))
         self.process.start()
         theirs.close()
-        self.in_hand: deque[FrameJob] = deque()
+        self.in_hand: deque[Job] = deque()
         self.opened = False
         self._packed = b""
 
-    def give(self, packed: bytes, job: FrameJob) -> None:
+    def give(self, packed: bytes, job: Job) -> None:
         """Hands a job over, and before it the function, where that is another one."""
         self.in_hand.append(job)
         with contextlib.suppress(OSError):  # it has died; its end of the pipe will tell
@@ -146,7 +146,7 @@ def _serve(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends us
     inbox: SimpleQueue[Any] = SimpleQueue()  # the packed function, jobs, None for the end
     Thread(target=_receive, args=(connection, inbox), daemon=True).start()
-    function: FrameFunction | None = None
+    function: JobFunction | None = None
     while (message := inbox.get()) is not None:
         if isinstance(message, bytes):
             function = None  # the one before, with its models, makes room first

@@ -15,8 +15,8 @@ from typing import Any
 from curate.errors import ConfigError, CurateError, one_line
 from pipelines.engine.executors.base import (
     IN_HAND,
-    FrameFunction,
-    FrameJob,
+    Job,
+    JobFunction,
     JobQueue,
     Outcome,
     attempt,
@@ -65,7 +65,7 @@ class RayExecutor:
         self._holder = self._ray.remote(**options)(Holder)
         self._crew: list[_Actor] = []
 
-    def map(self, function: FrameFunction, jobs: Iterable[FrameJob]) -> Iterator[Outcome]:
+    def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
         """One outcome per job, as they end.
 
         Raises:
@@ -151,7 +151,7 @@ class Holder:
     def __init__(self, search_path: Sequence[str]) -> None:
         # A detector that the driver finds beside itself must be found on another node as well.
         sys.path += [path for path in search_path if path not in sys.path]
-        self._function: FrameFunction | None = None
+        self._function: JobFunction | None = None
 
     def place(self) -> None:
         """Answers once the actor has found its place."""
@@ -167,7 +167,7 @@ class Holder:
         self._function = function
         return None
 
-    def work(self, job: FrameJob) -> tuple[Any, str | None, float]:
+    def work(self, job: Job) -> tuple[Any, str | None, float]:
         """Rows, error and seconds of a frame.
 
         Raises:
@@ -184,7 +184,7 @@ class _Actor:
 
     def __init__(self, handle: Any) -> None:
         self.handle = handle
-        self.jobs: deque[FrameJob] = deque()
+        self.jobs: deque[Job] = deque()
         self.answers: deque[Any] = deque([handle.place.remote()])
         self.placed = False
         self.opened = False
@@ -200,7 +200,7 @@ class _Actor:
             self._packed, self.opened = packed, False
             self.answers.append(self.handle.open.remote(packed))
 
-    def give(self, job: FrameJob) -> None:
+    def give(self, job: Job) -> None:
         """Hands a job over."""
         self.jobs.append(job)
         self.answers.append(self.handle.work.remote(job))

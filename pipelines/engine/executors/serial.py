@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable, Iterator
 
-from pipelines.engine.executors.base import FrameFunction, FrameJob, Outcome, attempt, open_function
+from pipelines.engine.executors.base import Job, JobFunction, Outcome, attempt, open_function
 
 
 class SerialExecutor:
     """Works on frames in their order."""
 
-    def map(self, function: FrameFunction, jobs: Iterable[FrameJob]) -> Iterator[Outcome]:
+    def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
         """One outcome per job, in order.
 
         Raises:

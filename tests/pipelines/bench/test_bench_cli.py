@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from io import StringIO
 from pathlib import Path
 
@@ -21,8 +22,9 @@ from pipelines.bench.grid import Job, jobs
 from pipelines.bench.metered import Metered
 from pipelines.bench.results import JobResult, read_result, write_result
 from pipelines.bench.settings import Bench, read_bench
-from pipelines.engine import plan
+from pipelines.engine.plan import Plan
 from pipelines.engine.rounds import open_round
+from pipelines.round import graph_of
 from pipelines.stages.methods import METHODS
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import sha256
@@ -136,16 +138,23 @@ def test_methods_share_the_teacher_and_its_evidence(toy_kitti: Path, tmp_path: P
     bench = make_bench(tmp_path, toy_kitti)
     workspace = initialise(tmp_path / "work", bench.config(0), "0.25", "")
     digest = sha256(workspace.root / "curate.toml")
-    checkpoint = (0, "", "pillars", "curate.toml", digest, "2023-02-01 00:00:00")
+    checkpoint = {
+        "round": 0,
+        "policy": "",
+        "detector": "pillars",
+        "path": "curate.toml",
+        "sha256": digest,
+        "created_at": datetime(2023, 2, 1, tzinfo=UTC),
+    }
     with workspace.database.writing() as connection:
-        bulk.insert(connection, "checkpoint", [checkpoint])
-    context = open_round(workspace, 1)
+        bulk.insert_rows(connection, "checkpoint", [checkpoint])
+    context, graph = open_round(workspace, 1), graph_of(workspace)
     stages = ("predict", "repredict", "points")
     prints = {}
     for method in METHODS:
         config = bench.config(0, method)
         under = type(workspace)(workspace.root, config, workspace.database)
-        found = plan.fingerprints(under, context, METHODS[method].policy)
+        found = Plan(under, context, graph).fingerprints(METHODS[method].policy)
         prints[method] = [found[stage] for stage in stages]
     assert len({tuple(each) for each in prints.values()}) == 1, prints
 

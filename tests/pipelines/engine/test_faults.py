@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from support.pipelines_cli import Curate
 from support.process_tree import environment, start, workers
+from support.rounds import run_workspace
 from support.stored_rows import dump
 
 from curate.errors import CurateError, DatabaseError
 from db import session
-from pipelines.engine.progress import Silent
-from pipelines.engine.schedule import run_all
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
 
@@ -60,7 +59,7 @@ time_t time(time_t *out) {
 def whole(tmp_path: Path, workspace: Workspace) -> list[tuple]:
     """What a run stores that nothing disturbs."""
     other = initialise(tmp_path / "whole", workspace.config, "0.25", "")
-    list(run_all(other, None, Silent()))
+    run_workspace(other)
     return dump(other)
 
 
@@ -127,7 +126,7 @@ def test_a_corrupted_database_is_detected_and_the_remedy_named(
     curate: Curate, workspace: Workspace, seed: int
 ) -> None:
     """Whatever pages are overwritten, a command works or ends in one line; never a traceback."""
-    list(run_all(workspace, None, Silent()))
+    run_workspace(workspace)
     _checkpoint(workspace)
     path = workspace.root / "curate.db"
     pages = bytearray(path.read_bytes())

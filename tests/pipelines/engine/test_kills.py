@@ -16,17 +16,12 @@ import numpy as np
 import pytest
 from support import older_schema
 from support.command_forks import CommandForks
+from support.rounds import run_stage, run_workspace
 from support.stored_rows import dump
 from support.toys import toy_document, write_toy_kitti
 
 from db.views import drop_views
-from pipelines.engine.executors.serial import SerialExecutor
-from pipelines.engine.progress import Silent
-from pipelines.engine.rounds import open_round
-from pipelines.engine.runner import run_frames, run_round
-from pipelines.engine.schedule import run_all
-from pipelines.engine.stage import FrameStage
-from pipelines.round import active
+from pipelines.round import graph_of
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
@@ -155,7 +150,7 @@ class Case:
     def _results(self) -> list[tuple]:
         """All that a run to the end stores: rows, the exported file, students, backups."""
         workspace = Workspace.open(self.workspace)
-        list(run_all(workspace, None, Silent()))
+        run_workspace(workspace)
         rows = dump(workspace)
         workspace.database.close()
         with closing(sqlite3.connect(self.workspace / "exports" / "labels.sqlite")) as labels:
@@ -191,14 +186,10 @@ def init_options(home: Path) -> list[object]:
 
 def bring_up_to(workspace: Workspace, until: str) -> None:
     """Runs every stage before one."""
-    context = open_round(workspace, 1)
-    for stage in active(workspace.config.run.priors):
+    for stage in graph_of(workspace).stages:
         if stage.name == until:
             break
-        if isinstance(stage, FrameStage):
-            run_frames(workspace, context, stage, SerialExecutor(), Silent())
-        else:
-            run_round(workspace, context, stage, "pspsl", Silent())
+        run_stage(workspace, stage.name)
 
 
 def downgrade(workspace: Workspace) -> None:

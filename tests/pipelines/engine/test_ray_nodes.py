@@ -14,13 +14,12 @@ from typing import Any
 import pytest
 from support.frame_functions import Slow
 from support.process_tree import descendants, start
+from support.rounds import run_workspace
 from support.stored_rows import dump
 from support.toys import toy_document, write_toy_kitti
 
 from pipelines.engine.executors.base import FrameJob
 from pipelines.engine.executors.ray import RayExecutor
-from pipelines.engine.progress import Silent
-from pipelines.engine.schedule import run_all
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
@@ -73,7 +72,7 @@ def test_a_killed_node_costs_its_frame_a_retry_and_nothing_else(
         found, nodes = [], set()
         for outcome in islice(outcomes, 40):
             found.append(outcome)
-            nodes.add(outcome.rows["nodes"][0][0])
+            nodes.add(outcome.rows[0]["nodes"]["name"][0])
             if len(nodes) == 2:
                 break
         assert len(nodes) == 2, "both nodes work"
@@ -114,7 +113,7 @@ def test_a_run_that_loses_a_node_stores_what_serial_stores(cluster: Any, home: P
     _, err = running.communicate()
     assert running.returncode == 0, err
     serial = made(home, "serial")
-    list(run_all(serial, None, Silent()))
+    run_workspace(serial)
     assert dump(workspace) == dump(serial)
 
 

@@ -1,22 +1,18 @@
 """The runner: what is done once, what becomes stale, and what a failure costs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from support import toys
+from support.rounds import run_stage, run_workspace
 from support.stored_rows import dump
 
 from curate.errors import WorkspaceError
 from curate.priors.points import PointPrior
 from curate.priors.semantic import SemanticPrior
-from pipelines.engine import plan
-from pipelines.engine.executors.serial import SerialExecutor
-from pipelines.engine.progress import Silent
-from pipelines.engine.rounds import open_round
-from pipelines.engine.runner import Report, run_frames, run_round
-from pipelines.engine.schedule import run_all
-from pipelines.round import ROUND, stage
+from pipelines.round import open_plan, round_graph
 from pipelines.workspace.workspace import Workspace
 
 ENGINES = ("sqlite", "postgresql")
@@ -32,7 +28,7 @@ def count(workspace: Workspace, table: str) -> int:
 
 def run(workspace: Workspace) -> dict[str, int]:
     """Runs everything; frames (or round stages) done anew, by stage."""
-    return {report.stage: report.done for report in run_all(workspace, None, Silent())}
+    return {report.stage: report.done for report in run_workspace(workspace)}
 
 
 def with_setting(workspace: Workspace, section: str, **changes: object) -> Workspace:
@@ -81,7 +77,7 @@ def test_what_left_with_its_prediction_is_made_again(workspace: Workspace) -> No
     run(workspace)
     before = dump(workspace)
     tried = with_setting(workspace, "detector", minimum_score=0.5)
-    run_frames(tried, open_round(tried, 1), stage("predict"), SerialExecutor(), Silent())
+    run_stage(tried, "predict", 1)
     assert count(workspace, "weight") == 0
     run(workspace)
     assert dump(workspace) == before
@@ -130,20 +126,14 @@ def test_a_frame_that_failed_is_measured_however_the_formula_changes(
     name = next(iter(workspace.frames("unlabeled")))
     path = toy_kitti / "training" / "image_2" / f"{name}.png"
     whole = path.read_bytes()
-    run_frames_of(workspace, "predict")
+    run_stage(workspace, "predict")
     path.write_bytes(whole[:-30])
-    assert run_frames_of(workspace, "semantic").failed == 1
+    assert run_stage(workspace, "semantic").failed == 1
     changed = with_setting(workspace, "semantic", mean="product")
-    assert run_frames_of(changed, "semantic").failed == 1
+    assert run_stage(changed, "semantic").failed == 1
     path.write_bytes(whole)
-    assert run_frames_of(changed, "semantic").done == 1
+    assert run_stage(changed, "semantic").done == 1
     assert count(workspace, "semantic_prior") == 18
-
-
-def run_frames_of(workspace: Workspace, name: str) -> Report:
-    """One frame stage of the first round."""
-    context = open_round(workspace, 1)
-    return run_frames(workspace, context, stage(name), SerialExecutor(), Silent())
 
 
 def test_another_detector_makes_everything_stale(workspace: Workspace, weights_file: Path) -> None:
@@ -159,7 +149,7 @@ def test_a_frame_whose_model_raises_is_recorded_and_costs_no_other_frame(
     """One line in its task; the others go on to the end, and it is tried again next time."""
     poisoned = next(iter(workspace.frames("unlabeled")))
     weights_file.write_text(poisoned)
-    reports = {report.stage: report for report in run_all(workspace, None, Silent())}
+    reports = {report.stage: report for report in run_workspace(workspace)}
     assert reports["predict"].failed == 1
     assert reports["predict"].done == 5
     [(frame, error)] = reports["predict"].errors
@@ -168,8 +158,7 @@ def test_a_frame_whose_model_raises_is_recorded_and_costs_no_other_frame(
         f"frame {poisoned}: RuntimeError: CUDA error: an illegal memory access was encountered"
     )
     assert count(workspace, "weight") == 15
-    context = open_round(workspace, 1)
-    again = run_frames(workspace, context, stage("predict"), SerialExecutor(), Silent())
+    again = run_stage(workspace, "predict")
     assert (again.failed, again.kept) == (1, 5)
 
 
@@ -179,7 +168,7 @@ def test_a_mended_frame_joins_the_others(workspace: Workspace, toy_kitti: Path) 
     path = toy_kitti / "training" / "velodyne" / f"{name}.bin"
     whole = path.read_bytes()
     path.write_bytes(whole[:-3])
-    reports = {report.stage: report for report in run_all(workspace, None, Silent())}
+    reports = {report.stage: report for report in run_workspace(workspace)}
     assert "truncated" in reports["predict"].errors[0][1]
     path.write_bytes(whole)
     assert run(workspace) == dict.fromkeys(FRAME_STAGES, 1) | {"solve": 1, "export": 1}
@@ -206,7 +195,7 @@ def test_a_damaged_file_fails_its_frame_with_one_line(
     """The line names the file; no other frame is lost."""
     name = next(iter(workspace.frames("unlabeled")))
     damage(toy_kitti / "training", name)
-    reports = list(run_all(workspace, None, Silent()))
+    reports = run_workspace(workspace)
     [error] = {error for report in reports for _, error in report.errors}
     assert message in error
     assert name in error
@@ -218,25 +207,23 @@ def test_an_empty_sweep_is_empty_in_every_stage(workspace: Workspace, toy_kitti:
     """No points, no labels, no failure."""
     name = next(iter(workspace.frames("unlabeled")))
     (toy_kitti / "training" / "velodyne" / f"{name}.bin").write_bytes(b"")
-    reports = {report.stage: report for report in run_all(workspace, None, Silent())}
+    reports = {report.stage: report for report in run_workspace(workspace)}
     assert [reports[name].empty for name in FRAME_STAGES] == [1] * 4
     assert count(workspace, "weight") == 15
 
 
 def test_solve_refuses_to_weigh_half_a_round(workspace: Workspace) -> None:
     """It says which command is missing."""
-    context = open_round(workspace, 1)
-    run_frames(workspace, context, stage("predict"), SerialExecutor(), Silent())
+    run_stage(workspace, "predict")
     with pytest.raises(WorkspaceError, match=r"repredict: 6 frames.*curate repredict"):
-        run_round(workspace, context, stage("solve"), "pspsl", Silent())
+        run_stage(workspace, "solve", policy="pspsl")
 
 
 def test_policies_stand_side_by_side(workspace: Workspace) -> None:
     """Solving for another policy leaves the first one's weights as they are."""
     run(workspace)
-    context = open_round(workspace, 1)
     before = [row for row in dump(workspace) if row[0] == "weight"]
-    run_round(workspace, context, stage("solve"), "uniform", Silent())
+    run_stage(workspace, "solve", policy="uniform")
     after = [row for row in dump(workspace) if row[0] == "weight"]
     assert set(before) < set(after)
     assert len(after) == 36
@@ -244,16 +231,14 @@ def test_policies_stand_side_by_side(workspace: Workspace) -> None:
 
 def test_every_stage_reads_what_exists_before_it(workspace: Workspace) -> None:
     """The DAG's edges go one way: inputs are sources or written by an earlier stage."""
-    known = {"frame", "ground_truth", "teacher"}
-    for each in ROUND:
+    known = {"frame", "ground_truth"}
+    for each in round_graph().stages:
         assert set(each.reads) <= known
         known |= set(each.writes)
 
 
 def test_fingerprints_do_not_depend_on_where_the_data_lies(workspace: Workspace) -> None:
     """A data set that moved is not worked on again."""
-    context = open_round(workspace, 1)
-    moved = with_setting(workspace, "dataset", root=Path("/elsewhere"))
-    assert plan.fingerprints(moved, context, "pspsl") == plan.fingerprints(
-        workspace, context, "pspsl"
-    )
+    plan = open_plan(workspace, 1)
+    moved = replace(plan, workspace=with_setting(workspace, "dataset", root=Path("/elsewhere")))
+    assert moved.fingerprints("pspsl") == plan.fingerprints("pspsl")

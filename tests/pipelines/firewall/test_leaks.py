@@ -9,12 +9,11 @@ from pathlib import Path
 
 import pytest
 from support.pipelines_cli import Curate, in_process
+from support.rounds import run_workspace
 from support.toys import toy_document, write_toy_kitti
 
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import DataError, LeakageError
-from pipelines.engine.progress import Silent
-from pipelines.engine.schedule import run_all
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
 
@@ -36,7 +35,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (home / "detector.txt").touch()
     document = toy_document(home / "kitti", home / "detector.txt")
     workspace = initialise(home / "work", make_config(document, "test"), "0.25", "")
-    for report in run_all(workspace, None, Silent(), train=False):
+    for report in run_workspace(workspace, train=False):
         assert report.failed == 0
     workspace.database.close()
     settings = home / "work" / "curate.toml"

@@ -2,13 +2,9 @@
 
 import numpy as np
 import pytest
+from support.rounds import run_stage
 
-from pipelines.engine.executors.serial import SerialExecutor
-from pipelines.engine.progress import Silent
-from pipelines.engine.rounds import open_round
-from pipelines.engine.runner import run_frames
 from pipelines.labels import evidence
-from pipelines.round import stage
 from pipelines.workspace.workspace import Workspace
 
 ENGINES = ("sqlite", "postgresql")
@@ -18,9 +14,8 @@ def test_evidence_of_many_frames_is_read_alike(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever reads the columns, they are the same to the bit."""
-    context = open_round(workspace, 1)
     for name in ("predict", "repredict", "points", "semantic"):
-        run_frames(workspace, context, stage(name), SerialExecutor(), Silent())
+        run_stage(workspace, name)
     frames = list(workspace.frames("unlabeled").values())
     keys, alone = evidence.read_evidence(workspace, 1, frames, boxes=True)
     assert len(keys) > 0

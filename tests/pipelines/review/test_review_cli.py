@@ -12,16 +12,13 @@ import numpy as np
 import pytest
 from support.paths import ROOT
 from support.pipelines_cli import Curate
+from support.rounds import state_of
+from support.stored_tuples import store
 
 from curate.errors import DatabaseError
 from curate.training.labels import WeightedLabels
-from db import bulk
-from pipelines.engine import plan
-from pipelines.engine.rounds import open_round
-from pipelines.engine.stage import RoundStage
 from pipelines.labels.of_one_frame import read_frame
 from pipelines.registry import EDITORS, POLICIES
-from pipelines.round import stage
 from pipelines.stages.export import label_set
 from pipelines.workspace.workspace import Workspace
 
@@ -207,13 +204,11 @@ def _exported(curate: Curate, workspace: Workspace, number: int) -> WeightedLabe
 def test_an_import_makes_files_stale(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
     """What trainers read is written again; a file without human labels stays as it was."""
     assert curate("export", "-w", weighted.root)[0] == 0
-    export = stage("export")
-    assert isinstance(export, RoundStage)
     folder = tmp_path / "review"
     frame = handed_out(curate, weighted, folder, *only_first(weighted))
 
     def state() -> str:
-        return plan.round_state(weighted, open_round(weighted, 1), export, "pspsl")
+        return state_of(weighted, "export")
 
     assert state() == "done"
     corrected(folder, frame)
@@ -403,7 +398,7 @@ def test_frames_that_are_not_unlabeled_cannot_have_human_labels(weighted: Worksp
         for claimed in (split, "unlabeled"):
             row = (key, 0, claimed, "r", None, "added", "Car", 1, *[1.0] * 7, *[None] * 7, "a", "n")
             with pytest.raises(DatabaseError), weighted.database.writing() as connection:
-                bulk.insert(connection, "human_label", [row])
+                store(connection, "human_label", [row])
 
 
 def test_a_killed_import_leaves_nothing_behind(

@@ -7,17 +7,16 @@ from pathlib import Path
 import pytest
 from sqlalchemy import text
 from support.pipelines_cli import Curate
+from support.rounds import run_workspace
 
 from curate.errors import ConfigError, DataError, WorkspaceError
 from curate.training.labels import WeightedLabels
-from pipelines.engine.progress import Silent
-from pipelines.engine.schedule import run_all
 from pipelines.workspace.workspace import Workspace
 
 
 def run(workspace: Workspace) -> Path:
     """Runs everything; gives the exported file."""
-    list(run_all(workspace, None, Silent()))
+    run_workspace(workspace)
     return workspace.root / "exports" / "labels.sqlite"
 
 

@@ -8,13 +8,10 @@ from pathlib import Path
 
 import pytest
 from support.pipelines_cli import Curate
+from support.rounds import run_stage, run_workspace
 
 from curate.errors import ConfigError, TrainerFailed, WorkspaceError
-from pipelines.engine.progress import Silent
-from pipelines.engine.rounds import find_teacher, open_round
-from pipelines.engine.runner import run_round
-from pipelines.engine.schedule import run_all
-from pipelines.round import stage
+from pipelines.engine.rounds import find_teacher
 from pipelines.stages.external_trainer import split_command
 from pipelines.workspace.workspace import Workspace
 
@@ -41,7 +38,7 @@ def command(tmp_path: Path) -> str:
 @pytest.fixture
 def exported(workspace: Workspace) -> Workspace:
     """A workspace with a brought detector, whose first round has ended with its export."""
-    list(run_all(workspace, None, Silent()))
+    run_workspace(workspace)
     return workspace
 
 
@@ -110,7 +107,7 @@ def test_a_command_given_by_hand_trains_later_rounds_too(
     assert path.read_text().startswith("# mine\n")
     told = Workspace.open(exported.root)
     assert told.config == exported.with_settings("train", command=command).config
-    done = [(each.round, each.stage) for each in run_all(told, 2, Silent()) if each.done]
+    done = [(each.round, each.stage) for each in run_workspace(told, 2) if each.done]
     assert (1, "train-round") not in done
     assert (2, "train-round") in done
     assert find_teacher(told, 3)[1].path.read_text() == "student-2"
@@ -135,7 +132,7 @@ def test_what_the_trainer_prints_is_streamed(
 ) -> None:
     """To standard error, so that JSON stays JSON."""
     told = exported.with_settings("train", command=command)
-    run_round(told, open_round(told, 1), stage("train-round"), "pspsl", Silent())
+    run_stage(told, "train-round", 1, "pspsl")
     output = capfd.readouterr()
     assert output.out == ""
     assert f"round 1: 18 labels from {exported.config.detector.path}" in output.err
@@ -144,13 +141,13 @@ def test_what_the_trainer_prints_is_streamed(
 def test_a_configured_command_trains_in_every_round(workspace: Workspace, command: str) -> None:
     """`curate run` then has several rounds with a brought detector, and a second run does none."""
     told = workspace.with_settings("train", command=command)
-    reports = list(run_all(told, 2, Silent()))
+    reports = run_workspace(told, 2)
     assert [report.round for report in reports if report.stage == "train-round"] == [1, 2]
     assert find_teacher(told, 2)[1].path.read_text() == "student-1"
     assert find_teacher(told, 3)[1].path.read_text() == "student-2"
-    assert {report.done for report in run_all(told, 2, Silent())} == {0}
+    assert {report.done for report in run_workspace(told, 2)} == {0}
     other = told.with_settings("train", command=command + " again")
-    again = [report.stage for report in run_all(other, 1, Silent()) if report.done]
+    again = [report.stage for report in run_workspace(other, 1) if report.done]
     assert again == ["train-round"]
 
 
@@ -223,7 +220,7 @@ def test_labels_that_are_not_exported_are_refused(
     curate: Curate, workspace: Workspace, command: str
 ) -> None:
     """Before the trainer starts; so are those that are older than their weights."""
-    list(run_all(workspace, None, Silent()))
+    run_workspace(workspace)
     (workspace.root / "exports" / "round-01-pspsl.sqlite").unlink()
     ended, _, err = curate("train-round", "--command", command, "-w", workspace.root)
     assert ended == WorkspaceError.exit_code

@@ -9,19 +9,13 @@ import numpy as np
 import pytest
 from support.paths import ROOT
 from support.pipelines_cli import Curate
+from support.rounds import run_stage, run_workspace, state_of
 
 from curate.detectors.pillars.checkpoint import load_checkpoint
 from curate.errors import ConfigError, WorkspaceError
-from pipelines.engine import plan
-from pipelines.engine.executors.serial import SerialExecutor
-from pipelines.engine.progress import Silent
-from pipelines.engine.rounds import find_teacher, open_round
-from pipelines.engine.runner import run_frames, run_round
-from pipelines.engine.schedule import run_all
-from pipelines.engine.stage import FrameStage
+from pipelines.engine.rounds import find_teacher
 from pipelines.labels.evidence import read_memory
 from pipelines.registry import POLICIES
-from pipelines.round import stage
 from pipelines.stages.methods import METHODS, method_named, method_of, with_method
 from pipelines.workspace.config import Config, make_config, write_config
 from pipelines.workspace.setup import initialise
@@ -41,18 +35,14 @@ def rows(workspace: Workspace, sql: str) -> list[tuple]:
 
 def run(workspace: Workspace) -> Workspace:
     """Brings everything up to date."""
-    list(run_all(workspace, None, Silent()))
+    run_workspace(workspace)
     return workspace
 
 
 def solved(workspace: Workspace, number: int, policy: str) -> None:
     """Brings a round up to a policy's weights."""
-    context = open_round(workspace, number)
-    for name in ("predict", "repredict", "points", "semantic"):
-        found = stage(name)
-        assert isinstance(found, FrameStage)
-        run_frames(workspace, context, found, SerialExecutor(), Silent())
-    run_round(workspace, context, stage("solve"), policy, Silent())
+    for name in ("predict", "repredict", "points", "semantic", "solve"):
+        run_stage(workspace, name, number, policy)
 
 
 def test_the_methods_are_the_ones_that_are_compared() -> None:
@@ -182,10 +172,8 @@ def test_what_is_remembered_makes_stale_what_it_decided(workspace: Workspace) ->
         solved(workspace, 2, policy)
     changed = workspace.with_settings("repredict", views=2)
     solved(changed, 1, "st3d")
-    context = open_round(workspace, 2)
-    solve = stage("solve")
-    assert plan.round_state(workspace, context, solve, "st3d") == "stale"
-    assert plan.round_state(workspace, context, solve, "uda") == "done"
+    assert state_of(workspace, "solve", "st3d", number=2) == "stale"
+    assert state_of(workspace, "solve", "uda", number=2) == "done"
 
 
 @pytest.mark.parametrize("priors", [("points",), ("semantic",), ()])

@@ -4,12 +4,11 @@ from pathlib import Path
 
 import pytest
 from sqlalchemy import text
+from support.rounds import run_workspace
 
 from curate.errors import ConfigError
-from pipelines.engine.progress import Silent
-from pipelines.engine.schedule import run_all
 from pipelines.registry import PRIORS
-from pipelines.round import ROUND, active, stage
+from pipelines.round import round_graph
 from pipelines.workspace.workspace import Workspace
 
 OWN = "support.toys:ToyPrior"
@@ -17,7 +16,7 @@ OWN = "support.toys:ToyPrior"
 
 def run(workspace: Workspace) -> dict[str, int]:
     """Runs everything; frames (or round stages) done anew, by stage."""
-    return {report.stage: report.done for report in run_all(workspace, None, Silent())}
+    return {report.stage: report.done for report in run_workspace(workspace)}
 
 
 def answers(workspace: Workspace) -> list[tuple]:
@@ -72,25 +71,27 @@ def test_other_maps_in_the_same_folder_are_looked_at_anew(
 def test_two_priors_for_one_place_are_refused() -> None:
     """The error names both and the table."""
     with pytest.raises(ConfigError, match=r"points and support.toys:ToyPrior.*point_prior"):
-        active(("points", OWN))
+        round_graph(("points", OWN))
 
 
 def test_evidence_without_a_place_is_refused() -> None:
     """The error names what can be stored."""
     with pytest.raises(ConfigError, match=r"rho_map.*rho_diff and rho_anno"):
-        active(("support.toys:UnstorablePrior",))
+        round_graph(("support.toys:UnstorablePrior",))
 
 
 def test_an_unknown_prior_is_refused() -> None:
     """A misspelt name is not passed over."""
     with pytest.raises(ConfigError, match="unknown prior 'pionts': use one of points, semantic"):
-        active(("pionts",))
+        round_graph(("pionts",))
 
 
 def test_the_shipped_round_has_a_stage_per_registered_prior() -> None:
     """In the order of the registry, between repredict and solve."""
-    names = [each.name for each in ROUND]
+    graph = round_graph(tuple(PRIORS.classes))
+    names = [each.name for each in graph.stages]
     assert names[names.index("repredict") + 1 : names.index("solve")] == list(PRIORS.classes)
-    assert set(active(("semantic",))) < set(ROUND)
-    assert stage("points").reads == ("frame", "ground_truth", "prediction")
-    assert stage("semantic").reads == ("frame", "prediction")
+    alone = [each.name for each in round_graph(("semantic",)).stages]
+    assert alone == [name for name in names if name not in PRIORS.classes or name == "semantic"]
+    assert graph.stage("points").reads == ("frame", "ground_truth", "prediction")
+    assert graph.stage("semantic").reads == ("frame", "prediction")

@@ -1,0 +1,183 @@
+"""Audits and evaluations in the database."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection
+
+from curate.detections import Detections
+from curate.evaluation.audit import Estimate, Figures
+from curate.evaluation.judged_labels import WHOLE
+from curate.evaluation.kitti_ap import KittiEvaluation
+from curate.evaluation.kitti_outcomes import Outcomes, object_outcomes
+from curate.evaluation.kitti_rules import DIFFICULTIES
+from db import bulk
+from db.models import BOX_COLUMNS
+from pipelines.assessment.audit import AuditedRound
+from pipelines.assessment.evaluation import ValObjects
+from pipelines.workspace.workspace import Workspace
+
+ESTIMATES = (
+    "share_right",
+    "auroc",
+    "average_precision",
+    "weighted_precision",
+    "weighted_recall",
+    "calibration_error",
+)
+OVERLAP, DIFFICULTY = "3d", "hard"
+
+Row = dict[str, Any]
+
+
+def store_audit(workspace: Workspace, found: AuditedRound) -> None:
+    """Replace what is stored of the same round, frames and overlap."""
+    request = found.request
+    key = {
+        "round": found.context.number,
+        "frames": request.frames,
+        "overlap": request.overlap,
+    }
+    rows: dict[str, list[Row]] = {"audit": [], "audit_slice": [], "audit_bin": []}
+    for figures in found.figures.figures:
+        of = {**key, "policy": figures.policy, "category": figures.category}
+        part = figures.slice
+        if part == WHOLE:
+            rows["audit"].append(of | _figures(figures))
+            rows["audit_bin"] += [of | row for row in _bins(figures)]
+        else:
+            edges = {"kind": part.by, "low": part.low, "high": _finite(part.high)}
+            rows["audit_slice"].append(of | edges | _figures(figures))
+    with workspace.database.writing() as connection:
+        for name, new in rows.items():
+            _replace(connection, name, key, new)
+
+
+def store_evaluation(
+    workspace: Workspace,
+    source: str,
+    found: Mapping[str, Detections],
+    objects: ValObjects,
+    figures: KittiEvaluation,
+) -> Mapping[str, int]:
+    """Replace what is stored of a source, and count the objects by their outcome.
+
+    Detections of every score take part, so an object is missed only where none of them finds it.
+
+    Args:
+        workspace: see `Workspace`.
+        source: whose detections, as people will ask for it.
+        found: detections of the val frames.
+        objects: the same in KITTI's form, with the ground truth.
+        figures: their evaluation.
+    """
+    keys = workspace.frames("val")
+    of_objects, of_detections = object_outcomes(
+        *objects,
+        metric=OVERLAP,
+        difficulty=DIFFICULTY,
+        min_overlaps=figures.min_overlaps,
+    )
+    truth = [annotations.boxes for annotations in workspace.ground_truth("val").values()]
+    predicted = [found[name].boxes for name in keys]
+    frame_ids = list(keys.values())
+    rows = {
+        "evaluation_object": [
+            *_outcomes("object", of_objects, frame_ids, truth),
+            *_outcomes("detection", of_detections, frame_ids, predicted),
+        ],
+        "evaluation_ap": list(_averages(figures)),
+    }
+    with workspace.database.writing() as connection:
+        for name, new in rows.items():
+            _replace(connection, name, {"source": source}, [{"source": source} | r for r in new])
+    names, counts = np.unique(of_objects.outcomes, return_counts=True)
+    return dict(zip(names.tolist(), counts.tolist(), strict=True))
+
+
+def _replace(connection: Connection, name: str, key: Row, rows: Sequence[Row]) -> None:
+    """Put rows in the place of all that have the same key."""
+    table = bulk.table(name)
+    same = (table.c[column] == value for column, value in key.items())
+    connection.execute(table.delete().where(*same))
+    bulk.insert_rows(connection, name, rows)
+
+
+def _figures(figures: Figures) -> Row:
+    """The columns that `audit` and `audit_slice` have in common."""
+    row: Row = {
+        "labels": figures.labels,
+        "neutral": figures.neutral,
+        "right_labels": figures.right,
+        "objects": figures.objects,
+    }
+    for name in ESTIMATES:
+        estimate: Estimate = getattr(figures, name)
+        row[name] = _finite(estimate.value)
+        row[f"{name}_low"] = _finite(estimate.low)
+        row[f"{name}_high"] = _finite(estimate.high)
+    return row
+
+
+def _bins(figures: Figures) -> Iterator[Row]:
+    """The bins that hold a label."""
+    bins = figures.bins
+    for i in np.flatnonzero(bins.labels).tolist():
+        yield {
+            "low": float(bins.edges[i]),
+            "high": float(bins.edges[i + 1]),
+            "labels": int(bins.labels[i]),
+            "mean_weight": _finite(bins.mean_weight[i]),
+            "precision": _finite(bins.precision[i]),
+            "recall": _finite(bins.recall[i]),
+        }
+
+
+def _outcomes(
+    side: str, outcomes: Outcomes, frame_ids: Sequence[int], boxes: Sequence[np.ndarray]
+) -> Iterator[Row]:
+    """Rows of `evaluation_object`; frame_ids and boxes by position of the frame."""
+    columns = (
+        *(outcomes.frames, outcomes.indices, outcomes.categories, outcomes.outcomes),
+        *(outcomes.matches, outcomes.overlaps, outcomes.scores),
+    )
+    for frame, k, category, outcome, match, iou, score in zip(
+        *(column.tolist() for column in columns), strict=True
+    ):
+        row = {
+            "frame_id": frame_ids[frame],
+            "side": side,
+            "k": k,
+            "category": category,
+            "outcome": outcome,
+            "matched_k": None if match < 0 else match,
+            "iou": iou,
+            "score": None if math.isnan(score) else score,
+            "overlap": OVERLAP,
+            "difficulty": DIFFICULTY,
+        }
+        yield row | dict(zip(BOX_COLUMNS, boxes[frame][k].tolist(), strict=True))
+
+
+def _averages(figures: KittiEvaluation) -> Iterator[Row]:
+    """Rows of `evaluation_ap`."""
+    plain = figures.as_dict()
+    for category, by_figure in plain["AP_R40"].items():
+        for figure, r40 in by_figure.items():
+            r11 = plain["AP_R11"][category][figure]
+            for d, difficulty in enumerate(DIFFICULTIES):
+                yield {
+                    "category": category,
+                    "figure": figure,
+                    "difficulty": difficulty,
+                    "objects": plain["objects"][category][d],
+                    "ap_r40": None if r40 is None else r40[d],
+                    "ap_r11": None if r40 is None else r11[d],
+                }
+
+
+def _finite(value: float) -> float | None:
+    """A number of Python; None where it is undefined or infinite."""
+    return float(value) if math.isfinite(value) else None

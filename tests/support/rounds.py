@@ -1,0 +1,32 @@
+"""Stages and rounds as the tests run them: serial, silent, by name."""
+
+from typing import Any
+
+from pipelines.engine.executors.serial import SerialExecutor
+from pipelines.engine.progress import Silent
+from pipelines.engine.runner import Report, run_frames, run_round
+from pipelines.engine.schedule import run_all
+from pipelines.engine.stage import RoundStage
+from pipelines.round import graph_of, open_plan
+from pipelines.workspace.workspace import Workspace
+
+
+def run_workspace(workspace: Workspace, rounds: int | None = None, **options: Any) -> list[Report]:
+    """Bring every stage up to date, as `curate run` does."""
+    return list(run_all(workspace, graph_of(workspace), rounds, Silent(), **options))
+
+
+def run_stage(
+    workspace: Workspace, name: str, number: int | None = 1, policy: str = "pspsl"
+) -> Report:
+    """Run one stage of a round."""
+    plan = open_plan(workspace, number)
+    if isinstance(plan.graph.stage(name), RoundStage):
+        return run_round(plan, name, policy, Silent())
+    return run_frames(plan, plan.graph.of_frames(name), SerialExecutor(), Silent())
+
+
+def state_of(workspace: Workspace, name: str, policy: str = "pspsl", number: int = 1) -> str:
+    """The state of a round stage."""
+    plan = open_plan(workspace, number)
+    return plan.round_state(plan.graph.of_rounds(name), policy)
