@@ -1,36 +1,29 @@
 """What every exporter offers: the labels of a round as files for trainers."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from numbers import Real
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from curate.errors import ConfigError, DataError, LeakageError
-from curate.exporters.columns import WEIGHTED_LABELS
+import numpy as np
+
+from curate.errors import DataError, LeakageError
+from curate.exporters.columns import WEIGHTED_LABELS, Column
 from curate.frames import Frame
+from curate.weighting.base import ZeroWeight
 
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
-WEIGHTED_LABEL_COLUMNS = tuple(WEIGHTED_LABELS)
+WEIGHTED_LABEL_COLUMNS = tuple(column.name for column in WEIGHTED_LABELS)
 GROUND_TRUTH_COLUMNS = ("frame", "k", "category", *BOX_COLUMNS, "truncated", "occluded")
-FRAME_COLUMNS = ("frame", "split", "points", "image", "calibration")
 
 # How many frames an error names.
 _NAMED_FRAMES = 5
 
-Row = tuple[Any, ...]
-
-
-class Rows(Protocol):
-    """Rows that can be counted and walked through again; they need not be in memory."""
-
-    def __len__(self) -> int:
-        """How many there are."""
-        ...
-
-    def __iter__(self) -> Iterator[Row]:
-        """From the first on."""
-        ...
+Block = Mapping[str, Sequence[Any] | np.ndarray]
+"""Rows as named columns, all of one length; None, or NaN in an array, is unknown."""
+Columns = Mapping[str, list[Any]]
+"""A block in plain Python values."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +37,8 @@ class LabelFileDescription:
         round: round that made the labels.
         policy: policy that weighted them.
         code_version: of curate.
+        zero_weight: what a label of weight 0 is, see `ZeroWeight`. What a person rejected is
+            background in any case.
     """
 
     dataset: str
@@ -52,6 +47,18 @@ class LabelFileDescription:
     round: int
     policy: str
     code_version: str
+    zero_weight: ZeroWeight = "background"
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """A frame to learn from, and where its files lie below the root of the data set."""
+
+    frame: str
+    split: str
+    points: str
+    image: str | None
+    calibration: str
 
 
 @dataclass(frozen=True)
@@ -63,55 +70,73 @@ class LabelSet:
 
     Attributes:
         description: see `LabelFileDescription`.
-        frames: rows of `FRAME_COLUMNS`; paths relative to the description's root.
-        ground_truth: rows of `GROUND_TRUTH_COLUMNS`, of labeled frames.
-        labels: rows of `WEIGHTED_LABEL_COLUMNS`, of unlabeled frames, by frame and k.
+        frames: the labeled and unlabeled frames, in their order.
+        ground_truth: the columns `GROUND_TRUTH_COLUMNS` of objects of labeled frames.
+        labels: blocks with the columns `columns` of labels of unlabeled frames, in the order of
+            frames and k; a frame may continue in the next block. Walked anew by each export.
         read: calibration and image size of a frame, for formats in the camera's frame.
         read_points: the same with the frame's points, for formats that carry objects' points.
-        categories: those that ground truth or labels have; not all need be ones to be learned.
+        columns: of the labels: the core ones first, further evidence behind them.
 
     Raises:
         LeakageError: ground truth of a frame that is not labeled, or a frame of another split.
-        DataError: labels of a frame that is not unlabeled, or a weight that is no number.
     """
 
     description: LabelFileDescription
-    frames: Sequence[Row]
-    ground_truth: Sequence[Row]
-    labels: Rows
+    frames: Sequence[FrameFiles]
+    ground_truth: Block
+    labels: Iterable[Block]
     read: Callable[[str], Frame]
     read_points: Callable[[str], Frame]
-    categories: frozenset[str] = field(init=False)
+    columns: tuple[Column, ...] = WEIGHTED_LABELS
 
     def __post_init__(self) -> None:
-        """Checks the splits and finds the categories in one walk through the labels."""
-        splits = {str(row[0]): str(row[1]) for row in self.frames}
-        others = {name for name, split in splits.items() if split not in ("labeled", "unlabeled")}
-        leaked = {row[0] for row in self.ground_truth if splits.get(row[0]) != "labeled"}
-        if others or leaked:
+        """Checks the splits of the frames and of the ground truth."""
+        for each in self.frames:
+            if each.split not in ("labeled", "unlabeled"):
+                raise LeakageError(
+                    f"frame {each.frame} is of split {each.split!r}; export labeled and unlabeled "
+                    "frames only"
+                )
+        leaked = set(self.ground_truth["frame"]) - self._of_split("labeled")
+        if leaked:
             raise LeakageError(
-                f"labels to export hold {'frames' if others else 'ground truth of frames'} outside "
-                f"the labeled split: {named(others or leaked)}; export labeled and unlabeled "
-                "frames only, with ground truth of labeled ones"
+                f"labels to export hold ground truth of frames outside the labeled split: "
+                f"{named(leaked)}; only labeled frames may bring ground truth into a training"
             )
-        columns = ("frame", "category", "weight")
-        frame, category, weight = map(WEIGHTED_LABEL_COLUMNS.index, columns)
-        found = {(row[frame], row[category], type(row[weight])) for row in self.labels}
-        words = {name for name, _, kind in found if not issubclass(kind, Real)}
-        if words:  # SQLite keeps text in a column of numbers
-            raise DataError(
-                f"weights of {named(words)} are no numbers; something else has written them into "
-                "the database: restore a backup"
-            )
-        strays = {name for name, _, _ in found if splits.get(name) != "unlabeled"}
-        if strays:
-            raise DataError(
-                f"labels to export belong to frames outside the unlabeled split: {named(strays)}; "
-                "export labels of unlabeled frames only"
-            )
-        of_truth = GROUND_TRUTH_COLUMNS.index("category")
-        categories = {row[of_truth] for row in self.ground_truth} | {name for _, name, _ in found}
-        object.__setattr__(self, "categories", frozenset(map(str, categories)))
+
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """The names of the columns of the labels."""
+        return tuple(column.name for column in self.columns)
+
+    def truth(self) -> Columns:
+        """Return the ground truth in plain Python values."""
+        return _plain(self.ground_truth, GROUND_TRUTH_COLUMNS)
+
+    def blocks(self) -> Iterator[Columns]:
+        """Walk through the labels once, and check them on the way.
+
+        Raises:
+            DataError: a weight is not a number in [0, 1], a label is of a frame outside the
+                unlabeled split, or a block has other columns.
+        """
+        unlabeled = self._of_split("unlabeled")
+        for given in self.labels:
+            block = _plain(given, self.column_names)
+            for place, weight in enumerate(block["weight"]):
+                if not (isinstance(weight, int | float) and 0 <= weight <= 1):
+                    raise bad_weight(block["frame"][place], block["k"][place], weight)
+            strays = set(block["frame"]) - unlabeled
+            if strays:
+                raise DataError(
+                    f"labels of frames outside the unlabeled split: {named(strays)}; export labels "
+                    "of unlabeled frames only"
+                )
+            yield block
+
+    def _of_split(self, split: str) -> set[str]:
+        return {each.frame for each in self.frames if each.split == split}
 
 
 class Exporter(Protocol):
@@ -119,6 +144,10 @@ class Exporter(Protocol):
 
     An export is whole or not there: what fails or is killed on the way leaves the former one as it
     was. Only former exports are replaced; `ConfigError` where something else is in the place.
+
+    A trainer that reads no weights never takes a label of weight 0 for an object. The format says
+    what such labels are, see `LabelFileDescription.zero_weight`: those to ignore are in the form
+    that its readers ignore; background ones are where its readers do not look, or left out.
     """
 
     name: ClassVar[str]
@@ -130,26 +159,57 @@ class Exporter(Protocol):
 
         Raises:
             ConfigError: something else is in the place.
-            DataError: a label cannot be, such as one whose weight is not in [0, 1].
+            DataError: a label cannot be, such as one with a weight that is not in [0, 1].
         """
         ...
 
 
+def by_frame(blocks: Iterable[Columns]) -> Iterator[tuple[str, Columns]]:
+    """Walk through blocks frame by frame; a frame may continue in the next block."""
+    for frame, parts in groupby(chain.from_iterable(map(_parts, blocks)), key=_frame_of):
+        own: dict[str, list[Any]] = {}
+        for part in parts:
+            for name, values in part.items():
+                own.setdefault(name, []).extend(values)
+        yield frame, own
+
+
+def _parts(block: Columns) -> Iterator[Columns]:
+    """Cut a block where the frame changes."""
+    start = 0
+    for _, group in groupby(block["frame"]):
+        stop = start + sum(1 for _ in group)
+        yield {name: values[start:stop] for name, values in block.items()}
+        start = stop
+
+
+def _frame_of(part: Columns) -> str:
+    return str(part["frame"][0])
+
+
+def _plain(block: Block, names: Sequence[str]) -> Columns:
+    """The columns by name and in order, in plain Python values."""
+    if set(block) != set(names) or len({len(values) for values in block.values()}) != 1:
+        raise DataError(
+            f"a block of labels has the columns {', '.join(block)}; it needs {', '.join(names)}, "
+            "all of one length"
+        )
+    return {name: _as_list(block[name]) for name in names}
+
+
+def _as_list(values: Sequence[Any] | np.ndarray) -> list[Any]:
+    if not isinstance(values, np.ndarray):
+        return list(values)
+    plain: list[Any] = values.tolist()
+    return [None if value != value else value for value in plain]  # noqa: PLR0124 - only NaN is
+
+
 def bad_weight(frame: str, k: int, weight: object) -> DataError:
-    """What is wrong with a label whose weight cannot be."""
+    """Return what is wrong with a label with an impossible weight."""
     return DataError(
         f"frame {frame}: label {k} has weight {weight!r}; weights are in [0, 1], something else "
         "has written this one: restore a backup"
     )
-
-
-def refuse_link(path: Path) -> None:
-    """ConfigError where an export would take the place of a link and leave what it leads to."""
-    if path.is_symlink():
-        raise ConfigError(
-            f"{path}: is a link, in whose place the export would come; name what it leads to, or "
-            "remove the link"
-        )
 
 
 def named(frames: Iterable[str]) -> str:

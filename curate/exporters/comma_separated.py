@@ -1,18 +1,17 @@
 """Weighted labels as one CSV file (RFC 4180), for spreadsheets and scripts.
 
 The columns are those of `weighted_labels`; what is unknown is an empty field. Numbers are written
-so that they come back to the last bit.
+so that they come back to the last bit. The format has no place to say what a weight of 0 means: the
+policy, a column, does.
 """
 
 import csv
-import io
 from pathlib import Path
 from typing import ClassVar
 
-from curate.errors import ConfigError
-from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelSet, refuse_link
-from curate.exporters.objects import refuse_bad_weights
-from curate.files.atomic import replace_file
+from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelSet
+from curate.exporters.place import check_place
+from curate.files.atomic import whole_file
 
 _HEADER = ",".join(WEIGHTED_LABEL_COLUMNS)
 
@@ -25,25 +24,18 @@ class CsvExporter:
 
     def write(self, path: Path, labels: LabelSet) -> int:
         """See `curate.exporters.base.Exporter`."""
-        _refuse_foreign(path)
-        refuse_bad_weights(labels)
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(WEIGHTED_LABEL_COLUMNS)
-        writer.writerows(labels.labels)
-        replace_file(path, text.getvalue().encode())
-        return len(labels.labels)
+        check_place(path, _is_former)
+        count = 0
+        with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(labels.column_names)
+            for block in labels.blocks():
+                writer.writerows(zip(*block.values(), strict=True))
+                count += len(block["k"])
+        return count
 
 
-def _refuse_foreign(path: Path) -> None:
-    """ConfigError where something would be lost that is no former export."""
-    refuse_link(path)
-    if not path.exists():
-        return
-    try:
-        with path.open(encoding="utf-8") as former:
-            known = former.readline(len(_HEADER) + 1).rstrip("\n") == _HEADER
-    except (OSError, UnicodeDecodeError):
-        known = False
-    if not known:
-        raise ConfigError(f"{path}: is there and is no former export; name another file")
+def _is_former(path: Path) -> bool:
+    with path.open(encoding="utf-8") as former:
+        start = former.readline(len(_HEADER) + 1)
+    return start.rstrip(",\n") == _HEADER

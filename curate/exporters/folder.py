@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from curate.errors import ConfigError
-from curate.exporters.base import refuse_link
+from curate.exporters.place import check_place
 
 _MARKER = "export.json"
 # Read by every Python 3 that a training framework still runs on.
@@ -39,7 +38,7 @@ def write_folder(
     Raises:
         ConfigError: the directory holds something else.
     """
-    _refuse_foreign(directory, format_name)
+    check_place(directory, lambda former: _is_former(former, format_name))
     partial = _own_partial(directory)
     try:
         partial.mkdir(parents=True)
@@ -72,18 +71,12 @@ class _ArrayPickler(pickle.Pickler):
         return np.ndarray, (value.shape, value.dtype.str, bytearray(value.tobytes()))
 
 
-def _refuse_foreign(directory: Path, format_name: str) -> None:
-    """ConfigError where something would be lost that is no former export."""
-    refuse_link(directory)
-    if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
-        return
-    try:
-        marker = json.loads((directory / _MARKER).read_text(encoding="utf-8"))
-        known = marker["format"] == format_name
-    except (OSError, ValueError, TypeError, KeyError):
-        known = False
-    if not known:
-        raise ConfigError(f"{directory}: is there and is no former export; name another folder")
+def _is_former(directory: Path, format_name: str) -> bool:
+    """Whether a folder is empty, or an export of that format."""
+    if directory.is_dir() and not any(directory.iterdir()):
+        return True
+    marker = json.loads((directory / _MARKER).read_text(encoding="utf-8"))
+    return bool(marker["format"] == format_name)
 
 
 def _own_partial(directory: Path) -> Path:

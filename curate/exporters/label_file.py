@@ -2,7 +2,8 @@
 
 A SQLite file is more than rows: a table may be a view that never ends, or a column an expression
 that fills the memory. Only the very tables that `curate.exporters.sqlite` makes are read, so what
-is read is bounded by the size of the file.
+is read is bounded by the size of the file. Files of version 1 and 2 are read; what the latter has
+of further evidence may only be plain columns.
 """
 
 import json
@@ -13,10 +14,15 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from curate.errors import DataError, one_line
-from curate.exporters.sqlite import FORMAT_VERSION, TABLES, refuse_locked
+from curate.errors import DataError, LeakageError, one_line
+from curate.exporters.base import named
+from curate.exporters.sqlite import refuse_locked, tables
+from curate.weighting.base import ZeroWeight
 
+_VERSIONS = ("1", "2")
 _KEYS = ("categories", "round", "policy", "root")
+# Behind the core columns of `label`, in a file of version 2.
+_FURTHER_COLUMNS = r"(?: [a-z]\w* (?:INTEGER|REAL|TEXT)(?: NOT NULL)?,)*"
 # No cell of a label file is longer; SQLite's own limit is a gigabyte.
 _LONGEST_CELL = 1 << 24
 
@@ -69,9 +75,10 @@ def read_meta(rows: sqlite3.Connection, path: Path) -> Mapping[str, str]:
     """
     meta = dict(rows.execute("SELECT key, value FROM meta"))
     version = meta.get("format_version")
-    if version != str(FORMAT_VERSION):
+    if version not in _VERSIONS:
         raise DataError(
-            f"{path}: label format {version!r}, this version reads {FORMAT_VERSION}; export again"
+            f"{path}: label format {version!r}, this version reads {' and '.join(_VERSIONS)}; "
+            "export again"
         )
     missing = [key for key in _KEYS if key not in meta]
     if missing:
@@ -92,6 +99,38 @@ def read_categories(meta: Mapping[str, str], path: Path) -> tuple[str, ...]:
             f"{path}: meta.categories is no list of names; delete it and export it again"
         )
     return tuple(names)
+
+
+def read_zero_weight(meta: Mapping[str, str], path: Path) -> ZeroWeight:
+    """Return what a label of weight 0 is; "ignore" where an older file does not say.
+
+    Raises:
+        DataError: it is neither "background" nor "ignore".
+    """
+    match meta.get("zero_weight", "ignore"):
+        case "background":
+            return "background"
+        case "ignore":
+            return "ignore"
+        case other:
+            raise DataError(
+                f"{path}: meta.zero_weight is {other!r}, expected background or ignore; delete the "
+                "file and export it again"
+            )
+
+
+def refuse_leakage(rows: sqlite3.Connection, path: Path) -> None:
+    """LeakageError where a label file holds ground truth of frames that are not labeled."""
+    leaked = rows.execute(
+        "SELECT DISTINCT frame FROM ground_truth WHERE frame NOT IN "
+        "(SELECT frame FROM frame WHERE split = 'labeled') ORDER BY frame"
+    ).fetchall()
+    if leaked:
+        raise LeakageError(
+            f"{path}: ground truth of frames outside the labeled split: "
+            f"{named(frame for (frame,) in leaked)}; only labeled frames may bring ground truth "
+            "into a training"
+        )
 
 
 def read_frames(path: Path) -> LabelFileFrames:
@@ -116,7 +155,7 @@ def _refuse_foreign_tables(rows: sqlite3.Connection, path: Path) -> None:
             raise DataError(
                 f"{path}: not a label file: no table {name}; delete it and export it again"
             )
-        if _bare(str(found[name])) != statement:
+        if not re.fullmatch(statement, _bare(str(found[name])), re.ASCII):
             raise DataError(
                 f"{path}: table {name} is not the one that an export makes; delete it and "
                 "export it again"
@@ -124,9 +163,11 @@ def _refuse_foreign_tables(rows: sqlite3.Connection, path: Path) -> None:
 
 
 def _statements() -> Mapping[str, str]:
-    """The bare CREATE TABLE statement of each table."""
-    parts = [part.strip() for part in _bare(TABLES).split(";") if part.strip()]
-    return {part.split()[2]: part for part in parts}
+    """A pattern of the bare CREATE TABLE statement of each table."""
+    parts = [part.strip() for part in _bare(tables()).split(";") if part.strip()]
+    patterns = {part.split()[2]: re.escape(part) for part in parts}
+    core, generated, rest = patterns["label"].partition(re.escape(" split TEXT GENERATED"))
+    return patterns | {"label": core + _FURTHER_COLUMNS + generated + rest}
 
 
 def _bare(statement: str) -> str:

@@ -5,8 +5,10 @@ DIRECTORY/kitti_infos_train.pkl, for `KittiDataset` and its `ann_file`, is a dic
 `categories`, and `data_list` with a dict per frame of X_l and X_u. `bbox_3d` of an instance is x,
 y, z of the bottom centre in the rectified camera frame, length, height, width, and the yaw about
 the camera's y; `bbox_label_3d` is the category's number, -1 for a label of weight 0, which is
-mmdetection3d's way to leave it out. Two keys are more than its own: `weight` (v; 1 for ground
-truth) and `category`, what the label was before it was ignored.
+mmdetection3d's way to leave it out: to a trainer that reads no more, it is background. Three keys
+are more than its own: `weight` (v; 1 for ground truth), `category`, and `ignored`, whether a label
+of weight 0 is a region to ignore; otherwise it is background. `zero_weight` of `metainfo` says what
+a weight of 0 means.
 
 The numbers of KITTI's categories are those of `KittiDataset`; further categories follow.
 R0_rect is the identity, Tr_velo_to_cam the whole way from the LiDAR to the rectified camera.
@@ -22,7 +24,13 @@ import numpy as np
 from curate.datasets.kitti.labels import from_detections
 from curate.exporters.base import LabelSet
 from curate.exporters.folder import write_folder, write_pickle
-from curate.exporters.objects import FrameObjects, difficulties, frame_objects
+from curate.exporters.objects import (
+    FrameObjects,
+    categories_of,
+    count_labels,
+    difficulties,
+    frame_objects,
+)
 from curate.frames import Calibration, Frame
 from curate.geometry.projection import project_points
 
@@ -30,7 +38,7 @@ _FORMAT = "curate weighted labels, mmdetection3d"
 _KITTI_ORDER = (
     "Pedestrian", "Cyclist", "Car", "Van", "Truck", "Person_sitting", "Tram", "Misc",
 )  # fmt: skip
-_IGNORED = -1
+_LEFT_OUT = -1
 
 
 class MMDet3DExporter:
@@ -49,21 +57,27 @@ class MMDet3DExporter:
 
 
 def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
-    own = [name for name in labels.description.categories if name not in _KITTI_ORDER]
-    rest = sorted(labels.categories - {*_KITTI_ORDER, *own})
+    about, frames = labels.description, list(frame_objects(labels))
+    own = [name for name in about.categories if name not in _KITTI_ORDER]
+    rest = sorted(categories_of(frames) - {*_KITTI_ORDER, *own})
     numbers = {name: number for number, name in enumerate((*_KITTI_ORDER, *own, *rest))}
     infos = []
-    for position, objects in enumerate(frame_objects(labels)):
+    for position, objects in enumerate(frames):
         name = objects.frame_id
         index = int(name) if name.isdecimal() else position
         infos.append(_info(index, objects, labels.read(name), numbers))
     metainfo = {
         "categories": numbers,
-        "dataset": labels.description.dataset,
+        "dataset": about.dataset,
+        "zero_weight": about.zero_weight,
         "info_version": "1.1",
     }
     write_pickle(folder / "kitti_infos_train.pkl", {"metainfo": metainfo, "data_list": infos})
-    return {"frames": len(infos), "labels": len(labels.labels)}
+    return {
+        "zero_weight": about.zero_weight,
+        "frames": len(infos),
+        "labels": count_labels(frames),
+    }
 
 
 def _info(
@@ -110,7 +124,7 @@ def _instances(
     instances = []
     for k in range(len(found)):
         category, weight = str(found.categories[k]), float(objects.weights[k])
-        label = _IGNORED if weight == 0 else numbers[category]
+        label = _LEFT_OUT if weight == 0 else numbers[category]
         box = (*shown.locations[k], *lengths_first[k], shown.rotations_y[k])
         instances.append(
             {
@@ -129,6 +143,7 @@ def _instances(
                 "index": k,
                 "group_id": k,
                 "weight": weight,
+                "ignored": bool(objects.ignored[k]),
                 "category": category,
             }
         )

@@ -3,8 +3,9 @@
 Source: nuScenes' detection task (nuscenes.org). A JSON object with `meta` and `results`: by sample
 token a list of boxes in the frame of the map, size as width, length, height, rotation as w, x, y,
 z. Beside nuScenes' own keys a box has `weight`, v, and `k`. Labels of weight 0 are not among the
-results but, in the same form, in `ignored`, which nuScenes' tools do not read. Velocities are not
-known and written as 0.
+results but, in the same form, in `ignored` or in `background`, by what they are; nuScenes' tools
+read neither. The meta's `zero_weight` says what a weight of 0 means. Velocities are not known and
+written as 0.
 """
 
 import json
@@ -15,9 +16,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from curate.datasets.nuscenes.names import detection_name
-from curate.errors import ConfigError, DataError
-from curate.exporters.base import LabelSet, refuse_link
+from curate.errors import DataError
+from curate.exporters.base import LabelSet
 from curate.exporters.objects import FrameObjects, frame_objects
+from curate.exporters.place import check_place, says
 from curate.files.atomic import replace_file
 from curate.frames import Calibration
 
@@ -38,15 +40,19 @@ class NuScenesExporter:
             DataError: the calibration of a frame cannot be read, or a category is none of
                 nuScenes'.
         """
-        _refuse_foreign(path)
-        results: dict[str, list[dict[str, Any]]] = {}
-        ignored: dict[str, list[dict[str, Any]]] = {}
+        check_place(path, says("meta", _FORMAT))
+        parts: dict[str, dict[str, list[dict[str, Any]]]] = {
+            "results": {}, "ignored": {}, "background": {},
+        }  # fmt: skip
+        count = 0
         for objects in frame_objects(labels):
             if objects.labeled:
                 continue
             boxes = _boxes(objects, labels.read(objects.frame_id).calibration)
-            results[objects.frame_id] = [box for box in boxes if box["weight"] > 0]
-            ignored[objects.frame_id] = [box for box in boxes if box["weight"] == 0]
+            masks = (objects.weights > 0, objects.ignored, objects.background)
+            for part, mask in zip(parts.values(), masks, strict=True):
+                part[objects.frame_id] = [boxes[k] for k in np.flatnonzero(mask)]
+            count += len(boxes)
         about = labels.description
         document = {
             "meta": {
@@ -58,13 +64,13 @@ class NuScenesExporter:
                 "description": _FORMAT,
                 "round": about.round,
                 "policy": about.policy,
+                "zero_weight": about.zero_weight,
                 "version": about.code_version,
             },
-            "results": results,
-            "ignored": ignored,
+            **parts,
         }
         replace_file(path, json.dumps(document, allow_nan=False).encode())
-        return len(labels.labels)
+        return count
 
 
 def _boxes(objects: FrameObjects, calibration: Calibration) -> list[dict[str, Any]]:
@@ -106,16 +112,3 @@ def _name(objects: FrameObjects, k: int) -> str:
             f"frame {objects.frame_id}: category {category!r} is none of nuScenes' detection task"
         )
     return name
-
-
-def _refuse_foreign(path: Path) -> None:
-    """ConfigError where something would be lost that is no former export."""
-    refuse_link(path)
-    if not path.exists():
-        return
-    try:
-        known = json.loads(path.read_bytes())["meta"]["description"] == _FORMAT
-    except (OSError, ValueError, TypeError, KeyError):
-        known = False
-    if not known:
-        raise ConfigError(f"{path}: is there and is no former export; name another file")

@@ -1,21 +1,15 @@
 """A label set frame by frame, as formats take it that hold X_l and X_u side by side."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
-from curate.detections import Detections
+from curate.detections import Detections, as_categories
+from curate.errors import DataError
 from curate.evaluation.kitti_rules import MAX_OCCLUSIONS, MAX_TRUNCATIONS, MIN_HEIGHTS
-from curate.exporters.base import (
-    BOX_COLUMNS,
-    GROUND_TRUTH_COLUMNS,
-    WEIGHTED_LABEL_COLUMNS,
-    LabelSet,
-    Row,
-    bad_weight,
-)
+from curate.exporters.base import BOX_COLUMNS, Columns, FrameFiles, LabelSet, by_frame
 
 UNKNOWN = -1
 
@@ -29,7 +23,8 @@ class FrameObjects:
         labeled: whether they are ground truth (X_l) or pseudo-labels (X_u).
         files: points and image, relative to the root of the data set.
         detections: boxes in the LiDAR frame; ground truth has score 1.
-        weights: (n,) v in [0, 1]; ground truth has 1, and 0 is an ignore region.
+        weights: (n,) in [0, 1]; ground truth has 1.
+        ignored: (n,) bool, which labels of weight 0 are regions to ignore.
         points: (n,) int64 LiDAR points in each box; -1 unknown.
         truncated: (n,) share outside the image; -1 unknown.
         occluded: (n,) int64, KITTI's levels 0 to 3; -1 unknown.
@@ -40,38 +35,50 @@ class FrameObjects:
     files: tuple[str, str]
     detections: Detections
     weights: np.ndarray
+    ignored: np.ndarray
     points: np.ndarray
     truncated: np.ndarray
     occluded: np.ndarray
 
+    @property
+    def background(self) -> np.ndarray:
+        """(n,) bool, which labels of weight 0 are background: no objects."""
+        return np.asarray((self.weights == 0) & ~self.ignored)
+
 
 def frame_objects(labels: LabelSet) -> Iterator[FrameObjects]:
-    """The frames of a label set in its order, those without objects too.
+    """The frames of a label set in its order, those without objects too; one walk, none is held.
 
     Raises:
-        DataError: a weight is not in [0, 1].
+        DataError: see `LabelSet.blocks`; or the labels are not in the order of the frames.
     """
-    refuse_bad_weights(labels)
-    rows: dict[str, list[Row]] = {row[0]: [] for row in labels.frames}
-    for table, columns in (
-        (labels.ground_truth, GROUND_TRUTH_COLUMNS),
-        (labels.labels, WEIGHTED_LABEL_COLUMNS),
-    ):
-        position = columns.index("frame")
-        for row in table:
-            rows[row[position]].append(row)
-    for frame_id, split, points, image, *_ in labels.frames:
-        files = (str(points), str(image))
-        found = rows[frame_id]
-        make = _true_objects if split == "labeled" else _weighted_objects
-        yield make(frame_id, files, found)
+    truth: Mapping[str, Columns] = dict(by_frame([labels.truth()]))
+    nothing: Columns = {name: [] for name in (*labels.column_names, "truncated", "occluded")}
+    found = by_frame(labels.blocks())
+    following = next(found, None)
+    for files in labels.frames:
+        if files.split == "labeled":
+            yield _true_objects(files, truth.get(files.frame, nothing))
+        elif following is not None and following[0] == files.frame:
+            yield _weighted_objects(files, following[1], labels)
+            following = next(found, None)
+        else:
+            yield _weighted_objects(files, nothing, labels)
+    if following is not None:
+        raise DataError(
+            f"labels of frame {following[0]} are out of order; labels to export are in the order "
+            "of their frames"
+        )
 
 
-def refuse_bad_weights(labels: LabelSet) -> None:
-    """DataError where a weight is not in [0, 1]."""
-    for row in labels.labels:
-        if not 0 <= row[-1] <= 1:
-            raise bad_weight(row[1], row[2], row[-1])
+def count_labels(frames: Sequence[FrameObjects]) -> int:
+    """Return how many pseudo-labels some frames have."""
+    return sum(len(objects.weights) for objects in frames if not objects.labeled)
+
+
+def categories_of(frames: Sequence[FrameObjects]) -> set[str]:
+    """Return the categories that occur in some frames."""
+    return {name for objects in frames for name in objects.detections.categories.tolist()}
 
 
 def difficulties(boxes_2d: np.ndarray, truncated: np.ndarray, occluded: np.ndarray) -> np.ndarray:
@@ -91,36 +98,40 @@ def difficulties(boxes_2d: np.ndarray, truncated: np.ndarray, occluded: np.ndarr
     return found
 
 
-def _true_objects(frame_id: str, files: tuple[str, str], rows: Sequence[Row]) -> FrameObjects:
-    count = len(rows)
-    wanted = itemgetter(*map(GROUND_TRUTH_COLUMNS.index, ("category", *BOX_COLUMNS)))
-    boxes = [wanted(row) for row in rows]
+def _true_objects(files: FrameFiles, rows: Columns) -> FrameObjects:
+    count = len(rows["category"])
     return FrameObjects(
-        frame_id,
+        files.frame,
         labeled=True,
-        files=files,
-        detections=Detections.from_rows([(box[0], 1.0, *box[1:], None) for box in boxes]),
+        files=(files.points, str(files.image)),
+        detections=_detections(rows, [1.0] * count),
         weights=np.ones(count),
+        ignored=np.zeros(count, dtype=bool),
         points=np.full(count, UNKNOWN, dtype=np.int64),
-        truncated=np.array([row[-2] for row in rows], dtype=np.float64),
-        occluded=np.array([row[-1] for row in rows], dtype=np.int64),
+        truncated=np.array(rows["truncated"], dtype=np.float64),
+        occluded=np.array(rows["occluded"], dtype=np.int64),
     )
 
 
-def _weighted_objects(frame_id: str, files: tuple[str, str], rows: Sequence[Row]) -> FrameObjects:
-    count = len(rows)
-    names = ("category", "score", *BOX_COLUMNS)
-    wanted = itemgetter(*map(WEIGHTED_LABEL_COLUMNS.index, names))
-    counted = WEIGHTED_LABEL_COLUMNS.index("points")
+def _weighted_objects(files: FrameFiles, rows: Columns, labels: LabelSet) -> FrameObjects:
+    count = len(rows["category"])
+    weights = np.array(rows["weight"], dtype=np.float64)
+    # What a person rejected is background, whatever the policy takes a weight of 0 for.
+    doubted = [each != "human" for each in rows["provenance"]]
+    ignoring = labels.description.zero_weight == "ignore"
     return FrameObjects(
-        frame_id,
+        files.frame,
         labeled=False,
-        files=files,
-        detections=Detections.from_rows([(*wanted(row), None) for row in rows]),
-        weights=np.array([row[-1] for row in rows], dtype=np.float64),
-        points=np.array(
-            [UNKNOWN if row[counted] is None else row[counted] for row in rows], dtype=np.int64
-        ),
+        files=(files.points, str(files.image)),
+        detections=_detections(rows, rows["score"]),
+        weights=weights,
+        ignored=(weights == 0) & ignoring & np.array(doubted, dtype=bool),
+        points=np.array([UNKNOWN if m is None else m for m in rows["points"]], dtype=np.int64),
         truncated=np.full(count, float(UNKNOWN)),
         occluded=np.full(count, UNKNOWN, dtype=np.int64),
     )
+
+
+def _detections(rows: Columns, scores: Sequence[Any]) -> Detections:
+    boxes = np.array([rows[name] for name in BOX_COLUMNS], dtype=np.float64).T
+    return Detections(boxes, np.array(scores, dtype=np.float64), as_categories(rows["category"]))

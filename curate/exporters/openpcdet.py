@@ -7,9 +7,11 @@ Source: OpenPCDet's KITTI data set (github.com/open-mmlab/OpenPCDet). DIRECTORY 
     kitti_dbinfos_train.pkl  the objects of X_l by category, for its cut-and-paste augmentation
     gt_database/*.bin        their points, relative to the box centre
 
-Beside OpenPCDet's own arrays `annos` has `weight` (v; 1 for ground truth) and `category`. The
-`name` of a label of weight 0 is DontCare, which OpenPCDet leaves out, so that a trainer that reads
-no weights never takes it for an object; one that does finds what it was in `category`.
+Beside OpenPCDet's own arrays `annos` has `weight` (v; 1 for ground truth), `category`, and
+`ignored`, which labels of weight 0 are regions to ignore; the others are background. The `name` of
+a label of weight 0 is DontCare, which OpenPCDet leaves out, so that a trainer that reads no weights
+never takes it for an object; to it, all of them are background. `zero_weight` of export.json says
+what a weight of 0 means.
 
 Annos are in the rectified camera frame (`location` is the bottom centre, `dimensions` length,
 height, width), `gt_boxes_lidar` is (n, 7) at the box centre in the LiDAR frame. R0_rect is the
@@ -54,7 +56,9 @@ def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
     infos: list[Info] = []
     database: dict[str, list[Info]] = {}
     (folder / _DATABASE).mkdir()
+    count = 0
     for objects in frame_objects(labels):
+        count += 0 if objects.labeled else len(objects.weights)
         read = labels.read_points if objects.labeled else labels.read
         frame = read(objects.frame_id)
         info = _info(objects, frame)
@@ -63,7 +67,8 @@ def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
         infos.append(info)
     write_pickle(folder / "kitti_infos_train.pkl", infos)
     write_pickle(folder / "kitti_dbinfos_train.pkl", database)
-    return {"frames": len(infos), "labels": len(labels.labels)}
+    zero_weight = labels.description.zero_weight
+    return {"zero_weight": zero_weight, "frames": len(infos), "labels": count}
 
 
 def _info(objects: FrameObjects, frame: Frame) -> Info:
@@ -93,6 +98,7 @@ def _annos(objects: FrameObjects, shown: KittiObjects) -> Info:
         "name": names,
         "category": found.categories,
         "weight": objects.weights,
+        "ignored": objects.ignored,
         "truncated": objects.truncated,
         "occluded": objects.occluded,
         "alpha": shown.alpha,

@@ -2,20 +2,21 @@
 
 Source: the Apache Parquet format (parquet.apache.org). The columns are those of `weighted_labels`,
 typed; what is unknown is null. The metadata of each field says its unit and meaning, that of the
-file (keys `curate.*`) the frame of reference, round, policy, data set, categories and version.
+file (keys `curate.*`) the frame of reference, round, policy, what a weight of 0 means
+(`curate.zero_weight`), data set, categories and version.
 Rows are streamed in row groups, so that millions of labels need no more memory than one group.
 """
 
 import json
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
-from curate.errors import ConfigError, DataError, one_line
-from curate.exporters.base import LabelFileDescription, LabelSet, Row, bad_weight, refuse_link
-from curate.exporters.columns import WEIGHTED_LABELS
-from curate.files.batches import batched
+from curate.errors import DataError, one_line
+from curate.exporters.base import Columns, LabelFileDescription, LabelSet
+from curate.exporters.columns import WEIGHTED_LABELS, Column
+from curate.exporters.place import check_place
+from curate.files.atomic import whole_file
 from curate.files.parquet import load_parquet
 
 FORMAT = "curate weighted labels, Parquet"
@@ -43,30 +44,22 @@ class ParquetExporter:
 
     def write(self, path: Path, labels: LabelSet) -> int:
         """See `curate.exporters.base.Exporter`."""
-        _refuse_foreign(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        try:
-            count = self._write(partial, labels)
-            with partial.open("rb") as written:
-                os.fsync(written.fileno())
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
-        return count
-
-    def _write(self, path: Path, labels: LabelSet) -> int:
+        check_place(path, _is_former)
         arrow, parquet = load_parquet()
-        schema = label_schema(labels.description)
+        schema = label_schema(labels.description, labels.columns)
         count = 0
-        with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-            for rows in _groups(labels.labels, self.rows_per_group):
-                writer.write_batch(_batch(arrow, schema, rows), row_group_size=len(rows))
-                count += len(rows)
+        with (
+            whole_file(path) as partial,
+            parquet.ParquetWriter(partial, schema, compression="zstd") as writer,
+        ):
+            for group in _groups(labels.blocks(), self.rows_per_group):
+                batch = _batch(arrow, schema, group)
+                writer.write_batch(batch, row_group_size=batch.num_rows)
+                count += batch.num_rows
         return count
 
 
-def label_schema(about: LabelFileDescription) -> Any:
+def label_schema(about: LabelFileDescription, columns: Iterable[Column] = WEIGHTED_LABELS) -> Any:
     """The Arrow schema of a label file, with what the labels are about as its metadata."""
     arrow, _ = load_parquet()
     types = {
@@ -76,9 +69,9 @@ def label_schema(about: LabelFileDescription) -> Any:
         "name": arrow.dictionary(arrow.int32(), arrow.string()),
     }
     fields = []
-    for name, column in WEIGHTED_LABELS.items():
+    for column in columns:
         told = {"meaning": column.meaning} | ({"unit": column.unit} if column.unit else {})
-        fields.append(arrow.field(name, types[column.kind], column.optional, told))
+        fields.append(arrow.field(column.name, types[column.kind], column.optional, told))
     return arrow.schema(fields, _metadata(about))
 
 
@@ -94,27 +87,35 @@ def _metadata(about: LabelFileDescription) -> dict[str, str]:
         "categories": json.dumps(list(about.categories)),
         "round": str(about.round),
         "policy": about.policy,
+        "zero_weight": about.zero_weight,
         "version": about.code_version,
     }
     return {f"curate.{key}": value for key, value in told.items()}
 
 
-def _groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
-    """The rows in groups, each checked; DataError at a weight that cannot be."""
-    for group in batched(rows, size):
-        for row in group:
-            if not 0 <= row[-1] <= 1:
-                raise bad_weight(row[1], row[2], row[-1])
-        yield group
+def _groups(blocks: Iterable[Columns], size: int) -> Iterator[Columns]:
+    """The same rows in blocks of that size, of which the last may be smaller."""
+    waiting: dict[str, list[Any]] = {}
+    for block in blocks:
+        for name, values in block.items():
+            waiting.setdefault(name, []).extend(values)
+        while len(waiting["k"]) >= size:
+            yield {name: values[:size] for name, values in waiting.items()}
+            waiting = {name: values[size:] for name, values in waiting.items()}
+    if waiting and waiting["k"]:
+        yield waiting
 
 
-def _batch(arrow: Any, schema: Any, rows: list[Row]) -> Any:
+def _batch(arrow: Any, schema: Any, rows: Columns) -> Any:
     """A record batch of the rows."""
     columns = []
-    for field, values in zip(schema, zip(*rows, strict=True), strict=True):
+    for field in schema:
+        values = rows[field.name]
         if not field.nullable and None in values:
-            row = rows[values.index(None)]
-            raise DataError(f"frame {row[1]}: label {row[2]} has no {field.name}")
+            place = values.index(None)
+            raise DataError(
+                f"frame {rows['frame'][place]}: label {rows['k'][place]} has no {field.name}"
+            )
         try:
             columns.append(arrow.array(values, field.type))
         except (arrow.ArrowException, OverflowError) as error:
@@ -124,15 +125,10 @@ def _batch(arrow: Any, schema: Any, rows: list[Row]) -> Any:
     return arrow.record_batch(columns, schema)
 
 
-def _refuse_foreign(path: Path) -> None:
-    """ConfigError where something would be lost that is no former export."""
-    refuse_link(path)
-    if not path.exists():
-        return
+def _is_former(path: Path) -> bool:
     arrow, parquet = load_parquet()
     try:
-        former = parquet.read_schema(path).metadata or {}
-    except (arrow.ArrowException, OSError):
-        former = {}
-    if former.get(b"curate.format") != FORMAT.encode():
-        raise ConfigError(f"{path}: is there and is no former export; name another file")
+        metadata = parquet.read_schema(path).metadata or {}
+    except arrow.ArrowException:
+        return False
+    return bool(metadata.get(b"curate.format") == FORMAT.encode())

@@ -3,32 +3,34 @@
 The file keeps the two kinds of truth apart by construction: a row of `ground_truth` can only refer
 to a frame of the labeled split, a row of `label` only to one of the unlabeled split, and other
 splits cannot be written at all.
+
+A label file of version 1 has the core columns, one of version 2 those of further evidence behind
+them. The row `zero_weight` of `meta` says what a label of weight 0 is; files without that row are
+older, and mean "ignore".
 """
 
 import json
-import os
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Final
 
-from curate.errors import ConfigError, DataError, LeakageError
-from curate.exporters.base import (
-    FRAME_COLUMNS,
-    GROUND_TRUTH_COLUMNS,
-    WEIGHTED_LABEL_COLUMNS,
-    LabelFileDescription,
-    LabelSet,
-    bad_weight,
-    named,
-    refuse_link,
-)
+from curate.errors import DataError
+from curate.exporters.base import GROUND_TRUTH_COLUMNS, Columns, LabelFileDescription, LabelSet
+from curate.exporters.columns import WEIGHTED_LABELS, Column
+from curate.exporters.place import check_place
+from curate.files.atomic import whole_file
 
-FORMAT_VERSION = 1
-
-# `label_file` reads no file whose tables are others.
-TABLES = """
+_FRAME_INSERTION = "INSERT INTO frame VALUES (:frame, :split, :points, :image, :calibration)"
+_TYPES: Final = {"int32": "INTEGER", "int64": "INTEGER", "float64": "REAL", "name": "TEXT"}
+_CHECKS: Final = {
+    **dict.fromkeys(("length", "width", "height"), "{} > 0"),
+    "provenance": "{} IN ('detector', 'human')",
+    "weight": "{} BETWEEN 0 AND 1",
+}
+_FIXED_TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
 CREATE TABLE frame (
     frame TEXT PRIMARY KEY,
@@ -52,38 +54,7 @@ CREATE TABLE ground_truth (
     split TEXT GENERATED ALWAYS AS ('labeled') VIRTUAL,
     FOREIGN KEY (frame, split) REFERENCES frame (frame, split)
 ) STRICT;
-CREATE TABLE label (
-    round INTEGER NOT NULL,
-    frame TEXT NOT NULL,
-    k INTEGER NOT NULL,
-    category TEXT NOT NULL,
-    x REAL NOT NULL, y REAL NOT NULL, z REAL NOT NULL,  -- box centre, metres, LiDAR frame
-    length REAL NOT NULL CHECK (length > 0),
-    width REAL NOT NULL CHECK (width > 0),
-    height REAL NOT NULL CHECK (height > 0),
-    yaw REAL NOT NULL,          -- radians, counter-clockwise from x
-    score REAL NOT NULL,
-    loss REAL,                  -- consistency loss L; NULL without a matched reprediction
-    points INTEGER,             -- LiDAR points in the box
-    points_threshold REAL,      -- m_th of the category
-    rho_diff REAL,              -- Eq. 8
-    mask_pixels INTEGER,        -- S, pixels of the category in the rectangle
-    box_pixels INTEGER,         -- A, pixels of the rectangle
-    rho_anno REAL,              -- Eq. 9
-    rho_det REAL,               -- rho_diff * rho_anno
-    lambda_u REAL,              -- age parameter, Eq. 4
-    provenance TEXT NOT NULL CHECK (provenance IN ('detector', 'human')),
-    policy TEXT NOT NULL,
-    weight REAL NOT NULL CHECK (weight BETWEEN 0 AND 1),  -- v; 0: no object to learn
-    split TEXT GENERATED ALWAYS AS ('unlabeled') VIRTUAL,
-    FOREIGN KEY (frame, split) REFERENCES frame (frame, split)
-) STRICT;
 """
-
-_VIEW = (
-    "CREATE VIEW weighted_labels AS "  # noqa: S608
-    f"SELECT {', '.join(WEIGHTED_LABEL_COLUMNS)} FROM label;"
-)
 
 # An index that exists during the load makes it several times slower.
 _INDEXES = """
@@ -100,56 +71,42 @@ class SqliteExporter:
     suffix: ClassVar[str] = ".sqlite"
 
     def write(self, path: Path, labels: LabelSet) -> int:
-        """See `curate.exporters.base.Exporter`."""
-        refuse_foreign(path)
-        write_labels(
-            path,
-            description=labels.description,
-            frames=labels.frames,
-            ground_truth=labels.ground_truth,
-            labels=labels.labels,
-        )
-        return len(labels.labels)
+        """See `curate.exporters.base.Exporter`.
+
+        Raises:
+            DataError: a row does not fit its table, or the disk is full.
+        """
+        check_label_file_place(path)
+        with whole_file(path) as partial:
+            try:
+                with closing(sqlite3.connect(partial, isolation_level=None)) as connection:
+                    return _fill(connection, path, labels)
+            except sqlite3.OperationalError as error:
+                raise DataError(
+                    f"{path}: cannot be written: {error}; see to the space and the rights of its "
+                    "folder"
+                ) from None
 
 
-def write_labels(
-    path: Path,
-    *,
-    description: LabelFileDescription,
-    frames: Iterable[tuple],
-    ground_truth: Iterable[tuple],
-    labels: Iterable[tuple],
-) -> None:
-    """Writes the label file at `path`, whole or not at all; rows are streamed.
+def check_label_file_place(path: Path) -> None:
+    """Raise ConfigError where a label file would replace something that is not a label file."""
+    check_place(path, lambda former: _is_former(former, path))
 
-    Args:
-        path: an existing file is replaced.
-        description: see `LabelFileDescription`.
-        frames: rows of `FRAME_COLUMNS`; paths relative to the description's root.
-        ground_truth: rows of `GROUND_TRUTH_COLUMNS`, of labeled frames only.
-        labels: rows of `WEIGHTED_LABEL_COLUMNS`, of unlabeled frames only. Python numbers, not
-            numpy's.
 
-    Raises:
-        LeakageError: ground truth of a frame that is not labeled, or a frame of another split.
-        DataError: a row does not fit its table, a label belongs to no unlabeled frame, or the disk
-            is full.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.unlink(missing_ok=True)
-    try:
-        with closing(sqlite3.connect(partial, isolation_level=None)) as connection:
-            _fill(connection, path, description, (frames, ground_truth, labels))
-        with partial.open("rb") as written:
-            os.fsync(written.fileno())
-        partial.replace(path)
-    except sqlite3.OperationalError as error:
-        raise DataError(
-            f"{path}: cannot be written: {error}; see to the space and the rights of its folder"
-        ) from None
-    finally:
-        partial.unlink(missing_ok=True)
+def tables(columns: Sequence[Column] = WEIGHTED_LABELS) -> str:
+    """Return the SQL that makes the tables; `label_file` reads no file with others."""
+    lines = "\n".join(f"    {_column(each)},  -- {_note(each)}" for each in columns)
+    return f"""{_FIXED_TABLES}CREATE TABLE label (
+{lines}
+    split TEXT GENERATED ALWAYS AS ('unlabeled') VIRTUAL,
+    FOREIGN KEY (frame, split) REFERENCES frame (frame, split)
+) STRICT;
+"""
+
+
+def format_version(columns: Sequence[Column]) -> str:
+    """Return the version of a label file with these columns."""
+    return "1" if len(columns) == len(WEIGHTED_LABELS) else "2"
 
 
 def refuse_locked(path: Path, error: Exception) -> None:
@@ -160,98 +117,81 @@ def refuse_locked(path: Path, error: Exception) -> None:
         ) from None
 
 
-def refuse_foreign(path: Path) -> None:
-    """ConfigError where something would be lost that is no former export."""
-    refuse_link(path)
-    if not path.exists():
-        return
+def _column(column: Column) -> str:
+    check = _CHECKS.get(column.name, "").format(column.name)
+    return (
+        f"{column.name} {_TYPES[column.kind]}"
+        f"{'' if column.optional else ' NOT NULL'}{f' CHECK ({check})' if check else ''}"
+    )
+
+
+def _note(column: Column) -> str:
+    """Unit and meaning on one line, as a comment."""
+    unit = f" [{column.unit}]" if column.unit not in ("", "1") else ""
+    return " ".join(column.meaning.split()) + unit
+
+
+def _is_former(former: Path, path: Path) -> bool:
+    query = "SELECT value FROM meta WHERE key = 'format_version'"
     try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as former:
-            former.execute("SELECT value FROM meta WHERE key = 'format_version'").fetchone()[0]
-    except (sqlite3.Error, TypeError) as error:
+        with closing(sqlite3.connect(f"{former.absolute().as_uri()}?mode=ro", uri=True)) as opened:
+            return opened.execute(query).fetchone() is not None
+    except sqlite3.Error as error:
         refuse_locked(path, error)
-        raise ConfigError(f"{path}: is there and is no former export; name another file") from None
+        return False
 
 
-def refuse_leakage(connection: sqlite3.Connection, path: Path) -> None:
-    """LeakageError where a label file holds ground truth of frames that are not labeled."""
-    leaked = _strangers(connection, "ground_truth", "labeled")
-    if leaked:
-        raise LeakageError(
-            f"{path}: ground truth of frames outside the labeled split: {leaked}; "
-            "only labeled frames may bring ground truth into a training"
-        )
-
-
-def _fill(
-    connection: sqlite3.Connection,
-    path: Path,
-    description: LabelFileDescription,
-    rows: tuple[Iterable[tuple], Iterable[tuple], Iterable[tuple]],
-) -> None:
+def _fill(connection: sqlite3.Connection, path: Path, labels: LabelSet) -> int:
+    """Write all tables; returns the number of labels."""
+    names = labels.column_names
+    view = f"CREATE VIEW weighted_labels AS SELECT {', '.join(names)} FROM label;"  # noqa: S608
+    last: list[Any] = ["none"]
+    count = 0
     # The file is thrown away unless it gets finished: no journal is needed to undo a half.
-    connection.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;" + TABLES)
+    connection.executescript(
+        "PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;" + tables(labels.columns)
+    )
     connection.execute("BEGIN")
-    columns = (FRAME_COLUMNS, GROUND_TRUTH_COLUMNS, WEIGHTED_LABEL_COLUMNS)
-    last: list[tuple] = [()]
     try:
-        connection.executemany("INSERT INTO meta VALUES (?, ?)", _meta(description).items())
-        for table, names, table_rows in zip(
-            ("frame", "ground_truth", "label"), columns, rows, strict=True
-        ):
-            marks = ", ".join("?" * len(names))
-            insert = f"INSERT INTO {table} ({', '.join(names)}) VALUES ({marks})"  # noqa: S608
-            connection.executemany(insert, _remembered(table_rows, last))
-        refuse_leakage(connection, path)
-        _refuse_stray_labels(connection, path)
-        connection.executescript(_VIEW + _INDEXES)
+        meta = _meta(labels.description, format_version(labels.columns))
+        connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
+        connection.executemany(_FRAME_INSERTION, map(asdict, labels.frames))
+        truth = _remembered(labels.truth(), last)
+        connection.executemany(_insertion("ground_truth", GROUND_TRUTH_COLUMNS), truth)
+        for block in labels.blocks():
+            connection.executemany(_insertion("label", names), _remembered(block, last))
+            count += len(block["k"])
+        connection.executescript(view + _INDEXES)
     except sqlite3.IntegrityError as error:
-        if "split IN" in str(error):
-            raise LeakageError(
-                f"{path}: frame {last[0][0]} is of split {last[0][1]!r}; "
-                "only labeled and unlabeled frames are trained on"
-            ) from None
-        if "weight BETWEEN" in str(error):
-            raise bad_weight(last[0][1], last[0][2], last[0][-1]) from None
         raise DataError(f"{path}: a row was refused: {error}; the last was {last[0]}") from None
     except (sqlite3.ProgrammingError, sqlite3.InterfaceError) as error:
-        reason = f"{error}; it was {last[0]}"
-        raise DataError(f"{path}: a row does not fit its table: {reason}") from None
+        raise DataError(
+            f"{path}: a row does not fit its table: {error}; it was {last[0]}"
+        ) from None
+    return count
 
 
-def _meta(description: LabelFileDescription) -> dict[str, str]:
+def _insertion(table: str, names: Sequence[str]) -> str:
+    marks = ", ".join("?" * len(names))
+    return f"INSERT INTO {table} ({', '.join(names)}) VALUES ({marks})"  # noqa: S608
+
+
+def _meta(about: LabelFileDescription, version: str) -> Mapping[str, str]:
     """The rows of `meta`."""
     return {
-        "format_version": str(FORMAT_VERSION),
-        "dataset": description.dataset,
-        "root": str(description.root),
-        "categories": json.dumps(list(description.categories)),
-        "round": str(description.round),
-        "policy": description.policy,
-        "code_version": description.code_version,
+        "format_version": version,
+        "dataset": about.dataset,
+        "root": str(about.root),
+        "categories": json.dumps(list(about.categories)),
+        "round": str(about.round),
+        "policy": about.policy,
+        "zero_weight": about.zero_weight,
+        "code_version": about.code_version,
     }
 
 
-def _remembered(rows: Iterable[tuple], last: list[tuple]) -> Iterator[tuple]:
+def _remembered(block: Columns, last: list[Any]) -> Iterator[tuple[Any, ...]]:
     """The rows; `last[0]` is the one that was taken last, for the message where it is refused."""
-    for row in rows:
+    for row in zip(*block.values(), strict=True):
         last[0] = row
         yield row
-
-
-def _refuse_stray_labels(connection: sqlite3.Connection, path: Path) -> None:
-    strays = _strangers(connection, "label", "unlabeled")
-    if strays:
-        raise DataError(
-            f"{path}: labels of frames outside the unlabeled split: {strays}; "
-            "export labels of unlabeled frames only"
-        )
-
-
-def _strangers(connection: sqlite3.Connection, table: str, split: str) -> str:
-    """The frames that a table may not refer to, as text; empty where there are none."""
-    query = (
-        f"SELECT DISTINCT frame FROM {table} WHERE frame NOT IN "  # noqa: S608
-        "(SELECT frame FROM frame WHERE split = ?) ORDER BY frame"
-    )
-    return named(row[0] for row in connection.execute(query, (split,)))

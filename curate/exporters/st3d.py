@@ -6,11 +6,14 @@ SELF_TRAIN.INIT_PS names, is a dict by frame id of X_u:
 
     gt_boxes        (n, 9) float32: x, y, z of the box centre, length, width, height, yaw in the
                     LiDAR frame; category, from 1 in the order of the configured categories, and
-                    negative for a label of weight 0, which is an ignore region; score
+                    negative for a label of weight 0 that is a region to ignore; score
     cls_scores      (n,) float32, the score
     iou_scores      None
     memory_counter  (n,) zeros: no round has missed the label yet
     weight          (n,) v, to be read by the loss
+
+Labels of weight 0 that are background are left out, as is what ST3D drops. `zero_weight` of
+export.json says what a weight of 0 means.
 
 A data set configuration with SHIFT_COOR works in shifted coordinates: the boxes here are not
 shifted.
@@ -55,14 +58,16 @@ def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
     }
     write_pickle(folder / "ps_label_e0.pkl", frames)
     return {
+        "zero_weight": labels.description.zero_weight,
         "frames": len(frames),
-        "labels": len(labels.labels),
+        "labels": sum(len(frame["weight"]) for frame in frames.values()),
         "categories": list(categories),
     }
 
 
 def _pseudo_labels(objects: FrameObjects, categories: tuple[str, ...]) -> dict[str, Any]:
-    found = objects.detections
+    kept = ~objects.background
+    found, weights = objects.detections.select(kept), objects.weights[kept]
     numbers = {name: number for number, name in enumerate(categories, start=1)}
     strangers = sorted(set(found.categories.tolist()) - set(numbers))
     if strangers:
@@ -71,12 +76,12 @@ def _pseudo_labels(objects: FrameObjects, categories: tuple[str, ...]) -> dict[s
             f"dataset.categories names {', '.join(categories)}"
         )
     order = np.array([numbers[str(name)] for name in found.categories], dtype=np.float64)
-    order = np.where(objects.weights == 0, -order, order)
+    order = np.where(weights == 0, -order, order)
     boxes = np.column_stack([found.boxes, order, found.scores])
     return {
         "gt_boxes": boxes.astype(np.float32),
         "cls_scores": found.scores.astype(np.float32),
         "iou_scores": None,
         "memory_counter": np.zeros(len(found)),
-        "weight": objects.weights,
+        "weight": weights,
     }

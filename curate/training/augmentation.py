@@ -21,8 +21,6 @@ class Augmentation:
         pasted: objects of each category pasted into a frame, where there is room.
         fewest_points: an object with fewer points than this is an ignore region: what the sensor
             did not see, or what a pasted object hides, can neither be learned nor be background.
-        zero_weight: what a pseudo-label of weight 0 is to the network, "ignore" or "background". To
-            what is pasted its place is taken either way.
     """
 
     flip_probability: float
@@ -30,13 +28,14 @@ class Augmentation:
     scale_range: tuple[float, float]
     pasted: int
     fewest_points: int
-    zero_weight: str = "ignore"
 
     def apply(self, sample: Sample, bank: ObjectBank, generator: np.random.Generator) -> Sample:
-        """A new sample; the one given is left as it is."""
-        sample = paste_objects(sample, bank, self.pasted, generator)
-        if self.zero_weight == "background" and not sample.labeled:
-            sample = _without_ignored(sample)
+        """A new sample; the one given is left as it is.
+
+        Pseudo-labels of weight 0 that are background are not in it; to what is pasted their place
+        is taken. All that weighs 0 afterwards is an ignore region.
+        """
+        sample = _without_background(paste_objects(sample, bank, self.pasted, generator))
         seen = count_points_in_boxes(sample.points, sample.boxes) >= self.fewest_points
         change = Similarity.draw(
             generator,
@@ -49,15 +48,16 @@ class Augmentation:
             points=change.apply_to_points(sample.points),
             boxes=change.apply_to_boxes(sample.boxes),
             weights=np.where(seen, sample.weights, 0.0),
+            zero_weight="ignore",
         )
 
 
-def _without_ignored(sample: Sample) -> Sample:
-    """The sample without its boxes of weight 0."""
-    learned = ~sample.ignored
+def _without_background(sample: Sample) -> Sample:
+    """The sample without the boxes of weight 0 that are background."""
+    kept = (sample.weights > 0) | sample.ignored
     return replace(
         sample,
-        boxes=sample.boxes[learned],
-        categories=sample.categories[learned],
-        weights=sample.weights[learned],
+        boxes=sample.boxes[kept],
+        categories=sample.categories[kept],
+        weights=sample.weights[kept],
     )

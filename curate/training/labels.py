@@ -19,11 +19,17 @@ from torch.utils.data import Dataset
 
 from curate.detections import as_categories
 from curate.errors import DataError
-from curate.exporters.label_file import open_label_file, read_categories, read_meta
-from curate.exporters.sqlite import refuse_leakage
+from curate.exporters.label_file import (
+    open_label_file,
+    read_categories,
+    read_meta,
+    read_zero_weight,
+    refuse_leakage,
+)
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.projection import in_view
+from curate.weighting.base import ZeroWeight
 
 # Ground truth that looks like a category without being one: neither object nor background of it.
 NEIGHBOURS: Final = {"Van": "Car", "Person_sitting": "Pedestrian"}
@@ -39,8 +45,9 @@ class Sample:
         points: (n, 4) float32 inside the camera's view, LiDAR frame.
         boxes: (m, 7) in the LiDAR frame.
         categories: (m,) str.
-        weights: (m,) v in [0, 1]: 1 for ground truth. 0 is an ignore region, neither object nor
-            background.
+        weights: (m,) in [0, 1]: 1 for ground truth.
+        zero_weight: what a pseudo-label of weight 0 is: "background", so no object, or a region to
+            "ignore". The label file says it, as the policy has it.
     """
 
     frame_id: str
@@ -49,11 +56,13 @@ class Sample:
     boxes: np.ndarray
     categories: np.ndarray
     weights: np.ndarray
+    zero_weight: ZeroWeight = "ignore"
 
     @property
     def ignored(self) -> np.ndarray:
-        """(m,) bool, which boxes are ignore regions."""
-        return np.asarray(self.weights == 0)
+        """(m,) bool, which boxes are ignore regions: neither object nor background."""
+        nothing = self.weights == 0
+        return nothing if self.labeled or self.zero_weight == "ignore" else np.zeros_like(nothing)
 
     @cached_property
     def ground(self) -> GroundMap:
@@ -90,14 +99,20 @@ class WeightedLabels(Dataset[Sample]):
         self.meta = read_meta(rows, path)
         refuse_leakage(rows, path)
         self.categories = read_categories(self.meta, path)
+        self.zero_weight = read_zero_weight(self.meta, path)
         frames = rows.execute("SELECT frame, split FROM frame ORDER BY frame").fetchall()
         self.frame_ids: tuple[str, ...] = tuple(frame for frame, _ in frames)
         self.labeled = np.array([split == "labeled" for _, split in frames], dtype=bool)
         self._boxes = dict.fromkeys(self.frame_ids, _NO_BOXES)
-        for table, weight in (("ground_truth", "1.0"), ("label", "weight")):
+        # What a person rejected is background under every policy.
+        rejected = "provenance IS 'human' AND weight IS 0"
+        for table, weight, left_out in (
+            ("ground_truth", "1.0", "0"),
+            ("label", "weight", rejected),
+        ):
             query = (
                 "SELECT frame, category, x, y, z, length, width, height, yaw, "  # noqa: S608
-                f"{weight} FROM {table} ORDER BY frame, k"
+                f"{weight} FROM {table} WHERE NOT ({left_out}) ORDER BY frame, k"
             )
             self._boxes.update(_group(path, rows.execute(query).fetchall(), self.categories))
 
@@ -115,7 +130,8 @@ class WeightedLabels(Dataset[Sample]):
         seen = in_view(frame.points, frame.calibration, frame.image_size)
         boxes, categories, weights = self._boxes[frame_id]
         labeled = bool(self.labeled[index])
-        return Sample(frame_id, labeled, frame.points[seen], boxes, categories, weights)
+        points = frame.points[seen]
+        return Sample(frame_id, labeled, points, boxes, categories, weights, self.zero_weight)
 
 
 _NO_BOXES = (np.zeros((0, 7)), as_categories([]), np.zeros(0))

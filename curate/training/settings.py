@@ -9,7 +9,6 @@ from curate.detectors.pillars.presets import preset_named
 from curate.errors import ConfigError
 from curate.training.augmentation import Augmentation
 
-ZeroWeight = Literal["ignore", "background"]
 Teacher = Literal["student", "ema"]
 
 
@@ -32,7 +31,6 @@ class TrainingSettings:
         seed: of the first weights, the order of the frames and the augmentation.
         threads: of torch, on CPU.
         device: "cpu", or a torch device such as "cuda".
-        zero_weight: what a label of weight 0 is: a region to "ignore", or "background".
         teacher: what the training leaves: the "student", or the moving average of its weights,
             "ema".
         ema_decay: see `MovingAverage`.
@@ -53,7 +51,6 @@ class TrainingSettings:
     seed: int = 0
     threads: int = 1
     device: str = "cpu"
-    zero_weight: ZeroWeight = "ignore"
     teacher: Teacher = "student"
     ema_decay: float = 0.999
     cache_bytes: int = 1 << 30
@@ -76,12 +73,9 @@ class TrainingSettings:
             raise ConfigError(
                 f"training: ema_decay is {self.ema_decay}, must be at least 0 and below 1"
             )
-        for name, choices in (("zero_weight", ZeroWeight), ("teacher", Teacher)):
-            if getattr(self, name) not in get_args(choices):
-                known = " or ".join(get_args(choices))
-                raise ConfigError(
-                    f"training: unknown {name} {getattr(self, name)!r}; choose {known}"
-                )
+        if self.teacher not in get_args(Teacher):
+            known = " or ".join(get_args(Teacher))
+            raise ConfigError(f"training: unknown teacher {self.teacher!r}; choose {known}")
 
     def augmentation(self) -> Augmentation:
         """The augmentation that these settings describe."""
@@ -91,7 +85,6 @@ class TrainingSettings:
             self.scale_range,
             self.pasted,
             self.fewest_points,
-            self.zero_weight,
         )
 
 

@@ -3,12 +3,19 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
 from curate.detections import empty_boxes
 from curate.errors import ConfigError, DataError
+
+ZeroWeight = Literal["background", "ignore"]
+"""What a label of weight 0 is to a student.
+
+"background": no object, and its region teaches so; nearly all labels that get weight 0 are wrong.
+"ignore": neither object nor background, for policies with an explicit band of doubt.
+"""
 
 
 @dataclass(frozen=True)
@@ -133,11 +140,11 @@ class Weights:
     """A policy's answer for the n labels of a round.
 
     Attributes:
-        v: (n,) float64 weight in [0, 1]; 0 means ignore.
+        v: (n,) float64 weight in [0, 1]; what 0 means, the policy says: `Policy.zero_weight`.
         lambda_u: (n,) the age parameter that the label was held against; NaN where the policy has
             none, or where no label of the label's group matched.
-        dropped: (n,) bool, labels that are not even to be ignored: they leave no label, and their
-            region is background. None, if left out; v is 0 where a label is dropped.
+        dropped: (n,) bool, labels that are not stored at all: their region is background, whatever
+            a weight of 0 means. None, if left out; v is 0 where a label is dropped.
     """
 
     v: np.ndarray
@@ -158,20 +165,22 @@ class Weights:
 class Policy(Protocol):
     """Weighs the labels of a round.
 
-    A policy that wants `Evidence.memory` has a further attribute, `remembers`, that is true. One
-    that looks only at some of the columns category, score, iou and loss may name them in a further
-    attribute, `reads`; the others are then not read for it, and hold NaN or "".
+    A policy inherits from this class and overrides what differs from the values here.
     """
 
-    @property
-    def name(self) -> str:
-        """As it is stored beside the weights."""
-        ...
+    name: ClassVar[str]
+    """As it is stored beside the weights."""
+    uses_unlabeled: ClassVar[bool] = True
+    """False where a student of this policy trains on X_l alone."""
+    zero_weight: ClassVar[ZeroWeight] = "background"
+    """What a label of weight 0 is to the student."""
+    remembers: ClassVar[bool] = False
+    """Whether the policy needs `Evidence.memory`."""
 
     @property
-    def uses_unlabeled(self) -> bool:
-        """False where a student of this policy trains on X_l alone."""
-        ...
+    def reads(self) -> tuple[str, ...]:
+        """Return which of these columns the policy reads; the others hold NaN or ""."""
+        return ("category", "score", "iou", "loss")
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
         """The weight of every label, in the order of the evidence."""

@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from curate.weighting.base import Age, Evidence, Weights
+from curate.weighting.base import Age, Evidence, Policy, Weights
 
 
 @dataclass(frozen=True)
-class Baseline:
+class Baseline(Policy):
     """v = 0, and no unlabeled frame is trained on."""
 
     name: ClassVar[str] = "baseline"

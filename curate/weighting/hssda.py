@@ -14,7 +14,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from curate.errors import ConfigError
-from curate.weighting.base import Age, Evidence, Weights
+from curate.weighting.base import Age, Evidence, Policy, Weights, ZeroWeight
 
 Ambiguous = Literal["soft", "ignore"]
 # With fewer labels there is nothing to cluster.
@@ -22,7 +22,7 @@ _FEWEST_LABELS = 3
 
 
 @dataclass(frozen=True)
-class HSSDA:
+class HSSDA(Policy):
     """v = 1 above both high thresholds; dropped below a low one; between them in doubt.
 
     A label that did not match its augmented copy has no agreement at all and is dropped. In a
@@ -34,7 +34,7 @@ class HSSDA:
 
     ambiguous: Ambiguous = "soft"
     name: ClassVar[str] = "hssda"
-    uses_unlabeled: ClassVar[bool] = True
+    zero_weight: ClassVar[ZeroWeight] = "ignore"
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a setting without meaning."""

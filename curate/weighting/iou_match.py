@@ -13,12 +13,12 @@ from typing import ClassVar
 import numpy as np
 
 from curate.errors import ConfigError
-from curate.weighting.base import Age, Evidence, Weights
+from curate.weighting.base import Age, Evidence, Policy, Weights
 from curate.weighting.threshold import by_category, check_share
 
 
 @dataclass(frozen=True)
-class IoUMatch:
+class IoUMatch(Policy):
     """v = 1 where the score and the IoU estimate reach their thresholds, else 0.
 
     Attributes:
@@ -33,7 +33,6 @@ class IoUMatch:
     score_per_category: Mapping[str, float] = field(default_factory=dict)
     iou_per_category: Mapping[str, float] = field(default_factory=lambda: {"Car": 0.5})
     name: ClassVar[str] = "3dioumatch"
-    uses_unlabeled: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a threshold that is no share."""

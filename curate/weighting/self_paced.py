@@ -10,13 +10,13 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from curate.errors import ConfigError
-from curate.weighting.base import Age, Evidence, Weights
+from curate.weighting.base import Age, Evidence, Policy, Weights
 
 Scope = Literal["round", "category", "frame"]
 
 
 @dataclass(frozen=True)
-class SPSL:
+class SPSL(Policy):
     """v = 1 - L / lambda where L < lambda, else 0 (Eq. 7).
 
     Attributes:
@@ -29,7 +29,6 @@ class SPSL:
     scope: Scope = "round"
     quantile: float | None = None
     name: ClassVar[str] = "spsl"
-    uses_unlabeled: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a setting without meaning."""
@@ -47,7 +46,7 @@ class SPSL:
 
 
 @dataclass(frozen=True)
-class PSPSL:
+class PSPSL(Policy):
     """v = rho_det * (1 - L / lambda) where L < lambda, else 0 (Eq. 11).
 
     Attributes:
@@ -62,7 +61,6 @@ class PSPSL:
     quantile: float | None = None
     self_paced: bool = True
     name: ClassVar[str] = "pspsl"
-    uses_unlabeled: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a setting without meaning."""

@@ -14,13 +14,13 @@ import numpy as np
 
 from curate.errors import ConfigError
 from curate.geometry.overlap import overlapping_pairs
-from curate.weighting.base import Age, Evidence, Memory, Weights
+from curate.weighting.base import Age, Evidence, Memory, Policy, Weights, ZeroWeight
 
 Confidence = Literal["score", "iou"]
 
 
 @dataclass(frozen=True)
-class ST3D:
+class ST3D(Policy):
     """Keeps (v = 1), ignores (v = 0) or drops a label by its confidence.
 
     Attributes:
@@ -35,8 +35,8 @@ class ST3D:
     confidence: Confidence = "score"
     minimum_iou: float = 0.1
     name: ClassVar[str] = "st3d"
-    uses_unlabeled: ClassVar[bool] = True
     remembers: ClassVar[bool] = True
+    zero_weight: ClassVar[ZeroWeight] = "ignore"
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a setting without meaning."""

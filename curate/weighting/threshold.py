@@ -7,11 +7,11 @@ from typing import ClassVar
 import numpy as np
 
 from curate.errors import ConfigError
-from curate.weighting.base import Age, Evidence, Weights
+from curate.weighting.base import Age, Evidence, Policy, Weights
 
 
 @dataclass(frozen=True)
-class Threshold:
+class Threshold(Policy):
     """v = 1 where the score is at least the threshold, else 0.
 
     Attributes:
@@ -22,7 +22,6 @@ class Threshold:
     threshold: float = 0.3
     per_category: Mapping[str, float] = field(default_factory=dict)
     name: ClassVar[str] = "threshold"
-    uses_unlabeled: ClassVar[bool] = True
     reads: ClassVar[tuple[str, ...]] = ("category", "score")
 
     def __post_init__(self) -> None:

@@ -9,11 +9,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from curate.weighting.base import Age, Evidence, Weights
+from curate.weighting.base import Age, Evidence, Policy, Weights
 
 
 @dataclass(frozen=True)
-class UDACurriculum:
+class UDACurriculum(Policy):
     """v = 1 for the e/E of the labels with the least consistency loss, else 0.
 
     A label that did not match its augmented copy is harder than any that did, so it counts in the
@@ -22,7 +22,6 @@ class UDACurriculum:
     """
 
     name: ClassVar[str] = "uda-cl"
-    uses_unlabeled: ClassVar[bool] = True
     reads: ClassVar[tuple[str, ...]] = ("loss",)
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:

@@ -9,15 +9,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from curate.weighting.base import Age, Evidence, Weights
+from curate.weighting.base import Age, Evidence, Policy, Weights
 
 
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(Policy):
     """v = 1."""
 
     name: ClassVar[str] = "uniform"
-    uses_unlabeled: ClassVar[bool] = True
     reads: ClassVar[tuple[str, ...]] = ()
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age

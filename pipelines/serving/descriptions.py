@@ -56,10 +56,10 @@ def exported_file() -> dict[str, Any]:
 def _weighted_labels() -> dict[str, str]:
     """The columns of the weighted labels, with their units."""
     return {
-        name: column.meaning
+        column.name: column.meaning
         + (f" [{column.unit}]" if column.unit not in ("", "1") else "")
-        + (f"; leads to {_LEADS_TO[name]}" if name in _LEADS_TO else "")
-        for name, column in WEIGHTED_LABELS.items()
+        + (f"; leads to {_LEADS_TO[column.name]}" if column.name in _LEADS_TO else "")
+        for column in WEIGHTED_LABELS
     }
 
 

@@ -7,14 +7,22 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Select, func, select
+from sqlalchemy import ColumnElement, Connection, Select, column, select
 
 import curate
 from curate.errors import WorkspaceError
-from curate.exporters.base import Exporter, LabelFileDescription, LabelSet
-from curate.exporters.sqlite import SqliteExporter, refuse_foreign
+from curate.exporters.base import (
+    GROUND_TRUTH_COLUMNS,
+    Block,
+    Exporter,
+    FrameFiles,
+    LabelFileDescription,
+    LabelSet,
+)
+from curate.exporters.columns import WEIGHTED_LABELS as LABEL_COLUMNS
+from curate.exporters.columns import Column
+from curate.exporters.sqlite import SqliteExporter, check_label_file_place
 from db import bulk
-from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
 from pipelines.engine.progress import Progress
@@ -22,16 +30,21 @@ from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.firewall.rules import enforce
 from pipelines.labels.by_frame import refuse_bad_weights
 from pipelines.labels.human_labels import fingerprint
+from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace, sha256
 
 CURRENT = "labels.sqlite"
 _CHUNK = 10_000
 
 
-def settings(workspace: Workspace, context: RoundContext, _policy: str) -> Settings:
-    """What the exported file depends on beside weights and ground truth: what people decided."""
+def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
+    """What the exported file depends on beside weights and ground truth.
+
+    That is what people decided, and what a weight of 0 means.
+    """
     human = fingerprint(workspace, context.number)
-    return {"format": 1} if human is None else {"format": 1, "human": human}
+    own = {"format": 1, "zero_weight": zero_weight_of(workspace.config, policy)}
+    return own if human is None else {**own, "human": human}
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
@@ -54,7 +67,7 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     path = file(workspace, job.context, job.policy)
     current = path.with_name(CURRENT) if job.policy == workspace.config.run.method else None
     if current:
-        refuse_foreign(current)
+        check_label_file_place(current)
     unlabeled = open_policy(workspace.config, job.policy).uses_unlabeled
     labels = write_label_file(workspace, path, job.context.number, job.policy if unlabeled else "")
     written = [path]
@@ -101,7 +114,7 @@ def export_as(
     """
     enforce(workspace, round_number)
     labels = label_set(workspace, round_number, policy)
-    if not len(labels.labels):
+    if all(each.split == "labeled" for each in labels.frames):
         raise WorkspaceError(
             f"round {round_number} has no labels weighted by {policy}; "
             f"run `curate solve --policy {policy}`"
@@ -111,54 +124,54 @@ def export_as(
 
 def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:
     """X_l with its ground truth, and X_u with the labels that a policy weighted in a round."""
+    config = workspace.config
     description = LabelFileDescription(
-        dataset=workspace.config.dataset.kind,
-        root=workspace.config.dataset.root,
-        categories=workspace.config.dataset.categories,
+        dataset=config.dataset.kind,
+        root=config.dataset.root,
+        categories=config.dataset.categories,
         round=round_number,
         policy=policy,
         code_version=curate.__version__,
+        zero_weight=zero_weight_of(config, policy or config.run.method),
     )
-    labels = StoredLabels(workspace, round_number, policy)
+    labels = StoredLabels(workspace, round_number, policy, LABEL_COLUMNS)
     with workspace.database.reading() as connection:
-        refuse_bad_weights(connection, round_number, policy)
         frames = _frames(connection, labels.frames(connection))
         truth = _ground_truth(connection)
     read = partial(workspace.dataset.read, points=False)
-    return LabelSet(description, frames, truth, labels, read, workspace.dataset.read)
+    return LabelSet(
+        description, frames, truth, labels, read, workspace.dataset.read, labels.columns
+    )
 
 
 @dataclass(frozen=True)
 class StoredLabels:
-    """The rows of `weighted_labels` of a round and policy, by frame and k, read as they are walked.
+    """The labels of a round and policy in blocks, by frame and k, read as they are walked.
 
     Attributes:
         workspace: that holds them.
         round_number: that made them.
         policy: that weighted them.
+        columns: of `weighted_labels`.
     """
 
     workspace: Workspace
     round_number: int
     policy: str
+    columns: tuple[Column, ...]
 
-    def __len__(self) -> int:
-        """How many there are."""
-        with self.workspace.database.reading() as connection:
-            return int(connection.execute(self._of(func.count())).scalar_one())
-
-    def __iter__(self) -> Iterator[bulk.Row]:
+    def __iter__(self) -> Iterator[Block]:
         """A few thousand at a time: two million labels would fill the memory."""
-        query = self._of(*WEIGHTED_LABELS.c).order_by(WEIGHTED_LABELS.c.frame, WEIGHTED_LABELS.c.k)
+        names = [each.name for each in self.columns]
+        query = self._of(*map(column, names)).order_by(column("frame"), column("k"))
         with self.workspace.database.reading() as connection:
             result = connection.execution_options(stream_results=True).execute(query)
             for rows in result.partitions(_CHUNK):
-                yield from map(tuple, rows)
+                yield dict(zip(names, zip(*rows, strict=True), strict=True))
 
     def frames(self, connection: Connection) -> set[str]:
         """The frames that have labels."""
-        query = self._of(WEIGHTED_LABELS.c.frame).distinct()
-        return {row[0] for row in bulk.select(connection, query)}
+        return set(connection.execute(self._of(column("frame")).distinct()).scalars())
 
     def _of(self, *columns: ColumnElement[Any]) -> Select[Any]:
         labels = WEIGHTED_LABELS.c
@@ -166,26 +179,36 @@ class StoredLabels:
         return select(*columns).select_from(WEIGHTED_LABELS).where(*chosen)
 
 
-def _frames(connection: Connection, with_labels: set[str]) -> list[bulk.Row]:
+def _frames(connection: Connection, with_labels: set[str]) -> list[FrameFiles]:
     """All labeled frames, with or without objects, and the unlabeled ones that have labels.
 
     An unlabeled frame in which the teacher found nothing is left out: no weight vouches for its
     emptiness, and as background it would teach what the teacher has missed.
     """
-    frame = bulk.table("frame")
-    paths = (frame.c.points_path, frame.c.image_path, frame.c.calibration_path)
-    query = select(frame.c.frame, frame.c.split, *paths).where(frame.c.split != "val")
-    rows = bulk.select(connection, query.order_by(frame.c.frame))
-    return [row for row in rows if row[1] == "labeled" or row[0] in with_labels]
+    frame = bulk.table("frame").c
+    query = select(
+        frame.frame,
+        frame.split,
+        frame.points_path.label("points"),
+        frame.image_path.label("image"),
+        frame.calibration_path.label("calibration"),
+    ).where(frame.split != "val")
+    rows = connection.execute(query.order_by(frame.frame)).mappings()
+    return [
+        FrameFiles(**row)
+        for row in rows
+        if row["split"] == "labeled" or row["frame"] in with_labels
+    ]
 
 
-def _ground_truth(connection: Connection) -> list[bulk.Row]:
+def _ground_truth(connection: Connection) -> Block:
     truth, frame = bulk.table("ground_truth"), bulk.table("frame")
-    names = ("k", "category", *BOX_COLUMNS, "truncated", "occluded")
+    columns = [frame.c.frame, *(truth.c[name] for name in GROUND_TRUTH_COLUMNS[1:])]
     query = (
-        select(frame.c.frame, *(truth.c[name] for name in names))
+        select(*columns)
         .join(frame, frame.c.id == truth.c.frame_id)
         .where(frame.c.split == "labeled", truth.c.x.is_not(None))
         .order_by(frame.c.frame, truth.c.k)
     )
-    return list(bulk.select(connection, query))
+    rows = connection.execute(query).mappings().all()
+    return {name: [row[name] for row in rows] for name in GROUND_TRUTH_COLUMNS}

@@ -1,6 +1,7 @@
 """The methods that can be compared: each a policy and how its student learns, by one word.
 
 The name of a method is the name of its policy, under which its weights and students are stored.
+What a label of weight 0 is to the student, the policy says, see `Policy.zero_weight`.
 """
 
 from collections.abc import Mapping
@@ -8,30 +9,27 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from curate.errors import ConfigError
+from curate.weighting.base import ZeroWeight
+from pipelines.assembly import open_policy
 from pipelines.registry import POLICIES
 from pipelines.workspace.config import Config
 
 TeacherMode = Literal["student", "ema"]
-ZeroWeight = Literal["ignore", "background"]
 
 
 @dataclass(frozen=True)
 class Method:
-    """How labels are weighed, what a weight of 0 is, and who teaches the next round.
+    """How labels are weighed, and who teaches the next round.
 
     Attributes:
         policy: of `POLICIES`, or package.module:Class.
         teacher: the "student" itself, or the moving average of its weights ("ema").
         note: what it is, in one line.
-        zero_weight: what a label of weight 0 is to the student: "background", as nearly all of
-            them are none (docs/results.md), or a region to "ignore" where the method has a band of
-            doubt between what it keeps and what it drops.
     """
 
     policy: str
     teacher: TeacherMode
     note: str
-    zero_weight: ZeroWeight = "background"
 
 
 METHODS: Final[Mapping[str, Method]] = {
@@ -50,11 +48,8 @@ METHODS: Final[Mapping[str, Method]] = {
             "pspsl", "student", "PSPSL-3D: v = rho_det (1 - L / lambda) (An et al. 2023, Eq. 11)"
         ),
         Method("threshold", "student", "every label with a score from 0.3 on weighs 1"),
-        Method(
-            "st3d", "student", "keep, ignore, drop with a memory (ST3D, Yang et al. 2021)",
-            "ignore",
-        ),
-        Method("hssda", "ema", "two thresholds from the data (HSSDA, Liu et al. 2023)", "ignore"),
+        Method("st3d", "student", "keep, ignore, drop with a memory (ST3D, Yang et al. 2021)"),
+        Method("hssda", "ema", "two thresholds from the data (HSSDA, Liu et al. 2023)"),
     )
 }  # fmt: skip
 
@@ -87,10 +82,12 @@ def with_method(config: Config, name: str) -> Config:
 
 
 def method_of(config: Config, policy: str) -> Method:
-    """The method of a policy, save where `train.teacher` or `train.zero_weight` is set."""
-    method, section = method_named(policy), config.train
-    if section.teacher != "method":
-        method = replace(method, teacher=section.teacher)
-    if section.zero_weight != "method":
-        method = replace(method, zero_weight=section.zero_weight)
-    return method
+    """The method of a policy, save where `train.teacher` is set."""
+    method, teacher = method_named(policy), config.train.teacher
+    return method if teacher == "method" else replace(method, teacher=teacher)
+
+
+def zero_weight_of(config: Config, policy: str) -> ZeroWeight:
+    """Return what a label of weight 0 is: the policy says, unless `train.zero_weight` is set."""
+    chosen = config.train.zero_weight
+    return open_policy(config, policy).zero_weight if chosen == "method" else chosen

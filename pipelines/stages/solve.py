@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from curate.weighting.base import Evidence, Policy, Weights
+from curate.weighting.base import Evidence, Weights
 from db import bulk, weight_index
 from pipelines.assembly import open_policy
 from pipelines.engine.progress import Progress
@@ -48,13 +48,13 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     """The policy's weights of the round."""
     context, policy = job.context, job.policy
     opened = open_policy(workspace.config, policy)
-    looks_back = context.number > 1 and remembers(opened)
+    looks_back = context.number > 1 and opened.remembers
     keys, evidence = read_evidence(
         workspace,
         context.number,
         job.frames,
         boxes=looks_back,
-        columns=getattr(opened, "reads", None),
+        columns=opened.reads,
     )
     if looks_back:
         evidence = replace(evidence, memory=read_memory(workspace, context.number - 1, policy))
@@ -81,14 +81,9 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     return Product(summary, write, keys_known=True)
 
 
-def remembers(policy: Policy) -> bool:
-    """Whether a policy wants to know what it thought of the round before."""
-    return bool(getattr(policy, "remembers", False))
-
-
 def _memory_fingerprint(workspace: Workspace, context: RoundContext, policy: str) -> str | None:
     """What a policy that remembers has stored of the round before."""
-    if context.number == 1 or not remembers(open_policy(workspace.config, policy)):
+    if context.number == 1 or not open_policy(workspace.config, policy).remembers:
         return None
     return solved_fingerprint(workspace, context.number - 1, policy)
 

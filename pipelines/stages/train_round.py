@@ -15,7 +15,7 @@ from pipelines.engine.rounds import is_trainable, register_checkpoint
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
 from pipelines.stages.external_trainer import train_externally
-from pipelines.stages.methods import Method, method_of
+from pipelines.stages.methods import Method, method_of, zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
             },
         ),
         "teacher": method.teacher,
-        "zero_weight": method.zero_weight,
+        "zero_weight": zero_weight_of(workspace.config, policy),
         "ema_decay": section.ema_decay if method.teacher == "ema" else None,
         "seed": context.seed,
         "device": workspace.config.detector.device,
@@ -120,7 +120,6 @@ def training_settings(
         "unlabeled_batch_size": section.unlabeled_batch_size,
         "learning_rate": learning_rate,
         "threads": section.threads,
-        "zero_weight": method.zero_weight,
         "pasted": section.pasted,
         "teacher": method.teacher,
         "ema_decay": section.ema_decay,

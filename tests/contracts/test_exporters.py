@@ -6,6 +6,7 @@ import pickle
 import sqlite3
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,13 +14,14 @@ import numpy as np
 import pytest
 from contracts.samples import assert_one_line, sample_of
 from scipy.spatial.transform import Rotation
+from support.exported import block, label, rows_of, truth, truth_block, with_rows
 from support.toys import SIZES
 
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, DataError, LeakageError
 from curate.exporters.base import (
     BOX_COLUMNS,
-    WEIGHTED_LABEL_COLUMNS,
+    FrameFiles,
     LabelFileDescription,
     LabelSet,
 )
@@ -200,17 +202,26 @@ def labels(frames) -> LabelSet:
             box = (*rng.uniform([6, -4, -1], [30, 4, 0]).tolist(), *SIZES[category], float(k - 2))
             # Without counterpart, without priors, weight zero and one: all that there is.
             loss, points = (None, None) if k == 0 else (0.5, 12)
-            evidence = (loss, points, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "detector", "pspsl", k / 4)
-            rows.append((1, name, k, category, *box, 0.7, *evidence))
+            rows.append(
+                label(
+                    name, k, box, category=category, score=0.7, loss=loss, points=points,
+                    points_threshold=20.0, rho_diff=0.6, mask_pixels=30, rho_anno=0.5, rho_det=0.3,
+                    weight=k / 4,
+                )
+            )  # fmt: skip
     return LabelSet(
-        description=LabelFileDescription("kitti", Path("/data"), CATEGORIES, 1, "pspsl", "1"),
-        frames=[(name, "unlabeled" if k else "labeled", "p", "i", "c")
-                for k, name in enumerate(names)],
-        ground_truth=[(names[0], 0, "Car", 10.0, 0.0, -0.8, 4.0, 1.8, 1.6, 0.0, 0.0, 0)],
-        labels=rows,
+        description=LabelFileDescription(
+            "kitti", Path("/data"), CATEGORIES, 1, "pspsl", "1", zero_weight="ignore"
+        ),
+        frames=[
+            FrameFiles(name, "unlabeled" if k else "labeled", "p", "i", "c")
+            for k, name in enumerate(names)
+        ],
+        ground_truth=truth_block([truth(names[0])]),
+        labels=[block(rows[:3]), block(rows[3:])],  # the first frame goes on in the second block
         read={frame.frame_id: frame for frame in frames}.__getitem__,
         read_points={frame.frame_id: frame for frame in frames}.__getitem__,
-    )  # fmt: skip
+    )
 
 
 def place(exporter, folder: Path) -> Path:
@@ -226,7 +237,8 @@ def files(path: Path) -> dict[str, bytes]:
 
 def with_weight(labels: LabelSet, weight: float) -> LabelSet:
     """The same labels, the last of which has another weight."""
-    return replace(labels, labels=[*labels.labels[:-1], (*labels.labels[-1][:-1], weight)])
+    *others, last = rows_of(labels)
+    return with_rows(labels, [*others, last | {"weight": weight}])
 
 
 def test_an_exporter_goes_by_its_registered_name(exporter, request) -> None:
@@ -241,11 +253,11 @@ def test_every_label_arrives_with_its_weight(exporter, read_back, labels, tmp_pa
     assert exporter.write(path, labels) == 10
     assert path.is_file() == bool(exporter.suffix)
     found = read_back(path)
-    assert sorted(found) == sorted({row[1] for row in labels.labels})
+    assert sorted(found) == sorted({row["frame"] for row in rows_of(labels)})
     for name, rows in found.items():
-        expected = [row for row in labels.labels if row[1] == name]
-        assert [row[0] for row in rows] == [row[3] for row in expected]
-        numbers = [(*row[4:11], row[-1]) for row in expected]
+        expected = [row for row in rows_of(labels) if row["frame"] == name]
+        assert [row[0] for row in rows] == [row["category"] for row in expected]
+        numbers = [[row[column] for column in (*BOX_COLUMNS, "weight")] for row in expected]
         np.testing.assert_allclose([row[1:] for row in rows], numbers, atol=2e-6)
 
 
@@ -263,8 +275,8 @@ def test_no_labels_make_an_export_without_labels(exporter, read_back, labels, tm
     """Of X_l alone, and of nothing at all; an unlabeled frame without labels is no failure."""
     path = place(exporter, tmp_path)
     for frames in (labels.frames, labels.frames[:1], []):
-        truth = labels.ground_truth if frames else []
-        bare = replace(labels, labels=[], frames=frames, ground_truth=truth)
+        objects = labels.ground_truth if frames else truth_block()
+        bare = replace(labels, labels=[], frames=frames, ground_truth=objects)
         assert exporter.write(path, bare) == 0
         assert sum(map(len, read_back(path).values())) == 0
 
@@ -318,21 +330,77 @@ def test_a_link_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
 
 def test_the_labels_are_left_as_they_are(exporter, labels, tmp_path) -> None:
     """Rows are read, and read only."""
-    before = [list(rows) for rows in (labels.frames, labels.ground_truth, labels.labels)]
+    before = deepcopy((labels.frames, labels.ground_truth, labels.labels))
     exporter.write(place(exporter, tmp_path), labels)
-    assert [labels.frames, labels.ground_truth, labels.labels] == before
+    assert (labels.frames, labels.ground_truth, labels.labels) == before
+
+
+def test_background_is_no_object_to_a_reader_of_objects(exporter, labels, tmp_path) -> None:
+    """A label of weight 0 is found among no format's objects where it is background."""
+    background = replace(labels, description=replace(labels.description, zero_weight="background"))
+    path = place(exporter, tmp_path)
+    exporter.write(path, background)
+    weights = weights_of_objects(exporter.name, path)
+    assert bool(weights) == (exporter.name in OBJECT_WEIGHTS)
+    assert 0 not in weights
+
+
+def weights_of_objects(name: str, path: Path) -> list[float]:
+    """The weights of what a reader that knows no weights takes for objects of unlabeled frames."""
+    return OBJECT_WEIGHTS[name](path) if name in OBJECT_WEIGHTS else []
+
+
+def kitti_objects(path: Path) -> list[float]:
+    """The lines of label_2 have no weights: those beyond the labels above 0 count as 0."""
+    weights = [row[-1] for rows in read_kitti(path).values() for row in rows]
+    lines = "".join(file.read_text() for file in (path / "label_2").iterdir()).splitlines()
+    objects = [line for line in lines if not line.startswith("DontCare")]
+    kept = [weight for weight in weights if weight > 0]
+    return kept + [0.0] * (len(objects) - len(kept))
+
+
+def openpcdet_objects(path: Path) -> list[float]:
+    """Annos with a name that is learned."""
+    infos = pickle.loads((path / "kitti_infos_train.pkl").read_bytes())
+    pairs = [zip(i["annos"]["weight"], i["annos"]["name"], strict=True) for i in infos]
+    return [weight for pair in pairs for weight, shown in pair if shown in CATEGORIES]
+
+
+def mmdet3d_objects(path: Path) -> list[float]:
+    """Instances with a label."""
+    infos = pickle.loads((path / "kitti_infos_train.pkl").read_bytes())["data_list"]
+    instances = [each for info in infos for each in info["instances"]]
+    return [each["weight"] for each in instances if each["bbox_label_3d"] >= 0]
+
+
+# SQLite, CSV and Parquet are tables of weights, with readers that cannot overlook them.
+OBJECT_WEIGHTS: Mapping[str, Callable[[Path], list[float]]] = {
+    "kitti": kitti_objects,
+    "coco": lambda path: [
+        each["weight"]
+        for each in json.loads(path.read_text())["annotations"]
+        if not each["iscrowd"]
+    ],
+    "openpcdet": openpcdet_objects,
+    "st3d": lambda path: [
+        weight
+        for frame in pickle.loads((path / "ps_label_e0.pkl").read_bytes()).values()
+        for weight in frame["weight"].tolist()
+    ],
+    "mmdet3d": mmdet3d_objects,
+    "nuscenes": lambda path: [
+        box["weight"] for boxes in json.loads(path.read_text())["results"].values() for box in boxes
+    ],
+}
 
 
 def test_no_exporter_can_be_given_ground_truth_of_unlabeled_frames(labels) -> None:
     """The label set itself refuses it, as well as other splits and labels of labeled frames."""
-    first, second, *_ = [row[0] for row in labels.frames]
-    truth = (second, *labels.ground_truth[0][1:])
+    first, second, *_ = [each.frame for each in labels.frames]
     with pytest.raises(LeakageError, match=second):
-        replace(labels, ground_truth=[truth])
+        replace(labels, ground_truth=truth_block([truth(second)]))
     with pytest.raises(LeakageError, match="000777"):
-        replace(labels, frames=[*labels.frames, ("000777", "val", "p", "i", "c")])
-    position = WEIGHTED_LABEL_COLUMNS.index("frame")
-    row = list(labels.labels[0])
-    row[position] = first
+        replace(labels, frames=[*labels.frames, FrameFiles("000777", "val", "p", "i", "c")])
+    strays = with_rows(labels, [rows_of(labels)[0] | {"frame": first}])
     with pytest.raises(DataError, match=first):
-        replace(labels, labels=[tuple(row)])
+        list(strays.blocks())

@@ -78,7 +78,7 @@ def test_weights_do_not_depend_on_the_order_of_the_labels(policy) -> None:
 
 def test_columns_that_a_policy_does_not_read_say_nothing_to_it(policy) -> None:
     """Where it names what it reads, the rest can be left unread."""
-    labels, reads = evidence(100), getattr(policy, "reads", ("category", "score", "iou", "loss"))
+    labels, reads = evidence(100), policy.reads
     nothing = {
         "category": np.full(100, ""),
         **dict.fromkeys(("score", "iou"), np.full(100, np.nan)),

@@ -1,15 +1,26 @@
 """A small label set for tests of single formats."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from curate.exporters.base import LabelFileDescription, LabelSet
+from curate.exporters.base import (
+    BOX_COLUMNS,
+    GROUND_TRUTH_COLUMNS,
+    WEIGHTED_LABEL_COLUMNS,
+    FrameFiles,
+    LabelFileDescription,
+    LabelSet,
+)
 from curate.frames import Frame
+from curate.weighting.base import ZeroWeight
 from support.toys import IMAGE_SIZE, toy_calibration
 
 TRUE_BOX = (10.0, 0.0, -0.8, 4.0, 1.8, 1.6, 0.0)
-# In view, to be ignored, and behind the camera.
+# In view, of weight 0, and behind the camera.
 BOXES = (
     (20.0, 1.0, -0.5, 4.0, 2.0, 1.5, 0.1),
     (10.0, -2.0, 0.0, 0.8, 0.6, 1.7, 3.0),
@@ -18,6 +29,63 @@ BOXES = (
 CATEGORIES = ("Car", "Pedestrian", "Car")
 WEIGHTS = (0.75, 0.0, 1 / 3)
 SCORES = (0.9, 0.3, 0.6)
+
+Row = dict[str, Any]
+
+
+def label(frame: str, k: int = 0, box: Sequence[float] = BOXES[0], **changes: Any) -> Row:
+    """A weighted label by column name."""
+    return {
+        "round": 1, "frame": frame, "k": k, "category": "Car",
+        **dict(zip(BOX_COLUMNS, box, strict=True)), "score": 0.9, "loss": 0.2, "points": 30,
+        "points_threshold": 60.0, "rho_diff": 0.5, "mask_pixels": 80, "box_pixels": 100,
+        "rho_anno": 0.8, "rho_det": 0.4, "lambda_u": 1.5, "provenance": "detector",
+        "policy": "pspsl", "weight": 0.5,
+    } | changes  # fmt: skip
+
+
+def truth(frame: str, k: int = 0, box: Sequence[float] = TRUE_BOX, **changes: Any) -> Row:
+    """An object of ground truth by column name."""
+    own = {"frame": frame, "k": k, "category": "Car", "truncated": 0.0, "occluded": 0}
+    return own | dict(zip(BOX_COLUMNS, box, strict=True)) | changes
+
+
+def block(rows: Sequence[Row], names: Sequence[str] = WEIGHTED_LABEL_COLUMNS) -> dict[str, list]:
+    """Rows as named columns."""
+    return {name: [row[name] for row in rows] for name in names}
+
+
+def truth_block(rows: Sequence[Row] = ()) -> dict[str, list]:
+    """Ground truth as named columns."""
+    return block(rows, GROUND_TRUTH_COLUMNS)
+
+
+def rows_of(labels: LabelSet) -> list[Row]:
+    """The labels of a label set, a row each."""
+    return [
+        dict(zip(each, values, strict=True))
+        for each in labels.labels
+        for values in zip(*each.values(), strict=True)
+    ]
+
+
+def with_rows(labels: LabelSet, rows: Sequence[Row]) -> LabelSet:
+    """The label set with other labels."""
+    return replace(labels, labels=[block(rows)] if rows else [])
+
+
+def renamed(labels: LabelSet, names: dict[str, str], read: Callable[[str], Frame]) -> LabelSet:
+    """The label set with other names of frames, and their reader."""
+    moved = with_rows(labels, [row | {"frame": names[row["frame"]]} for row in rows_of(labels)])
+    return replace(
+        moved,
+        frames=[replace(each, frame=names[each.frame]) for each in labels.frames],
+        ground_truth={
+            **labels.ground_truth,
+            "frame": [names[frame] for frame in labels.ground_truth["frame"]],
+        },
+        read=read,
+    )
 
 
 def toy_frame(name: str) -> Frame:
@@ -29,23 +97,42 @@ def toy_frame(name: str) -> Frame:
     return Frame(name, points, toy_calibration(), IMAGE_SIZE)
 
 
-def toy_labels(points: tuple[int | None, ...] = (12, None, 3)) -> LabelSet:
+def toy_labels(
+    points: tuple[int | None, ...] = (12, None, 3), zero_weight: ZeroWeight = "ignore"
+) -> LabelSet:
     """Labeled frame 000000 with a car and a van, unlabeled 000001 with three labels."""
     files = [(f"velodyne/00000{i}.bin", f"image_2/00000{i}.png", "c") for i in range(2)]
-    evidence = (20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "detector", "pspsl")
+    evidence = {
+        "points_threshold": 20.0, "rho_diff": 0.6, "mask_pixels": 30, "box_pixels": 100,
+        "rho_anno": 0.5, "rho_det": 0.3,
+    }  # fmt: skip
     return LabelSet(
         description=LabelFileDescription(
-            "kitti", Path("/data"), ("Car", "Pedestrian", "Cyclist"), 1, "pspsl", "1"
+            "kitti", Path("/data"), ("Car", "Pedestrian", "Cyclist"), 1, "pspsl", "1", zero_weight
         ),
-        frames=[("000000", "labeled", *files[0]), ("000001", "unlabeled", *files[1])],
-        ground_truth=[
-            ("000000", 0, "Car", *TRUE_BOX, 0.0, 0),
-            ("000000", 1, "Van", 25.0, 4.0, -0.8, 5.0, 2.0, 2.0, 0.5, 0.2, 1),
+        frames=[
+            FrameFiles("000000", "labeled", *files[0]),
+            FrameFiles("000001", "unlabeled", *files[1]),
         ],
+        ground_truth=truth_block(
+            [
+                truth("000000"),
+                truth(
+                    "000000", 1, (25.0, 4.0, -0.8, 5.0, 2.0, 2.0, 0.5), category="Van",
+                    truncated=0.2, occluded=1,
+                ),
+            ]
+        ),
         labels=[
-            (1, "000001", k, CATEGORIES[k], *BOXES[k], SCORES[k], None, points[k], *evidence,
-             WEIGHTS[k])
-            for k in range(3)
+            block(
+                [
+                    label(
+                        "000001", k, BOXES[k], category=CATEGORIES[k], score=SCORES[k], loss=None,
+                        points=points[k], weight=WEIGHTS[k], **evidence,
+                    )
+                    for k in range(3)
+                ]
+            )
         ],
         read=toy_frame,
         read_points=toy_frame,

@@ -9,11 +9,16 @@ from support.exported import SCORES, WEIGHTS, toy_labels
 from curate.exporters.coco import CocoExporter
 
 
+def written(path, labels):
+    """What a reader of the file gets."""
+    CocoExporter().write(path, labels)
+    return json.loads(path.read_text())
+
+
 @pytest.fixture
 def document(tmp_path):
-    """What a reader of the file gets."""
-    CocoExporter().write(tmp_path / "labels.json", toy_labels())
-    return json.loads((tmp_path / "labels.json").read_text())
+    """Labels of weight 0 are to be ignored."""
+    return written(tmp_path / "labels.json", toy_labels())
 
 
 def of_image(document, frame):
@@ -43,8 +48,22 @@ def test_a_box_is_the_rectangle_around_its_corners(document):
     assert (car["weight"], car["iscrowd"], "score" in car) == (1.0, 0, False)
 
 
+def test_what_is_background_is_no_annotation(tmp_path):
+    """It is beside the annotations, where COCO's readers do not look; the info says so."""
+    document = written(tmp_path / "labels.json", toy_labels(zero_weight="background"))
+    assert document["info"]["zero_weight"] == "background"
+    labels = of_image(document, "000001")
+    assert [each["weight"] for each in labels] == [WEIGHTS[0], WEIGHTS[2]]
+    assert [each["iscrowd"] for each in labels] == [0, 1]  # the latter is not in view
+    [left_out] = document["background"]
+    assert (left_out["k"], left_out["weight"], left_out["iscrowd"]) == (1, 0.0, 0)
+    assert [each["id"] for each in document["annotations"]] == [1, 2, 3, 4]
+
+
 def test_weights_and_scores_come_back_and_weight_0_is_a_crowd(document):
     """A crowd is what COCO ignores; what the camera does not see has no size."""
+    assert document["info"]["zero_weight"] == "ignore"
+    assert document["background"] == []
     labels = of_image(document, "000001")
     assert [each["weight"] for each in labels] == list(WEIGHTS)
     assert [each["score"] for each in labels] == list(SCORES)

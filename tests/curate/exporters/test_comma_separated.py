@@ -2,7 +2,7 @@
 
 import csv
 
-from support.exported import toy_labels
+from support.exported import rows_of, toy_labels
 
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from curate.exporters.comma_separated import CsvExporter
@@ -15,7 +15,9 @@ def test_every_column_comes_back_to_the_last_bit(tmp_path):
     with (tmp_path / "labels.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
     assert tuple(header) == WEIGHTED_LABEL_COLUMNS
-    assert len(rows) == len(labels.labels)
-    for row, label in zip(rows, labels.labels, strict=True):
-        for field, value in zip(row, label, strict=True):
+    expected = rows_of(labels)
+    assert len(rows) == len(expected)
+    for row, own in zip(rows, expected, strict=True):
+        for name, field in zip(header, row, strict=True):
+            value = own[name]
             assert field == "" if value is None else type(value)(field) == value

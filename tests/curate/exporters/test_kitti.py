@@ -16,15 +16,17 @@ BOXES = np.array(
 )
 
 
-def weighted_frame(name="000001", weights=(0.75, 0.0, 0.5)):
-    """Three labels, the second of which is to be ignored."""
+def weighted_frame(name="000001", weights=(0.75, 0.0, 0.5), zero_weight="ignore"):
+    """Three labels, the second of which weighs 0."""
     count = len(weights)
     labels = Detections(
         BOXES[:count],
         np.array([0.9, 0.3, 0.6])[:count],
         np.array(["Car", "Pedestrian", "Car"])[:count],
     )
-    return WeightedFrame(name, labels, np.array(weights), toy_calibration(), IMAGE_SIZE)
+    weights = np.array(weights)
+    nothing = (weights == 0) & (zero_weight == "ignore")
+    return WeightedFrame(name, labels, weights, nothing, toy_calibration(), IMAGE_SIZE)
 
 
 def files(directory):
@@ -57,6 +59,19 @@ def test_a_label_of_weight_0_is_an_ignored_region(tmp_path):
     category, *numbers = sidecar[1].split()
     assert category == "Pedestrian"
     assert [float(number) for number in numbers] == pytest.approx([0.0, 0.3, *BOXES[1]])
+
+
+def test_a_label_of_weight_0_that_is_background_has_no_line(tmp_path):
+    """It is in the folder `weight` alone, in its place; the marker says why."""
+    out = tmp_path / "out"
+    frames = [weighted_frame(zero_weight="background")]
+    assert export_kitti(out, frames, zero_weight="background") == 3
+    objects = read_objects(out / "label_2" / "000001.txt", scored=True)
+    assert objects.categories.tolist() == ["Car", "Car"]
+    assert objects.scores.tolist() == [0.75, 0.5]
+    lines = (out / "weight" / "000001.txt").read_text().splitlines()
+    assert [line.split()[0] for line in lines] == ["Car", "Pedestrian", "Car"]
+    assert json.loads((out / "export.json").read_text())["zero_weight"] == "background"
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,20 @@ def test_labels_come_back_with_their_weights(infos):
     assert [each["weight"] for each in instances] == list(WEIGHTS)
     assert [each["bbox_label_3d"] for each in instances] == [2, -1, 2]
     assert [each["category"] for each in instances] == ["Car", "Pedestrian", "Car"]
+    assert [each["ignored"] for each in instances] == [False, True, False]
+    assert infos["metainfo"]["zero_weight"] == "ignore"
     truth = infos["data_list"][0]["instances"]
     assert [(each["bbox_label_3d"], each["weight"]) for each in truth] == [(2, 1.0), (3, 1.0)]
+
+
+def test_background_has_no_category_and_is_told_apart(tmp_path):
+    """Label -1 is left out; a trainer that reads weights sees that it is not to be ignored."""
+    MMDet3DExporter().write(tmp_path / "out", toy_labels(zero_weight="background"))
+    infos = pickle.loads((tmp_path / "out" / "kitti_infos_train.pkl").read_bytes())
+    instances = infos["data_list"][1]["instances"]
+    assert [each["bbox_label_3d"] for each in instances] == [2, -1, 2]
+    assert [each["ignored"] for each in instances] == [False, False, False]
+    assert infos["metainfo"]["zero_weight"] == "background"
 
 
 def test_boxes_are_in_the_cameras_frame(infos):

@@ -1,11 +1,18 @@
 """Weighted labels as nuScenes' results."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.exported import BOXES, SCORES, toy_frame, toy_labels
+from support.exported import (
+    BOXES,
+    SCORES,
+    renamed,
+    rows_of,
+    toy_frame,
+    toy_labels,
+    with_rows,
+)
 from support.nuscenes_scenes import into_map, sample_token, vehicle_pose, write_nuscenes
 
 from curate.datasets.nuscenes import NuScenesDataset
@@ -21,18 +28,12 @@ def dataset(tmp_path):
     return NuScenesDataset(tmp_path / "nuscenes")
 
 
-def labels_of(dataset):
+def labels_of(dataset, zero_weight="ignore"):
     """The toy labels, of two frames of nuScenes."""
-    labels = toy_labels()
+    labels = toy_labels(zero_weight=zero_weight)
     first, second = (sample_token("scene-0061", 0), sample_token("scene-0103", 1))
     names = {"000000": first, "000001": second}
-    return replace(
-        labels,
-        frames=[(names[row[0]], *row[1:]) for row in labels.frames],
-        ground_truth=[(names[row[0]], *row[1:]) for row in labels.ground_truth],
-        labels=[(row[0], names[row[1]], *row[2:]) for row in labels.labels],
-        read=lambda name: dataset.read(name, points=False),
-    )
+    return renamed(labels, names, lambda name: dataset.read(name, points=False))
 
 
 def test_boxes_are_in_the_map(dataset, tmp_path):
@@ -56,6 +57,18 @@ def test_boxes_are_in_the_map(dataset, tmp_path):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("zero_weight", ["ignore", "background"])
+def test_what_weighs_nothing_is_listed_as_what_it_is(dataset, tmp_path, zero_weight):
+    """As ignored or as background; the other list is empty."""
+    NuScenesExporter().write(tmp_path / "a.json", labels_of(dataset, zero_weight))
+    document = json.loads((tmp_path / "a.json").read_text())
+    assert document["meta"]["zero_weight"] == zero_weight
+    listed = {"ignore": "ignored", "background": "background"}
+    for meaning, part in listed.items():
+        [boxes] = document[part].values()
+        assert [box["k"] for box in boxes] == ([1] if meaning == zero_weight else [])
+
+
 def test_our_results_are_a_record(dataset, tmp_path):
     """Written and read, the boxes are what they were."""
     NuScenesExporter().write(tmp_path / "a.json", labels_of(dataset))
@@ -77,6 +90,6 @@ def test_another_data_set_is_refused(tmp_path):
 def test_a_category_that_nuscenes_does_not_have_is_refused(dataset, tmp_path):
     """Its tools would stop at it."""
     labels = labels_of(dataset)
-    rows = [(*row[:3], "Tram", *row[4:]) for row in labels.labels]
+    rows = [row | {"category": "Tram"} for row in rows_of(labels)]
     with pytest.raises(DataError, match="category 'Tram' is none of nuScenes'"):
-        NuScenesExporter().write(tmp_path / "a.json", replace(labels, labels=rows))
+        NuScenesExporter().write(tmp_path / "a.json", with_rows(labels, rows))

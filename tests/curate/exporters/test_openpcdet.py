@@ -1,5 +1,6 @@
 """Weighted labels as OpenPCDet's infos and object database."""
 
+import json
 import pickle
 import pickletools
 
@@ -32,8 +33,19 @@ def test_labels_come_back_with_their_weights(folder):
     assert annos["score"].tolist() == list(SCORES)
     assert annos["name"].tolist() == ["Car", "DontCare", "Car"]
     assert annos["category"].tolist() == ["Car", "Pedestrian", "Car"]
+    assert annos["ignored"].tolist() == [False, True, False]
     assert annos["num_points_in_gt"].tolist() == [12, -1, 3]
     np.testing.assert_array_equal(annos["gt_boxes_lidar"], BOXES)
+
+
+def test_background_is_left_out_by_name_and_told_apart(tmp_path):
+    """OpenPCDet drops DontCare; a trainer that reads weights sees that it is not to be ignored."""
+    OpenPCDetExporter().write(tmp_path / "out", toy_labels(zero_weight="background"))
+    annos = load(tmp_path / "out" / "kitti_infos_train.pkl")[1]["annos"]
+    assert annos["name"].tolist() == ["Car", "DontCare", "Car"]
+    assert annos["ignored"].tolist() == [False, False, False]
+    marker = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert marker["zero_weight"] == "background"
 
 
 def test_camera_boxes_lead_back_to_the_lidar_boxes(folder):

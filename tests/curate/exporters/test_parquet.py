@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from support.exported import toy_labels
+from support.exported import block, rows_of, toy_labels, with_rows
 
 from curate.errors import ConfigError, DataError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
@@ -19,7 +19,7 @@ def test_every_column_comes_back_to_the_last_bit(tmp_path):
     assert ParquetExporter().write(tmp_path / "a.parquet", labels) == 3
     table = parquet.read_table(tmp_path / "a.parquet")
     assert tuple(table.column_names) == WEIGHTED_LABEL_COLUMNS
-    assert [tuple(row.values()) for row in table.to_pylist()] == labels.labels
+    assert table.to_pylist() == rows_of(labels)
 
 
 def test_columns_have_types_units_and_meanings(tmp_path):
@@ -48,24 +48,20 @@ def test_the_file_says_what_it_is_about(tmp_path):
     assert said["units"] == "metres, radians"
     assert (said["round"], said["policy"], said["version"]) == ("1", "pspsl", "1")
     assert (said["dataset"], said["root"]) == ("kitti", "/data")
+    assert said["zero_weight"] == "ignore"
     assert json.loads(said["categories"]) == ["Car", "Pedestrian", "Cyclist"]
 
 
 def test_rows_are_written_in_groups(tmp_path):
     """As they come, without holding all of them."""
     labels = toy_labels()
-    taken = []
 
     class Streamed:
-        """Rows that cannot be indexed."""
-
-        def __len__(self):
-            return len(labels.labels)
+        """Blocks of one row that cannot be indexed."""
 
         def __iter__(self):
-            for row in labels.labels:
-                taken.append(row)
-                yield row
+            for row in rows_of(labels):
+                yield block([row])
 
     streamed = replace(labels, labels=Streamed())
     assert ParquetExporter(rows_per_group=2).write(tmp_path / "a.parquet", streamed) == 3
@@ -84,12 +80,10 @@ def test_rows_are_written_in_groups(tmp_path):
 def test_a_value_that_does_not_fit_is_named(tmp_path, column, value, message):
     """In one line, and no file is left."""
     labels = toy_labels()
-    row = list(labels.labels[-1])
-    row[WEIGHTED_LABEL_COLUMNS.index(column)] = value
+    rows = rows_of(labels)
+    changed = with_rows(labels, [*rows[:-1], rows[-1] | {column: value}])
     with pytest.raises(DataError, match=message) as caught:
-        ParquetExporter().write(
-            tmp_path / "a.parquet", replace(labels, labels=[*labels.labels[:-1], tuple(row)])
-        )
+        ParquetExporter().write(tmp_path / "a.parquet", changed)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 

@@ -6,12 +6,17 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from support.exported import toy_labels
+from sqlalchemy import URL
+from support import exported
+from support.exported import toy_frame, toy_labels
 
 from curate.errors import DataError, LeakageError
-from curate.exporters.base import LabelFileDescription
+from curate.exporters.base import FrameFiles, LabelFileDescription, LabelSet
+from curate.exporters.columns import WEIGHTED_LABELS, Column
 from curate.exporters.label_file import read_frames
-from curate.exporters.sqlite import SqliteExporter, write_labels
+from curate.exporters.sqlite import SqliteExporter
+from curate.training.labels import WeightedLabels
+from pipelines.queries.run_query import ask
 
 DESCRIPTION = LabelFileDescription(
     "kitti", Path("/data/kitti"), ("Car", "Cyclist"), 2, "pspsl", "1"
@@ -20,40 +25,38 @@ BOX = (10.0, 1.0, -0.8, 4.0, 1.6, 1.5, 0.5)
 
 
 def frame(name, split):
-    """A row of `frame`."""
-    return (name, split, f"velodyne/{name}.bin", f"image_2/{name}.png", f"calib/{name}.txt")
+    """A frame and its files."""
+    return FrameFiles(
+        name, split, f"velodyne/{name}.bin", f"image_2/{name}.png", f"calib/{name}.txt"
+    )
 
 
 def truth(name, k=0):
-    """A row of `ground_truth`."""
-    return (name, k, "Car", *BOX, 0.0, 0)
+    """An object of ground truth."""
+    return exported.truth(name, k, BOX)
 
 
 def label(name, k=0, weight=0.5, **changes):
-    """A row of `label`, in the order of the view."""
-    row = {
-        "round": 2, "frame": name, "k": k, "category": "Car",
-        "x": BOX[0], "y": BOX[1], "z": BOX[2], "length": BOX[3], "width": BOX[4],
-        "height": BOX[5], "yaw": BOX[6], "score": 0.9, "loss": 0.2, "points": 30,
-        "points_threshold": 60.0, "rho_diff": 0.5, "mask_pixels": 80, "box_pixels": 100,
-        "rho_anno": 0.8, "rho_det": 0.4, "lambda_u": 1.5,
-        "provenance": "detector", "policy": "pspsl", "weight": weight,
-    } | changes  # fmt: skip
-    return tuple(row.values())
+    """A label of round 2."""
+    return exported.label(name, k, BOX, round=2, weight=weight, **changes)
 
 
 FRAMES = [frame("a", "labeled"), frame("b", "unlabeled"), frame("c", "unlabeled")]
 
 
-def write(path, frames=FRAMES, ground_truth=(), labels=()):
-    """Writes a label file of iterators, which can be read only once."""
-    write_labels(
-        path,
-        description=DESCRIPTION,
-        frames=iter(frames),
-        ground_truth=iter(ground_truth),
-        labels=iter(labels),
+def write(path, frames=FRAMES, ground_truth=(), labels=(), columns=WEIGHTED_LABELS):
+    """Writes a label file of blocks of one label."""
+    names = [column.name for column in columns]
+    given = LabelSet(
+        DESCRIPTION,
+        list(frames),
+        exported.truth_block(ground_truth),
+        (exported.block([row], names) for row in labels),
+        read=toy_frame,
+        read_points=toy_frame,
+        columns=columns,
     )
+    return SqliteExporter().write(path, given)
 
 
 def select(path, query):
@@ -69,7 +72,8 @@ def test_the_view_has_exactly_the_documented_columns_in_order(tmp_path):
     with closing(sqlite3.connect(path)) as connection:
         cursor = connection.execute("SELECT * FROM weighted_labels ORDER BY k")
         names = ", ".join(column[0] for column in cursor.description)
-        assert cursor.fetchall() == [label("b"), label("b", 1, 0.0, loss=None)]
+        expected = [label("b"), label("b", 1, 0.0, loss=None)]
+        assert cursor.fetchall() == [tuple(row.values()) for row in expected]
     assert names == (
         "round, frame, k, category, x, y, z, length, width, height, yaw, score, loss, points, "
         "points_threshold, rho_diff, mask_pixels, box_pixels, rho_anno, rho_det, lambda_u, "
@@ -89,6 +93,7 @@ def test_meta_says_what_the_labels_are_about(tmp_path):
         "root": "/data/kitti",
         "round": "2",
         "policy": "pspsl",
+        "zero_weight": "background",
         "code_version": "1",
     }
 
@@ -96,7 +101,7 @@ def test_meta_says_what_the_labels_are_about(tmp_path):
 def test_ground_truth_of_an_unlabeled_frame_is_refused_by_name(tmp_path):
     """The leak is an error that names the frames, and no file is left."""
     path = tmp_path / "labels.sqlite"
-    with pytest.raises(LeakageError, match=r"labels\.sqlite: ground truth of .* split: b, zz;"):
+    with pytest.raises(LeakageError, match=r"ground truth of .* split: b, zz;"):
         write(path, ground_truth=[truth("a"), truth("b"), truth("zz"), truth("b", 1)])
     assert list(tmp_path.iterdir()) == []
 
@@ -122,9 +127,10 @@ def test_the_finished_file_refuses_ground_truth_of_unlabeled_frames_too(tmp_path
         names = "frame, k, category, x, y, z, length, width, height, yaw, truncated, occluded"
         marks = ", ".join("?" * 12)
         insert = f"INSERT INTO ground_truth ({names}) VALUES ({marks})"
-        connection.execute(insert, truth("a"))
+        columns = names.split(", ")
+        connection.execute(insert, [truth("a")[name] for name in columns])
         with pytest.raises(sqlite3.IntegrityError, match="FOREIGN KEY"):
-            connection.execute(insert, truth("b"))
+            connection.execute(insert, [truth("b")[name] for name in columns])
 
 
 @pytest.mark.parametrize(
@@ -135,12 +141,11 @@ def test_the_finished_file_refuses_ground_truth_of_unlabeled_frames_too(tmp_path
         label("b", length=float("nan")),
         label("b", length=-1.0),
         label("b", points="many"),
-        label("b")[:-1],
     ],
 )
 def test_a_row_that_does_not_fit_is_refused(tmp_path, row):
-    """Weights outside [0, 1], NaN, sides below zero, text for a number, and missing columns."""
-    with pytest.raises(DataError, match=r"labels\.sqlite: a row|label 0 has weight 1\.5"):
+    """Weights outside [0, 1], NaN, sides below zero, and text for a number."""
+    with pytest.raises(DataError, match=r"labels\.sqlite: a row|label 0 has weight (1\.5|None)"):
         write(tmp_path / "labels.sqlite", labels=[row])
     assert list(tmp_path.iterdir()) == []
 
@@ -185,3 +190,136 @@ def test_a_file_that_another_program_writes_is_not_taken_for_a_foreign_one(tmp_p
                 look()
         other.execute("ROLLBACK")
     SqliteExporter().write(path, toy_labels())
+
+
+VISIBILITY = (
+    Column("visible_faces", "int32", "1", "faces of the box that the LiDAR sees", optional=True),
+    Column("density", "float64", "1/m2", "points per square metre\n of the nearest face"),
+)
+
+
+def test_further_evidence_stands_behind_the_core_columns(tmp_path):
+    """Table, view and version follow from the columns; what a training reads stays the same."""
+    path = tmp_path / "labels.sqlite"
+    rows = [label("b", visible_faces=2, density=1.5), label("c", visible_faces=None, density=0.0)]
+    assert write(path, labels=rows, columns=(*WEIGHTED_LABELS, *VISIBILITY)) == 2
+    with closing(sqlite3.connect(path)) as connection:
+        cursor = connection.execute("SELECT * FROM weighted_labels ORDER BY frame")
+        names = [column[0] for column in cursor.description]
+        assert [dict(zip(names, row, strict=True)) for row in cursor] == rows
+    assert names[-3:] == ["weight", "visible_faces", "density"]
+    assert select(path, "SELECT value FROM meta WHERE key = 'format_version'") == [("2",)]
+    assert len(WeightedLabels(path, read=toy_frame)) == 3
+
+
+@pytest.mark.parametrize("value", ["many", None])
+def test_further_evidence_that_does_not_fit_is_refused(tmp_path, value):
+    """Text for a number, nothing where something was declared."""
+    rows = [label("b", visible_faces=2, density=value)]
+    with pytest.raises(DataError, match=r"labels\.sqlite: a row was refused: .*label.density"):
+        write(tmp_path / "labels.sqlite", labels=rows, columns=(*WEIGHTED_LABELS, *VISIBILITY))
+
+
+@pytest.mark.parametrize(
+    "column", ["density BLOB AS (zeroblob(1000000))", "density REAL DEFAULT 1", '"a b" REAL']
+)
+def test_only_plain_columns_may_stand_behind_the_core_ones(tmp_path, column):
+    """Whatever else the table has is not what an export makes."""
+    path = tmp_path / "labels.sqlite"
+    write(path)
+    with closing(sqlite3.connect(path)) as connection:
+        [(made,)] = connection.execute("SELECT sql FROM sqlite_master WHERE name = 'label'")
+        connection.executescript(
+            "DROP VIEW weighted_labels; DROP TABLE label;"
+            + made.replace("    split TEXT", f"    {column},\n    split TEXT")
+        )
+    with pytest.raises(DataError, match="table label is not the one that an export makes"):
+        read_frames(path)
+
+
+# As curate 1 made it before any format had further columns.
+VERSION_1 = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
+CREATE TABLE frame (
+    frame TEXT PRIMARY KEY,
+    split TEXT NOT NULL CHECK (split IN ('labeled', 'unlabeled')),
+    points TEXT NOT NULL,       -- paths below meta.root
+    image TEXT,
+    calibration TEXT NOT NULL,
+    UNIQUE (frame, split)
+) STRICT;
+CREATE TABLE ground_truth (
+    frame TEXT NOT NULL,
+    k INTEGER NOT NULL,
+    category TEXT NOT NULL,
+    x REAL NOT NULL, y REAL NOT NULL, z REAL NOT NULL,  -- box centre, metres, LiDAR frame
+    length REAL NOT NULL CHECK (length > 0),
+    width REAL NOT NULL CHECK (width > 0),
+    height REAL NOT NULL CHECK (height > 0),
+    yaw REAL NOT NULL,          -- radians, counter-clockwise from x
+    truncated REAL NOT NULL,    -- share outside the image
+    occluded INTEGER NOT NULL,  -- KITTI's levels 0 to 3
+    split TEXT GENERATED ALWAYS AS ('labeled') VIRTUAL,
+    FOREIGN KEY (frame, split) REFERENCES frame (frame, split)
+) STRICT;
+CREATE TABLE label (
+    round INTEGER NOT NULL,
+    frame TEXT NOT NULL,
+    k INTEGER NOT NULL,
+    category TEXT NOT NULL,
+    x REAL NOT NULL, y REAL NOT NULL, z REAL NOT NULL,  -- box centre, metres, LiDAR frame
+    length REAL NOT NULL CHECK (length > 0),
+    width REAL NOT NULL CHECK (width > 0),
+    height REAL NOT NULL CHECK (height > 0),
+    yaw REAL NOT NULL,          -- radians, counter-clockwise from x
+    score REAL NOT NULL,
+    loss REAL,                  -- consistency loss L; NULL without a matched reprediction
+    points INTEGER,             -- LiDAR points in the box
+    points_threshold REAL,      -- m_th of the category
+    rho_diff REAL,              -- Eq. 8
+    mask_pixels INTEGER,        -- S, pixels of the category in the rectangle
+    box_pixels INTEGER,         -- A, pixels of the rectangle
+    rho_anno REAL,              -- Eq. 9
+    rho_det REAL,               -- rho_diff * rho_anno
+    lambda_u REAL,              -- age parameter, Eq. 4
+    provenance TEXT NOT NULL CHECK (provenance IN ('detector', 'human')),
+    policy TEXT NOT NULL,
+    weight REAL NOT NULL CHECK (weight BETWEEN 0 AND 1),  -- v; 0: no object to learn
+    split TEXT GENERATED ALWAYS AS ('unlabeled') VIRTUAL,
+    FOREIGN KEY (frame, split) REFERENCES frame (frame, split)
+) STRICT;
+INSERT INTO meta VALUES ('format_version', '1'), ('dataset', 'kitti'), ('root', '/data/kitti'),
+    ('categories', '["Car", "Cyclist"]'), ('round', '2'), ('policy', 'pspsl'),
+    ('code_version', '1');
+INSERT INTO frame VALUES ('a', 'labeled', 'velodyne/a.bin', 'image_2/a.png', 'calib/a.txt'),
+    ('b', 'unlabeled', 'velodyne/b.bin', 'image_2/b.png', 'calib/b.txt');
+INSERT INTO ground_truth VALUES ('a', 0, 'Car', 10.0, 1.0, -0.8, 4.0, 1.6, 1.5, 0.5, 0.0, 0);
+INSERT INTO label VALUES
+    (2, 'b', 0, 'Car', 10.0, 1.0, -0.8, 4.0, 1.6, 1.5, 0.5, 0.9, 0.2, 30, 60.0, 0.5, 80, 100, 0.8,
+     0.4, 1.5, 'detector', 'pspsl', 0.5),
+    (2, 'b', 1, 'Car', 20.0, 1.0, -0.8, 4.0, 1.6, 1.5, 0.5, 0.4, NULL, 3, 60.0, 0.05, 8, 100, 0.1,
+     0.01, 1.5, 'detector', 'pspsl', 0.0);
+CREATE VIEW weighted_labels AS SELECT round, frame, k, category, x, y, z, length, width, height,
+    yaw, score, loss, points, points_threshold, rho_diff, mask_pixels, box_pixels, rho_anno,
+    rho_det, lambda_u, provenance, policy, weight FROM label;
+CREATE UNIQUE INDEX ground_truth_frame ON ground_truth (frame, k);
+CREATE UNIQUE INDEX label_frame ON label (frame, k, round, policy);
+ANALYZE;
+"""
+
+
+def test_a_file_of_version_1_is_still_read(tmp_path):
+    """By the firewall, a training and a query; its weight of 0 is what it was: to be ignored."""
+    path = tmp_path / "labels.sqlite"
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript(VERSION_1)
+    found = read_frames(path)
+    assert (found.splits, found.objects, found.labels) == ({"a": "labeled", "b": "unlabeled"}, 1, 2)
+    labels = WeightedLabels(path, read=toy_frame)
+    assert labels.zero_weight == "ignore"
+    assert labels[1].weights.tolist() == [0.5, 0.0]
+    assert labels[1].ignored.tolist() == [False, True]
+    names, rows = ask(URL.create("sqlite", database=str(path)), "SELECT * FROM weighted_labels")
+    assert dict(zip(names, next(rows), strict=True)) == label("b")
+    write(path, labels=[label("b")])
+    assert select(path, "SELECT count(*) FROM label") == [(1,)]

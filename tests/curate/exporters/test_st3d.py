@@ -26,6 +26,15 @@ def test_pseudo_labels_come_back_with_their_weights(tmp_path):
     assert frames["000001"]["cls_scores"] == pytest.approx(np.array(SCORES))
 
 
+def test_background_is_left_out(tmp_path):
+    """ST3D would ignore a negative class; what is dropped is background there."""
+    assert ST3DExporter().write(tmp_path / "out", toy_labels(zero_weight="background")) == 2
+    frame = pickle.loads((tmp_path / "out" / "ps_label_e0.pkl").read_bytes())["000001"]
+    assert frame["gt_boxes"][:, 7].tolist() == [1, 1]
+    assert frame["weight"].tolist() == [WEIGHTS[0], WEIGHTS[2]]
+    assert len(frame["cls_scores"]) == len(frame["memory_counter"]) == 2
+
+
 def test_a_category_without_a_number_is_refused(tmp_path):
     """The error names the frame and what is configured."""
     labels = toy_labels()

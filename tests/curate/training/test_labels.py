@@ -49,10 +49,32 @@ def test_only_points_in_the_camera_view_are_kept(make_labels):
 
 
 def test_weight_zero_is_marked_as_ignored(make_labels):
-    """A label of weight 0 is there, marked as a region to leave out."""
+    """A label of weight 0 is there, marked as a region to leave out where the file says so."""
     sample = WeightedLabels(make_labels(labeled=1, unlabeled=1, weight=0.0))[1]
     assert sample.ignored.all()
     assert len(sample.boxes) == 3
+
+
+def test_weight_zero_is_not_ignored_where_it_is_background(make_labels):
+    """It is there with its weight; its region is not left out."""
+    path = make_labels(labeled=1, unlabeled=1, weight=0.0, zero_weight="background")
+    sample = WeightedLabels(path)[1]
+    assert not sample.ignored.any()
+    assert sample.weights.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_what_a_person_rejected_is_background_under_every_policy(make_labels):
+    """No region is ignored for it, even where the policy's own doubt is."""
+    path = make_labels(labeled=1, unlabeled=1, weight=0.0, provenance="human")
+    assert WeightedLabels(path)[1].boxes.shape == (0, 7)
+
+
+def test_another_meaning_of_weight_zero_is_refused(make_labels):
+    """A file that somebody has changed."""
+    path = make_labels(labeled=1)
+    change(path, "UPDATE meta SET value = 'perhaps' WHERE key = 'zero_weight'")
+    with pytest.raises(DataError, match=r"meta\.zero_weight is 'perhaps', expected background or"):
+        WeightedLabels(path)
 
 
 def test_neighbour_categories_are_ignored_and_strangers_left_out(make_labels):

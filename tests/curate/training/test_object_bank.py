@@ -219,7 +219,8 @@ def test_a_place_of_weight_zero_is_taken_even_where_it_counts_as_background(bank
     standing = [[15.0, y, -0.9, 4.0, 4.0, 1.5, 0.0] for y in np.arange(-9, 10, 4.5)]
     sample = sample_of(wall(40), standing, labeled=False, weights=np.zeros(5))
     for zero, boxes in (("ignore", 5), ("background", 0)):
-        augmentation = Augmentation(0.0, 0.0, (1.0, 1.0), 3, 0, zero)
+        sample = replace(sample, zero_weight=zero)
+        augmentation = Augmentation(0.0, 0.0, (1.0, 1.0), 3, 0)
         for seed in range(8):
             changed = augmentation.apply(sample, bank, np.random.default_rng(seed))
             pasted = changed.boxes[boxes:]

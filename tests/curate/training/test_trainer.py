@@ -194,13 +194,18 @@ def test_frames_of_x_u_come_besides_those_of_x_l(make_labels, tiny):
 
 def test_labels_of_weight_zero_can_become_background(make_labels, tiny):
     """`background` forgets them, `ignore` blanks their regions."""
-    labels = WeightedLabels(make_labels(labeled=1, unlabeled=1, weight=0.0))
+    files = {
+        zero: make_labels(
+            labeled=1, unlabeled=1, weight=0.0, name=f"{zero}.sqlite", zero_weight=zero
+        )
+        for zero in ("ignore", "background")
+    }
     blank = {
-        zero: Batches(labels, quick(tiny, pasted=0, zero_weight=zero))[0]
+        zero: Batches(WeightedLabels(path), quick(tiny, pasted=0))[0]
         .targets.background[-1]
         .eq(0)
         .sum()
-        for zero in ("ignore", "background")
+        for zero, path in files.items()
     }
     assert blank["ignore"] > 0
     assert blank["background"] == 0
@@ -254,7 +259,7 @@ def test_the_rate_rises_and_falls():
         ({"learning_rate": 0.0}, "learning_rate"),
         ({"unlabeled_batch_size": -1}, "unlabeled_batch_size"),
         ({"scale_range": (0.0, 1.0)}, "scale_range"),
-        ({"zero_weight": "perhaps"}, "choose ignore or background"),
+        ({"teacher": "perhaps"}, "choose student or ema"),
     ],
 )
 def test_settings_that_no_training_can_use(wrong, message):

@@ -51,13 +51,19 @@ def test_an_unlabeled_frame_without_predictions_is_left_out(
 def test_an_unlabeled_frame_whose_labels_all_weigh_nothing_is_exported(
     workspace: Workspace,
 ) -> None:
-    """Its labels are regions to leave out; what is around them is background."""
+    """Its labels are background, as the policy says, and so is what is around them."""
     strict = workspace.with_settings("run", method="threshold")
     strict = strict.with_settings("solve", options={"threshold": {"threshold": 1.0}})
     samples = [sample for sample in WeightedLabels(run(strict)) if not sample.labeled]
     assert len(samples) == 6
     assert all(len(sample.boxes) == 3 for sample in samples)
-    assert any(sample.ignored.all() for sample in samples)
+    assert any((sample.weights == 0).all() for sample in samples)
+    assert not any(sample.ignored.any() for sample in samples)
+
+
+def weight_lines(folder: Path) -> list[str]:
+    """The lines of all files in a folder."""
+    return [line for path in folder.iterdir() for line in path.read_text().splitlines()]
 
 
 def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_path: Path) -> None:
@@ -66,8 +72,11 @@ def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_pa
     folder = ("-w", workspace.root)
     code, out, _ = curate("export", "--format", "kitti", *folder)
     assert (code, out) == (0, f"18 labels of round 1 in {workspace.root}/exports/kitti\n")
-    files = list((workspace.root / "exports" / "kitti" / "label_2").iterdir())
-    assert sum(len(path.read_text().splitlines()) for path in files) == 18
+    weighted = weight_lines(workspace.root / "exports" / "kitti" / "weight")
+    assert len(weighted) == 18
+    kept = [line for line in weighted if float(line.split()[1]) > 0]
+    # Under pspsl a label of weight 0 is background: readers of objects do not see it.
+    assert len(weight_lines(workspace.root / "exports" / "kitti" / "label_2")) == len(kept) < 18
     copy = tmp_path / "copy.sqlite"
     code, out, _ = curate("export", "--output", copy, *folder)
     assert (code, out) == (0, f"18 labels of round 1 in {copy}\n")

@@ -16,7 +16,7 @@ from curate.errors import ConfigError, WorkspaceError
 from pipelines.engine.rounds import find_teacher
 from pipelines.labels.evidence import read_memory
 from pipelines.registry import POLICIES
-from pipelines.stages.methods import METHODS, method_named, method_of, with_method
+from pipelines.stages.methods import METHODS, method_named, method_of, with_method, zero_weight_of
 from pipelines.workspace.config import Config, make_config, write_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace, sha256
@@ -82,14 +82,18 @@ def test_a_method_is_one_word_in_the_configuration(tmp_path: Path) -> None:
     assert averaged.model_copy(update={"run": config.run}) == config
     own = {"teacher": "student", "zero_weight": "ignore"}
     own_config = make_config({"dataset": {"root": tmp_path}, "train": own}, "test")
-    found = method_of(with_method(own_config, "sess"), "sess")
-    assert (found.policy, found.teacher, found.zero_weight) == ("sess", "student", "ignore")
+    own_config = with_method(own_config, "sess")
+    found = method_of(own_config, "sess")
+    assert (found.policy, found.teacher) == ("sess", "student")
+    assert zero_weight_of(own_config, "sess") == "ignore"
     assert method_named("mylab.rules:Mine").teacher == method_named("uniform").teacher == "student"
 
 
-def test_only_bands_of_doubt_are_ignored() -> None:
+def test_only_bands_of_doubt_are_ignored(tmp_path: Path) -> None:
     """ST3D and HSSDA drop what they hold to be nothing; elsewhere a weight of 0 says so."""
-    assert [name for name in NAMES if METHODS[name].zero_weight == "ignore"] == ["st3d", "hssda"]
+    config = make_config({"dataset": {"root": tmp_path}}, "test")
+    ignoring = [name for name in NAMES if zero_weight_of(config, name) == "ignore"]
+    assert ignoring == ["st3d", "hssda"]
 
 
 def test_an_unknown_method_names_the_known_ones(curate: Curate, workspace: Workspace) -> None:
