@@ -289,8 +289,9 @@ class SemanticPrior(Base):
 class Weight(Base):
     """The reliability weight v that one policy gives a label; policies stand side by side.
 
-    v = 0 marks a region to ignore. A label that a policy drops has no row of that policy. Each
-    policy has an index by value of its own, see `db.weight_index`.
+    What v = 0 means is a member of the policy: background, or ignored where the policy has a band
+    of doubt. A label that a policy drops has no row of that policy. Each policy has an index by
+    value of its own, see `db.weight_index`.
     """
 
     __tablename__ = "weight"

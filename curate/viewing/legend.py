@@ -7,7 +7,7 @@ from curate.viewing.palette import (
     FAINT_TEXT,
     GROUND_TRUTH,
     HUMAN,
-    IGNORED,
+    ZERO_WEIGHT,
     PANEL,
     TEXT,
     UNWEIGHTED,
@@ -46,7 +46,7 @@ def draw_legend(
     canvas.box(0, top, canvas.width, canvas.height, PANEL)
     baseline = top + 25.0
     left = _weight_bar(canvas, 14.0, top + 13.0, baseline)
-    left = _swatch(canvas, left, baseline, "weight 0", IGNORED)
+    left = _swatch(canvas, left, baseline, "weight 0", ZERO_WEIGHT)
     if unweighted:
         left = _swatch(canvas, left, baseline, "not weighted", UNWEIGHTED)
     if repredictions:

@@ -14,7 +14,7 @@ TEXT = (226, 231, 238)
 FAINT_TEXT = (139, 150, 165)
 GROUND_TRUTH = (255, 255, 255)
 HUMAN = (255, 96, 208)
-IGNORED = (128, 134, 146)
+ZERO_WEIGHT = (128, 134, 146)
 UNWEIGHTED = (236, 128, 84)
 
 _ANCHORS = np.array(
@@ -25,13 +25,13 @@ _ANCHORS = np.array(
 def weight_colours(weights: np.ndarray) -> np.ndarray:
     """(n, 3) uint8 RGB of (n,) weights in [0, 1].
 
-    Weight 0 means ignore and is grey; NaN means that nobody weighted the box and is orange.
+    Weight 0, which is not learned as an object, is grey; NaN means that nobody weighted the box and is orange.
     """
     unknown = np.isnan(weights)
     place = np.clip(np.where(unknown, 0, weights), 0, 1) * (len(_ANCHORS) - 1)
     channels = [np.interp(place, np.arange(len(_ANCHORS)), channel) for channel in _ANCHORS.T]
     colours: np.ndarray = np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
-    colours[np.asarray(weights) <= 0] = IGNORED
+    colours[np.asarray(weights) <= 0] = ZERO_WEIGHT
     colours[unknown] = UNWEIGHTED
     return colours
 

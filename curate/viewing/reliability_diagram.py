@@ -11,7 +11,7 @@ from curate.viewing.palette import (
     BACKGROUND,
     FAINT_TEXT,
     GRID,
-    IGNORED,
+    ZERO_WEIGHT,
     PANEL,
     TEXT,
     weight_colours,
@@ -81,7 +81,7 @@ def _draw_policy(canvas: Canvas, left: int, top: int, figures: Figures) -> None:
         canvas.box(box[0], reached, box[1], frame[3], (red, green, blue), opacity)
         count = (_COUNT_HEIGHT - 14) * np.log10(1 + bins.labels[b]) / most
         floor = frame[3] + 20 + _COUNT_HEIGHT
-        canvas.box(box[0], floor - count, box[1], floor, IGNORED, 0.55)
+        canvas.box(box[0], floor - count, box[1], floor, ZERO_WEIGHT, 0.55)
         number = _count(int(bins.labels[b]))
         middle = (box[0] + box[1] - text_width(number, 9)) / 2
         canvas.text(middle, floor - count - 3, number, FAINT_TEXT, 9)

@@ -22,7 +22,8 @@ class ShownLabels:
         boxes: (n, 7) in the LiDAR frame.
         categories: (n,) str.
         scores: (n,) in [0, 1].
-        weights: (n,) in [0, 1]; 0 means ignore, NaN that nobody weighted the label.
+        weights: (n,) in [0, 1]; 0 means that the label is not learned as an object, NaN that
+            nobody weighted it.
         points: (n,) LiDAR points inside each box, or None where they were not counted.
     """
 
@@ -46,7 +47,7 @@ class ShownLabels:
         return np.where(np.isnan(self.weights), 0.5, self.weights)
 
     def caption(self, index: int) -> tuple[str, str]:
-        """The two lines of a label's caption; the first is empty where the label is ignored."""
+        """The two lines of a label's caption; the first is empty where the label has weight 0."""
         points = "" if self.points is None else f"  {self.points[index]} pts"
         weight = f"{self.weights[index]:.2f}" if self.weights[index] > 0 else ""
         return weight, f"{self.categories[index]} {self.scores[index]:.2f}{points}"

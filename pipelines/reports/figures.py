@@ -9,6 +9,7 @@ from curate.viewing.page import ALL, Figure, Section
 from curate.viewing.svg import Mark, histogram
 from db import bulk
 from pipelines.reports.totals import BANDS, SHARES, SHOWN_AGES, RoundTotals, Sums
+from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
 _TOLD = {
@@ -18,6 +19,8 @@ _TOLD = {
     "rho_anno": "the semantic prior (Eq. 9)",
     "rho_det": "the product of the priors",
 }
+
+ZERO_WEIGHT_WORDS = {"background": "background", "ignore": "regions to ignore"}
 
 
 def is_repredicted(workspace: Workspace, number: int) -> bool:
@@ -29,7 +32,7 @@ def is_repredicted(workspace: Workspace, number: int) -> bool:
 
 
 def summary(
-    workspace: Workspace, totals: RoundTotals, number: int, *, repredicted: bool
+    workspace: Workspace, totals: RoundTotals, number: int, policy: str, *, repredicted: bool
 ) -> Section:
     """The round in a few numbers."""
     n, kept, trusted = totals.everything.labels, totals.everything.kept, totals.trusted
@@ -50,7 +53,7 @@ def summary(
     facts.append(("age e/E", _age(workspace, number)))
     note = (
         f"{n:,} labels in {totals.frames:,} unlabeled frames, {kept:,} with a weight "
-        "above 0; the others mark regions to ignore."
+        f"above 0; the others are {ZERO_WEIGHT_WORDS[zero_weight_of(workspace.config, policy)]}."
     )
     return Section("The round", note, facts=facts)
 

@@ -60,7 +60,7 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
             comparison.add(each, labels)
     rejected = _rejected(workspace, number, policy, doubted)
     sections = [
-        summary(workspace, totals, number, repredicted=repredicted),
+        summary(workspace, totals, number, policy, repredicted=repredicted),
         distributions(totals),
         by_category(totals, workspace.config.dataset.categories),
         *beside_others(workspace, number, policy),

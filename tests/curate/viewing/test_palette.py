@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from curate.viewing.palette import BACKGROUND, IGNORED, height_shades, weight_colours
+from curate.viewing.palette import BACKGROUND, ZERO_WEIGHT, height_shades, weight_colours
 
 
 def lightness(colours):
@@ -30,8 +30,8 @@ def test_every_weight_stands_out_from_the_ground():
 def test_weight_0_is_not_on_the_scale():
     """Ignored labels are grey; tiny weights are not."""
     colours = weight_colours(np.array([0.0, 1e-9, 1.0]))
-    assert tuple(colours[0]) == IGNORED
-    assert tuple(colours[1]) != IGNORED
+    assert tuple(colours[0]) == ZERO_WEIGHT
+    assert tuple(colours[1]) != ZERO_WEIGHT
     assert np.ptp(colours[1].astype(int)) > 60
     assert weight_colours(np.zeros(0)).shape == (0, 3)
 
