@@ -10,6 +10,7 @@ import numpy as np
 from sqlalchemy import Connection, Select, Table
 
 from db import server_columns
+from db.evidence import Declaration, evidence_table
 from db.models import Base
 
 Row = tuple[Any, ...]
@@ -22,9 +23,19 @@ _BULK_CACHE_KIB = 64 * 1024
 _MOST_ROWS, _MOST_VARIABLES = 50, 999
 
 
+SCHEMA_TABLES = frozenset(Base.metadata.tables)
+_OF_SOURCES: dict[str, Table] = {}
+
+
 def table(name: str) -> Table:
-    """The table of that name."""
-    return Base.metadata.tables[name]
+    """Return the table of that name: of the schema, or of a source that is in use."""
+    return Base.metadata.tables[name] if name in SCHEMA_TABLES else _OF_SOURCES[name]
+
+
+def use_source(declaration: Declaration) -> None:
+    """Make the table of an evidence source known by its name."""
+    if declaration.table not in SCHEMA_TABLES:
+        _OF_SOURCES[declaration.table] = evidence_table(declaration)
 
 
 def insert_rows(connection: Connection, name: str, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -286,6 +286,22 @@ class SemanticPrior(Base):
     rho_anno: Mapped[Share]
 
 
+class EvidenceSource(Base):
+    """What an evidence source has declared that has a table `prior_NAME` of its own."""
+
+    __tablename__ = "evidence_source"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    name: Mapped[str] = mapped_column(Text, primary_key=True, comment="its table is prior_NAME")
+    source: Mapped[str] = mapped_column(Text, comment="as run.priors names it")
+    columns: Mapped[str] = mapped_column(
+        Text, comment="JSON: name, kind, unit, meaning and optional of each"
+    )
+    rho_column: Mapped[str | None] = mapped_column(
+        Text, comment="the column with its trust in [0, 1]; null = not a prior"
+    )
+
+
 class Weight(Base):
     """The reliability weight v that one policy gives a label; policies stand side by side.
 
@@ -561,6 +577,16 @@ class LabelFile(Base):
     round: Mapped[int] = mapped_column(Integer, comment="0 = ground truth of X_l alone")
     policy: Mapped[Name]
     sha256: Mapped[str] = mapped_column(Text, comment="of the file")
+
+
+class ViewDefinition(Base):
+    """The views as they were made last; those with another definition are made anew."""
+
+    __tablename__ = "view_definition"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    name: Mapped[str] = mapped_column(Text, primary_key=True, comment="of the view")
+    sha256: Mapped[str] = mapped_column(Text, comment="of its definition")
 
 
 class Task(Base):

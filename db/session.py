@@ -18,7 +18,7 @@ from db.backups import back_up
 from db.claims import Check, claimed, one_at_a_time, round_resources
 from db.lock_holders import holders
 from db.models import Base
-from db.views import create_views, drop_views
+from db.views import create_views, drop_views, refresh_views, views_are_current
 
 # A writer that finds another one waits this long before it gives up.
 BUSY_TIMEOUT_MS = 30_000
@@ -109,8 +109,9 @@ class Database:
                 self._refuse_foreign_tables(connection)
             elif current == head:
                 self._refuse_missing_tables(connection)
+            views_current = current == head and views_are_current(connection)
         self._write_ahead()
-        if current == head:
+        if views_current:
             return
         with self.writing() as connection:
             one_at_a_time(connection, _MIGRATION_LOCK)
@@ -118,6 +119,7 @@ class Database:
             # and one that is made now would take its place.
             current = self._revision(connection, script)
             if current == head:
+                refresh_views(connection)
                 return
             if current is not None:
                 back_up(self.url, current, backups)

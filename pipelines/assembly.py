@@ -9,7 +9,7 @@ from curate.consistency import ConsistencySettings
 from curate.detectors.base import Detector
 from curate.errors import ConfigError
 from curate.frames import Calibration
-from curate.priors.base import Prior
+from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
 from curate.priors.semantic import SemanticSettings
 from curate.segmenters.base import Segmenter
@@ -128,7 +128,7 @@ def consistency_settings(config: Config) -> ConsistencySettings:
 
 def open_prior(
     config: Config, name: str, thresholds: Mapping[str, float], *, measures: bool = True
-) -> Prior:
+) -> EvidenceSource:
     """A prior with its settings.
 
     Args:
@@ -137,7 +137,7 @@ def open_prior(
         thresholds: points per category, learned from X_l; read by priors that name them.
         measures: whether it will look at frames, for which alone a segmenter is opened.
     """
-    prior: Prior = registry.PRIORS.build(
+    prior: EvidenceSource = registry.PRIORS.build(
         name,
         offered={
             "thresholds": lambda: thresholds,
@@ -147,6 +147,14 @@ def open_prior(
         options=config.run.prior_options.get(name, {}),
     )
     return prior
+
+
+def open_sequence_source(config: Config, name: str) -> SequenceSource:
+    """A source of evidence that looks at whole sequences, with its options."""
+    source: SequenceSource = registry.PRIORS.build(
+        name, offered={}, options=config.run.prior_options.get(name, {})
+    )
+    return source
 
 
 def point_settings(config: Config) -> PointSettings:

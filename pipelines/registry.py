@@ -144,7 +144,7 @@ SEGMENTERS = Registry(
 )
 PRIORS = Registry(
     "prior",
-    "curate.priors.base:Prior",
+    "curate.priors.base:Declared",
     {
         "points": "curate.priors.points:PointPrior",
         "semantic": "curate.priors.semantic:SemanticPrior",

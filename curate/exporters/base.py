@@ -9,8 +9,9 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from curate.errors import DataError, LeakageError
-from curate.exporters.columns import WEIGHTED_LABELS, Column
+from curate.exporters.columns import WEIGHTED_LABELS
 from curate.frames import Frame
+from curate.priors.base import Column
 from curate.weighting.base import ZeroWeight
 
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")

@@ -1,25 +1,15 @@
 """What an exported weighted label says of itself: its columns, their units and their meanings."""
 
-from dataclasses import dataclass
+from dataclasses import replace
+
+from curate.priors.base import Column
+from curate.priors.points import PointPrior
+from curate.priors.semantic import SemanticPrior
 
 
-@dataclass(frozen=True)
-class Column:
-    """One column of the weighted labels.
-
-    Attributes:
-        name: of the column.
-        kind: type of its values: "name", "int32", "int64" or "float64".
-        unit: "m", "rad", "px", "1" for a number without unit, "" for what is no quantity.
-        meaning: in a few words, with the symbol and equation of the paper.
-        optional: whether it is null where there is no evidence.
-    """
-
-    name: str
-    kind: str
-    unit: str
-    meaning: str
-    optional: bool = False
+def as_optional(columns: tuple[Column, ...]) -> tuple[Column, ...]:
+    """Return columns of evidence as a label has them: null where there is no such evidence."""
+    return tuple(replace(column, optional=True) for column in columns)
 
 
 WEIGHTED_LABELS = (
@@ -36,15 +26,9 @@ WEIGHTED_LABELS = (
     Column("yaw", "float64", "rad", "counter-clockwise from x, in (-pi, pi]"),
     Column("score", "float64", "1", "s of the detector, in [0, 1]"),
     Column("loss", "float64", "1", "consistency loss L; null without a matched reprediction", True),
-    Column("points", "int32", "1", "m, LiDAR points in the box", True),
-    Column(
-        "points_threshold", "float64", "1", "m_th, what labeled boxes of the category hold", True
-    ),
-    Column("rho_diff", "float64", "1", "point prior, Eq. 8: min(m, m_th) / m_th", True),
-    Column("mask_pixels", "int64", "px", "S, pixels of the category in the projected box", True),
-    Column("box_pixels", "int64", "px", "A, pixels of the projected box", True),
-    Column("rho_anno", "float64", "1", "semantic prior, Eq. 9, from s, S and A", True),
-    Column("rho_det", "float64", "1", "rho_diff * rho_anno", True),
+    *as_optional(PointPrior.columns),
+    *as_optional(SemanticPrior.columns),
+    Column("rho_det", "float64", "1", "product of the priors' rho", True),
     Column("lambda_u", "float64", "1", "age parameter, Eq. 4: losses above it weigh 0", True),
     Column("provenance", "name", "", "detector, or human where a person decided"),
     Column("policy", "name", "", "that weighted the label"),

@@ -14,10 +14,11 @@ from typing import Any, ClassVar
 
 from curate.errors import DataError, one_line
 from curate.exporters.base import Columns, LabelFileDescription, LabelSet
-from curate.exporters.columns import WEIGHTED_LABELS, Column
+from curate.exporters.columns import WEIGHTED_LABELS
 from curate.exporters.place import check_place
 from curate.files.atomic import whole_file
 from curate.files.parquet import load_parquet
+from curate.priors.base import Column
 
 FORMAT = "curate weighted labels, Parquet"
 FORMAT_VERSION = "1"

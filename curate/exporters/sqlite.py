@@ -19,9 +19,10 @@ from typing import Any, ClassVar, Final
 
 from curate.errors import DataError
 from curate.exporters.base import GROUND_TRUTH_COLUMNS, Columns, LabelFileDescription, LabelSet
-from curate.exporters.columns import WEIGHTED_LABELS, Column
+from curate.exporters.columns import WEIGHTED_LABELS
 from curate.exporters.place import check_place
 from curate.files.atomic import whole_file
+from curate.priors.base import Column
 
 _FRAME_INSERTION = "INSERT INTO frame VALUES (:frame, :split, :points, :image, :calibration)"
 _TYPES: Final = {"int32": "INTEGER", "int64": "INTEGER", "float64": "REAL", "name": "TEXT"}

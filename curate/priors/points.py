@@ -6,7 +6,7 @@ Source: An et al., Remote Sensing 15(3):627, 2023.
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from curate.detections import Annotations, Detections
 from curate.errors import ConfigError
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
-from curate.priors.base import Measured
+from curate.priors.base import Column, Evidence, EvidenceSource, Measured
 
 logger = logging.getLogger(__name__)
 
@@ -64,26 +64,6 @@ class PointThresholds:
     values: Mapping[str, float]
     ground_truths: Mapping[str, int]
     fallbacks: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class PointEvidence:
-    """The point prior's columns for n labels.
-
-    Attributes:
-        points: (n,) int64 m, LiDAR points inside the box.
-        points_threshold: (n,) m_th of the label's category.
-        rho_diff: (n,) min(m, m_th) / m_th.
-    """
-
-    points: np.ndarray
-    points_threshold: np.ndarray
-    rho_diff: np.ndarray
-
-    @property
-    def rho(self) -> np.ndarray:
-        """(n,) rho_diff."""
-        return self.rho_diff
 
 
 _DEFAULT = PointSettings()
@@ -152,7 +132,7 @@ def learn_thresholds(
 
 
 @dataclass(frozen=True)
-class PointPrior:
+class PointPrior(EvidenceSource):
     """rho_diff = min(m, m_th(c)) / m_th(c).
 
     Attributes:
@@ -161,9 +141,13 @@ class PointPrior:
 
     thresholds: Mapping[str, float]
     name: ClassVar[str] = "points"
-    rho_column: ClassVar[str] = "rho_diff"
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column("points", "int32", "1", "m, LiDAR points in the box"),
+        Column("points_threshold", "float64", "1", "m_th, what labeled boxes of the category hold"),
+        Column("rho_diff", "float64", "1", "point prior, Eq. 8: min(m, m_th) / m_th"),
+    )
+    rho_column: ClassVar[str | None] = "rho_diff"
     measured_columns: ClassVar[tuple[str, ...]] = ("points",)
-    needs_image: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Raises ConfigError where a threshold is not a positive number."""
@@ -178,22 +162,21 @@ class PointPrior:
         counts = count_points_in_boxes(frame.points, detections.boxes)
         return {"points": np.asarray(counts, dtype=np.int64)}
 
-    def rate(self, detections: Detections, measured: Measured) -> PointEvidence:
+    def rate(self, detections: Detections, measured: Measured) -> Evidence:
         """Compare the counts with the threshold.
 
         Raises:
             ConfigError: a detection's category has no threshold.
         """
         points, threshold = measured["points"], self._threshold_per_label(detections.categories)
-        return PointEvidence(points, threshold, point_trust(points, threshold))
+        rho = point_trust(points, threshold)
+        return {"points": points, "points_threshold": threshold, "rho_diff": rho}
 
-    def score(self, frame: Frame, detections: Detections) -> PointEvidence:
-        """Both.
-
-        Raises:
-            ConfigError: a detection's category has no threshold.
-        """
-        return self.rate(detections, self.measure(frame, detections))
+    def describe(self, row: Mapping[str, Any]) -> str:
+        """Return Eq. 8 with the numbers of a label."""
+        return (
+            "Eq. 8: rho_diff = min({points}, {points_threshold}) / {points_threshold} = {rho_diff}"
+        ).format(**row)
 
     def _threshold_per_label(self, categories: np.ndarray) -> np.ndarray:
         """(n,) float64."""

@@ -4,9 +4,9 @@ Source: An et al., Remote Sensing 15(3):627, 2023. Its prose says "arithmetic me
 the share of class pixels, its printed formula is a square root: geometric is the default here.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from curate.detections import Detections
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
 from curate.geometry.projection import image_rectangles
-from curate.priors.base import Measured
+from curate.priors.base import Column, Evidence, EvidenceSource, Measured
 from curate.segmenters.base import Segmenter, SemanticMap
 
 Mean = Literal["geometric", "product", "arithmetic"]
@@ -43,31 +43,11 @@ class SemanticSettings:
                 )
 
 
-@dataclass(frozen=True)
-class SemanticEvidence:
-    """The semantic prior's columns for n labels.
-
-    Attributes:
-        mask_pixels: (n,) int64 S, pixels of the label's classes in its rectangle.
-        box_pixels: (n,) int64 A, pixels of the rectangle; 0 where the image does not show the box.
-        rho_anno: (n,) in [0, 1].
-    """
-
-    mask_pixels: np.ndarray
-    box_pixels: np.ndarray
-    rho_anno: np.ndarray
-
-    @property
-    def rho(self) -> np.ndarray:
-        """(n,) rho_anno."""
-        return self.rho_anno
-
-
 _DEFAULT = SemanticSettings()
 
 
 @dataclass(frozen=True)
-class SemanticPrior:
+class SemanticPrior(EvidenceSource):
     """rho_anno = sqrt(s * S / A) with the semantic map of a segmenter.
 
     Attributes:
@@ -78,7 +58,12 @@ class SemanticPrior:
     segmenter: Segmenter | None
     settings: SemanticSettings = _DEFAULT
     name: ClassVar[str] = "semantic"
-    rho_column: ClassVar[str] = "rho_anno"
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column("mask_pixels", "int64", "px", "S, pixels of the category in the projected box"),
+        Column("box_pixels", "int64", "px", "A, pixels of the projected box"),
+        Column("rho_anno", "float64", "1", "semantic prior, Eq. 9, from s, S and A"),
+    )
+    rho_column: ClassVar[str | None] = "rho_anno"
     measured_columns: ClassVar[tuple[str, ...]] = ("mask_pixels", "box_pixels")
 
     @property
@@ -114,20 +99,19 @@ class SemanticPrior:
         counts = count_pixels(rectangles, detections.categories, semantic_map)
         return dict(zip(self.measured_columns, counts, strict=True))
 
-    def rate(self, detections: Detections, measured: Measured) -> SemanticEvidence:
-        """Equation 9."""
+    def rate(self, detections: Detections, measured: Measured) -> Evidence:
+        """Return S, A and what follows from them by equation 9."""
         mask_pixels, box_pixels = (measured[name] for name in self.measured_columns)
         rho = semantic_trust(detections.scores, mask_pixels, box_pixels, self.settings)
-        return SemanticEvidence(mask_pixels, box_pixels, rho)
+        return {"mask_pixels": mask_pixels, "box_pixels": box_pixels, "rho_anno": rho}
 
-    def score(self, frame: Frame, detections: Detections) -> SemanticEvidence:
-        """Both.
-
-        Raises:
-            ConfigError: there is no segmenter, or it has no classes for a detection's category.
-            ModelError: the semantic map is not in the size of the image.
-        """
-        return self.rate(detections, self.measure(frame, detections))
+    def describe(self, row: Mapping[str, Any]) -> str:
+        """Return Eq. 9 with the numbers of a label."""
+        formula = {
+            "geometric": "sqrt(s S/A)", "product": "s S/A", "arithmetic": "(s + S/A) / 2",
+        }[self.settings.mean]  # fmt: skip
+        numbers = "s = {score}, S = {mask_pixels}, A = {box_pixels} pixels = {rho_anno}"
+        return f"Eq. 9: rho_anno = {formula} with {numbers}".format(**row)
 
 
 def semantic_trust(

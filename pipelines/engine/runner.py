@@ -90,6 +90,8 @@ def run_frames(
     database, number = plan.workspace.database, plan.context.number
     with database.claiming_round(number, None, stage.name):
         start = time.perf_counter()
+        if stage.prepare:
+            stage.prepare(plan.workspace)
         total = plan.count_waiting(stage, split)
         before = plan.counts(stage, split)
         writer = _Writer(plan, stage)

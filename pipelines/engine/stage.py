@@ -136,6 +136,7 @@ class FrameStage:
         function: what it does with a frame.
         recall: see `Recall`; None where there is nothing that could be kept.
         check: what can be known before the first frame to be wrong with its settings; raises.
+        prepare: makes what it writes to, where that is not there yet.
     """
 
     name: str
@@ -146,6 +147,7 @@ class FrameStage:
     function: Callable[[Workspace, RoundContext], FrameFunction]
     recall: Recall | None = None
     check: Callable[[Workspace], None] | None = None
+    prepare: Callable[[Workspace], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -162,6 +164,7 @@ class SequenceStage:
         settings: what its rows depend on beside what it reads.
         function: what it does with a sequence.
         check: what can be known before the first frame to be wrong with its settings; raises.
+        prepare: makes what it writes to, where that is not there yet.
     """
 
     name: str
@@ -171,6 +174,7 @@ class SequenceStage:
     settings: Callable[[Workspace, RoundContext], Settings]
     function: Callable[[Workspace, RoundContext], SequenceFunction]
     check: Callable[[Workspace], None] | None = None
+    prepare: Callable[[Workspace], None] | None = None
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from curate.errors import WorkspaceError
 from curate.evaluation.label_changes import RoundLabels
 from curate.files.batches import batched
 from db import bulk
+from db.evidence import weighted_label_columns
 from db.models import BOX_COLUMNS
-from db.views import WEIGHTED_LABELS
+from db.views import weighted_labels
 from pipelines.labels.by_frame import refuse_bad_weights
 from pipelines.workspace.workspace import Workspace
 
-NUMBERS = ("score", "loss", "points", "rho_diff", "rho_anno", "rho_det", "lambda_u", "weight")
 _CHUNK = 50_000
 _BLOCK_FRAMES = 1000
 # SQLite looks so few frames up one by one; for more it would walk through the whole round.
@@ -52,6 +52,15 @@ class LabelColumns:
     def weights(self) -> np.ndarray:
         """(n,) in [0, 1]."""
         return self.numbers["weight"]
+
+
+def numeric_columns(connection: Connection) -> list[str]:
+    """Return the numeric columns of `weighted_labels` beside the keys and the box."""
+    return [
+        column.name
+        for column in weighted_label_columns(connection)
+        if column.kind != "name" and column.name not in ("round", "k", *BOX_COLUMNS)
+    ]
 
 
 def read_columns(workspace: Workspace, round_number: int, policy: str) -> LabelColumns:
@@ -119,8 +128,9 @@ def _read(
     wanted: Sequence[str] | None = None,
 ) -> LabelColumns:
     """The labels of a round, of all frames or of the wanted ones."""
-    labels = WEIGHTED_LABELS.c
-    values = (*BOX_COLUMNS, *NUMBERS)
+    view = weighted_labels(connection)
+    labels, numbers = view.c, numeric_columns(connection)
+    values = (*BOX_COLUMNS, *numbers)
     # Not ordered: the database would write millions of whole rows to its disk to sort them.
     query = select(
         labels.frame, labels.k, labels.category, *(labels[name] for name in values)
@@ -134,12 +144,12 @@ def _read(
     keys, tables = [np.zeros((0, 3), np.int64)], [np.zeros((0, len(values)))]
     streaming = connection.execution_options(stream_results=True)
     for rows in chain.from_iterable(streaming.execute(each).partitions(_CHUNK) for each in queries):
-        names, numbers, kinds, *columns = zip(*rows, strict=True)
+        names, places_in_frame, kinds, *columns = zip(*rows, strict=True)
         places = [frames.setdefault(name, len(frames)) for name in names]
         own = [categories.setdefault(name, len(categories)) for name in kinds]
-        keys.append(np.array([places, numbers, own], dtype=np.int64).T)
+        keys.append(np.array([places, places_in_frame, own], dtype=np.int64).T)
         tables.append(np.array(columns, dtype=np.float64).T)
-    return _ordered(list(frames), tuple(categories), _joined(keys), _joined(tables))
+    return _ordered(list(frames), tuple(categories), _joined(keys), _joined(tables), numbers)
 
 
 def _joined(chunks: list[np.ndarray]) -> np.ndarray:
@@ -154,7 +164,11 @@ def _joined(chunks: list[np.ndarray]) -> np.ndarray:
 
 
 def _ordered(
-    names: list[str], categories: tuple[str, ...], key: np.ndarray, table: np.ndarray
+    names: list[str],
+    categories: tuple[str, ...],
+    key: np.ndarray,
+    table: np.ndarray,
+    columns: Sequence[str],
 ) -> LabelColumns:
     """The columns by frame and k, whatever the order in which the database gave them."""
     rank = np.empty(len(names), np.int64)
@@ -163,7 +177,7 @@ def _ordered(
     order = np.lexsort([key[:, 1], frames])
     if (order[1:] < order[:-1]).any():
         frames, key, table = frames[order], key[order], table[order]
-    numbers = {name: table[:, 7 + i] for i, name in enumerate(NUMBERS)}
+    numbers = {name: table[:, 7 + i] for i, name in enumerate(columns)}
     return LabelColumns(
         sorted(names), frames, key[:, 1], key[:, 2], categories, table[:, :7], numbers
     )

@@ -17,8 +17,7 @@ from curate.weighting.base import Evidence, Memory
 from db import bulk
 from db.columns import Columns, reading_columns
 from db.models import BOX_COLUMNS
-from pipelines.registry import PRIORS
-from pipelines.stages.score import table_of
+from pipelines.labels.sources import prepare_table, rho_columns, sources_of
 from pipelines.workspace.workspace import Workspace
 
 _K_BITS = 32
@@ -65,7 +64,9 @@ def read_evidence(
             are NaN, or "" for the category.
     """
     wanted = {"category", "score", "iou", "loss"} if columns is None else set(columns)
-    rho = {PRIORS.load(prior).rho_column: table_of(prior) for prior in workspace.config.run.priors}
+    for source in sources_of(workspace.config.run.priors):
+        prepare_table(workspace, source)
+    rho = rho_columns(workspace.config.run.priors)
     database, many = workspace.database, len(frames) >= _MANY_FRAMES
     with (
         database.reading() as connection,

@@ -2,23 +2,28 @@
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Select, and_, select, text
 
+from curate.detections import Detections
 from curate.errors import WorkspaceError
-from curate.priors.points import point_trust
-from curate.priors.semantic import semantic_trust
+from curate.priors.base import EvidenceSource
 from curate.weighting.base import Age, Evidence
 from curate.weighting.self_paced import age_parameter, easiness
 from db import bulk
-from db.views import WEIGHTED_LABELS
-from pipelines.assembly import semantic_settings
+from db.models import BOX_COLUMNS
+from db.views import weighted_labels
+from pipelines.assembly import open_prior, open_sequence_source
 from pipelines.labels.by_frame import refuse_bad_weights, weighted_round
+from pipelines.labels.sources import Source, sources_of
 from pipelines.registry import PRIORS
+from pipelines.reports.figures import ZERO_WEIGHT_WORDS
 from pipelines.review.decisions import tell_decision
+from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.config import Config, make_config
 from pipelines.workspace.workspace import Workspace
 
@@ -62,11 +67,16 @@ class AgeParameter:
 
 @dataclass(frozen=True)
 class Recomputed:
-    """The numbers of a label, each worked out again from those before it; None where unused."""
+    """The numbers of a label, each worked out again from those before it.
+
+    Attributes:
+        loss: L; None where nothing matched.
+        rho: trust by column of each prior; None where the prior has no evidence.
+        rho_det: product of the priors.
+    """
 
     loss: float | None
-    rho_diff: float | None
-    rho_anno: float | None
+    rho: Mapping[str, float | None]
     rho_det: float
 
 
@@ -108,7 +118,7 @@ def _human(workspace: Workspace, label: dict[str, Any]) -> Explanation:
         alone = _computed(workspace, {**label, "weight": told.policy_weight})
         return replace(alone, label=label, lines=(*alone.lines, told.lines[0]))
     lines = (*_head(_numbers(label)), *told.lines)
-    nothing = Recomputed(None, None, None, math.nan)
+    nothing = Recomputed(None, {}, math.nan)
     return Explanation(label, (), None, nothing, None, lines)
 
 
@@ -131,10 +141,11 @@ def _label(
     if round_number is None:
         round_number = weighted_round(workspace, policy)
     with workspace.database.reading() as connection:
-        labels = WEIGHTED_LABELS.c
+        view = weighted_labels(connection)
+        labels = view.c
         refuse_bad_weights(connection, round_number or 1, policy, frame)
         key = {"round": round_number, "frame": frame, "k": k, "policy": policy}
-        query = select(WEIGHTED_LABELS).where(*(labels[name] == key[name] for name in key))
+        query = select(view).where(*(labels[name] == key[name] for name in key))
         row = connection.execute(query).fetchone()
     if row is None:
         raise WorkspaceError(
@@ -224,35 +235,40 @@ def _evidence(config: Config, label: dict[str, Any], views: tuple[View, ...]) ->
         for view in views
         if view.score_loss is not None and view.box_loss is not None
     ]
-    again = {"points": ("rho_diff", _rho_diff), "semantic": ("rho_anno", _rho_anno)}
-    rho: dict[str, float | None] = {}
-    for prior in config.run.priors:
-        if prior in again:
-            column, formula = again[prior]
-            rho[column] = formula(config, label)
-        else:
-            column = PRIORS.load(prior).rho_column
-            rho[column] = label[column]
+    rho = {
+        column: _rho_again(config, source, label)
+        for source in sources_of(config.run.priors)
+        for column in [source.declaration.rho_column]
+        if column is not None
+    }
     product = math.prod(value for value in rho.values() if value is not None)
     loss = sum(losses) / len(losses) if losses else None
-    return Recomputed(loss, rho.get("rho_diff"), rho.get("rho_anno"), product)
+    return Recomputed(loss, rho, product)
 
 
-def _rho_diff(_config: Config, label: dict[str, Any]) -> float | None:
-    """Eq. 8."""
-    if label["points"] is None:
-        return None
-    return float(point_trust(*(np.array(label[name]) for name in ("points", "points_threshold"))))
-
-
-def _rho_anno(config: Config, label: dict[str, Any]) -> float | None:
-    """Eq. 9."""
-    if label["box_pixels"] is None:
-        return None
-    score, mask_pixels, box_pixels = (
-        np.array(label[name]) for name in ("score", "mask_pixels", "box_pixels")
+def _rho_again(config: Config, source: Source, label: dict[str, Any]) -> float | None:
+    """The trust of a prior rated again from what it measured; a user's own as it is stored."""
+    column = str(source.declaration.rho_column)
+    stored: float | None = label.get(column)
+    if stored is None or source.configured not in PRIORS.classes or source.of_sequences:
+        return stored
+    rated = _opened(config, source, label).rate(
+        _detections(label),
+        {name: np.array([label[name]]) for name in source.measured_columns},
     )
-    return float(semantic_trust(score, mask_pixels, box_pixels, semantic_settings(config)))
+    return float(rated[column][0])
+
+
+def _opened(config: Config, source: Source, label: dict[str, Any]) -> EvidenceSource:
+    """A source that rates one label, with the threshold that is stored with it."""
+    thresholds = {label["category"]: label["points_threshold"] or 1.0}
+    return open_prior(config, source.configured, thresholds, measures=False)
+
+
+def _detections(label: dict[str, Any]) -> Detections:
+    """The label as the only detection of a frame."""
+    box = [label[name] for name in BOX_COLUMNS]
+    return Detections.from_rows([(label["category"], label["score"], *box, None)])
 
 
 def _self_paced(config: Config, policy: str) -> bool:
@@ -298,24 +314,11 @@ def _lines(
         if views
         else "  consistency    no second pass over augmented copies, so no L"
     )
-    if label["points"] is not None:
-        lines.append(
-            "  points, Eq. 8  rho_diff = min({points}, {points_threshold}) / {points_threshold} "
-            "= {rho_diff}".format(**number)
-        )
-    if label["box_pixels"] is not None:
-        formula = {
-            "geometric": "sqrt(s S/A)", "product": "s S/A", "arithmetic": "(s + S/A) / 2",
-        }[config.semantic.mean]  # fmt: skip
-        lines.append(
-            f"  semantic, Eq. 9  rho_anno = {formula} with s = {number['score']}, "
-            f"S = {number['mask_pixels']}, A = {number['box_pixels']} pixels = {number['rho_anno']}"
-        )
-    factors = [
-        f"{name} {value:.4f}"
-        for name, value in (("rho_diff", evidence.rho_diff), ("rho_anno", evidence.rho_anno))
-        if value is not None
-    ]
+    for source in sources_of(config.run.priors):
+        if any(label.get(column.name) is not None for column in source.declaration.columns):
+            told = _described(config, source, label, number)
+            lines.append(f"  {source.declaration.name:<14} {told}")
+    factors = [f"{name} {value:.4f}" for name, value in evidence.rho.items() if value is not None]
     lines.append(f"  priors         rho_det = {' * '.join(factors) or '1'} = {number['rho_det']}")
     lines.append(_age_line(config, label["policy"], age, str(number["lambda_u"])))
     formulas = {"spsl": "1 - L / lambda, Eq. 7", "pspsl": "rho_det (1 - L / lambda), Eq. 11"}
@@ -323,12 +326,23 @@ def _lines(
         formulas["pspsl"] = "rho_det, without the self-paced term"
     formula = formulas.get(label["policy"], "see curate solve --help")
     lines.append(f"  policy         {label['policy']}: v = {formula}")
-    lines.append(f"  weight         {number['weight']}")
+    meaning = zero_weight_of(config, label["policy"])
+    zero = f", which is {ZERO_WEIGHT_WORDS[meaning]} to a student" if label["weight"] == 0 else ""
+    lines.append(f"  weight         {number['weight']}{zero}")
     if recomputed is not None:
         lines.append(f"  recomputed     {_working(label, evidence, age)}{recomputed:.4f}")
         if not math.isclose(recomputed, label["weight"], abs_tol=1e-6):
             lines.append("  they differ: settings have changed since; `curate solve` weighs again")
     return lines
+
+
+def _described(
+    config: Config, source: Source, label: dict[str, Any], number: Mapping[str, Any]
+) -> str:
+    """What a source says of the label's columns."""
+    if source.of_sequences:
+        return open_sequence_source(config, source.configured).describe(number)
+    return _opened(config, source, label).describe(number)
 
 
 def _numbers(label: dict[str, Any]) -> dict[str, Any]:

@@ -8,17 +8,9 @@ from sqlalchemy import case, func, select
 from curate.viewing.page import ALL, Figure, Section
 from curate.viewing.svg import Mark, histogram
 from db import bulk
-from pipelines.reports.totals import BANDS, SHARES, SHOWN_AGES, RoundTotals, Sums
+from pipelines.reports.totals import BANDS, SHOWN_AGES, RoundTotals, Sums
 from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
-
-_TOLD = {
-    "weight": "the weight v",
-    "score": "the detector's score s",
-    "rho_diff": "the point prior (Eq. 8)",
-    "rho_anno": "the semantic prior (Eq. 9)",
-    "rho_det": "the product of the priors",
-}
 
 ZERO_WEIGHT_WORDS = {"background": "background", "ignore": "regions to ignore"}
 
@@ -70,14 +62,14 @@ def distributions(totals: RoundTotals) -> Section:
         )
         chart = histogram(loss.counts, loss.edges, "consistency loss L", marks)
         figures.append(Figure(chart, unmatched))
-    for name in SHARES:
+    for name, meaning in totals.shares.items():
         found = totals.histograms[name]
         if not found.above:
             continue
         # Most weights are 0: in the same chart they would flatten all others.
         left_out = f"; {found.zeros:,} labels with 0 left out" if found.zeros else ""
         chart = histogram(found.counts, found.edges, name)
-        figures.append(Figure(chart, f"{_TOLD[name]} of {found.above:,} labels{left_out}"))
+        figures.append(Figure(chart, f"{meaning}; {found.above:,} labels{left_out}"))
     return Section("Losses, priors and weights", figures=figures)
 
 

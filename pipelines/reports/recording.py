@@ -11,14 +11,10 @@ from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.viewing.recording import RecordedFrame, load_rerun, write_recording
 from curate.viewing.tags import ShownLabels
 from db import bulk
-from db.views import WEIGHTED_LABELS
+from db.views import weighted_labels
+from pipelines.labels.columns import numeric_columns
 from pipelines.labels.of_one_frame import read_frame
 from pipelines.workspace.workspace import Workspace
-
-EVIDENCE = (
-    "loss", "points_threshold", "rho_diff", "mask_pixels", "box_pixels", "rho_anno", "rho_det",
-    "lambda_u",
-)  # fmt: skip
 
 
 def record_frames(
@@ -54,8 +50,8 @@ def _recorded(
         labels = ShownLabels(
             found.labels.boxes, found.labels.categories, found.labels.scores, found.weights, counts
         )
-        evidence = {"points": counts.astype(np.float64)}
-        evidence |= _evidence(workspace, name, round_number, policy, len(labels))
+        evidence = _evidence(workspace, name, round_number, policy, len(labels))
+        evidence["points"] = counts.astype(np.float64)
         yield RecordedFrame(
             frame,
             labels,
@@ -71,12 +67,14 @@ def _evidence(
     workspace: Workspace, name: str, round_number: int, policy: str, count: int
 ) -> dict[str, np.ndarray]:
     """(count,) by k of each kind of evidence; NaN where there is none."""
-    labels = WEIGHTED_LABELS.c
-    query = select(labels.k, *(labels[column] for column in EVIDENCE)).where(
-        labels.round == round_number, labels.frame == name, labels.policy == policy
-    )
-    table = np.full((count, len(EVIDENCE)), np.nan)
     with workspace.database.reading() as connection:
+        labels = weighted_labels(connection).c
+        columns = [each for each in numeric_columns(connection) if each not in ("score", "weight")]
+        query = select(labels.k, *(labels[column] for column in columns)).where(
+            labels.round == round_number, labels.frame == name, labels.policy == policy
+        )
+        table = np.full((count, len(columns)), np.nan)
         for k, *values in bulk.select(connection, query):
-            table[k] = values
-    return dict(zip(EVIDENCE, table.T, strict=True))
+            if k < count:  # others are objects that people added
+                table[k] = values
+    return dict(zip(columns, table.T, strict=True))

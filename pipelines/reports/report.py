@@ -25,8 +25,7 @@ from pipelines.reports.figures import (
     is_repredicted,
     summary,
 )
-from pipelines.reports.label_ranking import RankedLabel, Ranking
-from pipelines.reports.totals import RoundTotals, extent
+from pipelines.reports.totals import RankedLabel, Ranking, RoundTotals, extent, read_shares
 from pipelines.workspace.workspace import Workspace
 
 _PICTURES = 6
@@ -45,7 +44,7 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
     """
     policy = policy or workspace.config.run.method
     number = chosen_round(workspace, round_number or weighted_round(workspace, policy))
-    totals = RoundTotals(extent(workspace, number, policy))
+    totals = RoundTotals(extent(workspace, number, policy), read_shares(workspace))
     repredicted = is_repredicted(workspace, number)
     doubted, kept = Ranking(_PICTURES), Ranking(_PICTURES)
     comparison = Comparison(_PICTURES)
@@ -59,6 +58,7 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
         for each in former:
             comparison.add(each, labels)
     rejected = _rejected(workspace, number, policy, doubted)
+    priors = [name for name in totals.shares if name not in ("weight", "score", "rho_det")]
     sections = [
         summary(workspace, totals, number, policy, repredicted=repredicted),
         distributions(totals),
@@ -70,7 +70,7 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
             else _changes(workspace, comparison.finish((before, number), policy))
         ),
         *(
-            _shown(workspace, heading, ranking, rejected, repredicted=repredicted)
+            _shown(workspace, heading, ranking, rejected, priors, repredicted=repredicted)
             for heading, ranking in (
                 ("Most doubted: high score, low weight", doubted),
                 ("Kept against a low score: below 0.5, greatest weight", kept),
@@ -144,6 +144,7 @@ def _shown(
     title: str,
     ranking: Ranking,
     rejected: AbstractSet[tuple[str, int]],
+    priors: Sequence[str],
     *,
     repredicted: bool,
 ) -> Section:
@@ -153,27 +154,30 @@ def _shown(
             workspace,
             each.frame,
             LabelShown(each.box, each.numbers["weight"]),
-            _told(each, rejected=(each.frame, each.k) in rejected, repredicted=repredicted),
+            _told(
+                each,
+                priors,
+                rejected=(each.frame, each.k) in rejected,
+                repredicted=repredicted,
+            ),
         )
         for each in ranking.labels
     ]
     return Section(title, "" if figures else "There is none.", figures=figures)
 
 
-def _told(label: RankedLabel, *, rejected: bool, repredicted: bool) -> str:
+def _told(label: RankedLabel, priors: Sequence[str], *, rejected: bool, repredicted: bool) -> str:
     """What a label is, its numbers, and what took its weight away."""
     own = label.numbers
-    shown = {"score": "score", "weight": "weight", "loss": "L", "points": "points",
-             "rho_diff": "rho_diff", "rho_anno": "rho_anno"}  # fmt: skip
     numbers = ", ".join(
-        f"{word} {_figure(own[name])}" for name, word in shown.items() if not np.isnan(own[name])
+        f"{name} {_figure(value)}" for name, value in own.items() if not np.isnan(value)
     )
     reasons = {
         "no reprediction matched it": repredicted and np.isnan(own["loss"]),
         "its loss is above lambda": own["loss"] >= own["lambda_u"],
-        "no pixel of its category": own["rho_anno"] == 0,
-        "no LiDAR point inside": own["points"] == 0,
     }
+    # A trust of 0 takes the whole weight away.
+    reasons |= {f"{name} is 0": own[name] == 0 for name in priors}
     if rejected:
         reasons = {"a person rejected it": True}
     found = [reason for reason, holds in reasons.items() if holds and own["weight"] <= 0]

@@ -1,18 +1,20 @@
-"""What the labels of a round amount to, summed up block by block in memory that does not grow."""
+"""What the labels of a round amount to, and which rank highest, found block by block."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from sqlalchemy import func, select
 
+from curate.priors.points import PointPrior
+from curate.priors.semantic import SemanticPrior
 from db import bulk
+from db.evidence import read_declarations, weighted_label_columns
 from pipelines.labels.columns import LabelColumns
 from pipelines.workspace.workspace import Workspace
 
 BANDS = (0.0, 20.0, 40.0, 60.0, np.inf)
 """Edges of the distances from the LiDAR, metres."""
-SHARES = ("weight", "score", "rho_diff", "rho_anno", "rho_det")
-"""Numbers from 0 to 1 of which a histogram is kept."""
 SHOWN_AGES = 4
 LOSS_BINS, SHARE_BINS = 40, 25
 
@@ -70,15 +72,17 @@ class RoundTotals:
 
     Attributes:
         extent: the greatest loss and the least lambda; NaN where there is none.
+        shares: columns of numbers from 0 to 1, with their meanings; a histogram is kept of each.
         frames: with labels.
         trusted: labels with a weight above 0.5.
         ages: the `SHOWN_AGES` least values of lambda and the greatest.
         everything: sums over all labels.
         cells: sums by category and place in `BANDS`.
-        histograms: of the loss and of each of `SHARES`, by name.
+        histograms: of the loss and of each of `shares`, by name.
     """
 
     extent: tuple[float, float]
+    shares: Mapping[str, str]
     frames: int = 0
     trusted: int = 0
     ages: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -90,7 +94,7 @@ class RoundTotals:
         reach = float(np.nanmax((*self.extent, 1e-9))) * 1.02
         loss = Histogram(np.linspace(0, reach, LOSS_BINS + 1), with_zeros=True)
         edges = np.linspace(0, 1, SHARE_BINS + 1)
-        self.histograms = {"loss": loss} | {name: Histogram(edges) for name in SHARES}
+        self.histograms = {"loss": loss} | {name: Histogram(edges) for name in self.shares}
 
     @property
     def matched(self) -> int:
@@ -118,6 +122,19 @@ class RoundTotals:
             sums.add(weights[own], scores[own])
 
 
+def read_shares(workspace: Workspace) -> dict[str, str]:
+    """Return the columns with numbers from 0 to 1, with their meanings.
+
+    They are weight, score, the trust of every prior that has stored evidence, and their product.
+    """
+    with workspace.database.reading() as connection:
+        columns = {each.name: each.meaning for each in weighted_label_columns(connection)}
+        further = [each.rho_column for each in read_declarations(connection)]
+    priors = (PointPrior.rho_column, SemanticPrior.rho_column, *further)
+    names = ("weight", "score", *(name for name in priors if name is not None), "rho_det")
+    return {name: columns[name] for name in names}
+
+
 def extent(workspace: Workspace, round_number: int, policy: str) -> tuple[float, float]:
     """The greatest loss and the least lambda of a round; NaN where there is none."""
     loss, weight = bulk.table("consistency").c, bulk.table("weight").c
@@ -131,3 +148,53 @@ def extent(workspace: Workspace, round_number: int, policy: str) -> tuple[float,
         found = [connection.execute(query).scalar_one() for query in queries]
     greatest, least = (float("nan") if each is None else float(each) for each in found)
     return greatest, least
+
+
+@dataclass(frozen=True)
+class RankedLabel:
+    """A label and its rank.
+
+    Attributes:
+        rank: above 0.
+        frame: its frame.
+        k: its number there.
+        category: its category.
+        box: (7,) in the LiDAR frame.
+        numbers: of `weighted_labels` by name; NaN for null.
+    """
+
+    rank: float
+    frame: str
+    k: int
+    category: str
+    box: np.ndarray
+    numbers: dict[str, float]
+
+
+@dataclass
+class Ranking:
+    """The labels with the highest rank above 0 so far.
+
+    Attributes:
+        count: how many are kept.
+        labels: the highest first; of equals the one that came first.
+    """
+
+    count: int
+    labels: list[RankedLabel] = field(default_factory=list)
+
+    def add(self, labels: LabelColumns, rank: np.ndarray) -> None:
+        """A block of labels with their (n,) ranks more."""
+        first = np.argsort(-rank, kind="stable")[: self.count]
+        found = [
+            RankedLabel(
+                float(rank[i]),
+                labels.frame_names[labels.frames[i]],
+                int(labels.k[i]),
+                labels.category_names[labels.categories[i]],
+                labels.boxes[i].copy(),
+                {name: float(values[i]) for name, values in labels.numbers.items()},
+            )
+            for i in first[rank[first] > 0].tolist()
+        ]
+        self.labels = sorted([*self.labels, *found], key=lambda each: -each.rank)[: self.count]

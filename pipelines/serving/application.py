@@ -1,12 +1,13 @@
 """The pages as one ASGI application."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from curate.errors import ConfigError
+from db.evidence import Declaration, read_declarations
 from pipelines.serving import descriptions
 from pipelines.workspace.workspace import Workspace
 
@@ -82,11 +83,15 @@ def application(served: Served, host: str) -> Iterator[Any]:
 
 def _metadata(served: Served) -> dict[str, Any]:
     """What Datasette says of all of it."""
+    declared: Sequence[Declaration] = ()
+    if served.working and served.workspace:
+        with served.workspace.database.reading() as connection:
+            declared = read_declarations(connection)
     return {
         "title": served.title,
         "databases": {
             name: (
-                descriptions.working_database()
+                descriptions.working_database(declared)
                 if name == served.working
                 else descriptions.exported_file()
             )

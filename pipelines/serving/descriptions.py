@@ -1,9 +1,12 @@
 """What the pages say of databases, tables, columns and questions, from the models themselves."""
 
 import inspect
+from collections.abc import Sequence
 from typing import Any
 
 from curate.exporters.columns import WEIGHTED_LABELS
+from curate.priors.base import Column
+from db.evidence import Declaration, label_columns
 from db.models import Base
 from pipelines.queries.named_queries import named_queries
 
@@ -25,14 +28,19 @@ _EXPORTED = {
 }
 
 
-def working_database() -> dict[str, Any]:
-    """Datasette's metadata of a workspace's database."""
+def working_database(declared: Sequence[Declaration] = ()) -> dict[str, Any]:
+    """Datasette's metadata of a workspace's database, with what its evidence sources declare."""
     tables = {model.__tablename__: _of_model(model) for model in Base.__subclasses__()}
     tables["alembic_version"] = {"hidden": True}
     tables["frame"]["label_column"] = "frame"
     for name, told in _VIEWS.items():
         tables[name] = {"description": told}
-    tables["weighted_labels"]["columns"] = _weighted_labels()
+    tables["weighted_labels"]["columns"] = _weighted_labels(label_columns(declared))
+    for each in declared:
+        tables[each.table] = {
+            "description": f"Evidence of the source '{each.name}'.",
+            "columns": _meanings(each.columns),
+        }
     return {
         "description": "Predictions, their evidence, their weights, and what was done",
         "tables": tables,
@@ -45,7 +53,7 @@ def exported_file() -> dict[str, Any]:
     tables: dict[str, Any] = {name: {"description": told} for name, told in _EXPORTED.items()}
     tables["weighted_labels"] = {"description": _VIEWS["weighted_labels"]}
     for name in ("label", "weighted_labels"):
-        tables[name]["columns"] = _weighted_labels()
+        tables[name]["columns"] = _weighted_labels(WEIGHTED_LABELS)
     return {
         "description": "The exported weighted labels that a training reads",
         "tables": tables,
@@ -53,13 +61,19 @@ def exported_file() -> dict[str, Any]:
     }
 
 
-def _weighted_labels() -> dict[str, str]:
+def _weighted_labels(columns: Sequence[Column]) -> dict[str, str]:
     """The columns of the weighted labels, with their units."""
     return {
-        column.name: column.meaning
-        + (f" [{column.unit}]" if column.unit not in ("", "1") else "")
-        + (f"; leads to {_LEADS_TO[column.name]}" if column.name in _LEADS_TO else "")
-        for column in WEIGHTED_LABELS
+        name: meaning + (f"; leads to {_LEADS_TO[name]}" if name in _LEADS_TO else "")
+        for name, meaning in _meanings(columns).items()
+    }
+
+
+def _meanings(columns: Sequence[Column]) -> dict[str, str]:
+    """What each column means, with its unit."""
+    return {
+        column.name: column.meaning + (f" [{column.unit}]" if column.unit not in ("", "1") else "")
+        for column in columns
     }
 
 

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from curate.errors import ConfigError, CurateError
 from pipelines.serving.guard import Application, guard
-from pipelines.serving.shown_frames import COLUMNS, FramePages, ShownFrame
+from pipelines.serving.shown_frames import FramePages, ShownFrame
 
 # Also the package whose folders `templates` and `static` Datasette finds by this name.
 NAME = "pipelines.serving"
@@ -112,7 +112,7 @@ class CuratePlugin:
             return Response.html(page, status=404)
         context = {
             "shown": shown,
-            "columns": COLUMNS,
+            "columns": shown.columns,
             "k": k,
             "explanation": told,
             "picture": _link("/-/picture", shown),

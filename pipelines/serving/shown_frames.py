@@ -5,20 +5,17 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import and_, select
+from sqlalchemy import Table, and_, select
 
 from curate.errors import ConfigError
+from curate.priors.base import Column
 from curate.viewing.canvas import jpeg
 from db import bulk
+from db.evidence import OWN_TABLES, evidence_table, label_columns, read_declarations
 from pipelines.labels.of_one_frame import chosen_round
 from pipelines.reports.pictures import frame_picture
 from pipelines.workspace.workspace import Workspace
 
-COLUMNS = (
-    "k", "category", "x", "y", "score", "loss", "points", "points_threshold", "rho_diff",
-    "mask_pixels", "box_pixels", "rho_anno", "rho_det", "lambda_u", "v",
-)  # fmt: skip
-_TABLES = ("consistency", "point_prior", "semantic_prior")
 _KEPT_PICTURES = 24
 
 
@@ -31,7 +28,8 @@ class ShownFrame:
         split: of the frame.
         round: number.
         policy: whose weights.
-        labels: a row of `COLUMNS` per label.
+        columns: of the labels.
+        labels: a row per label.
         choices: (round, policy) of all weights that the frame has.
         before: the frame of the same split before this one, None at the start.
         after: the one after it, None at the end.
@@ -41,6 +39,7 @@ class ShownFrame:
     split: str
     round: int
     policy: str
+    columns: tuple[str, ...]
     labels: tuple[bulk.Row, ...]
     choices: tuple[tuple[int, str], ...]
     before: str | None
@@ -83,8 +82,8 @@ class FramePages:
         if choices and (number, policy) not in choices:
             raise ConfigError(f"frame {name} has no weights by {policy} in round {number}")
         before, after = (self._neighbour(name, split, step) for step in (-1, 1))
-        labels = self._labels(found, number, policy)
-        return ShownFrame(name, split, number, policy, labels, choices, before, after)
+        columns, labels = self._labels(found, number, policy)
+        return ShownFrame(name, split, number, policy, columns, labels, choices, before, after)
 
     def picture(self, shown: ShownFrame) -> bytes:
         """The picture of a frame as JPEG."""
@@ -135,23 +134,39 @@ class FramePages:
         rows = self._ask(query.order_by(order).limit(1))
         return str(rows[0][0]) if rows else None
 
-    def _labels(self, key: int, number: int, policy: str) -> tuple[bulk.Row, ...]:
+    def _labels(
+        self, key: int, number: int, policy: str
+    ) -> tuple[tuple[str, ...], tuple[bulk.Row, ...]]:
+        """The columns of the labels, and a row each; frames of any split have them."""
         prediction, weight = bulk.table("prediction"), bulk.table("weight")
+        with self._workspace.database.reading() as connection:
+            declared = read_declarations(connection)
+        tables = [bulk.table(name) for name in ("consistency", *OWN_TABLES.values())]
+        tables += [evidence_table(each) for each in declared]
+        evidence = [
+            column.name for column in label_columns(declared) if _is_evidence(column, tables)
+        ]
+        names = ("k", "category", "x", "y", "score", *evidence, "rho_det", "lambda_u", "v")
         joined: Any = prediction
         columns = {**prediction.c}
-        for table in (*map(bulk.table, _TABLES), weight):
+        for table in (*tables, weight):
             same = [table.c[name] == prediction.c[name] for name in ("round", "frame_id", "k")]
             own = [weight.c.policy == policy] if table is weight else []
             joined = joined.outerjoin(table, and_(*same, *own))
             columns = {**table.c, **columns}
         query = (
-            select(*(columns[name] for name in COLUMNS))
+            select(*(columns[name] for name in names))
             .select_from(joined)
             .where(prediction.c.round == number, prediction.c.frame_id == key)
             .order_by(prediction.c.k)
         )
-        return tuple(self._ask(query))
+        return names, tuple(self._ask(query))
 
     def _ask(self, query: Any) -> list[bulk.Row]:
         with self._workspace.database.reading() as connection:
             return list(bulk.select(connection, query))
+
+
+def _is_evidence(column: Column, tables: list[Table]) -> bool:
+    """Whether a column of `weighted_labels` is stored in one of the tables of evidence."""
+    return any(column.name in table.c for table in tables if column.name not in ("round", "k"))

@@ -19,10 +19,10 @@ from curate.exporters.base import (
     LabelFileDescription,
     LabelSet,
 )
-from curate.exporters.columns import WEIGHTED_LABELS as LABEL_COLUMNS
-from curate.exporters.columns import Column
 from curate.exporters.sqlite import SqliteExporter, check_label_file_place
+from curate.priors.base import Column
 from db import bulk
+from db.evidence import read_declarations, weighted_label_columns
 from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
 from pipelines.engine.progress import Progress
@@ -43,8 +43,19 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
     That is what people decided, and what a weight of 0 means.
     """
     human = fingerprint(workspace, context.number)
-    own = {"format": 1, "zero_weight": zero_weight_of(workspace.config, policy)}
-    return own if human is None else {**own, "human": human}
+    further = _further_columns(workspace)
+    return {
+        "format": 1,
+        "zero_weight": zero_weight_of(workspace.config, policy),
+        **({"columns": further} if further else {}),
+        **({} if human is None else {"human": human}),
+    }
+
+
+def _further_columns(workspace: Workspace) -> list[str]:
+    """The columns behind the core ones, as they are declared."""
+    with workspace.database.reading() as connection:
+        return [repr(each) for each in read_declarations(connection)]
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
@@ -134,8 +145,9 @@ def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:
         code_version=curate.__version__,
         zero_weight=zero_weight_of(config, policy or config.run.method),
     )
-    labels = StoredLabels(workspace, round_number, policy, LABEL_COLUMNS)
     with workspace.database.reading() as connection:
+        columns = weighted_label_columns(connection)
+        labels = StoredLabels(workspace, round_number, policy, columns)
         frames = _frames(connection, labels.frames(connection))
         truth = _ground_truth(connection)
     read = partial(workspace.dataset.read, points=False)

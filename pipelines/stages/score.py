@@ -1,134 +1,170 @@
-"""score: a prior trusts or mistrusts every label of a frame; each prior is a stage of its own.
+"""score: evidence on every label; each source is a stage of its own.
 
-What a prior measures in a frame is stored beside the trust that follows from it. Where only the
-formula has changed, its labels are rated again from what is stored, without a look at the frame.
+What a source measures in a frame is stored beside what follows from it. Where only the formula has
+changed, its labels are rated again from what is stored, without a look at the frame.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from sqlalchemy import select
 
-from curate.errors import ConfigError, WorkspaceError
-from curate.priors.base import Measured, PriorEvidence, columns
+from curate.errors import WorkspaceError
+from curate.priors.base import Evidence, Measured, SequenceFrame, check_evidence
 from curate.priors.points import learn_thresholds
 from db import bulk
-from pipelines.assembly import open_prior, open_segmenter, point_settings, segmenter_path
-from pipelines.engine.executors.base import FrameJob, FrameRows
-from pipelines.engine.stage import FrameStage, Recall, RoundContext, Settings
+from pipelines.assembly import (
+    open_prior,
+    open_segmenter,
+    open_sequence_source,
+    point_settings,
+    segmenter_path,
+)
+from pipelines.engine.executors.base import FrameJob, FrameRows, SequenceJob
+from pipelines.engine.stage import (
+    FramesStage,
+    FrameStage,
+    Recall,
+    RoundContext,
+    SequenceStage,
+    Settings,
+)
+from pipelines.labels.sources import Source, prepare_table, source_of, sources_of
 from pipelines.registry import PRIORS
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace, glance, open_dataset, sha256
 
-# Where evidence is stored, by the column of its trust; at most one prior fills each.
-TABLES = {"rho_diff": "point_prior", "rho_anno": "semantic_prior"}
-
 
 @dataclass
 class Score:
-    """Asks one prior about the labels of a frame.
+    """Has one source look at a frame and judge its labels.
 
     Attributes:
         config: all sections.
-        prior_name: whom to ask.
-        thresholds: learned from X_l, for priors that name them.
+        source: as the configuration names it.
+        thresholds: learned from X_l, for sources that name them.
     """
 
     config: Config
-    prior_name: str
+    source: str
     thresholds: Mapping[str, float]
 
     def open(self) -> None:
-        """Loads the data set and what the prior needs."""
+        """Load the data set and what the source needs."""
         self.dataset = open_dataset(self.config)
-        self.prior = open_prior(self.config, self.prior_name, self.thresholds)
+        self.prior = open_prior(self.config, self.source, self.thresholds)
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """The rows of the prior's table."""
+        """Return the columns of the source's table."""
         if job.predictions is None:
             raise WorkspaceError(f"frame {job.frame} came without its predictions")
-        points = getattr(self.prior, "needs_points", True)
-        frame = self.dataset.read(job.frame, points=points, image=self.prior.needs_image)
-        return self.rows(self.prior.score(frame, job.predictions))
+        frame = self.dataset.read(
+            job.frame, points=self.prior.needs_points, image=self.prior.needs_image
+        )
+        return self.rows(self.prior.score(frame, job.predictions), len(job.predictions))
 
-    def rows(self, evidence: PriorEvidence) -> FrameRows:
-        """The evidence as rows."""
-        found = {name: column.tolist() for name, column in columns(evidence).items()}
-        count = len(evidence.rho)
-        return {TABLES[self.prior.rho_column]: {"k": list(range(count)), **found}}
+    def rows(self, evidence: Evidence, count: int) -> FrameRows:
+        """Return the evidence of a frame's labels as columns of the source's table."""
+        found = check_evidence(self.prior, evidence, count)
+        return {source_of(self.source).table: {"k": list(range(count)), **found}}
 
 
 class Rate(Score):
     """Rates the labels of a frame from what was measured before."""
 
     def open(self) -> None:
-        """Needs neither data set nor segmenter."""
-        self.prior = open_prior(self.config, self.prior_name, self.thresholds, measures=False)
+        """Open the source alone: neither data set nor segmenter is needed."""
+        self.prior = open_prior(self.config, self.source, self.thresholds, measures=False)
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """The rows of the prior's table."""
+        """Return the columns of the source's table."""
         if job.predictions is None or job.measured is None:
             raise WorkspaceError(f"frame {job.frame} came without predictions and measurements")
-        return self.rows(self.prior.rate(job.predictions, job.measured))
+        evidence = self.prior.rate(job.predictions, job.measured)
+        return self.rows(evidence, len(job.predictions))
 
 
-@cache
-def stage(name: str) -> FrameStage:
-    """The stage that asks a prior.
+@dataclass
+class ScoreSequence:
+    """Has one source look at a whole sequence.
 
-    Raises:
-        ConfigError: there is no such prior, or no table for its evidence.
+    Attributes:
+        config: all sections.
+        source: as the configuration names it.
     """
+
+    config: Config
+    source: str
+
+    def open(self) -> None:
+        """Load the data set and the source."""
+        self.dataset = open_dataset(self.config)
+        self.opened = open_sequence_source(self.config, self.source)
+
+    def __call__(self, job: SequenceJob) -> Sequence[FrameRows]:
+        """Return the columns of the source's table, for each frame."""
+        frames = []
+        for each in job.frames:
+            if each.predictions is None:
+                raise WorkspaceError(f"frame {each.frame} came without its predictions")
+            read = partial(self.dataset.read, each.frame)
+            frames.append(SequenceFrame(each.frame, each.predictions, read))
+        found = self.opened.score_sequence(frames)
+        table = source_of(self.source).table
+        return [
+            {
+                table: {
+                    "k": list(range(len(frame.detections))),
+                    **check_evidence(self.opened, evidence, len(frame.detections)),
+                }
+            }
+            for frame, evidence in zip(frames, found, strict=True)
+        ]
+
+
+def stage(source: Source) -> FramesStage:
+    """Return the stage of a source."""
+    name = source.configured
+    if source.of_sequences:
+        return SequenceStage(
+            name,
+            command=f"score --prior {name}",
+            reads=("frame", "prediction"),
+            writes=(source.table,),
+            settings=partial(_sequence_settings, source),
+            function=partial(_sequence_function, name),
+            prepare=partial(prepare_table, source=source),
+        )
     learns = ("ground_truth",) if PRIORS.takes(name, "thresholds") else ()
     return FrameStage(
         name,
         command=f"score --prior {name}",
         reads=("frame", *learns, "prediction"),
-        writes=(table_of(name),),
-        settings=partial(_settings, name),
+        writes=(source.table,),
+        settings=partial(_settings, source),
         function=partial(_function, Score, name),
         recall=Recall(
             reads=("frame", "prediction"),
-            settings=partial(_measured_settings, name),
-            read=partial(_read_measured, name),
+            settings=partial(_measured_settings, source),
+            read=partial(_read_measured, source),
             function=partial(_function, Rate, name),
         ),
         check=partial(_check, name),
+        prepare=partial(prepare_table, source=source),
     )
 
 
-def stages(names: Sequence[str]) -> tuple[FrameStage, ...]:
-    """The stages of several priors.
+def stages(names: Sequence[str]) -> tuple[FramesStage, ...]:
+    """Return the stages of several sources.
 
     Raises:
-        ConfigError: two of them would be stored in the same place.
+        ConfigError: if one is unknown or invalid, or two share a name or a column.
     """
-    found = tuple(map(stage, names))
-    for i, one in enumerate(found):
-        for other in found[:i]:
-            if one.writes == other.writes:
-                raise ConfigError(
-                    f"run.priors: {other.name} and {one.name} are both stored in {one.writes[0]}; "
-                    "name one of them"
-                )
-    return found
-
-
-def table_of(name: str) -> str:
-    """Where a prior's evidence is stored.
-
-    Raises:
-        ConfigError: there is no such prior, or no table for its evidence.
-    """
-    column = PRIORS.load(name).rho_column
-    if column not in TABLES:
-        raise ConfigError(
-            f"prior '{name}' answers {column}, but only {' and '.join(TABLES)} can be stored"
-        )
-    return TABLES[column]
+    return tuple(map(stage, sources_of(names)))
 
 
 def _check(name: str, workspace: Workspace) -> None:
@@ -137,8 +173,16 @@ def _check(name: str, workspace: Workspace) -> None:
         open_segmenter(workspace.config)
 
 
-def _settings(name: str, workspace: Workspace, _context: RoundContext) -> Settings:
+def _declared(source: Source) -> Settings:
+    """The declaration of a source, as far as no migration of the schema fixes it."""
+    if source.table in bulk.SCHEMA_TABLES:
+        return {}
+    return {"columns": repr(source.declaration)}
+
+
+def _settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:
     """What rho depends on beside predictions, ground truth and measurements: the formula."""
+    name = source.configured
     sections = {"thresholds": workspace.config.points, "settings": workspace.config.semantic}
     return {
         argument: section.model_dump(mode="json")
@@ -147,10 +191,16 @@ def _settings(name: str, workspace: Workspace, _context: RoundContext) -> Settin
     }
 
 
-def _measured_settings(name: str, workspace: Workspace, _context: RoundContext) -> Settings:
+def _sequence_settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:
+    """What the evidence of a sequence depends on beside its predictions."""
+    options = workspace.config.run.prior_options.get(source.configured, {})
+    return {"options": options, **_declared(source)}
+
+
+def _measured_settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:
     """What measurements depend on beside frame and predictions."""
-    config = workspace.config
-    options = {"options": config.run.prior_options.get(name, {})}
+    config, name = workspace.config, source.configured
+    options = {"options": config.run.prior_options.get(name, {}), **_declared(source)}
     if not PRIORS.takes(name, "segmenter"):
         return options
     path = segmenter_path(config)
@@ -171,6 +221,11 @@ def _function(kind: type[Score], name: str, workspace: Workspace, _context: Roun
     return kind(workspace.config, name, thresholds)
 
 
+def _sequence_function(name: str, workspace: Workspace, _context: RoundContext) -> ScoreSequence:
+    """What score does with a sequence."""
+    return ScoreSequence(workspace.config, name)
+
+
 def _learned(workspace: Workspace) -> Mapping[str, float]:
     """m_th of each category, from X_l."""
     truth = workspace.ground_truth("labeled")
@@ -183,11 +238,10 @@ def _learned(workspace: Workspace) -> Mapping[str, float]:
 
 
 def _read_measured(
-    name: str, workspace: Workspace, context: RoundContext, frame_ids: Sequence[int]
+    source: Source, workspace: Workspace, context: RoundContext, frame_ids: Sequence[int]
 ) -> Mapping[int, Measured]:
     """The measured columns of some frames, in the order of k."""
-    table = bulk.table(table_of(name))
-    names = PRIORS.load(name).measured_columns
+    table, names = bulk.table(source.table), source.measured_columns
     query = (
         select(table.c.frame_id, *(table.c[column] for column in names))
         .where(table.c.round == context.number, table.c.frame_id.in_(frame_ids))
@@ -198,6 +252,11 @@ def _read_measured(
         for key, *row in bulk.select(connection, query):
             found[key].append(tuple(row))
     return {
-        key: dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
+        key: dict(zip(names, map(_array, zip(*rows, strict=True)), strict=True))
         for key, rows in found.items()
     }
+
+
+def _array(values: Sequence[Any]) -> np.ndarray:
+    """A stored column; NaN for null."""
+    return np.array(values, dtype=np.float64) if None in values else np.array(values)

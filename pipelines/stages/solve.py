@@ -14,6 +14,7 @@ from pipelines.engine.progress import Progress
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.labels.evidence import LabelKeys, read_evidence, read_memory, solved_fingerprint
 from pipelines.labels.human_labels import refresh_matches
+from pipelines.labels.sources import report_unused
 from pipelines.workspace.workspace import Workspace
 
 TRUSTED = 0.5  # a label of a greater weight counts as trusted
@@ -46,6 +47,7 @@ def check(workspace: Workspace, policy: str) -> None:
 
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     """The policy's weights of the round."""
+    report_unused(workspace)
     context, policy = job.context, job.policy
     opened = open_policy(workspace.config, policy)
     looks_back = context.number > 1 and opened.remembers

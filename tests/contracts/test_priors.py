@@ -10,10 +10,11 @@ from support.toys import SIZES, ToySegmenter
 
 from curate.detections import CATEGORIES, Detections
 from curate.errors import ConfigError
-from curate.priors.base import columns
-from db import bulk
+from curate.priors.base import Evidence, check_evidence
+from db.evidence import evidence_table
+from db.models import Base
+from pipelines.labels.sources import source_of
 from pipelines.registry import PRIORS
-from pipelines.stages.score import TABLES, table_of
 
 # Options without which a prior cannot be made.
 SAMPLES: dict[str, dict[str, Any]] = {}
@@ -39,6 +40,13 @@ def prior(request: pytest.FixtureRequest):
     return build(request.param)
 
 
+def assert_same_evidence(one: Evidence, other: Evidence) -> None:
+    """Equal to the last bit."""
+    assert list(one) == list(other)
+    for name, column in one.items():
+        np.testing.assert_array_equal(column, other[name], err_msg=name)
+
+
 def labels(count: int, seed: int = 0) -> Detections:
     """So many boxes of all categories around the camera, some behind it, scores from 0 to 1."""
     rng = np.random.default_rng(seed)
@@ -54,46 +62,55 @@ def labels(count: int, seed: int = 0) -> Detections:
 
 
 @pytest.mark.parametrize("count", [0, 1, 60])
-def test_evidence_fits_its_table(prior, frames, count: int) -> None:
-    """A value per label and column of the table, in its order; counts are whole numbers."""
+def test_evidence_is_what_was_declared(prior, frames, count: int) -> None:
+    """A value per label and declared column, in its order and of its type."""
     found = prior.score(frames[0], labels(count))
-    table = bulk.table(TABLES[prior.rho_column])
-    assert list(columns(found)) == [
-        column.name for column in table.columns if column.name not in KEY
-    ]
-    for name, column in columns(found).items():
-        assert column.shape == (count,), name
-        kind = "iu" if table.c[name].type.python_type is int else "f"
-        assert column.dtype.kind in kind, name
-        assert np.isfinite(column).all(), name
+    assert list(found) == [column.name for column in prior.columns]
+    for column in prior.columns:
+        values = found[column.name]
+        assert values.shape == (count,), column.name
+        assert values.dtype.kind in ("iu" if column.kind.startswith("int") else "f"), column.name
+        assert column.optional or np.isfinite(values).all(), column.name
+    assert list(check_evidence(prior, found, count)) == list(found)
+
+
+def test_a_declaration_has_its_table(request: pytest.FixtureRequest, prior) -> None:
+    """With its columns in their order, each with a unit or none, and a meaning."""
+    name = request.node.callspec.params["prior"]
+    declaration = source_of(name).declaration
+    known = declaration.table in Base.metadata.tables
+    table = Base.metadata.tables[declaration.table] if known else evidence_table(declaration)
+    own = [column.name for column in table.columns if column.name not in KEY]
+    assert own == [column.name for column in prior.columns]
+    assert all(column.meaning for column in prior.columns)
+    assert prior.name == name
 
 
 def test_trust_lies_between_0_and_1(prior, frames) -> None:
     """For labels of all scores, in view or not, with points or without; not all alike."""
+    if prior.rho_column is None:
+        pytest.skip("evidence, but not a prior")
     for frame in frames:
-        rho = prior.score(frame, labels(80)).rho
+        rho = prior.score(frame, labels(80))[prior.rho_column]
         assert rho.dtype == np.float64
         assert ((rho >= 0) & (rho <= 1)).all()
         assert len(np.unique(rho)) > 1
 
 
-def test_a_prior_names_its_columns(request: pytest.FixtureRequest, prior, frames) -> None:
-    """The one of its trust has a table; those that it measures are among its evidence."""
-    found = columns(prior.score(frames[0], labels(5)))
-    assert prior.name == request.node.callspec.params["prior"]
-    assert table_of(prior.name) == TABLES[prior.rho_column]
-    assert found[prior.rho_column].tolist() == prior.score(frames[0], labels(5)).rho.tolist()
+def test_what_is_measured_is_not_the_trust(prior) -> None:
+    """It is among the columns, and the trust follows from it."""
     assert prior.measured_columns
-    assert set(prior.measured_columns) <= set(found) - {prior.rho_column}
+    names = {column.name for column in prior.columns}
+    assert set(prior.measured_columns) <= names - {prior.rho_column}
 
 
 def test_labels_do_not_matter_to_each_other(prior, frames) -> None:
     """A permutation of the labels permutes the evidence; a part of them has its part of it."""
     found = labels(50)
-    whole = columns(prior.score(frames[0], found))
+    whole = prior.score(frames[0], found)
     order = np.random.default_rng(1).permutation(50)
     for index in (order, order[:7]):
-        part = columns(prior.score(frames[0], found.select(index)))
+        part = prior.score(frames[0], found.select(index))
         for name, column in part.items():
             np.testing.assert_array_equal(column, whole[name][index], err_msg=name)
 
@@ -102,7 +119,7 @@ def test_the_order_of_the_points_does_not_matter(prior, frames) -> None:
     """A sweep is a set."""
     frame = frames[0]
     shuffled = frame.with_points(np.random.default_rng(0).permutation(frame.points))
-    assert_same(prior.score(shuffled, labels(50)), prior.score(frame, labels(50)))
+    assert_same_evidence(prior.score(shuffled, labels(50)), prior.score(frame, labels(50)))
 
 
 def test_evidence_does_not_depend_on_what_was_asked_before(prior, frames) -> None:
@@ -110,8 +127,8 @@ def test_evidence_does_not_depend_on_what_was_asked_before(prior, frames) -> Non
     before = [prior.score(frame, labels(20)) for frame in frames]
     other = build(prior.name)
     for frame, expected in reversed(list(zip(frames, before, strict=True))):
-        assert_same(other.score(frame, labels(20)), expected)
-        assert_same(prior.score(frame, labels(20)), expected)
+        assert_same_evidence(other.score(frame, labels(20)), expected)
+        assert_same_evidence(prior.score(frame, labels(20)), expected)
 
 
 def test_rating_what_was_measured_is_scoring(prior, frames) -> None:
@@ -120,9 +137,9 @@ def test_rating_what_was_measured_is_scoring(prior, frames) -> None:
     measured = prior.measure(frames[0], found)
     assert set(measured) == set(prior.measured_columns)
     expected = prior.score(frames[0], found)
-    assert_same(prior.rate(found, measured), expected)
+    assert_same_evidence(prior.rate(found, measured), expected)
     stored = {name: np.array(column.tolist()) for name, column in measured.items()}
-    assert_same(build(prior.name, measures=False).rate(found, stored), expected)
+    assert_same_evidence(build(prior.name, measures=False).rate(found, stored), expected)
 
 
 def test_frame_and_labels_are_left_as_they_are(prior, frames) -> None:
@@ -139,7 +156,7 @@ def test_frame_and_labels_are_left_as_they_are(prior, frames) -> None:
 def test_a_sweep_without_points_is_no_failure(prior, frames) -> None:
     """Every label has its evidence."""
     found = prior.score(frames[0].with_points(frames[0].points[:0]), labels(9))
-    assert ((found.rho >= 0) & (found.rho <= 1)).all()
+    assert list(check_evidence(prior, found, 9)) == [column.name for column in prior.columns]
 
 
 def test_the_image_is_read_only_where_it_is_needed(prior, frames) -> None:
@@ -147,4 +164,4 @@ def test_the_image_is_read_only_where_it_is_needed(prior, frames) -> None:
     assert isinstance(prior.needs_image, bool)
     if not prior.needs_image:
         bare = replace(frames[0], image=None)
-        assert_same(prior.score(bare, labels(9)), prior.score(frames[0], labels(9)))
+        assert_same_evidence(prior.score(bare, labels(9)), prior.score(frames[0], labels(9)))

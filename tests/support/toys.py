@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -12,7 +13,14 @@ from curate.datasets.kitti.dataset import KittiDataset, write_calibration
 from curate.datasets.kitti.labels import from_annotations, write_objects
 from curate.detections import Annotations, Detections
 from curate.frames import Calibration, Frame
-from curate.priors.base import Measured
+from curate.priors.base import (
+    Column,
+    Evidence,
+    EvidenceSource,
+    Measured,
+    SequenceFrame,
+    SequenceSource,
+)
 from curate.segmenters.base import SemanticMap
 
 IMAGE_SIZE = (120, 40)
@@ -144,52 +152,58 @@ class ToySegmenter:
 
 
 @dataclass(frozen=True)
-class ToyEvidence:
-    """What the toy prior says: columns of the point prior's table."""
+class ToyPrior(EvidenceSource):
+    """A prior of somebody else's: an integer and a real number are measured, a third follows."""
 
-    points: np.ndarray
-    points_threshold: np.ndarray
-    rho_diff: np.ndarray
-
-    @property
-    def rho(self) -> np.ndarray:
-        """(n,) rho_diff."""
-        return self.rho_diff
-
-
-@dataclass(frozen=True)
-class ToyPrior:
-    """A user's own prior in the place of the point prior: it counts all points of the frame.
-
-    Attributes:
-        plenty: so many are enough.
-    """
-
-    plenty: float = 1000.0
+    plenty: float = 12.0
     name: ClassVar[str] = "toy"
-    rho_column: ClassVar[str] = "rho_diff"
-    measured_columns: ClassVar[tuple[str, ...]] = ("points",)
-    needs_image: ClassVar[bool] = False
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column("near_points", "int32", "1", "LiDAR points within 5 m of the centre"),
+        Column("nearest", "float64", "m", "distance of the nearest LiDAR point", optional=True),
+        Column("rho_toy", "float64", "1", "toy prior: near_points / plenty, at most 1"),
+    )
+    rho_column: ClassVar[str | None] = "rho_toy"
+    measured_columns: ClassVar[tuple[str, ...]] = ("near_points", "nearest")
 
     def measure(self, frame: Frame, detections: Detections) -> Measured:
-        """The points of the frame, for each label."""
-        return {"points": np.full(len(detections), len(frame.points))}
+        """Distances from the centres."""
+        centres = detections.boxes[:, None, :3]
+        apart = np.linalg.norm(frame.points[None, :, :3] - centres, axis=-1)
+        nearest = apart.min(axis=1, initial=np.inf)
+        return {
+            "near_points": (apart < 5).sum(axis=1),
+            "nearest": np.where(np.isfinite(nearest), nearest, np.nan),
+        }
 
-    def rate(self, detections: Detections, measured: Measured) -> ToyEvidence:
-        """Their share of plenty."""
-        points = measured["points"]
-        rho = np.minimum(points / self.plenty, 1.0)
-        return ToyEvidence(points, np.full(len(detections), self.plenty), rho)
-
-    def score(self, frame: Frame, detections: Detections) -> ToyEvidence:
-        """Both."""
-        return self.rate(detections, self.measure(frame, detections))
+    def rate(self, detections: Detections, measured: Measured) -> Evidence:
+        """Compare the count with what is plenty."""
+        rho = np.minimum(np.asarray(measured["near_points"]) / self.plenty, 1.0)
+        return {**measured, "rho_toy": rho}
 
 
-class UnstorablePrior(ToyPrior):
-    """A prior whose trust has no place in the tables."""
+class ToyPriorAgain(ToyPrior):
+    """Another class with the same name."""
 
-    rho_column: ClassVar[str] = "rho_map"
+
+class ToyTracks(SequenceSource):
+    """A source of somebody else's that counts how often a category occurs in the whole sequence."""
+
+    name: ClassVar[str] = "toy_tracks"
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column("occurrences", "int64", "1", "labels of the category in the sequence"),
+        Column("first_frame", "name", "", "first frame of the sequence"),
+    )
+
+    def score_sequence(self, frames: Sequence[SequenceFrame]) -> Sequence[Evidence]:
+        """Count over all frames."""
+        names = np.concatenate([frame.detections.categories for frame in frames])
+        return [
+            {
+                "occurrences": np.array([(names == each).sum() for each in found.categories]),
+                "first_frame": np.full(len(found), frames[0].frame_id),
+            }
+            for found in (frame.detections for frame in frames)
+        ]
 
 
 class ToySequences(KittiDataset):

@@ -65,7 +65,8 @@ def judged(request, kitti_root):
         verdict = judge(found, dataset.annotations(frame_id), JudgeSettings(neighbors_are="right"))
         rows.append((
             np.full(len(found), index), found.categories, found.scores,
-            consistency(found, back).loss, *(prior.score(frame, found).rho for prior in priors),
+            consistency(found, back).loss,
+            *(prior.score(frame, found)[prior.rho_column] for prior in priors),
             verdict.right,
         ))  # fmt: skip
     *columns, diff, anno, right = (np.concatenate(column) for column in zip(*rows, strict=True))

@@ -98,7 +98,7 @@ def test_the_semantic_prior_counts_the_pixels_of_masks(tmp_path: Path) -> None:
     evidence = prior.score(FRAME, cars)
     columns = np.arange(np.floor(left + 0.5), np.floor(right + 0.5) + 1)
     share = (columns < middle).mean()
-    assert evidence.rho_anno == pytest.approx(np.sqrt(0.81 * share))
+    assert evidence["rho_anno"] == pytest.approx(np.sqrt(0.81 * share))
     assert 0.4 < share < 0.6
 
 

@@ -1,17 +1,30 @@
-"""Priors as stages: the shipped ones, and those that a user brings."""
+"""Evidence sources as stages: the shipped ones, and those from outside."""
 
+import csv
+import json
+import re
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy import text
-from support.rounds import run_workspace
+from support.pipelines_cli import Curate
+from support.rounds import run_stage, run_workspace
+from support.toys import ToyPrior, ToySequences
 
 from curate.errors import ConfigError
+from pipelines.labels.sources import source_of
 from pipelines.registry import PRIORS
 from pipelines.round import round_graph
+from pipelines.workspace.config import write_config
 from pipelines.workspace.workspace import Workspace
 
-OWN = "support.toys:ToyPrior"
+OWN, TRACKS = "support.toys:ToyPrior", "support.toys:ToyTracks"
+ENGINES = ("sqlite", "postgresql")
 
 
 def run(workspace: Workspace) -> dict[str, int]:
@@ -19,36 +32,187 @@ def run(workspace: Workspace) -> dict[str, int]:
     return {report.stage: report.done for report in run_workspace(workspace)}
 
 
-def answers(workspace: Workspace) -> list[tuple]:
-    """What the view shows of the point prior and of what follows from it."""
-    columns = "frame, k, points, points_threshold, rho_diff, rho_det, weight"
+def rows(workspace: Workspace, columns: str = "*") -> list[dict[str, Any]]:
+    """What the view shows, by column name."""
     with workspace.database.reading() as connection:
         query = text(f"SELECT {columns} FROM weighted_labels ORDER BY frame, k")
-        return list(map(tuple, connection.execute(query)))
+        return [dict(row) for row in connection.execute(query).mappings()]
 
 
-def test_a_prior_of_the_users_own_takes_the_place_of_another(workspace: Workspace) -> None:
-    """Named as module:Class, with an option; its evidence is stored like that of the other."""
-    options = {OWN: {"plenty": 5000.0}}
-    own = workspace.with_settings("run", priors=(OWN, "semantic"), prior_options=options)
+def test_a_prior_from_outside_has_its_columns_everywhere(
+    curate: Curate, workspace: Workspace, tmp_path: Path
+) -> None:
+    """In the view, the weights, the exports, the explanation, the report and queries."""
+    own = workspace.with_settings(
+        "run", priors=("points", OWN), prior_options={OWN: {"plenty": 30.0}}
+    )
+    write_config(workspace.root / "curate.toml", own.config)
     assert run(own)[OWN] == 6
-    rows = answers(own)
-    assert len(rows) == 18
-    assert {row[3] for row in rows} == {5000.0}
-    assert all(row[4] == pytest.approx(row[2] / 5000) for row in rows)
+    found = rows(own)
+    assert len(found) == 18
+    assert list(found[0])[-4:] == ["weight", "near_points", "nearest", "rho_toy"]
+    for row in found:
+        assert row["rho_toy"] == pytest.approx(min(row["near_points"] / 30, 1))
+        assert row["rho_det"] == pytest.approx(row["rho_diff"] * row["rho_toy"])
+    assert {type(row["near_points"]) for row in found} == {int}
+    with closing(sqlite3.connect(own.root / "exports" / "labels.sqlite")) as exported:
+        exported.row_factory = sqlite3.Row
+        query = "SELECT * FROM weighted_labels ORDER BY frame, k"
+        assert [dict(row) for row in exported.execute(query)] == found
+    for name in ("csv", "parquet"):
+        path = tmp_path / f"labels.{name}"
+        assert curate("export", "--format", name, "--output", path, "-w", own.root)[0] == 0
+    with (tmp_path / "labels.csv").open(newline="") as file:
+        written = list(csv.DictReader(file))
+    assert [float(row["nearest"]) for row in written] == [row["nearest"] for row in found]
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is an extra")
+    table = parquet.read_table(tmp_path / "labels.parquet")
+    assert table.column("near_points").to_pylist() == [row["near_points"] for row in found]
+    assert str(table.schema.field("near_points").type) == "int32"
+    frame = found[0]["frame"]
+    code, out, err = curate("explain", frame, "0", "-w", own.root)
+    assert code == 0, err
+    assert f"near_points = {found[0]['near_points']}" in out
+    assert f"rho_toy {found[0]['rho_toy']:.4f}" in out
+    assert "recomputed" in out
+    assert "they differ" not in out
+    assert curate("report", "-w", own.root)[0] == 0
+    page = (own.root / "reports" / "round-01-pspsl.html").read_text()
+    assert "toy prior: near_points / plenty, at most 1" in page
+    sql = "SELECT rho_toy FROM weighted_labels ORDER BY frame, k"
+    out = curate("query", sql, "--json", "-w", own.root)[1]
+    assert [row["rho_toy"] for row in json.loads(out)] == [row["rho_toy"] for row in found]
 
 
-def test_priors_that_take_turns_do_not_pass_for_each_other(workspace: Workspace) -> None:
-    """Both fill the same table: back at the first, its evidence is gathered again."""
+def test_a_source_of_sequences_sees_whole_sequences(workspace: Workspace) -> None:
+    """Its columns are in the view; it is no prior, so the weights are those without it."""
+    sequenced = workspace.with_settings(
+        "dataset", kind="support.toys:ToySequences", split_by="frame"
+    )
+    run(sequenced)
+    before = [row["weight"] for row in rows(sequenced)]
+    own = sequenced.with_settings("run", priors=("points", "semantic", TRACKS))
+    assert run(own)[TRACKS] == 6
+    found = rows(own)
+    assert [row["weight"] for row in found] == before
+    frames = list(own.frames("unlabeled"))
+    for row in found:
+        sequence = ToySequences.sequence_name(row["frame"])
+        members = [name for name in frames if ToySequences.sequence_name(name) == sequence]
+        assert row["occurrences"] == len(members)
+        assert row["first_frame"] == members[0]
+    assert run(own)[TRACKS] == 0
+
+
+def test_a_prior_that_is_replaced_gets_its_evidence_again(workspace: Workspace) -> None:
+    """Each source has a table of its own; back at the first, nothing is gathered again."""
     run(workspace)
-    before = answers(workspace)
+    before = rows(workspace)
     own = workspace.with_settings("run", priors=(OWN, "semantic"))
     done = run(own)
     assert (done[OWN], done["semantic"]) == (6, 0)
-    assert answers(own) != before
-    assert run(workspace)["points"] == 6
-    assert answers(workspace) == before
-    assert set(run(workspace).values()) == {0}
+    assert [row["weight"] for row in rows(own)] != [row["weight"] for row in before]
+    assert run(workspace)["points"] == 0
+    core = [{name: row[name] for name in before[0]} for row in rows(workspace)]
+    assert core == before
+    assert run(own)[OWN] == 0
+
+
+def test_a_changed_declaration_makes_its_table_anew(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What it stored is computed again; one line says so."""
+    own = workspace.with_settings("run", priors=("points", OWN))
+    run(own)
+    changed = tuple(replace(column, meaning="changed") for column in ToyPrior.columns)
+    monkeypatch.setattr(ToyPrior, "columns", changed)
+    source_of.cache_clear()
+    assert run(own)[OWN] == 6
+    [line] = [each for each in caplog.messages if "is made anew" in each]
+    assert "evidence source 'toy'" in line
+    assert "prior_toy" in line
+    source_of.cache_clear()
+
+
+def test_a_source_that_left_the_configuration_is_named(
+    workspace: Workspace, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its table stays, its columns are shown, and no weight uses it."""
+    run(workspace.with_settings("run", priors=("points", OWN)))
+    caplog.clear()
+    run(workspace)
+    lines = [each for each in caplog.messages if "not in run.priors any more" in each]
+    assert len(set(lines)) == 1
+    assert "'toy'" in lines[0]
+    assert "prior_toy" in lines[0]
+    for row in rows(workspace):
+        assert row["rho_toy"] is not None
+        assert row["rho_det"] == pytest.approx(row["rho_diff"] * row["rho_anno"])
+
+
+COLUMN = ToyPrior.columns[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"columns": (COLUMN, COLUMN)}, "'toy'.*'near_points': declared twice"),
+        ({"columns": (replace(COLUMN, name="score"),)}, "'score': the name is reserved"),
+        ({"columns": (replace(COLUMN, name="rho_diff"),)}, "'rho_diff': the name is reserved"),
+        ({"columns": (replace(COLUMN, name="probability"),)}, "'probability': .* reserved"),
+        ({"columns": (replace(COLUMN, name="No good"),)}, "'No good': the name must be of"),
+        ({"columns": (replace(COLUMN, kind="int128"),)}, "unknown type 'int128', use one of int32"),
+        ({"columns": ()}, "'toy': declares no columns"),
+        ({"name": "Toy prior"}, "'Toy prior': the name must be of"),
+        ({"rho_column": "trust"}, "rho_column 'trust' is not a declared column"),
+        ({"name": "points"}, "the name 'points' is taken"),
+    ],
+)
+def test_a_wrong_declaration_is_refused_before_any_work(
+    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], message: str
+) -> None:
+    """In one line that names the source and the column."""
+    for name, value in changes.items():
+        monkeypatch.setattr(ToyPrior, name, value)
+    source_of.cache_clear()
+    with pytest.raises(ConfigError, match=message) as caught:
+        round_graph(("points", OWN))
+    assert "\n" not in str(caught.value)
+    source_of.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"rho_toy": [0.5]}, "column rho_toy has 1 rows, not 3"),
+        ({"rho_toy": [0.5, np.nan, 0.5]}, "rho_toy of label 1 is None, but the column is not"),
+        ({"rho_toy": [0.5, 1.5, 0.5]}, r"rho_toy of label 1 is 1.5, not in \[0, 1\]"),
+        ({"near_points": [1, 2.5, 3]}, "near_points of label 1 is 2.5, not a number of int32"),
+        ({"near_points": [1, 2**40, 3]}, "near_points of label 1 is 1099511627776, not a number"),
+        ({"nearest": ["a", "b", "c"]}, "nearest of label 0 is 'a', not a finite number"),
+        ({"more": [1, 2, 3]}, "column more is not declared"),
+    ],
+)
+def test_wrong_evidence_fails_its_frame_in_one_line(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, wrong: dict[str, list], message: str
+) -> None:
+    """The line names the source and the column."""
+    right = ToyPrior.rate
+    monkeypatch.setattr(
+        ToyPrior,
+        "rate",
+        lambda self, *arguments: {
+            **right(self, *arguments),
+            **{name: np.array(values) for name, values in wrong.items()},
+        },
+    )
+    own = workspace.with_settings("run", priors=("points", OWN))
+    run_stage(own, "predict")
+    report = run_stage(own, OWN)
+    assert report.failed == 6
+    for _, error in report.errors:
+        assert re.search(f"evidence source 'toy': .*{message}", error), error
+        assert "\n" not in error
 
 
 def test_other_maps_in_the_same_folder_are_looked_at_anew(
@@ -68,16 +232,10 @@ def test_other_maps_in_the_same_folder_are_looked_at_anew(
     assert run(own)["semantic"] == 0
 
 
-def test_two_priors_for_one_place_are_refused() -> None:
-    """The error names both and the table."""
-    with pytest.raises(ConfigError, match=r"points and support.toys:ToyPrior.*point_prior"):
-        round_graph(("points", OWN))
-
-
-def test_evidence_without_a_place_is_refused() -> None:
-    """The error names what can be stored."""
-    with pytest.raises(ConfigError, match=r"rho_map.*rho_diff and rho_anno"):
-        round_graph(("support.toys:UnstorablePrior",))
+def test_two_sources_of_one_name_are_refused() -> None:
+    """The error names both."""
+    with pytest.raises(ConfigError, match=r"ToyPrior and .*ToyPriorAgain have the same name 'toy'"):
+        round_graph((OWN, "support.toys:ToyPriorAgain"))
 
 
 def test_an_unknown_prior_is_refused() -> None:

@@ -1,0 +1,131 @@
+"""Tables of evidence sources, made from what the sources declare.
+
+`point_prior` and `semantic_prior` are tables of the schema. Any other source has a table
+`prior_NAME`, made when the source is first used and recorded in `evidence_source`. From this record
+the columns behind the core ones of `weighted_labels` follow.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    Connection,
+    Float,
+    ForeignKeyConstraint,
+    Integer,
+    MetaData,
+    Table,
+    Text,
+    select,
+)
+from sqlalchemy.schema import CreateTable, DropTable
+from sqlalchemy.types import TypeEngine
+
+from curate.exporters.columns import WEIGHTED_LABELS, as_optional
+from curate.priors.base import Column as Declared
+from db.models import Base, EvidenceSource
+
+OWN_TABLES: Mapping[str, str] = {"points": "point_prior", "semantic": "semantic_prior"}
+"""The tables of sources that are part of the schema."""
+_KEY = ("round", "frame_id", "k")
+_TYPES: Mapping[str, TypeEngine[Any]] = {
+    "int32": Integer(), "int64": BigInteger(), "float64": Float(53), "name": Text(),
+}  # fmt: skip
+_RECORD = Base.metadata.tables[EvidenceSource.__tablename__]
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What an evidence source stores.
+
+    Attributes:
+        name: of the source.
+        source: as the configuration names it.
+        columns: beside the key of the label.
+        rho_column: see `curate.priors.base.Declared`.
+    """
+
+    name: str
+    source: str
+    columns: tuple[Declared, ...]
+    rho_column: str | None
+
+    @property
+    def table(self) -> str:
+        """The name of its table."""
+        return OWN_TABLES.get(self.name, f"prior_{self.name}")
+
+
+def evidence_table(declaration: Declaration) -> Table:
+    """Return the table of a source that is not part of the schema."""
+    prediction = Base.metadata.tables["prediction"]
+    columns = [
+        Column(each.name, _TYPES[each.kind], nullable=each.optional, comment=each.meaning)
+        for each in declaration.columns
+    ]
+    return Table(
+        declaration.table,
+        MetaData(naming_convention=Base.metadata.naming_convention),
+        *(Column(name, Integer, primary_key=True, autoincrement=False) for name in _KEY),
+        *columns,
+        ForeignKeyConstraint(_KEY, [prediction.c[name] for name in _KEY], ondelete="CASCADE"),
+        sqlite_with_rowid=False,
+    )
+
+
+def read_declarations(connection: Connection) -> tuple[Declaration, ...]:
+    """Return what sources have declared that are not part of the schema, by name."""
+    c = _RECORD.c
+    rows = connection.execute(select(c.name, c.source, c.columns, c.rho_column).order_by(c.name))
+    return tuple(
+        Declaration(
+            row.name,
+            row.source,
+            tuple(Declared(**column) for column in json.loads(row.columns)),
+            row.rho_column,
+        )
+        for row in rows
+    )
+
+
+def declare(connection: Connection, declaration: Declaration) -> bool:
+    """Make the table of a source where there is none, and record its declaration.
+
+    A table of the same name with other columns, or of another class, is made anew, and the tasks of
+    that source are deleted: evidence can be computed again.
+
+    Returns:
+        Whether anything changed; the views are then to be made anew.
+    """
+    former = {each.name: each for each in read_declarations(connection)}.get(declaration.name)
+    if declaration.name in OWN_TABLES or former == declaration:
+        return False
+    if former is not None:
+        connection.execute(DropTable(evidence_table(former)))
+        task = Base.metadata.tables["task"]
+        connection.execute(task.delete().where(task.c.stage == former.source))
+        connection.execute(_RECORD.delete().where(_RECORD.c.name == declaration.name))
+    connection.execute(CreateTable(evidence_table(declaration)))
+    row = {
+        "name": declaration.name,
+        "source": declaration.source,
+        "columns": json.dumps([asdict(column) for column in declaration.columns]),
+        "rho_column": declaration.rho_column,
+    }
+    connection.execute(_RECORD.insert().values(**row))
+    return True
+
+
+def weighted_label_columns(connection: Connection) -> tuple[Declared, ...]:
+    """Return all columns of the view `weighted_labels`: the core ones, then further evidence."""
+    return label_columns(read_declarations(connection))
+
+
+def label_columns(declarations: Sequence[Declaration]) -> tuple[Declared, ...]:
+    """Return the core columns of a weighted label, then those of further sources."""
+    further = (column for each in declarations for column in each.columns)
+    return (*WEIGHTED_LABELS, *as_optional(tuple(further)))
