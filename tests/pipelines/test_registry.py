@@ -41,6 +41,6 @@ def test_a_class_without_what_the_pipeline_asks_for_is_refused(
     )
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(
-        ConfigError, match=r"^prior '.*' has no rho_column, rate, score; see curate"
+        ConfigError, match=r"^prior '.*' has no columns, rho_column; see curate"
     ):
         PRIORS.load("priors_of_a_user:Mine")
