@@ -25,7 +25,7 @@ _ANCHORS = np.array(
 def weight_colours(weights: np.ndarray) -> np.ndarray:
     """(n, 3) uint8 RGB of (n,) weights in [0, 1].
 
-    Weight 0, which is not learned as an object, is grey; NaN means that nobody weighted the box and is orange.
+    Weight 0 is grey; NaN means that nobody weighted the box and is orange.
     """
     unknown = np.isnan(weights)
     place = np.clip(np.where(unknown, 0, weights), 0, 1) * (len(_ANCHORS) - 1)

@@ -19,6 +19,7 @@ from pipelines.assembly import semantic_settings
 from pipelines.labels.by_frame import refuse_bad_weights, weighted_round
 from pipelines.registry import PRIORS
 from pipelines.review.decisions import tell_decision
+from pipelines.stages.methods import ZERO_WEIGHT_WORDS, zero_weight_of
 from pipelines.workspace.config import Config, make_config
 from pipelines.workspace.workspace import Workspace
 
@@ -323,12 +324,19 @@ def _lines(
         formulas["pspsl"] = "rho_det, without the self-paced term"
     formula = formulas.get(label["policy"], "see curate solve --help")
     lines.append(f"  policy         {label['policy']}: v = {formula}")
-    lines.append(f"  weight         {number['weight']}")
+    lines.append(f"  weight         {number['weight']}{_meaning(config, label)}")
     if recomputed is not None:
         lines.append(f"  recomputed     {_working(label, evidence, age)}{recomputed:.4f}")
         if not math.isclose(recomputed, label["weight"], abs_tol=1e-6):
             lines.append("  they differ: settings have changed since; `curate solve` weighs again")
     return lines
+
+
+def _meaning(config: Config, label: dict[str, Any]) -> str:
+    """What labels of weight 0 are to the student; empty for other weights."""
+    if label["weight"] > 0:
+        return ""
+    return f" ({ZERO_WEIGHT_WORDS[zero_weight_of(config, label['policy'])]})"
 
 
 def _numbers(label: dict[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from curate.viewing.page import ALL, Figure, Section
 from curate.viewing.svg import Mark, histogram
 from db import bulk
 from pipelines.reports.totals import BANDS, SHARES, SHOWN_AGES, RoundTotals, Sums
-from pipelines.stages.methods import zero_weight_of
+from pipelines.stages.methods import ZERO_WEIGHT_WORDS, zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
 _TOLD = {
@@ -19,8 +19,6 @@ _TOLD = {
     "rho_anno": "the semantic prior (Eq. 9)",
     "rho_det": "the product of the priors",
 }
-
-ZERO_WEIGHT_WORDS = {"background": "background", "ignore": "regions to ignore"}
 
 
 def is_repredicted(workspace: Workspace, number: int) -> bool:
