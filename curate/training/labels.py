@@ -104,8 +104,9 @@ class WeightedLabels(Dataset[Sample]):
         self.frame_ids: tuple[str, ...] = tuple(frame for frame, _ in frames)
         self.labeled = np.array([split == "labeled" for _, split in frames], dtype=bool)
         self._boxes = dict.fromkeys(self.frame_ids, _NO_BOXES)
-        # What a person rejected is background under every policy.
+        # What a person rejected is background, also where a weight of 0 is to be ignored.
         rejected = "provenance IS 'human' AND weight IS 0"
+        rejected = rejected if self.zero_weight == "ignore" else "false"
         for table, weight, left_out in (
             ("ground_truth", "1.0", "0"),
             ("label", "weight", rejected),

@@ -108,6 +108,7 @@ def draw_bird_eye(
     draw_title(canvas, title, "bird's eye view, x forward, metres")
     draw_legend(
         canvas,
+        zero_weight=labels.zero_weight,
         truth=truth_boxes is not None,
         repredictions=repredictions is not None,
         unweighted=bool(np.isnan(labels.weights).any()),

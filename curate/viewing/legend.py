@@ -13,6 +13,7 @@ from curate.viewing.palette import (
     ZERO_WEIGHT,
     weight_colours,
 )
+from curate.weighting.base import ZeroWeight
 
 STRIP_HEIGHT = 40
 TITLE_HEIGHT = 36
@@ -37,6 +38,7 @@ def draw_legend(
     canvas: Canvas,
     *,
     truth: bool,
+    zero_weight: ZeroWeight = "background",
     repredictions: bool = False,
     unweighted: bool = False,
     human: bool = False,
@@ -46,7 +48,7 @@ def draw_legend(
     canvas.box(0, top, canvas.width, canvas.height, PANEL)
     baseline = top + 25.0
     left = _weight_bar(canvas, 14.0, top + 13.0, baseline)
-    left = _swatch(canvas, left, baseline, "weight 0", ZERO_WEIGHT)
+    left = _swatch(canvas, left, baseline, f"weight 0: {zero_weight}", ZERO_WEIGHT)
     if unweighted:
         left = _swatch(canvas, left, baseline, "not weighted", UNWEIGHTED)
     if repredictions:

@@ -88,6 +88,7 @@ def draw_overlay(
     if legend:
         draw_legend(
             canvas,
+            zero_weight=labels.zero_weight,
             truth=truth_boxes is not None,
             repredictions=repredictions is not None,
             unweighted=bool(np.isnan(labels.weights).any()),

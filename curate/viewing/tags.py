@@ -6,6 +6,7 @@ import numpy as np
 
 from curate.viewing.canvas import Canvas, Colour, text_width
 from curate.viewing.palette import BACKGROUND, FAINT_TEXT, weight_colours
+from curate.weighting.base import ZeroWeight
 
 _LARGE, _SMALL = 14.0, 10.5
 _LINE_PIXELS = (15.0, 12.0)
@@ -22,9 +23,9 @@ class ShownLabels:
         boxes: (n, 7) in the LiDAR frame.
         categories: (n,) str.
         scores: (n,) in [0, 1].
-        weights: (n,) in [0, 1]; 0 means that the label is not learned as an object, NaN that
-            nobody weighted it.
+        weights: (n,) in [0, 1]; NaN where nobody weighted the label.
         points: (n,) LiDAR points inside each box, or None where they were not counted.
+        zero_weight: what a label of weight 0 is to a student, for the legend.
     """
 
     boxes: np.ndarray
@@ -32,6 +33,7 @@ class ShownLabels:
     scores: np.ndarray
     weights: np.ndarray
     points: np.ndarray | None = None
+    zero_weight: ZeroWeight = "background"
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -47,7 +49,7 @@ class ShownLabels:
         return np.where(np.isnan(self.weights), 0.5, self.weights)
 
     def caption(self, index: int) -> tuple[str, str]:
-        """The two lines of a label's caption; the first is empty where the label has weight 0."""
+        """The two lines of a label's caption; the first is empty where the label weighs 0."""
         points = "" if self.points is None else f"  {self.points[index]} pts"
         weight = f"{self.weights[index]:.2f}" if self.weights[index] > 0 else ""
         return weight, f"{self.categories[index]} {self.scores[index]:.2f}{points}"

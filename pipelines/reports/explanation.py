@@ -21,9 +21,8 @@ from pipelines.assembly import open_prior, open_sequence_source
 from pipelines.labels.by_frame import refuse_bad_weights, weighted_round
 from pipelines.labels.sources import Source, sources_of
 from pipelines.registry import PRIORS
-from pipelines.reports.figures import ZERO_WEIGHT_WORDS
 from pipelines.review.decisions import tell_decision
-from pipelines.stages.methods import zero_weight_of
+from pipelines.stages.methods import ZERO_WEIGHT_WORDS, zero_weight_of
 from pipelines.workspace.config import Config, make_config
 from pipelines.workspace.workspace import Workspace
 
@@ -326,9 +325,7 @@ def _lines(
         formulas["pspsl"] = "rho_det, without the self-paced term"
     formula = formulas.get(label["policy"], "see curate solve --help")
     lines.append(f"  policy         {label['policy']}: v = {formula}")
-    meaning = zero_weight_of(config, label["policy"])
-    zero = f", which is {ZERO_WEIGHT_WORDS[meaning]} to a student" if label["weight"] == 0 else ""
-    lines.append(f"  weight         {number['weight']}{zero}")
+    lines.append(f"  weight         {number['weight']}{_meaning(config, label)}")
     if recomputed is not None:
         lines.append(f"  recomputed     {_working(label, evidence, age)}{recomputed:.4f}")
         if not math.isclose(recomputed, label["weight"], abs_tol=1e-6):
@@ -343,6 +340,13 @@ def _described(
     if source.of_sequences:
         return open_sequence_source(config, source.configured).describe(number)
     return _opened(config, source, label).describe(number)
+
+
+def _meaning(config: Config, label: dict[str, Any]) -> str:
+    """What labels of weight 0 are to the student; empty for other weights."""
+    if label["weight"] > 0:
+        return ""
+    return f" ({ZERO_WEIGHT_WORDS[zero_weight_of(config, label['policy'])]})"
 
 
 def _numbers(label: dict[str, Any]) -> dict[str, Any]:

@@ -9,10 +9,8 @@ from curate.viewing.page import ALL, Figure, Section
 from curate.viewing.svg import Mark, histogram
 from db import bulk
 from pipelines.reports.totals import BANDS, SHOWN_AGES, RoundTotals, Sums
-from pipelines.stages.methods import zero_weight_of
+from pipelines.stages.methods import ZERO_WEIGHT_WORDS, zero_weight_of
 from pipelines.workspace.workspace import Workspace
-
-ZERO_WEIGHT_WORDS = {"background": "background", "ignore": "regions to ignore"}
 
 
 def is_repredicted(workspace: Workspace, number: int) -> bool:

@@ -13,6 +13,7 @@ from curate.viewing.overlay import draw_overlay
 from curate.viewing.tags import ShownLabels
 from pipelines.labels.by_frame import FrameLabels, read_labels
 from pipelines.labels.of_one_frame import chosen_round, read_frame
+from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
 
@@ -64,7 +65,12 @@ def frame_picture(workspace: Workspace, name: str, round_number: int, policy: st
     frame = workspace.dataset.read(name, image=True)
     counts = count_points_in_boxes(frame.points, found.labels.boxes)
     labels = ShownLabels(
-        found.labels.boxes, found.labels.categories, found.labels.scores, found.weights, counts
+        found.labels.boxes,
+        found.labels.categories,
+        found.labels.scores,
+        found.weights,
+        counts,
+        zero_weight_of(workspace.config, policy),
     )
     title = f"frame {name} ({found.split}), round {round_number}, weights by {policy}"
     return draw_frame(
@@ -88,6 +94,7 @@ def draw_labels(workspace: Workspace, round_number: int, shown: FrameLabels) -> 
         shown.labels.scores,
         shown.weights,
         shown.points,
+        zero_weight_of(workspace.config, workspace.config.run.method),
     )
     title = f"frame {shown.frame}, round {round_number}, weights by {workspace.config.run.method}"
     stem = f"round-{round_number:02d}-{shown.frame}"

@@ -14,6 +14,7 @@ from db import bulk
 from db.views import weighted_labels
 from pipelines.labels.columns import numeric_columns
 from pipelines.labels.of_one_frame import read_frame
+from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
 
@@ -43,12 +44,18 @@ def _recorded(
     workspace: Workspace, names: Sequence[str], round_number: int, policy: str
 ) -> Iterator[RecordedFrame]:
     """The frames, one at a time: their points do not fit into memory together."""
+    meaning = zero_weight_of(workspace.config, policy)
     for name in names:
         found = read_frame(workspace, name, round_number, policy)
         frame = workspace.dataset.read(name, image=True)
         counts = count_points_in_boxes(frame.points, found.labels.boxes)
         labels = ShownLabels(
-            found.labels.boxes, found.labels.categories, found.labels.scores, found.weights, counts
+            found.labels.boxes,
+            found.labels.categories,
+            found.labels.scores,
+            found.weights,
+            counts,
+            meaning,
         )
         evidence = _evidence(workspace, name, round_number, policy, len(labels))
         evidence["points"] = counts.astype(np.float64)
@@ -59,7 +66,8 @@ def _recorded(
             found.repredictions,
             found.truth_boxes,
             None if found.truth is None else found.truth.categories,
-            f"frame {name} ({found.split}), round {round_number}, weights by {policy}",
+            f"frame {name} ({found.split}), round {round_number}, weights by {policy}; "
+            f"weight 0: {meaning}",
         )
 
 

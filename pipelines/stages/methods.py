@@ -16,6 +16,12 @@ from pipelines.workspace.config import Config
 
 TeacherMode = Literal["student", "ema"]
 
+ZERO_WEIGHT_WORDS: Final[Mapping[ZeroWeight, str]] = {
+    "background": "background",
+    "ignore": "regions to ignore",
+}
+"""What the labels of weight 0 are, in words."""
+
 
 @dataclass(frozen=True)
 class Method:

@@ -1,12 +1,12 @@
 """What every registered exporter promises."""
 
+import copy
 import csv
 import json
 import pickle
 import sqlite3
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,12 +70,14 @@ def read_csv(path: Path) -> Written:
 
 
 def read_coco(path: Path) -> Written:
-    """The annotations of the unlabeled images."""
+    """The annotations of the unlabeled images, and what is background."""
     document = json.loads(path.read_text())
     names = {category["id"]: category["name"] for category in document["categories"]}
     images = {image["id"]: image for image in document["images"] if image["split"] == "unlabeled"}
     found: dict[str, list[tuple]] = {image["frame"]: [] for image in images.values()}
-    for each in document["annotations"]:
+    annotations = [*document["annotations"], *document["background"]]
+    assert all(each["weight"] == 0 for each in document["background"])
+    for each in sorted(annotations, key=lambda each: each["k"]):
         if each["image_id"] in images:
             row = (names[each["category_id"]], *each["box_3d"], each["weight"])
             found[images[each["image_id"]]["frame"]].append(row)
@@ -98,7 +100,7 @@ def read_st3d(path: Path) -> Written:
     found = {}
     for name, frame in pickle.loads((path / "ps_label_e0.pkl").read_bytes()).items():
         boxes, weights = frame["gt_boxes"], frame["weight"]
-        assert ((boxes[:, 7] < 0) == (weights == 0)).all()
+        assert ((boxes[:, 7] < 0) == (weights == 0)).all()  # background is left out
         categories = [CATEGORIES[int(abs(number)) - 1] for number in boxes[:, 7]]
         rows = np.column_stack([boxes[:, :7].astype(float), weights]).tolist()
         found[name] = [(c, *row) for c, row in zip(categories, rows, strict=True)]
@@ -135,14 +137,15 @@ def read_parquet(path: Path) -> Written:
 
 
 def read_nuscenes(path: Path) -> Written:
-    """Results and ignored boxes, brought back from the map."""
+    """Results, and boxes that are ignored or background, brought back from the map."""
     document = json.loads(path.read_text())
     found = {}
     for name, results in document["results"].items():
         assert all(box["weight"] > 0 for box in results)
-        assert all(box["weight"] == 0 for box in document["ignored"][name])
+        nothing = document["ignored"][name] + document["background"][name]
+        assert all(box["weight"] == 0 for box in nothing)
         rows = []
-        for box in sorted(results + document["ignored"][name], key=lambda box: box["k"]):
+        for box in sorted(results + nothing, key=lambda box: box["k"]):
             w, *xyz = box["rotation"]
             turn = Rotation.from_quat([*xyz, w])
             back = MAP_POSE[:3, :3].T @ (np.array(box["translation"]) - MAP_POSE[:3, 3])
@@ -168,6 +171,8 @@ SAMPLES: Mapping[str, Callable[[Path], Written]] = {
     "parquet": read_parquet,
     "nuscenes": read_nuscenes,
 }
+# What no reader of the format would take for background is not in it.
+LEAVE_OUT_BACKGROUND = {"st3d"}
 # Packages of extras, without which an exporter is not tested.
 NEEDS = {"parquet": "pyarrow"}
 
@@ -186,8 +191,8 @@ def read_back(exporter) -> Callable[[Path], Written]:
     return sample_of(SAMPLES, exporter.name, "a function that reads an export back, see `Written`")
 
 
-@pytest.fixture
-def labels(frames) -> LabelSet:
+@pytest.fixture(params=["background", "ignore"])
+def labels(request: pytest.FixtureRequest, frames) -> LabelSet:
     """A labeled frame with one object, and two unlabeled frames with five labels each."""
     rng = np.random.default_rng(0)
     frames = [
@@ -202,23 +207,18 @@ def labels(frames) -> LabelSet:
             box = (*rng.uniform([6, -4, -1], [30, 4, 0]).tolist(), *SIZES[category], float(k - 2))
             # Without counterpart, without priors, weight zero and one: all that there is.
             loss, points = (None, None) if k == 0 else (0.5, 12)
-            rows.append(
-                label(
-                    name, k, box, category=category, score=0.7, loss=loss, points=points,
-                    points_threshold=20.0, rho_diff=0.6, mask_pixels=30, rho_anno=0.5, rho_det=0.3,
-                    weight=k / 4,
-                )
-            )  # fmt: skip
+            own = {"category": category, "loss": loss, "points": points, "weight": k / 4}
+            rows.append(label(name, k, box, score=0.7, **own))
     return LabelSet(
         description=LabelFileDescription(
-            "kitti", Path("/data"), CATEGORIES, 1, "pspsl", "1", zero_weight="ignore"
+            "kitti", Path("/data"), CATEGORIES, 1, "pspsl", "1", request.param
         ),
         frames=[
             FrameFiles(name, "unlabeled" if k else "labeled", "p", "i", "c")
             for k, name in enumerate(names)
         ],
-        ground_truth=truth_block([truth(names[0])]),
-        labels=[block(rows[:3]), block(rows[3:])],  # the first frame goes on in the second block
+        ground_truth=truth_block([truth(names[0], box=(10.0, 0.0, -0.8, 4.0, 1.8, 1.6, 0.0))]),
+        labels=[block(rows[:7]), block(rows[7:])],
         read={frame.frame_id: frame for frame in frames}.__getitem__,
         read_points={frame.frame_id: frame for frame in frames}.__getitem__,
     )
@@ -237,8 +237,15 @@ def files(path: Path) -> dict[str, bytes]:
 
 def with_weight(labels: LabelSet, weight: float) -> LabelSet:
     """The same labels, the last of which has another weight."""
-    *others, last = rows_of(labels)
-    return with_rows(labels, [*others, last | {"weight": weight}])
+    rows = rows_of(labels)
+    return with_rows(labels, [*rows[:-1], rows[-1] | {"weight": weight}])
+
+
+def arriving(exporter, labels: LabelSet) -> list[dict]:
+    """The labels that are in an export."""
+    leaves_out = exporter.name in LEAVE_OUT_BACKGROUND
+    least = 0 if leaves_out and labels.description.zero_weight == "background" else -1
+    return [row for row in rows_of(labels) if row["weight"] > least]
 
 
 def test_an_exporter_goes_by_its_registered_name(exporter, request) -> None:
@@ -249,13 +256,14 @@ def test_an_exporter_goes_by_its_registered_name(exporter, request) -> None:
 
 def test_every_label_arrives_with_its_weight(exporter, read_back, labels, tmp_path) -> None:
     """Boxes to a millimetre, weights to a millionth, of all unlabeled frames."""
-    path = place(exporter, tmp_path)
-    assert exporter.write(path, labels) == 10
+    path, wanted = place(exporter, tmp_path), arriving(exporter, labels)
+    assert len(wanted) >= 8
+    assert exporter.write(path, labels) == len(wanted)
     assert path.is_file() == bool(exporter.suffix)
     found = read_back(path)
-    assert sorted(found) == sorted({row["frame"] for row in rows_of(labels)})
+    assert sorted(found) == sorted({row["frame"] for row in wanted})
     for name, rows in found.items():
-        expected = [row for row in rows_of(labels) if row["frame"] == name]
+        expected = [row for row in wanted if row["frame"] == name]
         assert [row[0] for row in rows] == [row["category"] for row in expected]
         numbers = [[row[column] for column in (*BOX_COLUMNS, "weight")] for row in expected]
         np.testing.assert_allclose([row[1:] for row in rows], numbers, atol=2e-6)
@@ -275,8 +283,8 @@ def test_no_labels_make_an_export_without_labels(exporter, read_back, labels, tm
     """Of X_l alone, and of nothing at all; an unlabeled frame without labels is no failure."""
     path = place(exporter, tmp_path)
     for frames in (labels.frames, labels.frames[:1], []):
-        objects = labels.ground_truth if frames else truth_block()
-        bare = replace(labels, labels=[], frames=frames, ground_truth=objects)
+        own = labels.ground_truth if frames else truth_block()
+        bare = replace(labels, labels=[], frames=frames, ground_truth=own)
         assert exporter.write(path, bare) == 0
         assert sum(map(len, read_back(path).values())) == 0
 
@@ -330,7 +338,7 @@ def test_a_link_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
 
 def test_the_labels_are_left_as_they_are(exporter, labels, tmp_path) -> None:
     """Rows are read, and read only."""
-    before = deepcopy((labels.frames, labels.ground_truth, labels.labels))
+    before = copy.deepcopy((labels.frames, labels.ground_truth, labels.labels))
     exporter.write(place(exporter, tmp_path), labels)
     assert (labels.frames, labels.ground_truth, labels.labels) == before
 
@@ -394,13 +402,44 @@ OBJECT_WEIGHTS: Mapping[str, Callable[[Path], list[float]]] = {
 }
 
 
-def test_no_exporter_can_be_given_ground_truth_of_unlabeled_frames(labels) -> None:
+@pytest.mark.parametrize("fault", ["weight", "labeled frame"])
+def test_an_export_walks_the_labels_once(exporter, labels, tmp_path, fault: str) -> None:
+    """What is wrong with the last block is found on the same walk as all others."""
+    walks = []
+
+    class Walked:
+        """Blocks that note when they are walked."""
+
+        def __init__(self, blocks) -> None:
+            self.blocks = blocks
+
+        def __iter__(self):
+            walks.append(1)
+            return iter(self.blocks)
+
+    rows = rows_of(labels)
+    wrong = {"weight": {"weight": "much"}, "labeled frame": {"frame": labels.frames[0].frame}}
+    bad = [block(rows[:-1]), block([rows[-1] | wrong[fault]])]
+    path = place(exporter, tmp_path)
+    exporter.write(path, replace(labels, labels=Walked(labels.labels)))
+    before = files(path)
+    with pytest.raises(DataError, match=r"weight|outside the unlabeled split") as caught:
+        exporter.write(path, replace(labels, labels=Walked(bad)))
+    assert_one_line(caught.value)
+    assert len(walks) == 2
+    assert files(path) == before
+
+
+def test_no_exporter_can_be_given_ground_truth_of_unlabeled_frames(
+    exporter, labels, tmp_path
+) -> None:
     """The label set itself refuses it, as well as other splits and labels of labeled frames."""
     first, second, *_ = [each.frame for each in labels.frames]
     with pytest.raises(LeakageError, match=second):
-        replace(labels, ground_truth=truth_block([truth(second)]))
+        replace(labels, ground_truth=labels.ground_truth | {"frame": [second]})
     with pytest.raises(LeakageError, match="000777"):
         replace(labels, frames=[*labels.frames, FrameFiles("000777", "val", "p", "i", "c")])
-    strays = with_rows(labels, [rows_of(labels)[0] | {"frame": first}])
+    rows = rows_of(labels)
+    strayed = with_rows(labels, [rows[0] | {"frame": first}, *rows[1:]])
     with pytest.raises(DataError, match=first):
-        list(strays.blocks())
+        exporter.write(place(exporter, tmp_path), strayed)

@@ -15,7 +15,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from support.exported import BOXES, toy_labels
+from support.exported import BOXES, renamed, toy_labels
 from support.nuscenes_scenes import sample_token, write_nuscenes
 from support.reviews import small_sheet
 from support.toys import IMAGE_SIZE
@@ -116,13 +116,7 @@ def test_the_devkit_of_nuscenes_reads_the_results(tmp_path, stubbed):
     write_nuscenes(tmp_path / "nuscenes")
     dataset, labels = NuScenesDataset(tmp_path / "nuscenes"), toy_labels()
     names = {"000000": sample_token("scene-0061", 0), "000001": sample_token("scene-0103", 1)}
-    labels = replace(
-        labels,
-        frames=[(names[row[0]], *row[1:]) for row in labels.frames],
-        ground_truth=[(names[row[0]], *row[1:]) for row in labels.ground_truth],
-        labels=[(row[0], names[row[1]], *row[2:]) for row in labels.labels],
-        read=lambda name: dataset.read(name, points=False),
-    )
+    labels = renamed(labels, names, lambda name: dataset.read(name, points=False))
     NuScenesExporter().write(tmp_path / "a.json", labels)
     document = json.loads((tmp_path / "a.json").read_text())
     assert {"use_camera", "use_lidar", "use_radar", "use_map", "use_external"} <= set(

@@ -6,11 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.exported import block, label, toy_frame, truth, truth_block
 from support.paths import ROOT
 from support.toys import SIZES, write_toy_kitti
 
-from curate.exporters.base import LabelFileDescription
-from curate.exporters.sqlite import write_labels
+from curate.exporters.base import FrameFiles, LabelFileDescription, LabelSet
+from curate.exporters.sqlite import SqliteExporter
+from curate.weighting.base import ZeroWeight
 from pipelines.registry import EXPORTERS
 
 PAGE = ROOT / "docs" / "training.md"
@@ -18,8 +20,7 @@ PAGE = ROOT / "docs" / "training.md"
 BLOCKED = "import sys\nsys.modules['db'] = sys.modules['pipelines'] = None\n"
 
 
-@pytest.fixture
-def labels(tmp_path: Path) -> Path:
+def write_labels(tmp_path: Path, zero_weight: ZeroWeight) -> Path:
     """A labeled frame with a car, an unlabeled one with three labels of weight 0 to 1."""
     root = tmp_path / "kitti"
     write_toy_kitti(root, frames=2)
@@ -28,19 +29,27 @@ def labels(tmp_path: Path) -> Path:
               (("velodyne", "bin"), ("image_2", "png"), ("calib", "txt")))
         for name in ("000000", "000001")
     ]  # fmt: skip
-    evidence = (0.9, 0.1, 9, 20.0, 0.6, 30, 100, 0.5, 0.3, 1.5, "detector", "pspsl")
+    rows = [
+        label("000001", k, (8.0 + 6 * k, 0.0, -0.8, *SIZES["Car"], 0.1), weight=k / 2)
+        for k in range(3)
+    ]
     path = tmp_path / "labels.sqlite"
-    write_labels(
-        path,
-        description=LabelFileDescription("kitti", root, tuple(SIZES), 1, "pspsl", "1"),
-        frames=[("000000", "labeled", *files[0]), ("000001", "unlabeled", *files[1])],
-        ground_truth=[("000000", 0, "Car", 12.0, 1.0, -0.8, *SIZES["Car"], 0.3, 0.0, 0)],
-        labels=[
-            (1, "000001", k, "Car", 8.0 + 6 * k, 0.0, -0.8, *SIZES["Car"], 0.1, *evidence, k / 2)
-            for k in range(3)
-        ],
+    given = LabelSet(
+        LabelFileDescription("kitti", root, tuple(SIZES), 1, "pspsl", "1", zero_weight),
+        [FrameFiles("000000", "labeled", *files[0]), FrameFiles("000001", "unlabeled", *files[1])],
+        truth_block([truth("000000", box=(12.0, 1.0, -0.8, *SIZES["Car"], 0.3))]),
+        [block(rows)],
+        read=toy_frame,
+        read_points=toy_frame,
     )
+    SqliteExporter().write(path, given)
     return path
+
+
+@pytest.fixture
+def labels(tmp_path: Path) -> Path:
+    """A label file in which a weight of 0 is to be ignored."""
+    return write_labels(tmp_path, "ignore")
 
 
 def run(code: str, *arguments: object) -> str:
@@ -51,6 +60,23 @@ def run(code: str, *arguments: object) -> str:
     )  # fmt: skip
     assert ended.returncode == 0, ended.stderr
     return ended.stdout
+
+
+# The slopes at the three labels of the unlabeled frame, and beside all of them.
+CHECK = """
+found, codes, weight = targets(labels[1])
+answer = torch.zeros(1600, 7, requires_grad=True)
+weighted_loss(answer, found, codes, weight, 1).backward()
+print([answer.grad[(cells - torch.tensor([x, 0.5])).norm(dim=1).argmin(), 0].item()
+       for x in (8.5, 14.5, 20.5, 35.5)])
+"""
+
+
+def definitions() -> str:
+    """The example up to where it trains."""
+    example = re.search(r"<!-- plain pytorch.*?```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert example is not None
+    return example[1].partition("torch.manual_seed")[0]
 
 
 def test_the_torch_data_set_needs_neither_db_nor_pipelines(labels: Path) -> None:
@@ -79,18 +105,13 @@ def test_the_plain_pytorch_example_learns(labels: Path, tmp_path: Path) -> None:
 
 def test_the_example_lets_v_count(labels: Path) -> None:
     """No gradient in the region of a label with v = 0; half of it where v is half."""
-    example = re.search(r"<!-- plain pytorch.*?```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert example is not None
-    definitions = example[1].partition("torch.manual_seed")[0]
-    check = (
-        "found, codes, weight = targets(labels[1])\n"
-        "answer = torch.zeros(1600, 7, requires_grad=True)\n"
-        "weighted_loss(answer, found, codes, weight, 1).backward()\n"
-        "slopes = [answer.grad[(cells - torch.tensor([x, 0.5])).norm(dim=1).argmin(), 0].item()\n"
-        "          for x in (8.5, 14.5, 20.5, 35.5)]\n"
-        "print(slopes)\n"
-    )
-    assert run(definitions + check, labels) == "[0.0, -0.25, -0.5, 0.5]\n"
+    assert run(definitions() + CHECK, labels) == "[0.0, -0.25, -0.5, 0.5]\n"
+
+
+def test_the_example_takes_background_for_background(tmp_path: Path) -> None:
+    """Where the file says so, the region of a label with v = 0 teaches that nothing is there."""
+    path = write_labels(tmp_path, "background")
+    assert run(definitions() + CHECK, path) == "[0.5, -0.25, -0.5, 0.5]\n"
 
 
 def test_every_format_is_described() -> None:

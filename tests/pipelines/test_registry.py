@@ -40,7 +40,5 @@ def test_a_class_without_what_the_pipeline_asks_for_is_refused(
         "    def measure(self, frame, detections): ...\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(
-        ConfigError, match=r"^prior '.*' has no columns, rho_column; see curate"
-    ):
+    with pytest.raises(ConfigError, match=r"^prior '.*' has no columns, rho_column; see curate"):
         PRIORS.load("priors_of_a_user:Mine")

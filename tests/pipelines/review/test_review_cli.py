@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.exported import rows_of
 from support.paths import ROOT
 from support.pipelines_cli import Curate
 from support.rounds import state_of
@@ -219,7 +220,7 @@ def test_an_import_makes_files_stale(curate: Curate, weighted: Workspace, tmp_pa
     file = weighted.root / "exports" / "labels.sqlite"
     sql = "SELECT count(*) AS n FROM weighted_labels WHERE provenance = 'human'"
     assert json.loads(curate("query", sql, "--file", file, "--json")[1]) == [{"n": 4}]
-    assert len(label_set(weighted, 1, "pspsl").labels) == 19
+    assert len(rows_of(label_set(weighted, 1, "pspsl"))) == 19
 
 
 def test_a_decision_counts_from_the_reviewed_round_on(

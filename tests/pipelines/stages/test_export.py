@@ -51,19 +51,18 @@ def test_an_unlabeled_frame_without_predictions_is_left_out(
 def test_an_unlabeled_frame_whose_labels_all_weigh_nothing_is_exported(
     workspace: Workspace,
 ) -> None:
-    """Its labels are background, as the policy says, and so is what is around them."""
+    """Its labels are background, as all around them, or regions to leave out: as it is set."""
     strict = workspace.with_settings("run", method="threshold")
     strict = strict.with_settings("solve", options={"threshold": {"threshold": 1.0}})
     samples = [sample for sample in WeightedLabels(run(strict)) if not sample.labeled]
     assert len(samples) == 6
     assert all(len(sample.boxes) == 3 for sample in samples)
-    assert any((sample.weights == 0).all() for sample in samples)
-    assert not any(sample.ignored.any() for sample in samples)
-
-
-def weight_lines(folder: Path) -> list[str]:
-    """The lines of all files in a folder."""
-    return [line for path in folder.iterdir() for line in path.read_text().splitlines()]
+    empty = [sample for sample in samples if (sample.weights == 0).all()]
+    assert empty
+    assert not any(sample.ignored.any() for sample in empty)
+    doubting = strict.with_settings("train", zero_weight="ignore")
+    samples = [sample for sample in WeightedLabels(run(doubting)) if not sample.labeled]
+    assert any(sample.ignored.all() for sample in samples)
 
 
 def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_path: Path) -> None:
@@ -72,11 +71,13 @@ def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_pa
     folder = ("-w", workspace.root)
     code, out, _ = curate("export", "--format", "kitti", *folder)
     assert (code, out) == (0, f"18 labels of round 1 in {workspace.root}/exports/kitti\n")
-    weighted = weight_lines(workspace.root / "exports" / "kitti" / "weight")
-    assert len(weighted) == 18
-    kept = [line for line in weighted if float(line.split()[1]) > 0]
-    # Under pspsl a label of weight 0 is background: readers of objects do not see it.
-    assert len(weight_lines(workspace.root / "exports" / "kitti" / "label_2")) == len(kept) < 18
+    folders = [workspace.root / "exports" / "kitti" / name for name in ("weight", "label_2")]
+    listed, objects = (
+        [line for path in folder.iterdir() for line in path.read_text().splitlines()]
+        for folder in folders
+    )
+    assert len(listed) == 18
+    assert len(objects) == sum(float(line.split()[1]) > 0 for line in listed) < 18
     copy = tmp_path / "copy.sqlite"
     code, out, _ = curate("export", "--output", copy, *folder)
     assert (code, out) == (0, f"18 labels of round 1 in {copy}\n")
