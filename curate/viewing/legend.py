@@ -7,10 +7,10 @@ from curate.viewing.palette import (
     FAINT_TEXT,
     GROUND_TRUTH,
     HUMAN,
-    ZERO_WEIGHT,
     PANEL,
     TEXT,
     UNWEIGHTED,
+    ZERO_WEIGHT,
     weight_colours,
 )
 

@@ -11,9 +11,9 @@ from curate.viewing.palette import (
     BACKGROUND,
     FAINT_TEXT,
     GRID,
-    ZERO_WEIGHT,
     PANEL,
     TEXT,
+    ZERO_WEIGHT,
     weight_colours,
 )
 
