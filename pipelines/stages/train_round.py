@@ -129,8 +129,7 @@ def store_statistics(
         }
         for each in statistics
     ]
-    if rows:
-        connection.execute(table.insert(), rows)
+    bulk.insert_rows(connection, "training_statistics", rows)
 
 
 def training_settings(
