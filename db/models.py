@@ -169,6 +169,25 @@ class Checkpoint(Base):
     created_at: Mapped[datetime] = mapped_column(DateTime(timezone=True))
 
 
+class TrainingStatistics(Base):
+    """The curves of a training: loss terms, learning rate and gradient norm of every few steps."""
+
+    __tablename__ = "training_statistics"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    round: Mapped[int] = mapped_column(
+        Integer, primary_key=True, autoincrement=False, comment="as of the checkpoint"
+    )
+    policy: Mapped[str] = mapped_column(Text, primary_key=True, comment="as of the checkpoint")
+    step: Mapped[int] = mapped_column(
+        Integer, primary_key=True, autoincrement=False, comment="of the optimiser, from 1"
+    )
+    name: Mapped[str] = mapped_column(
+        Text, primary_key=True, comment="loss, a term of it, learning_rate or gradient_norm"
+    )
+    value: Mapped[Figure] = mapped_column(comment="of this step alone; null = not finite")
+
+
 class Round(Base):
     """One round e of E: the teacher's answers, their evidence, their weights, the student."""
 

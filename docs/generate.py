@@ -14,6 +14,7 @@ from curate.errors import CurateError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db.models import Base
 from pipelines.queries.named_queries import named_queries
+from pipelines.registry import DETECTORS, trainable
 from pipelines.round import round_graph
 from pipelines.workspace.config import Config, write_config
 
@@ -113,7 +114,16 @@ def config_page() -> str:
         path = Path(folder) / "curate.toml"
         write_config(path, Config.model_validate({"dataset": {"root": "/data/kitti"}}))
         text = path.read_text()
-    return f"# The configuration\n\n{_NOTE}\n`curate init` writes it:\n\n```toml\n{text}```\n"
+    presets = "".join(
+        f"| {name} | {', '.join(found.presets)} |\n"
+        for name in DETECTORS.classes
+        if (found := trainable(name))
+    )
+    return (
+        f"# The configuration\n\n{_NOTE}\n`curate init` writes it:\n\n```toml\n{text}```\n\n"
+        "`train.preset` is one of the detector's presets; `auto` is the first.\n\n"
+        f"| detector | presets |\n|---|---|\n{presets}"
+    )
 
 
 def queries_page() -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.consistency import ConsistencySettings
-from curate.detectors.base import Detector
+from curate.detectors.base import Detector, TrainableDetector, choose_preset
 from curate.errors import ConfigError
 from curate.frames import Calibration
 from curate.priors.base import EvidenceSource, SequenceSource
@@ -41,6 +41,47 @@ def open_detector(config: Config, path: Path) -> Detector:
         options=section.options,
     )
     return detector
+
+
+@dataclasses.dataclass(frozen=True)
+class Trainable:
+    """A detector that curate trains.
+
+    Attributes:
+        detector: its class.
+        preset: the configured one of its presets.
+    """
+
+    detector: type[TrainableDetector]
+    preset: str
+
+
+def trainable_detector(config: Config) -> Trainable | None:
+    """Return the configured detector if curate can train it, None if it is external.
+
+    Raises:
+        ConfigError: if the detector has no preset of the configured name, or its class cannot be
+            used.
+    """
+    detector, preset = registry.trainable(config.detector.name), config.train.preset
+    if detector is None:
+        return None
+    try:
+        return Trainable(detector, choose_preset(detector, None if preset == "auto" else preset))
+    except ConfigError as error:
+        raise ConfigError(f"train.preset of detector '{config.detector.name}': {error}") from None
+
+
+def trained_detector(config: Config) -> Trainable:
+    """Return the configured detector, which curate must be able to train.
+
+    Raises:
+        ConfigError: if it is external, or see `trainable_detector`.
+    """
+    found = trainable_detector(config)
+    if found is None:
+        raise ConfigError(f"detector '{config.detector.name}' is not trained by curate")
+    return found
 
 
 def wants_views(config: Config) -> bool:

@@ -7,9 +7,12 @@ import importlib
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, get_origin
+from typing import TYPE_CHECKING, Any, ClassVar, get_origin
 
 from curate.errors import ConfigError, CurateError, one_line
+
+if TYPE_CHECKING:
+    from curate.detectors.base import TrainableDetector
 
 
 @dataclass(frozen=True)
@@ -52,25 +55,13 @@ class Registry:
             ) from error
         if not callable(found):
             raise ConfigError(f"{self.kind} '{name}' is no class but {found!r:.80}")
-        missing = [member for member in self._members() if not hasattr(found, member)]
+        missing = [member for member in _members(self.protocol) if not hasattr(found, member)]
         if isinstance(found, type) and missing:
             raise ConfigError(
                 f"{self.kind} '{name}' has no {', '.join(missing)}; see "
                 f"{self.protocol.replace(':', '.')}"
             )
         return found
-
-    def _members(self) -> list[str]:
-        """The methods and attributes that the classes themselves must have."""
-        module_name, _, class_name = self.protocol.partition(":")
-        members = vars(getattr(importlib.import_module(module_name), class_name))
-        fixed = [
-            name
-            for name, kind in members.get("__annotations__", {}).items()
-            if get_origin(kind) is ClassVar
-        ]
-        methods = [name for name, member in members.items() if inspect.isfunction(member)]
-        return [*fixed, *(name for name in methods if not name.startswith("_"))]
 
     def takes(self, name: str, argument: str) -> bool:
         """Whether the constructor behind a name has an argument of that name."""
@@ -200,5 +191,46 @@ EDITORS = Registry(
         "cvat": "curate.review.editors.cvat:CvatEditor",
     },
 )
-# Detectors that `pretrain` and `train-round` can train; the others are brought by the user.
-TRAINABLE = frozenset({"pillars"})
+_TRAINABLE = "curate.detectors.base:TrainableDetector"
+
+
+def trainable(name: str) -> "type[TrainableDetector] | None":
+    """Return the class of a detector that curate can train; None for any other detector.
+
+    Raises:
+        ConfigError: if nobody knows the name, it cannot be imported, or its class has some members
+            of `TrainableDetector` but lacks others.
+    """
+    found: type[TrainableDetector] = DETECTORS.load(name)
+    members = _members(_TRAINABLE)
+    missing = [member for member in members if not hasattr(found, member)]
+    if missing == members:
+        return None
+    if missing:
+        raise ConfigError(
+            f"detector '{name}' cannot be trained: it has no {', '.join(missing)}; see "
+            f"{_TRAINABLE.replace(':', '.')}"
+        )
+    return found
+
+
+def trainable_names() -> list[str]:
+    """Return the names of the registered detectors that curate can train."""
+    return [name for name in DETECTORS.classes if trainable(name)]
+
+
+def _members(protocol: str) -> list[str]:
+    """Return the class attributes and methods that a protocol itself declares."""
+    module_name, _, class_name = protocol.partition(":")
+    members = vars(getattr(importlib.import_module(module_name), class_name))
+    fixed = [
+        name
+        for name, kind in members.get("__annotations__", {}).items()
+        if get_origin(kind) is ClassVar
+    ]
+    methods = [name for name, member in members.items() if _is_method(member)]
+    return [*fixed, *(name for name in methods if not name.startswith("_"))]
+
+
+def _is_method(member: object) -> bool:
+    return inspect.isfunction(member) or isinstance(member, classmethod)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from pipelines.engine.graph import Graph
 from pipelines.engine.plan import Plan
-from pipelines.engine.rounds import is_trainable, open_round
+from pipelines.engine.rounds import is_pretrained, open_round
 from pipelines.engine.stage import FirstStage, FrameStage, RoundStage, Stage
 from pipelines.stages import export, predict, pretrain, repredict, score, solve, train_round
 from pipelines.workspace.config import DEFAULT_PRIORS
@@ -90,8 +90,8 @@ def round_graph(priors: Sequence[str] = DEFAULT_PRIORS, *, pretrained: bool = Tr
 
 
 def graph_of(workspace: Workspace) -> Graph:
-    """Return the graph of a workspace; it has pretrain where its detector can be trained."""
-    return round_graph(workspace.config.run.priors, pretrained=is_trainable(workspace))
+    """Return the graph of a workspace; it has pretrain where curate trains the first teacher."""
+    return round_graph(workspace.config.run.priors, pretrained=is_pretrained(workspace))
 
 
 def open_plan(workspace: Workspace, number: int | None = None, rounds: int | None = None) -> Plan:

@@ -8,9 +8,14 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 from support import postgres_server
+from support.exported import block, label, truth, truth_block
 from support.paths import ROOT
 from support.toys import write_toy_kitti
 
+from curate.datasets.kitti.dataset import KittiDataset
+from curate.detections import CATEGORIES
+from curate.exporters.base import FrameFiles, LabelFileDescription, LabelSet
+from curate.exporters.sqlite import SqliteExporter
 from db.session import Database
 
 # The default run tries the same examples every time; `make fuzz-random` tries others.
@@ -101,3 +106,37 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> str:
     )
     monkeypatch.setitem(presets.PRESETS, "tiny", preset)
     return "tiny"
+
+
+@pytest.fixture
+def make_labels(toy_kitti, tmp_path):
+    """Writes a label file: `labeled` frames with ground truth, `unlabeled` ones with weights."""
+    dataset = KittiDataset(toy_kitti)
+
+    def make(
+        labeled=4, unlabeled=0, weight=0.5, name="labels.sqlite", categories=CATEGORIES,
+        zero_weight="ignore", provenance="detector",
+    ) -> Path:  # fmt: skip
+        ids = dataset.frame_ids()[: labeled + unlabeled]
+        splits = dict.fromkeys(ids[:labeled], "labeled") | dict.fromkeys(ids[labeled:], "unlabeled")
+        objects, labels = [], []
+        for frame, split in splits.items():
+            annotations = dataset.annotations(frame)
+            for k, box in enumerate(annotations.boxes.tolist()):
+                own = {"category": str(annotations.categories[k])}
+                if split == "labeled":
+                    objects.append(truth(frame, k, box, **own))
+                else:
+                    own |= {"weight": weight, "provenance": provenance}
+                    labels.append(label(frame, k, box, **own))
+        description = LabelFileDescription(
+            "kitti", toy_kitti, categories, 1, "pspsl", "1", zero_weight
+        )
+        frames = [FrameFiles(frame, split, "p", "i", "c") for frame, split in splits.items()]
+        given = LabelSet(
+            description, frames, truth_block(objects), [block(labels)], dataset.read, dataset.read
+        )
+        SqliteExporter().write(tmp_path / name, given)
+        return tmp_path / name
+
+    return make

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from curate.detectors.base import Sample
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.geometry.similarity import Similarity
-from curate.training.labels import Sample
 from curate.training.object_bank import ObjectBank, paste_objects
 
 

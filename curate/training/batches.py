@@ -1,35 +1,12 @@
-"""The batches of a training: which frames meet in a step, augmented and encoded."""
-
-from dataclasses import dataclass
+"""The batches of a training: which frames meet in a step, augmented."""
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from curate.detectors.pillars.encoding import encode_boxes, encode_points
-from curate.detectors.pillars.presets import preset_named
+from curate.detectors.base import Sample
 from curate.errors import DataError
-from curate.training.labels import Sample, WeightedLabels
-from curate.training.loss import BatchTargets
+from curate.training.labels import WeightedLabels
 from curate.training.object_bank import ObjectBank
 from curate.training.settings import TrainingSettings
-
-
-@dataclass(frozen=True)
-class Batch:
-    """The input of the network for b frames, and its targets.
-
-    Attributes:
-        features: (n, POINT_FEATURES) of the points of all frames.
-        slots: (n,) row of each point's pillar in the canvas of all frames.
-        frames: b.
-        targets: see `BatchTargets`.
-    """
-
-    features: Tensor
-    slots: Tensor
-    frames: int
-    targets: BatchTargets
 
 
 class Batches:
@@ -49,7 +26,6 @@ class Batches:
     def __init__(self, labels: WeightedLabels, settings: TrainingSettings) -> None:
         self._labels = labels
         self._settings = settings
-        self._preset = preset_named(settings.preset)
         self._augmentation = settings.augmentation()
         self._cache: dict[int, Sample] = {}
         self._room = settings.cache_bytes
@@ -62,30 +38,13 @@ class Batches:
         known = sum(np.count_nonzero(~sample.ignored) for sample in labeled)
         self.objects_per_frame = max(known / len(labeled), 1.0)
 
-    def __getitem__(self, step: int) -> Batch:
-        """The batch of a step."""
-        pillars, targets = [], []
-        names = self._labels.categories
+    def __getitem__(self, step: int) -> list[Sample]:
+        """Return the augmented samples of a step."""
+        augmented = []
         for place, index in enumerate(self._chosen(step)):
             generator = np.random.default_rng([self._settings.seed, step, place])
-            sample = self._augmentation.apply(self._sample(index), self.bank, generator)
-            ground = sample.ground
-            pillars.append(encode_points(ground.lowered(sample.points), self._preset))
-            ids = np.array([names.index(name) for name in sample.categories], dtype=np.int64)
-            targets.append(
-                encode_boxes(
-                    ground.lowered(sample.boxes), ids, sample.weights, len(names), self._preset
-                )
-            )
-        slots_per_frame = 4 * self._preset.cells[0] * self._preset.cells[1]
-        slots = [frame.slots + i * slots_per_frame for i, frame in enumerate(pillars)]
-        device = self._settings.device
-        return Batch(
-            torch.from_numpy(np.concatenate([frame.features for frame in pillars])).to(device),
-            torch.from_numpy(np.concatenate(slots)).to(device),
-            len(pillars),
-            BatchTargets.stack(targets, device),
-        )
+            augmented.append(self._augmentation.apply(self._sample(index), self.bank, generator))
+        return augmented
 
     def _chosen(self, step: int) -> list[int]:
         """The frames of a step: X_l and X_u each run through in an order new for every pass."""

@@ -9,8 +9,6 @@ Needs the exported file and the frames it names, nothing else of this project's 
 
 import sqlite3
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +16,7 @@ import numpy as np
 from torch.utils.data import Dataset
 
 from curate.detections import as_categories
+from curate.detectors.base import Sample
 from curate.errors import DataError
 from curate.exporters.label_file import (
     open_label_file,
@@ -27,47 +26,10 @@ from curate.exporters.label_file import (
     refuse_leakage,
 )
 from curate.frames import Frame
-from curate.geometry.ground import GroundMap
 from curate.geometry.projection import in_view
-from curate.weighting.base import ZeroWeight
 
 # Ground truth that looks like a category without being one: neither object nor background of it.
 NEIGHBOURS: Final = {"Van": "Car", "Person_sitting": "Pedestrian"}
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One frame to learn from.
-
-    Attributes:
-        frame_id: name of the frame.
-        labeled: whether the boxes are ground truth (X_l) or pseudo-labels (X_u).
-        points: (n, 4) float32 inside the camera's view, LiDAR frame.
-        boxes: (m, 7) in the LiDAR frame.
-        categories: (m,) str.
-        weights: (m,) in [0, 1]: 1 for ground truth.
-        zero_weight: what a pseudo-label of weight 0 is: "background", so no object, or a region to
-            "ignore". The label file says it, as the policy has it.
-    """
-
-    frame_id: str
-    labeled: bool
-    points: np.ndarray
-    boxes: np.ndarray
-    categories: np.ndarray
-    weights: np.ndarray
-    zero_weight: ZeroWeight = "ignore"
-
-    @property
-    def ignored(self) -> np.ndarray:
-        """(m,) bool, which boxes are ignore regions: neither object nor background."""
-        nothing = self.weights == 0
-        return nothing if self.labeled or self.zero_weight == "ignore" else np.zeros_like(nothing)
-
-    @cached_property
-    def ground(self) -> GroundMap:
-        """The height of the ground; a training asks for it in every pass."""
-        return GroundMap.of(self.points)
 
 
 class WeightedLabels(Dataset[Sample]):

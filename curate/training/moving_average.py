@@ -8,8 +8,6 @@ import copy
 
 import torch
 
-from curate.detectors.pillars.network import PillarNetwork
-
 # A decay is stated for this share of a training, so that the average looks back over the same share
 # of any training: 0.999 forgets over its last tenth.
 _SHARE = 1 / 10_000
@@ -27,11 +25,11 @@ class MovingAverage:
         network: the average.
     """
 
-    def __init__(self, network: PillarNetwork, decay: float, steps: int) -> None:
+    def __init__(self, network: torch.nn.Module, decay: float, steps: int) -> None:
         self.network = copy.deepcopy(network).requires_grad_(requires_grad=False)
         self._kept = step_decay(decay, steps)
 
-    def follow(self, student: PillarNetwork) -> None:
+    def follow(self, student: torch.nn.Module) -> None:
         """Takes the student's weights in; counters are copied."""
         with torch.no_grad():
             own = self.network.state_dict()

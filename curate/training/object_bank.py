@@ -13,12 +13,12 @@ from typing import Self
 import numpy as np
 
 from curate.detections import as_categories
+from curate.detectors.base import Sample
 from curate.errors import LeakageError
 from curate.geometry.boxes import box_corners
 from curate.geometry.overlap import bev_iou
 from curate.geometry.points_in_boxes import box_of_points, count_points_in_boxes
 from curate.geometry.similarity import Similarity
-from curate.training.labels import Sample
 
 # Tries per object that is asked for; crowded frames get fewer objects.
 _TRIES = 2

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from curate.detectors.pillars.presets import preset_named
 from curate.errors import ConfigError
 from curate.training.augmentation import Augmentation
 
@@ -17,7 +16,7 @@ class TrainingSettings:
     """How to train; the defaults suit a training from scratch on a few dozen labeled frames.
 
     Attributes:
-        preset: size of the detector, `small` or `kitti`.
+        preset: one of the detector's presets; None for its first.
         steps: optimiser steps.
         batch_size: frames of X_l per step.
         unlabeled_batch_size: frames of X_u per step, besides: Eq. 6 adds the two sums, so pseudo-
@@ -36,9 +35,10 @@ class TrainingSettings:
         ema_decay: see `MovingAverage`.
         cache_bytes: of points kept in memory between the steps.
         snapshot_seconds: between two snapshots from which a killed training goes on.
+        statistics_steps: between two steps of which statistics are kept.
     """
 
-    preset: str = "small"
+    preset: str | None = None
     steps: int = 1200
     batch_size: int = 2
     unlabeled_batch_size: int = 2
@@ -55,13 +55,13 @@ class TrainingSettings:
     ema_decay: float = 0.999
     cache_bytes: int = 1 << 30
     snapshot_seconds: float = 20.0
+    statistics_steps: int = 20
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a setting that no training can use."""
-        preset_named(self.preset)
         for name, least in (
             ("steps", 1), ("batch_size", 1), ("threads", 1), ("pasted", 0), ("seed", 0),
-            ("fewest_points", 0), ("unlabeled_batch_size", 0),
+            ("fewest_points", 0), ("unlabeled_batch_size", 0), ("statistics_steps", 1),
         ):  # fmt: skip
             if getattr(self, name) < least:
                 raise ConfigError(f"training: {name} is {getattr(self, name)}, least is {least}")
@@ -89,11 +89,26 @@ class TrainingSettings:
 
 
 @dataclass(frozen=True)
+class Statistic:
+    """A number that describes a step of a training.
+
+    Attributes:
+        step: from 1.
+        name: "loss", one of its terms, "learning_rate" or "gradient_norm" (before clipping).
+        value: at this step.
+    """
+
+    step: int
+    name: str
+    value: float
+
+
+@dataclass(frozen=True)
 class TrainingReport:
     """What a training did.
 
     Attributes:
-        checkpoint: the file that was written; its ONNX graph lies beside it.
+        checkpoint: the file that was written.
         steps: optimiser steps in all.
         resumed_at: step at which it went on from an earlier, killed run; 0 where it began anew.
         loss: mean of the last steps.
@@ -101,6 +116,8 @@ class TrainingReport:
         labeled_frames: of X_l.
         unlabeled_frames: of X_u.
         bank: objects in the bank by category.
+        statistics: of every `statistics_steps`-th step and the last one, also of those before a
+            kill.
     """
 
     checkpoint: Path
@@ -111,3 +128,4 @@ class TrainingReport:
     labeled_frames: int
     unlabeled_frames: int
     bank: dict[str, int]
+    statistics: tuple[Statistic, ...]

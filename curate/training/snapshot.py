@@ -12,19 +12,26 @@ from typing import Any
 
 import torch
 
+from curate.detectors.base import TrainableDetector
 from curate.files.atomic import replace_file
 from curate.training.settings import TrainingSettings
 
 _log = logging.getLogger(__name__)
 
 # Settings that change where or how often, but not what is computed.
-_WITHOUT_EFFECT = ("cache_bytes", "snapshot_seconds")
+_WITHOUT_EFFECT = ("cache_bytes", "snapshot_seconds", "statistics_steps")
 
 
-def fingerprint(labels: Path, settings: TrainingSettings, start: Path | None) -> str:
+def fingerprint(
+    detector: type[TrainableDetector],
+    labels: Path,
+    settings: TrainingSettings,
+    start: Path | None,
+) -> str:
     """What a training's result depends on, as SHA-256 in hexadecimal."""
     relevant = {key: at for key, at in asdict(settings).items() if key not in _WITHOUT_EFFECT}
-    digest = hashlib.sha256(json.dumps([relevant, torch.__version__]).encode())
+    trained = [detector.__module__, detector.__qualname__, detector.checkpoint_version]
+    digest = hashlib.sha256(json.dumps([trained, relevant, torch.__version__]).encode())
     for path in (labels, start):
         digest.update(path.read_bytes() if path else b"from scratch")
     return digest.hexdigest()

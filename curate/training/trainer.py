@@ -1,23 +1,24 @@
-"""Trains the pillar detector on labeled frames and weighted pseudo-labels (Eqs. 6 and 10)."""
+"""Trains a detector on labeled frames and weighted pseudo-labels (Eqs. 6 and 10)."""
 
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import astuple, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 
-from curate.detectors.pillars.checkpoint import load_checkpoint, save_checkpoint
-from curate.detectors.pillars.network import PillarNetwork, checkpoint_of, network_of
-from curate.detectors.pillars.presets import preset_named
-from curate.errors import ConfigError, ModelError, first_line
+from curate.detectors.base import Student, TrainableDetector, choose_preset
+from curate.errors import ConfigError, first_line
 from curate.frames import Frame
 from curate.training.batches import Batches
 from curate.training.labels import WeightedLabels
-from curate.training.loss import weighted_loss
 from curate.training.moving_average import MovingAverage
-from curate.training.settings import TrainingReport, TrainingSettings
+from curate.training.settings import Statistic, TrainingReport, TrainingSettings
 from curate.training.snapshot import fingerprint, load_snapshot, save_snapshot, snapshot_path
 
 _log = logging.getLogger(__name__)
@@ -35,6 +36,7 @@ _RECENT_STEPS = 50
 
 
 def train(
+    detector: type[TrainableDetector],
     labels: Path,
     output: Path,
     settings: TrainingSettings,
@@ -43,14 +45,15 @@ def train(
     read: Callable[[str], Frame] | None = None,
     progress: Progress | None = None,
 ) -> TrainingReport:
-    """Trains a detector and writes its checkpoint and ONNX graph, or those of its moving average.
+    """Train a detector and write its checkpoint, or that of its moving average.
 
     A killed training, called again with the same arguments, goes on from its last snapshot and ends
     with the weights that it would have had.
 
     Args:
+        detector: its class.
         labels: exported label file; its unlabeled frames may be none.
-        output: the checkpoint to write, NAME.safetensors; its graph becomes NAME.onnx.
+        output: the checkpoint to write.
         settings: see `TrainingSettings`.
         start: checkpoint to begin from, such as the teacher; from scratch without.
         read: see `WeightedLabels`.
@@ -60,12 +63,15 @@ def train(
         DataError: the labels or a frame cannot be read.
         LeakageError: ground truth of unlabeled frames is among the labels.
         ModelError: the start cannot be used.
-        ConfigError: the start is of another preset or other categories, or there is no such device.
+        ConfigError: the start is of another preset or other categories, or the detector has no such
+            preset or lacks a member, or there is no such device.
     """
     began = time.monotonic()
     torch.set_num_threads(settings.threads)
+    settings = replace(settings, preset=choose_preset(detector, settings.preset))
     samples = WeightedLabels(labels, read=read)
-    network = _first_network(settings, samples.categories, start)
+    student = _first_student(detector, settings, samples.categories, start)
+    network = student.network
     batches = Batches(samples, settings)
     for category, objects in batches.bank.objects.items():
         if not objects:
@@ -73,24 +79,33 @@ def train(
     optimizer = torch.optim.AdamW(
         network.parameters(), weight_decay=_WEIGHT_DECAY, betas=(0.9, 0.99)
     )
-    mark = fingerprint(labels, settings, start)
+    mark = fingerprint(detector, labels, settings, start)
     average = _average_of(network, settings)
     networks = [network, average.network] if average else [network]
-    state = load_snapshot(output, mark, networks, optimizer) or {"step": 0, "losses": []}
+    nothing: dict[str, Any] = {"step": 0, "losses": [], "statistics": []}
+    state = load_snapshot(output, mark, networks, optimizer) or nothing
     resumed_at, losses = state["step"], state["losses"]
+    statistics = [Statistic(*each) for each in state["statistics"]]
     saved = time.monotonic()
     network.train()
     for step in range(resumed_at, settings.steps):
-        losses = [*losses[1 - _RECENT_STEPS :], _learn(network, optimizer, batches, step, settings)]
+        described = _learn(student, optimizer, batches, step, settings)
+        losses = [*losses[1 - _RECENT_STEPS :], float(described["loss"])]
+        if (step + 1) % settings.statistics_steps == 0 or step + 1 == settings.steps:
+            statistics += [Statistic(step + 1, name, float(of)) for name, of in described.items()]
         if average:
             average.follow(network)
         if progress:
             progress(step + 1, settings.steps, losses[-1])
         if time.monotonic() - saved >= settings.snapshot_seconds:
-            state = {"step": step + 1, "losses": losses}
+            state = {
+                "step": step + 1,
+                "losses": losses,
+                "statistics": list(map(astuple, statistics)),
+            }
             save_snapshot(output, mark, networks, optimizer, state)
             saved = time.monotonic()
-    save_checkpoint(output, checkpoint_of(networks[-1], samples.categories))
+    student.save(output, networks[-1].state_dict())
     snapshot_path(output).unlink(missing_ok=True)
     return TrainingReport(
         checkpoint=output,
@@ -101,6 +116,7 @@ def train(
         labeled_frames=len(batches.labeled),
         unlabeled_frames=len(batches.unlabeled),
         bank={category: len(objects) for category, objects in batches.bank.objects.items()},
+        statistics=tuple(statistics),
     )
 
 
@@ -113,7 +129,7 @@ def one_cycle(step: int, steps: int, peak: float) -> float:
     return peak * (1 + math.cos(math.pi * (step - rising) / max(1.0, steps - rising))) / 2
 
 
-def _average_of(network: PillarNetwork, settings: TrainingSettings) -> MovingAverage | None:
+def _average_of(network: torch.nn.Module, settings: TrainingSettings) -> MovingAverage | None:
     """What follows the student, if its average is to be left."""
     if settings.teacher == "student":
         return None
@@ -121,49 +137,70 @@ def _average_of(network: PillarNetwork, settings: TrainingSettings) -> MovingAve
 
 
 def _learn(
-    network: PillarNetwork,
+    student: Student,
     optimizer: torch.optim.Optimizer,
     batches: Batches,
     step: int,
     settings: TrainingSettings,
-) -> float:
-    """One step; gives its loss."""
+) -> dict[str, float | torch.Tensor]:
+    """Take one step; return its loss and what else describes it."""
+    rate = one_cycle(step, settings.steps, settings.learning_rate)
     for group in optimizer.param_groups:
-        group["lr"] = one_cycle(step, settings.steps, settings.learning_rate)
-    batch = batches[step]
-    answers = network(batch.features, batch.slots, batch.frames)
+        group["lr"] = rate
+    batch = student.encode(batches[step], settings.device)
     expected = settings.batch_size * batches.objects_per_frame
-    loss = weighted_loss(answers, batch.targets, network.preset, expected)
+    with _torch_seeded([settings.seed, step], settings.device):
+        terms = student.loss(batch, expected)
     optimizer.zero_grad(set_to_none=True)
-    torch.autograd.backward(loss)
-    torch.nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)
+    torch.autograd.backward(terms["loss"])
+    norm = torch.nn.utils.clip_grad_norm_(student.network.parameters(), _LARGEST_GRADIENT)
     optimizer.step()
-    return float(loss.detach())
+    described = {name: term.detach() for name, term in terms.items()}
+    return {**described, "learning_rate": rate, "gradient_norm": norm}
 
 
-def _first_network(
-    settings: TrainingSettings, categories: tuple[str, ...], start: Path | None
-) -> PillarNetwork:
-    """The network before the first step, on the device of the training."""
+@contextmanager
+def _torch_seeded(seed: list[int], device: str) -> Iterator[None]:
+    """Seed torch's global generators for a step, and leave them as they were.
+
+    A student's dropout and sampling cannot be given a generator; seeded by the step, they draw the
+    same numbers after a kill.
+    """
+    devices = [] if device == "cpu" else range(torch.cuda.device_count())
+    with torch.random.fork_rng(devices=devices):
+        torch.manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
+        yield
+
+
+def _first_student(
+    detector: type[TrainableDetector],
+    settings: TrainingSettings,
+    categories: tuple[str, ...],
+    start: Path | None,
+) -> Student:
+    """The student before the first step, on the device of the training."""
     if start is None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
-            network = PillarNetwork(preset_named(settings.preset), len(categories))
+            student = detector.new_student(settings.preset or "", categories)
     else:
-        checkpoint = load_checkpoint(start)
-        if (checkpoint.preset.name, checkpoint.categories) != (settings.preset, categories):
-            raise ConfigError(
-                f"{start}: is a {checkpoint.preset.name} detector of "
-                f"{', '.join(checkpoint.categories)}; the training is for {settings.preset} and "
-                f"{', '.join(categories)}"
-            )
-        try:
-            network = network_of(checkpoint)
-        except ModelError as error:
-            raise ModelError(f"{start}: {error}") from None
+        student = detector.load_student(start)
+    expected = (*Student.__annotations__, *(name for name in vars(Student) if name[0] != "_"))
+    missing = [name for name in expected if not hasattr(student, name)]
+    if missing:
+        raise ConfigError(
+            f"{type(student).__module__}:{type(student).__qualname__} has no {', '.join(missing)}; "
+            "see curate.detectors.base.Student"
+        )
+    if (student.preset, student.categories) != (settings.preset, categories):
+        raise ConfigError(
+            f"{start}: is a {student.preset} detector of {', '.join(student.categories)}; the "
+            f"training is for {settings.preset} and {', '.join(categories)}"
+        )
     try:
-        return network.to(settings.device)
+        student.network.to(settings.device)
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(
             f"device {settings.device!r} cannot be used: {first_line(error)}"
         ) from None
+    return student

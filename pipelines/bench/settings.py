@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from curate.errors import ConfigError, DataError, WorkspaceError
 from curate.files.atomic import replace_file
-from pipelines.registry import TRAINABLE
+from pipelines.registry import trainable, trainable_names
 from pipelines.stages.methods import METHODS, with_method
 from pipelines.workspace.config import AtLeastOne, Config, Section, change_setting, make_config
 
@@ -115,10 +115,10 @@ class Bench:
         if document["segmenter"]["name"] == "none":
             document["run"].setdefault("priors", ("points",))
         shared = make_config(document, "curate bench")
-        if shared.detector.name not in TRAINABLE:
+        if trainable(shared.detector.name) is None:
             raise ConfigError(
                 f"--set detector.name={shared.detector.name}: a bench trains its detector; use "
-                f"one of {', '.join(sorted(TRAINABLE))}"
+                f"one of {', '.join(trainable_names())}"
             )
         return shared if method is None else _under(shared, method, overrides)
 

@@ -9,14 +9,23 @@ from sqlalchemy import Connection, func, select
 import curate
 from curate.errors import WorkspaceError
 from db import bulk
+from pipelines.assembly import trainable_detector
 from pipelines.engine.stage import RoundContext, Teacher
-from pipelines.registry import TRAINABLE
 from pipelines.workspace.workspace import Workspace, sha256
 
 
 def is_trainable(workspace: Workspace) -> bool:
-    """Whether curate trains the configured detector; otherwise the user brings it."""
-    return workspace.config.detector.name in TRAINABLE
+    """Return whether curate trains the configured detector; otherwise it is external.
+
+    Raises:
+        ConfigError: if its class cannot be used, or has no preset of the configured name.
+    """
+    return trainable_detector(workspace.config) is not None
+
+
+def is_pretrained(workspace: Workspace) -> bool:
+    """Return whether curate trains the first teacher, as the user brings no checkpoint of it."""
+    return is_trainable(workspace) and workspace.config.detector.path is None
 
 
 def is_student_trained(workspace: Workspace) -> bool:
@@ -104,8 +113,8 @@ def find_teacher(
 ) -> tuple[int, Teacher]:
     """The key and the file of the detector that answers in a round.
 
-    A detector that the user brings answers in the first round, and in later ones as well where it
-    is not trained; where it is, the student of the round before does.
+    A detector or checkpoint that the user brings answers in the first round, and in later ones as
+    well where it is not trained; where it is, the student of the round before does.
 
     Args:
         workspace: see `Workspace`.
@@ -115,13 +124,18 @@ def find_teacher(
     Raises:
         WorkspaceError: it does not exist yet, or is another.
         ConfigError: the user's file does not exist.
+        ModelError: it is about to answer and is not a checkpoint of the configured detector.
     """
-    brought = not is_trainable(workspace)
+    trainable = trainable_detector(workspace.config)
+    brought = not is_pretrained(workspace)
     if brought and number == 1:
-        return _brought(workspace)
+        key, teacher = _brought(workspace)
+        if to_work and trainable:
+            trainable.detector.check_checkpoint(teacher.path)
+        return key, teacher
     table = bulk.table("checkpoint")
     policy = workspace.config.run.method if number > 1 else ""
-    query = select(table.c.id, table.c.path, table.c.sha256).where(
+    query = select(table.c.id, table.c.path, table.c.sha256, table.c.detector).where(
         table.c.round == number - 1, table.c.policy == policy
     )
     with workspace.database.reading() as connection:
@@ -131,7 +145,7 @@ def find_teacher(
         return _brought(workspace)
     if not found:
         raise WorkspaceError(f"round {number} has no teacher yet; run `{before}`")
-    key, path, digest = found[0]
+    key, path, digest, detector = found[0]
     place = workspace.root / path
     if not (place.is_file() or place.is_dir()):  # a pipe in its place would never end
         raise WorkspaceError(f"{place}: the checkpoint is gone; run `{before}`")
@@ -140,6 +154,14 @@ def find_teacher(
             f"{place}: has changed since it was made; put the one that was made back, or take the "
             f"file away and run `{before}`"
         )
+    if to_work and trainable:
+        now = workspace.config.detector.name
+        if detector != now:
+            raise WorkspaceError(
+                f"{place}: is a checkpoint of detector '{detector}', and detector.name is '{now}'; "
+                f"run `{before}`, or set detector.name back"
+            )
+        trainable.detector.check_checkpoint(place)
     return key, Teacher(place, digest)
 
 

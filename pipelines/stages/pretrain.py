@@ -5,20 +5,24 @@ from typing import Any
 
 from sqlalchemy import Connection
 
-from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import WorkspaceError
+from pipelines.assembly import trained_detector
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import register_checkpoint
 from pipelines.engine.stage import Product
 from pipelines.firewall.rules import enforce
 from pipelines.stages.export import register_label_file, write_label_file
 from pipelines.stages.methods import METHODS
-from pipelines.stages.train_round import train_with_progress, training_settings
+from pipelines.stages.train_round import (
+    store_statistics,
+    train_with_progress,
+    training_settings,
+)
 from pipelines.workspace.workspace import Workspace
 
 _OTHERS = {  # settings that only later trainings depend on
     "round_steps", "round_learning_rate", "unlabeled_batch_size", "threads", "start",
-    "zero_weight", "teacher", "ema_decay", "command", "labels_format",
+    "zero_weight", "teacher", "ema_decay", "command", "labels_format", "statistics_steps",
 }  # fmt: skip
 
 
@@ -31,19 +35,22 @@ def settings(workspace: Workspace) -> Any:
     config, labeled = workspace.config, workspace.frames("labeled")
     if not labeled:
         raise WorkspaceError("no labeled frames to learn from; `curate init --labeled` takes some")
+    trained = trained_detector(config)
     return [
-        config.train.model_dump(mode="json", exclude=_OTHERS),
+        config.train.model_dump(mode="json", exclude=_OTHERS) | {"preset": trained.preset},
         sorted(labeled),
         config.run.seed,
         config.detector.device,
         config.dataset.categories,
-        FORMAT_VERSION,
+        config.detector.name,
+        trained.detector.checkpoint_version,
     ]
 
 
 def file(workspace: Workspace) -> Path:
     """Return the place of the first teacher's checkpoint."""
-    return workspace.root / "checkpoints" / "round-00.safetensors"
+    suffix = trained_detector(workspace.config).detector.checkpoint_suffix
+    return workspace.root / "checkpoints" / f"round-00{suffix}"
 
 
 def guard(workspace: Workspace) -> None:
@@ -60,6 +67,7 @@ def run(workspace: Workspace, progress: Progress) -> Product:
     config, path, labels = workspace.config, file(workspace), _labels(workspace)
     write_label_file(workspace, labels, 0, "")
     report = train_with_progress(
+        trained_detector(config).detector,
         labels=labels,
         output=path,
         settings=training_settings(
@@ -76,6 +84,7 @@ def run(workspace: Workspace, progress: Progress) -> Product:
 
     def write(connection: Connection) -> None:
         register_checkpoint(connection, workspace, 0, "", path)
+        store_statistics(connection, 0, "", report.statistics)
         register_label_file(connection, workspace, labels, 0, "")
 
     frames = len(workspace.frames("labeled"))

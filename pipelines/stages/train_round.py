@@ -1,17 +1,18 @@
 """train-round: the student, from the exported labels and the teacher."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection
 
-from curate.detectors.pillars.checkpoint import FORMAT_VERSION
 from curate.errors import ConfigError
 from curate.frames import Frame
-from pipelines.assembly import device
+from db import bulk
+from pipelines.assembly import device, trainable_detector, trained_detector
 from pipelines.engine.progress import Progress, reaching
-from pipelines.engine.rounds import is_trainable, register_checkpoint
+from pipelines.engine.rounds import register_checkpoint
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
 from pipelines.stages.external_trainer import train_externally
@@ -19,7 +20,8 @@ from pipelines.stages.methods import Method, method_of, zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
-    from curate.training.settings import TrainingReport, TrainingSettings
+    from curate.detectors.base import TrainableDetector
+    from curate.training.settings import Statistic, TrainingReport, TrainingSettings
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
@@ -27,7 +29,7 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
     section = workspace.config.train
     if section.command is not None:
         return {"command": section.command, "labels_format": section.labels_format}
-    method = method_of(workspace.config, policy)
+    method, trainable = method_of(workspace.config, policy), trainable_detector(workspace.config)
     return {
         **section.model_dump(
             mode="json",
@@ -38,14 +40,17 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
                 "ema_decay",
                 "command",
                 "labels_format",
+                "statistics_steps",
             },
         ),
+        "preset": trainable and trainable.preset,
         "teacher": method.teacher,
         "zero_weight": zero_weight_of(workspace.config, policy),
         "ema_decay": section.ema_decay if method.teacher == "ema" else None,
         "seed": context.seed,
         "device": workspace.config.detector.device,
-        "checkpoint": FORMAT_VERSION,
+        "detector": workspace.config.detector.name,
+        "checkpoint": trainable and trainable.detector.checkpoint_version,
     }
 
 
@@ -55,7 +60,10 @@ def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
     It ends like the file that the user brings, so that the detector knows it by its name.
     """
     brought = workspace.config.detector.path
-    suffix = ".safetensors" if is_trainable(workspace) else (brought.suffix if brought else "")
+    trainable = trainable_detector(workspace.config)
+    suffix = brought.suffix if brought else ""
+    if trainable:
+        suffix = trainable.detector.checkpoint_suffix
     name = f"round-{context.number:02d}-{policy}{suffix}"
     return workspace.root / "checkpoints" / name
 
@@ -68,20 +76,24 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
         TrainerFailed: the command failed, or left no checkpoint.
     """
     path = file(workspace, job.context, job.policy)
+    trainable = trainable_detector(workspace.config)
+    statistics: list[Statistic] = []
 
     def write(connection: Connection) -> None:
         register_checkpoint(connection, workspace, job.context.number, job.policy, path)
+        store_statistics(connection, job.context.number, job.policy, statistics)
 
     if workspace.config.train.command is not None:
         train_externally(workspace, job, path)
         return Product(f"{workspace.relative(path)}, by your trainer", write)
-    if not is_trainable(workspace):
+    if trainable is None:
         raise ConfigError(
             f"detector '{workspace.config.detector.name}' is not trained by curate; "
             f"train it from {export.file(workspace, job.context, job.policy)}, or with --command"
         )
     section = workspace.config.train
     report = train_with_progress(
+        trainable.detector,
         labels=export.file(workspace, job.context, job.policy),
         output=path,
         settings=training_settings(
@@ -95,7 +107,29 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
         read=workspace.dataset.read,
         progress=progress,
     )
+    statistics += report.statistics
     return Product(f"{report.steps} steps, {workspace.relative(path)}", write)
+
+
+def store_statistics(
+    connection: Connection, round_number: int, policy: str, statistics: "Sequence[Statistic]"
+) -> None:
+    """Store the curves of a training in place of those of an earlier one; NaN becomes null."""
+    table = bulk.table("training_statistics")
+    connection.execute(
+        table.delete().where(table.c.round == round_number, table.c.policy == policy)
+    )
+    rows = [
+        {
+            "round": round_number,
+            "policy": policy,
+            "step": each.step,
+            "name": each.name,
+            "value": each.value if isfinite(each.value) else None,
+        }
+        for each in statistics
+    ]
+    bulk.insert_rows(connection, "training_statistics", rows)
 
 
 def training_settings(
@@ -114,7 +148,7 @@ def training_settings(
 
     section = workspace.config.train
     known = {
-        "preset": section.preset,
+        "preset": trained_detector(workspace.config).preset,
         "steps": steps,
         "batch_size": section.batch_size,
         "unlabeled_batch_size": section.unlabeled_batch_size,
@@ -123,6 +157,7 @@ def training_settings(
         "pasted": section.pasted,
         "teacher": method.teacher,
         "ema_decay": section.ema_decay,
+        "statistics_steps": section.statistics_steps,
         "seed": workspace.config.run.seed + round_number,
         "device": device(workspace.config),
     }
@@ -134,6 +169,7 @@ def training_settings(
 
 
 def train_with_progress(
+    detector: "type[TrainableDetector]",
     *,
     labels: Path,
     output: Path,
@@ -151,4 +187,4 @@ def train_with_progress(
         def show(step: int, steps: int, loss: float) -> None:
             reach(step, steps, f"loss {loss:.2f}")
 
-        return train(labels, output, settings, start=start, read=read, progress=show)
+        return train(detector, labels, output, settings, start=start, read=read, progress=show)

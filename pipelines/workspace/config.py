@@ -130,7 +130,7 @@ class SolveSection(Section):
 class TrainSection(Section):
     """How the detector learns."""
 
-    preset: Literal["small", "kitti"] = "small"
+    preset: str = "auto"  # auto: the detector's first, see docs/config.md
     pretrain_steps: AtLeastOne = 1200
     round_steps: AtLeastOne = 1200
     batch_size: AtLeastOne = 2  # frames of X_l per step
@@ -142,6 +142,7 @@ class TrainSection(Section):
     start: Literal["teacher", "scratch"] = "teacher"
     teacher: Literal["method", "student", "ema"] = "method"  # what teaches the next round
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999  # per 1/10,000 of the training
+    statistics_steps: AtLeastOne = 20  # between two points of the training's curves
     pasted: Annotated[int, Field(ge=0)] = 4  # of the object bank, per category; 0 = no bank
     command: str | None = None  # of your own trainer, see docs/training.md
     labels_format: str = "sqlite"  # in which it gets the labels; an exporter's name

@@ -1,13 +1,15 @@
 """The trained pillar detector: frames in, boxes out, in ONNX Runtime on CPU and torch on a GPU."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from curate.detections import Detections
 from curate.detectors.pillars.checkpoint import (
+    FORMAT_VERSION,
     GRAPH_DIGEST,
     Checkpoint,
     digest_of,
@@ -16,10 +18,14 @@ from curate.detectors.pillars.checkpoint import (
     write_graph,
 )
 from curate.detectors.pillars.encoding import Pillars, decode, encode_points
+from curate.detectors.pillars.presets import PRESETS
 from curate.errors import ConfigError, ModelError, first_line
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.nms import nms_bev
+
+if TYPE_CHECKING:
+    from curate.detectors.pillars.training import PillarStudent
 
 # Scores, box codes and estimated IoU of one frame.
 _Answers = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -40,6 +46,10 @@ class PillarDetector:
         ConfigError: there is no such device.
     """
 
+    presets: ClassVar[Collection[str]] = PRESETS.keys()
+    checkpoint_suffix: ClassVar[str] = ".safetensors"
+    checkpoint_version: ClassVar[str] = FORMAT_VERSION
+
     def __init__(
         self,
         checkpoint: Path,
@@ -57,6 +67,25 @@ class PillarDetector:
             if device == "cpu"
             else _torch_answers(checkpoint, self._checkpoint, device)
         )
+
+    @classmethod
+    def check_checkpoint(cls, checkpoint: Path) -> None:
+        """See `curate.detectors.base.TrainableDetector`."""
+        load_checkpoint(checkpoint)
+
+    @classmethod
+    def new_student(cls, preset: str, categories: tuple[str, ...]) -> "PillarStudent":
+        """See `curate.detectors.base.TrainableDetector`."""
+        from curate.detectors.pillars.training import PillarStudent
+
+        return PillarStudent.new(preset, categories)
+
+    @classmethod
+    def load_student(cls, checkpoint: Path) -> "PillarStudent":
+        """See `curate.detectors.base.TrainableDetector`."""
+        from curate.detectors.pillars.training import PillarStudent
+
+        return PillarStudent.load(checkpoint)
 
     @property
     def categories(self) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """The pillar network: points to pillars, three scales over the ground, boxes and scores."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -169,10 +170,15 @@ def network_of(checkpoint: Checkpoint) -> PillarNetwork:
     return network
 
 
-def checkpoint_of(network: PillarNetwork, categories: tuple[str, ...]) -> Checkpoint:
-    """The network's present weights, copied."""
-    weights = {
+def checkpoint_of(
+    network: PillarNetwork,
+    categories: tuple[str, ...],
+    weights: Mapping[str, Tensor] | None = None,
+) -> Checkpoint:
+    """Return the network's present weights, or others in their place, copied."""
+    state = network.state_dict() if weights is None else weights
+    arrays = {
         name: tensor.detach().to("cpu", copy=True).contiguous().numpy()
-        for name, tensor in network.state_dict().items()
+        for name, tensor in state.items()
     }
-    return Checkpoint(network.preset, categories, weights)
+    return Checkpoint(network.preset, categories, arrays)

@@ -18,13 +18,25 @@ from curate.training.batches import Batches
 from curate.training.labels import WeightedLabels
 from curate.training.settings import TrainingSettings
 from curate.training.snapshot import snapshot_path
-from curate.training.trainer import one_cycle, train
+from curate.training.trainer import one_cycle
+from curate.training.trainer import train as train_detector
 
 
 def quick(tiny, **changes):
     """Settings of a training of a second or so."""
     settings = {"preset": tiny, "steps": 6, "batch_size": 2, "pasted": 1, "snapshot_seconds": 0.0}
     return TrainingSettings(**(settings | changes))
+
+
+def train(labels, output, settings, **options):
+    """Trains the pillar detector."""
+    return train_detector(PillarDetector, labels, output, settings, **options)
+
+
+def encoded(labels, settings, step=0):
+    """The batch of a step as the pillar detector takes it."""
+    student = PillarDetector.new_student(settings.preset, labels.categories)
+    return student.encode(Batches(labels, settings)[step], "cpu")
 
 
 class Killed(Exception):  # noqa: N818 - stands for a signal
@@ -81,12 +93,32 @@ def test_a_labeled_frame_without_objects_is_all_background(make_labels, tiny, tm
     with closing(sqlite3.connect(labels)) as connection:
         connection.execute("DELETE FROM ground_truth WHERE frame = '000001'")
         connection.commit()
-    targets = Batches(WeightedLabels(labels), settings)[0].targets
+    targets = encoded(WeightedLabels(labels), settings).targets
     empty, full = targets.heatmap.amax(dim=(1, 2, 3)).argsort().tolist()
     assert targets.heatmap[empty].max() == 0
     assert targets.background[empty].min() == 1
     assert targets.heatmap[full].max() == 1
     assert train(labels, tmp_path / "out.safetensors", settings).labeled_frames == 2
+
+
+def test_statistics_describe_every_few_steps_and_the_last(make_labels, tiny, tmp_path):
+    """The loss is the sum of its terms, and a killed training keeps what it had noted."""
+    labels, settings = make_labels(labeled=2), quick(tiny, statistics_steps=4)
+    whole = train(labels, tmp_path / "whole.safetensors", settings)
+    by_step = {}
+    for each in whole.statistics:
+        by_step.setdefault(each.step, {})[each.name] = each.value
+    assert list(by_step) == [4, 6]
+    for step, numbers in by_step.items():
+        terms = numbers["heatmap"] + numbers["box"] + numbers["iou"]
+        assert numbers["loss"] == pytest.approx(terms)
+        assert numbers["learning_rate"] == one_cycle(step - 1, 6, settings.learning_rate)
+        assert numbers["gradient_norm"] > 0
+    with pytest.raises(Killed):
+        train(labels, tmp_path / "killed.safetensors", settings, progress=kill_at(6))
+    resumed = train(labels, tmp_path / "killed.safetensors", settings)
+    assert resumed.resumed_at == 5
+    assert resumed.statistics == whole.statistics
 
 
 @pytest.mark.parametrize("teacher", ["student", "ema"])
@@ -201,7 +233,7 @@ def test_labels_of_weight_zero_can_become_background(make_labels, tiny):
         for zero in ("ignore", "background")
     }
     blank = {
-        zero: Batches(WeightedLabels(path), quick(tiny, pasted=0))[0]
+        zero: encoded(WeightedLabels(path), quick(tiny, pasted=0))
         .targets.background[-1]
         .eq(0)
         .sum()
@@ -214,8 +246,8 @@ def test_labels_of_weight_zero_can_become_background(make_labels, tiny):
 def test_frames_that_do_not_fit_into_memory_are_read_again(make_labels, tiny):
     """Without room in the cache the batches are the same."""
     labels = WeightedLabels(make_labels(labeled=3))
-    with_room = Batches(labels, quick(tiny))[2]
-    without = Batches(labels, quick(tiny, cache_bytes=0))[2]
+    with_room = encoded(labels, quick(tiny), 2)
+    without = encoded(labels, quick(tiny, cache_bytes=0), 2)
     assert torch.equal(with_room.features, without.features)
     assert torch.equal(with_room.targets.heatmap, without.targets.heatmap)
 
@@ -254,7 +286,6 @@ def test_the_rate_rises_and_falls():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"preset": "huge"}, "unknown preset 'huge'"),
         ({"steps": 0}, "steps is 0"),
         ({"learning_rate": 0.0}, "learning_rate"),
         ({"unlabeled_batch_size": -1}, "unlabeled_batch_size"),
@@ -266,6 +297,12 @@ def test_settings_that_no_training_can_use(wrong, message):
     """A wrong setting is named before anything is read."""
     with pytest.raises(ConfigError, match=message):
         TrainingSettings(**wrong)
+
+
+def test_an_unknown_preset_is_named_before_anything_is_read(tmp_path):
+    """The known presets are listed; the label file does not even exist."""
+    with pytest.raises(ConfigError, match="unknown preset 'huge'; choose one of small, kitti"):
+        train(tmp_path / "none.sqlite", tmp_path / "out.safetensors", quick("huge"))
 
 
 def test_an_unknown_device_is_named(make_labels, tiny, tmp_path):

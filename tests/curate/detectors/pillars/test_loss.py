@@ -8,9 +8,15 @@ import pytest
 import torch
 
 from curate.detectors.pillars.encoding import BOX_CODE, encode_boxes
+from curate.detectors.pillars.loss import (
+    BatchTargets,
+    box_loss,
+    heatmap_loss,
+    iou_loss,
+    weighted_loss,
+)
 from curate.detectors.pillars.network import Answers
 from curate.detectors.pillars.presets import PRESETS
-from curate.training.loss import BatchTargets, box_loss, heatmap_loss, iou_loss, weighted_loss
 
 PRESET = replace(PRESETS["small"], x_range=(0.0, 20.48), y_range=(-10.24, 10.24))
 CAR = [10.0, 0.0, -0.8, 4.0, 1.6, 1.5, 0.3]
@@ -45,7 +51,7 @@ def answers(frames=1, seed=0):
 def gradients(targets, seed=0, frames=1):
     """Of the whole loss."""
     given = answers(frames, seed)
-    weighted_loss(given, targets, PRESET, 1.0).backward()
+    weighted_loss(given, targets, PRESET, 1.0)["loss"].backward()
     return Answers(*(part.grad for part in given))
 
 
@@ -156,9 +162,11 @@ def test_frames_of_a_batch_do_not_mix():
     """The loss of a batch is the sum of the losses of its frames."""
     frames = ([(CAR, 1.0)], [], [([5.0, -3.0, *CAR[2:]], 0.4), (CAR, 0.9)])
     given = answers(3)
-    together = weighted_loss(given, targets_of(*frames), PRESET, 2.0)
+    together = weighted_loss(given, targets_of(*frames), PRESET, 2.0)["loss"]
     alone = [
-        weighted_loss(Answers(*(part[i : i + 1] for part in given)), targets_of(frame), PRESET, 2.0)
+        weighted_loss(
+            Answers(*(part[i : i + 1] for part in given)), targets_of(frame), PRESET, 2.0
+        )["loss"]
         for i, frame in enumerate(frames)
     ]
     torch.testing.assert_close(together, sum(alone))

@@ -142,8 +142,8 @@ def _found_beside(logits: Tensor, targets: BatchTargets) -> Tensor:
 
 def weighted_loss(
     answers: Answers, targets: BatchTargets, preset: Preset, objects: float
-) -> Tensor:
-    """The loss of a batch.
+) -> dict[str, Tensor]:
+    """Return the loss of a batch, and the terms that it is the sum of, without gradient.
 
     Args:
         answers: of the network for b frames.
@@ -153,4 +153,7 @@ def weighted_loss(
     """
     box = BOX_WEIGHT * box_loss(answers.codes, targets)
     iou = IOU_WEIGHT * iou_loss(answers, targets, preset)
-    return (heatmap_loss(answers.logits, targets) + box + iou) / objects
+    heatmap = heatmap_loss(answers.logits, targets)
+    terms = {"heatmap": heatmap, "box": box, "iou": iou}
+    shares = {name: term.detach() / objects for name, term in terms.items()}
+    return {"loss": (heatmap + box + iou) / objects, **shares}
