@@ -39,7 +39,7 @@ bench: $(READY)
 lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy curate db pipelines
+	$(BIN)/mypy curate db pipelines curate_command.py
 
 docs: $(READY)
 	$(BIN)/python -m docs.generate

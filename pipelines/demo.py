@@ -161,7 +161,8 @@ def _train_students(workspace: Workspace, demo: Demo) -> None:
 
 def _train_student(workspace: Workspace, policy: str) -> None:
     command = [
-        *(sys.executable, "-m", "pipelines", "train-round", "--round", "1", "--policy", policy),
+        *(sys.executable, "-m", "curate_command", "train-round"),
+        *("--round", "1", "--policy", policy),
         *("--workspace", str(workspace.root)),
     ]
     ended = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)  # noqa: S603

@@ -1,6 +1,7 @@
 """Every extension point with the names that a configuration may use: one line per extension.
 
-A class from outside is named as `package.module:Class`.
+A class from outside is named as `package.module:Class`; it is found on PYTHONPATH and in the
+current folder.
 """
 
 import importlib
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, get_origin
 
 from curate.errors import ConfigError, CurateError, one_line
+from pipelines.user_modules import import_user_module
 
 if TYPE_CHECKING:
     from curate.detectors.base import TrainableDetector
@@ -43,9 +45,10 @@ class Registry:
         """
         self.refuse_unknown(name)
         module_name, _, class_name = self.classes.get(name, name).partition(":")
+        importer = importlib.import_module if name in self.classes else import_user_module
         try:
-            found = getattr(importlib.import_module(module_name), class_name)
-        except (ImportError, AttributeError) as error:
+            found = getattr(importer(module_name), class_name)
+        except (ImportError, AttributeError, ConfigError) as error:
             raise ConfigError(f"{self.kind} '{name}' cannot be imported: {error}") from error
         except (Exception, SystemExit) as error:  # the module may be the user's, and do anything
             words = one_line(error, 200)

@@ -57,7 +57,7 @@ class JobProcesses:
     def _start(self, job: Job, log: int) -> subprocess.Popen[str] | None:
         method = [] if job.method is None else ["--method", job.method]
         command = [
-            *(sys.executable, "-m", "pipelines", "bench-cell", str(self._root)),
+            *(sys.executable, "-m", "curate_command", "bench-cell", str(self._root)),
             *("--ratio", repr(job.ratio), "--seed", str(job.seed), *method),
         ]
         with self._lock:

@@ -232,7 +232,9 @@ def _join(ray: Any, address: str | None, workers: int) -> None:
         }
     )
     try:
-        ray.init(**where, logging_level="ERROR", log_to_driver=False)
+        # Before an actor's class is looked up there; PYTHONPATH may hold other packages so named.
+        first = {"worker_process_setup_hook": "curate_command.claim_packages"}
+        ray.init(**where, runtime_env=first, logging_level="ERROR", log_to_driver=False)
     except Exception as error:  # Ray raises many kinds, none of which says more than its words
         done = f"joined at {joins}" if joins else "started on this machine"
         raise CurateError(f"no Ray cluster could be {done}: {one_line(error, 200)}") from error

@@ -1,0 +1,43 @@
+"""The command `curate`, with its own packages first.
+
+`curate`, `db` and `pipelines` are common names. A project of the user may have packages with the
+same names, and Python looks into the current folder and into PYTHONPATH before it looks where
+curate is installed. The name of this module is unlikely to be taken. On import it loads the three
+packages that lie beside it; whatever is imported from them later comes from there as well, and
+`sys.path` is left as the user has set it. Worker processes import this module before they unpickle
+their work: multiprocessing imports the main module of its parent, Ray calls `claim_packages`.
+"""
+
+import importlib
+import sys
+from pathlib import Path
+
+HOME = Path(__file__).resolve().parent
+PACKAGES = ("curate", "db", "pipelines")
+
+
+def claim_packages() -> None:
+    """Import curate's own packages, whatever else has their names."""
+    sys.path.insert(0, str(HOME))
+    try:
+        for name in PACKAGES:
+            found = Path(importlib.import_module(name).__file__ or "").resolve()
+            if found.parents[1:2] != (HOME,):
+                sys.exit(
+                    f"error: the package '{name}' of {found.parent} was imported before curate's "
+                    f"own ({HOME / name}); start curate with the command `curate`"
+                )
+    finally:
+        sys.path.remove(str(HOME))
+
+
+def main() -> None:
+    """Run the command line."""
+    from pipelines import cli
+
+    cli.main()
+
+
+claim_packages()
+if __name__ == "__main__":
+    main()

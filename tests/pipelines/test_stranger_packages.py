@@ -1,0 +1,219 @@
+"""A user's own packages `curate`, `db` and `pipelines`, where Python finds them before ours."""
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from support.paths import ROOT, TESTS
+
+from pipelines.workspace.workspace import Workspace
+
+NAMES = ("curate", "db", "pipelines")
+# Whoever imports this package in place of ours fails at once.
+STRANGER = "raise RuntimeError('the package of a stranger was imported')\n"
+SCRIPT = Path(sys.executable).with_name("curate")
+COMMANDS = {
+    "script": [str(SCRIPT)],
+    "launcher": [sys.executable, "-m", "curate_command"],
+}
+EXECUTORS = [
+    "serial",
+    "process",
+    pytest.param(
+        "ray",
+        marks=pytest.mark.skipif(find_spec("ray") is None, reason="pip install '.[ray]'"),
+    ),
+]
+
+
+def write_packages(folder: Path) -> None:
+    """A package of each name that raises when it is imported."""
+    for name in NAMES:
+        (folder / name).mkdir(parents=True)
+        (folder / name / "__init__.py").write_text(STRANGER)
+
+
+def write_modules(folder: Path) -> None:
+    """The same as single files."""
+    folder.mkdir()
+    for name in NAMES:
+        (folder / f"{name}.py").write_text(STRANGER)
+
+
+def write_bare_folders(folder: Path) -> None:
+    """Folders of data without __init__.py, which Python takes for namespace packages."""
+    for name in NAMES:
+        (folder / name).mkdir(parents=True)
+        (folder / name / "models.py").write_text(STRANGER)
+
+
+@pytest.fixture(params=[write_packages, write_modules, write_bare_folders])
+def project(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A folder with strangers in it."""
+    request.param(tmp_path / "project")
+    return tmp_path / "project"
+
+
+@pytest.fixture(params=COMMANDS)
+def command(request: pytest.FixtureRequest) -> list[str]:
+    """How curate is started."""
+    if request.param == "script" and not SCRIPT.exists():
+        pytest.skip("curate is not installed here, it has no console script")
+    return COMMANDS[request.param]
+
+
+def curate(command: list[str], project: Path, *arguments: object) -> subprocess.CompletedProcess:
+    """Run it in the project's folder, with the project first on PYTHONPATH."""
+    folders = os.pathsep.join(map(str, (project, TESTS, ROOT)))
+    return subprocess.run(
+        [*command, *map(str, arguments)],
+        cwd=project,
+        env=os.environ | {"PYTHONPATH": folders, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+
+
+def test_help_and_status_work_beside_strangers(
+    command: list[str], project: Path, workspace: Workspace
+) -> None:
+    """In the current folder and on PYTHONPATH, as packages, modules and bare folders."""
+    for arguments in (("--help",), ("status", "-w", workspace.root)):
+        ended = curate(command, project, *arguments)
+        assert (ended.returncode, ended.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("executor", EXECUTORS)
+def test_a_stage_runs_beside_strangers(
+    command: list[str], project: Path, workspace: Workspace, executor: str
+) -> None:
+    """Two workers, each of them a process that looks for its modules anew."""
+    configuration = workspace.root / "curate.toml"
+    text = configuration.read_text()
+    assert "\nexecutor = " in text
+    lines = [
+        f'executor = "{executor}"' if line.startswith("executor = ") else line
+        for line in text.splitlines()
+        if not line.startswith("workers = ")
+    ]
+    workers = [] if executor == "serial" else ["workers = 2"]
+    at = lines.index(f'executor = "{executor}"')
+    configuration.write_text("\n".join([*lines[:at], *workers, *lines[at:], ""]))
+    # A slow stage, as the start of Ray is, reports its progress on standard error.
+    for stage in ("predict",) if executor == "ray" else ("predict", "repredict", "score"):
+        ended = curate(command, project, stage, "-w", workspace.root)
+        assert ended.returncode == 0, ended.stderr
+        assert "Traceback" not in ended.stderr
+
+
+DETECTOR = """
+from curate.detections import Detections
+from support.toys import ToyDetector
+{line}
+class Det(ToyDetector):
+    def predict(self, frame):
+        {late}
+        return super().predict(frame)
+"""
+
+
+def run_with_detector(
+    project: Path, workspace: Workspace, line: str, late: str = "pass"
+) -> subprocess.CompletedProcess:
+    """Predict with a detector of the project; its module runs `line`, its method `late`."""
+    (project / "mydet.py").write_text(DETECTOR.format(line=line, late=late))
+    configuration = workspace.root / "curate.toml"
+    text = configuration.read_text()
+    configuration.write_text(text.replace("support.toys:ToyDetector", "mydet:Det"))
+    return curate(COMMANDS["launcher"], project, "predict", "-w", workspace.root)
+
+
+def write_project_database(project: Path) -> None:
+    """The package `db` of a project, with what only that project has."""
+    (project / "db").mkdir(parents=True)
+    (project / "db" / "__init__.py").write_text("def connect(): return 'the project'\n")
+    (project / "db" / "models.py").write_text("class Sensor: ...\n")
+    (project / "db" / "sensors.py").write_text("")
+
+
+@pytest.mark.parametrize(
+    ("line", "late"),
+    [
+        ("import db", "pass"),
+        ("import db; db.connect()", "pass"),
+        ("from db import connect", "pass"),
+        ("from db.models import Sensor", "pass"),
+        ("import db.sensors", "pass"),
+        ("pass", "import db; db.connect()"),
+    ],
+)
+def test_a_detector_that_expects_its_own_db_is_rejected(
+    tmp_path: Path, workspace: Workspace, line: str, late: str
+) -> None:
+    """In one line with both packages and what to do, and before any frame."""
+    project = tmp_path / "project"
+    write_project_database(project)
+    ended = run_with_detector(project, workspace, line, late)
+    assert ended.returncode == 2
+    assert len(ended.stderr.splitlines()) == 1
+    assert "'mydet:Det'" in ended.stderr
+    for expected in (project / "db" / "__init__.py", ROOT / "db"):
+        assert f"({expected})" in ended.stderr
+    assert "rename yours" in ended.stderr
+
+
+def test_a_detector_that_does_not_use_the_other_db_works(
+    tmp_path: Path, workspace: Workspace
+) -> None:
+    """The package beside it is nobody's concern."""
+    project = tmp_path / "project"
+    write_project_database(project)
+    ended = run_with_detector(project, workspace, "import json")
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_a_detector_in_the_current_folder_is_found_without_a_pythonpath(
+    tmp_path: Path, workspace: Workspace
+) -> None:
+    """The console script does not put the current folder on Python's path."""
+    if not SCRIPT.exists():
+        pytest.skip("curate is not installed here, it has no console script")
+    (tmp_path / "mydet.py").write_text("class Det:\n    def predict(self, frame): ...\n")
+    configuration = workspace.root / "curate.toml"
+    text = configuration.read_text()
+    configuration.write_text(text.replace("support.toys:ToyDetector", "mydet:Det"))
+    ended = subprocess.run(
+        [SCRIPT, "predict", "-w", workspace.root],
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert ended.returncode == 2
+    # It was found: what is wrong is its constructor, or the segmenter that is not on the path.
+    assert "No module named 'mydet'" not in ended.stderr
+
+
+def test_a_package_that_was_imported_first_is_named(tmp_path: Path) -> None:
+    """By a script that starts the command line itself."""
+    (tmp_path / "db.py").write_text("")
+    ended = subprocess.run(
+        [sys.executable, "-c", "import db; import curate_command"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT)))},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert ended.returncode == 1
+    assert len(ended.stderr.splitlines()) == 1
+    assert "'db'" in ended.stderr
+    assert str(tmp_path) in ended.stderr
