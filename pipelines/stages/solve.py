@@ -93,36 +93,11 @@ def _memory_fingerprint(workspace: Workspace, context: RoundContext, policy: str
 def _store(
     connection: Connection, round_number: int, policy: str, columns: Mapping[str, np.ndarray]
 ) -> None:
-    """Puts the weights of a policy in the place of its former ones.
-
-    Those of the same labels are changed where they are; a server makes a new row of each change.
-    """
-    mine = {"round": round_number, "policy": policy}
-    if bulk.on_server(connection) or not bulk.update_columns(
-        connection, "weight", mine, ("frame_id", "k"), columns
-    ):
-        _replace(connection, mine, columns)
-
-
-def _replace(
-    connection: Connection, mine: Mapping[str, Any], columns: Mapping[str, np.ndarray]
-) -> None:
-    """Deletes the former weights and inserts the new ones.
-
-    The former ones of some frames leave just before the new ones come: their pages are at hand
-    then, and have room.
-    """
-    weight = bulk.table("weight")
-    former = [weight.c[name] == value for name, value in mine.items()]
-    frame_id, end = columns["frame_id"], 0
-    while end < len(frame_id):
-        start, last = end, int(frame_id[min(end + bulk.BLOCK_ROWS, len(frame_id)) - 1])
-        end = int(np.searchsorted(frame_id, last, side="right"))
-        connection.execute(weight.delete().where(*former, weight.c.frame_id <= last))
-        block = {name: values[start:end] for name, values in columns.items()}
-        bulk.insert(connection, "weight", {**mine, **block})
-        former[len(mine) :] = [weight.c.frame_id > last]
-    connection.execute(weight.delete().where(*former))
+    """Put the weights of a policy in the place of its former ones."""
+    weight, mine = bulk.table("weight"), {"round": round_number, "policy": policy}
+    connection.execute(weight.delete().where(*(weight.c[name] == at for name, at in mine.items())))
+    if len(columns["k"]):
+        bulk.insert(connection, "weight", {**mine, **columns})
 
 
 def _columns(keys: LabelKeys, weights: Weights, evidence: Evidence) -> dict[str, np.ndarray]:
@@ -141,8 +116,9 @@ def _counts(
     round_number: int, policy: str, keys: LabelKeys, weights: Weights
 ) -> list[dict[str, Any]]:
     """The rows of `label_count`."""
-    kept, size = ~weights.dropped, len(keys.category_names)
-    category, v = keys.category[kept], weights.v[kept]
+    kept = ~weights.dropped
+    names, category = np.unique(keys.category[kept], return_inverse=True)
+    v, size = weights.v[kept], len(names)
     counts = {
         "labels": np.bincount(category, minlength=size),
         "kept": np.bincount(category[v > 0], minlength=size),
@@ -152,6 +128,5 @@ def _counts(
     return [
         {"round": round_number, "policy": policy, "category": name}
         | {column: values[i].item() for column, values in counts.items()}
-        for i, name in enumerate(keys.category_names)
-        if counts["labels"][i]
+        for i, name in enumerate(names.tolist())
     ]

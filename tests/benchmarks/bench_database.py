@@ -11,7 +11,6 @@ from sqlalchemy import insert, select
 from support.stored_tuples import COLUMNS, store
 
 from db import bulk
-from db.columns import reading_columns
 from db.session import BUSY_TIMEOUT_MS, Database
 from pipelines.engine.progress import Silent
 from pipelines.engine.stage import RoundContext, RoundJob, Teacher
@@ -160,11 +159,8 @@ def bench_read_column(benchmark, name, copies, predictions):
     query = query.order_by(prediction.frame_id, prediction.k)
 
     def ours():
-        with (
-            database.reading() as connection,
-            reading_columns(database, connection, many=True) as asked,
-        ):
-            return asked.numbers(query)
+        with database.reading() as connection:
+            return bulk.select_columns(connection, query)["score"]
 
     def driver():
         asked = "SELECT score FROM prediction WHERE round = 1 ORDER BY frame_id, k"

@@ -35,7 +35,7 @@ def predictions():
 
 
 def write_ours(connection, rows):
-    """COPY, its binary form made of columns."""
+    """COPY of named columns."""
     store(connection, "prediction", rows)
 
 
@@ -112,7 +112,7 @@ def bench_server_read(benchmark, name, database, predictions):
 
     def ours():
         with database.reading() as connection:
-            return bulk.numbers(connection, query)
+            return bulk.select_columns(connection, query)["score"]
 
     def rows():
         with database.reading() as connection:
