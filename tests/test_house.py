@@ -25,9 +25,9 @@ LAYERS = {
         "firewall", "viewing", "review", "training",
     ),
     "pipelines": (
-        "registry", "workspace", "assembly", "engine", "labels", "firewall", "review", "stages",
-        "round", "assessment", "queries", "reports", "serving", "bench", "demo", "commands", "cli",
-        "__main__",
+        "user_modules", "registry", "workspace", "assembly", "engine", "labels", "firewall",
+        "review", "stages", "round", "assessment", "queries", "reports", "serving", "bench", "demo",
+        "commands", "cli", "__main__",
     ),
 }  # fmt: skip
 HOUSE = sorted(path for folder in MAY_IMPORT for path in (ROOT / folder).rglob("*.py"))

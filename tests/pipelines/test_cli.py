@@ -117,8 +117,9 @@ def test_explain_recomputes_the_weight(curate: Curate, made: Path) -> None:
     found = json.loads(out)
     assert found["recomputed"] == pytest.approx(best["weight"])
     assert found["age"]["lambda_u"] == pytest.approx(found["label"]["lambda_u"])
+    evidence = {**found["evidence"], **found["evidence"]["rho"]}
     for name in ("loss", "rho_diff", "rho_anno", "rho_det"):
-        assert found["evidence"][name] == pytest.approx(found["label"][name])
+        assert evidence[name] == pytest.approx(found["label"][name])
     code, out, _ = curate("explain", best["frame"], best["k"])
     assert all(f"Eq. {number}" in out for number in (4, 8, 9, 11))
     assert "they differ" not in out

@@ -6,7 +6,6 @@ import sqlite3
 import subprocess
 import sys
 import time
-from datetime import UTC, datetime
 from io import StringIO
 from pathlib import Path
 
@@ -16,18 +15,16 @@ from support.paths import ROOT
 from support.pipelines_cli import Curate
 
 from curate.errors import CellsFailed, ConfigError, DataError, WorkspaceError
-from db import bulk
 from pipelines.bench.cell import run_job
 from pipelines.bench.grid import Job, jobs
 from pipelines.bench.metered import Metered
 from pipelines.bench.results import JobResult, read_result, write_result
 from pipelines.bench.settings import Bench, read_bench
 from pipelines.engine.plan import Plan
-from pipelines.engine.rounds import open_round
+from pipelines.engine.stage import RoundContext, Teacher
 from pipelines.round import graph_of
 from pipelines.stages.methods import METHODS
 from pipelines.workspace.setup import initialise
-from pipelines.workspace.workspace import sha256
 
 GIVE_UP_S = 3600
 # Two rounds of few steps, snapshots that a kill finds, and labels although nothing was learned yet.
@@ -137,18 +134,8 @@ def test_methods_share_the_teacher_and_its_evidence(toy_kitti: Path, tmp_path: P
     """No method's settings make stale what was prepared once for all of them."""
     bench = make_bench(tmp_path, toy_kitti)
     workspace = initialise(tmp_path / "work", bench.config(0), "0.25", "")
-    digest = sha256(workspace.root / "curate.toml")
-    checkpoint = {
-        "round": 0,
-        "policy": "",
-        "detector": "pillars",
-        "path": "curate.toml",
-        "sha256": digest,
-        "created_at": datetime(2023, 2, 1, tzinfo=UTC),
-    }
-    with workspace.database.writing() as connection:
-        bulk.insert_rows(connection, "checkpoint", [checkpoint])
-    context, graph = open_round(workspace, 1), graph_of(workspace)
+    teacher = Teacher(workspace.root / "curate.toml", "0" * 64)
+    context, graph = RoundContext(1, 2, 0, teacher), graph_of(workspace)
     stages = ("predict", "repredict", "points")
     prints = {}
     for method in METHODS:
