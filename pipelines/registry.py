@@ -142,6 +142,7 @@ PRIORS = Registry(
     {
         "points": "curate.priors.points:PointPrior",
         "semantic": "curate.priors.semantic:SemanticPrior",
+        "density": "curate.priors.density:DensityPrior",
     },
 )
 POLICIES = Registry(
