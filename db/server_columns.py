@@ -32,7 +32,7 @@ from sqlalchemy.types import TypeEngine
 PART_ROWS = 16_000_000
 BLOCK_ROWS = 50_000  # rows of a COPY that are bytes at a time
 # Texts are a matrix as wide as the longest; where it is larger, rows are written one by one.
-_MOST_TEXT_BYTES = 64 << 20
+MOST_TEXT_BYTES = 64 << 20
 
 # What the view weighted_labels and the counts are made of.
 _ASKED_TABLES = (
@@ -221,7 +221,7 @@ def _texts(values: Any) -> _Field:
     encoded = [b"" if value is None else str.encode(value) for value in values]
     sizes = np.fromiter(map(len, encoded), np.int32, len(encoded))
     width = int(sizes.max())
-    if width * len(encoded) > _MOST_TEXT_BYTES:
+    if width * len(encoded) > MOST_TEXT_BYTES:
         raise ValueError("texts too long")
     content = np.array(encoded, dtype=f"S{max(width, 1)}").view(np.uint8)
     return _Field(content.reshape(len(encoded), -1), np.where(nulls, -1, sizes))

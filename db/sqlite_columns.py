@@ -20,7 +20,7 @@ import numpy as np
 _ROW, _DONE, _NULL = 100, 101, 5
 # Read only, and without locks against other threads: a connection here belongs to one.
 _FLAGS = 0x1 | 0x8000
-_BLOCK_ROWS = 1_000_000
+BLOCK_ROWS = 1_000_000  # that are read at a time
 # A statement, the array to fill; how many rows it filled, and SQLite's last answer.
 _Fill = Callable[[int | None, np.ndarray], tuple[int, int]]
 
@@ -68,7 +68,7 @@ class SqliteColumns:
         with self._statement(sql) as statement:
             answer = _ROW
             while answer == _ROW:
-                block: np.ndarray = np.empty(_BLOCK_ROWS, kind)
+                block: np.ndarray = np.empty(BLOCK_ROWS, kind)
                 count, answer = fill(statement.value, block)
                 found.append(block[:count])
             self._must(answer, _DONE)

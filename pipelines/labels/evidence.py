@@ -22,7 +22,7 @@ from pipelines.workspace.workspace import Workspace
 
 _K_BITS = 32
 # Compiling the loop that reads them takes a second, as long as the driver takes for so many.
-_MANY_FRAMES = 10_000
+MANY_FRAMES = 10_000
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def read_evidence(
     for source in sources_of(workspace.config.run.priors):
         prepare_table(workspace, source)
     rho = rho_columns(workspace.config.run.priors)
-    database, many = workspace.database, len(frames) >= _MANY_FRAMES
+    database, many = workspace.database, len(frames) >= MANY_FRAMES
     with (
         database.reading() as connection,
         reading_columns(database, connection, many=many) as asked,

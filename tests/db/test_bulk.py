@@ -232,7 +232,7 @@ def test_texts_too_long_for_a_matrix_go_row_by_row(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The rows are the same."""
-    monkeypatch.setattr(server_columns, "_MOST_TEXT_BYTES", 10)
+    monkeypatch.setattr(server_columns, "MOST_TEXT_BYTES", 10)
     rows = [(1, 1, k, name, 0.5, *[1.0] * 7, None) for k, name in ((50, "a"), (51, "b" * 99))]
     table = bulk.table("prediction")
     with database.writing() as connection:

@@ -60,7 +60,7 @@ def test_integers_are_those_of_the_driver(path: Path, values: list[int]) -> None
 def test_blocks_do_not_show(path: Path, monkeypatch: pytest.MonkeyPatch, block: int) -> None:
     """Whether the rows fill the last one or not."""
     _stored(path, "INTEGER", list(range(7)))
-    monkeypatch.setattr(sqlite_columns, "_BLOCK_ROWS", block)
+    monkeypatch.setattr(sqlite_columns, "BLOCK_ROWS", block)
     with closing(SqliteColumns(path, 1000)) as asked:
         assert asked.integers("SELECT value FROM t ORDER BY id").tolist() == list(range(7))
 

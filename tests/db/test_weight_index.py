@@ -72,7 +72,7 @@ def test_only_the_policys_own_index_is_made_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While its weights are replaced it is away, that of another stays; then both are there."""
-    monkeypatch.setattr(weight_index, "_REBUILT_FROM", 1)
+    monkeypatch.setattr(weight_index, "REBUILT_FROM", 1)
     database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
     for policy in ("pspsl", "spsl"):
         weight_index.prepare(database, policy)

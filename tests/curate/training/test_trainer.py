@@ -216,12 +216,12 @@ def test_frames_of_x_u_come_besides_those_of_x_l(make_labels, tiny):
     settings = quick(tiny, batch_size=2, unlabeled_batch_size=3)
     mixed = Batches(WeightedLabels(make_labels(2, 6)), settings)
     for step in range(5):
-        chosen = mixed._chosen(step)
+        chosen = mixed.chosen(step)
         assert [index in mixed.labeled for index in chosen] == [True] * 2 + [False] * 3
-    seen = {index for step in range(3) for index in mixed._chosen(step)}
+    seen = {index for step in range(3) for index in mixed.chosen(step)}
     assert seen == set(range(8))
     alone = Batches(WeightedLabels(make_labels(2, name="b.sqlite")), settings)
-    assert [index in alone.labeled for index in alone._chosen(7)] == [True] * 2
+    assert [index in alone.labeled for index in alone.chosen(7)] == [True] * 2
 
 
 def test_labels_of_weight_zero_can_become_background(make_labels, tiny):

@@ -19,7 +19,7 @@ def test_evidence_of_many_frames_is_read_alike(
     frames = list(workspace.frames("unlabeled").values())
     keys, alone = evidence.read_evidence(workspace, 1, frames, boxes=True)
     assert len(keys) > 0
-    monkeypatch.setattr(evidence, "_MANY_FRAMES", 1)
+    monkeypatch.setattr(evidence, "MANY_FRAMES", 1)
     same, together = evidence.read_evidence(workspace, 1, frames, boxes=True)
     for one, other in ((keys, same), (alone, together)):
         for name, value in vars(one).items():

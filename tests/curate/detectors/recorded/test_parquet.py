@@ -8,7 +8,7 @@ import pytest
 from support.exported import BOXES, CATEGORIES, SCORES, toy_labels
 from support.toys import IMAGE_SIZE, toy_calibration
 
-from curate.detectors.recorded import RecordedDetector, detector
+from curate.detectors.recorded import RecordedDetector
 from curate.errors import ConfigError, DataError
 from curate.exporters.parquet import ParquetExporter
 from curate.frames import Frame
@@ -89,7 +89,6 @@ def test_views_are_in_the_same_file(tmp_path):
 
 def test_without_views_the_user_is_told_once(tmp_path, caplog):
     """An export of labels has none."""
-    detector._warn_once.cache_clear()
     record = RecordedDetector(write(tmp_path / "a.parquet"))
     with caplog.at_level(logging.WARNING):
         assert list(record.views("a")) == list(record.views("b")) == []
@@ -166,7 +165,7 @@ def test_a_table_takes_no_passes(tmp_path):
         RecordedDetector(write(tmp_path / "a.parquet"), passes=[{"path": "b", "flip_y": True}])
 
 
-def test_only_a_few_row_groups_are_held(tmp_path):
+def test_only_a_few_row_groups_are_held(tmp_path, monkeypatch):
     """Whatever the size of the file."""
     path = tmp_path / "a.parquet"
     one = table(frame=["a"] * 3)
@@ -177,8 +176,20 @@ def test_only_a_few_row_groups_are_held(tmp_path):
     parquet.write_table(rows, path, row_group_size=30)
     record = RecordedDetector(path)
     assert record.frame_ids() == tuple(names)
+    read, read_row_group = [], parquet.ParquetFile.read_row_group
+
+    def counted(file, number, **options):
+        read.append(number)
+        return read_row_group(file, number, **options)
+
+    monkeypatch.setattr(parquet.ParquetFile, "read_row_group", counted)
     for name in names:
         assert len(record.predict(frame(name))) == 3
-    held = record._record._groups.cache_info()
-    assert held.currsize <= 2
-    assert held.misses == 30
+    assert read == list(range(30))
+    read.clear()
+    for name in reversed(names):
+        assert len(record.predict(frame(name))) == 3
+    # Those that were still held need not be read again.
+    held = 30 - len(read)
+    assert held <= 2
+    assert read == list(reversed(range(30 - held)))
