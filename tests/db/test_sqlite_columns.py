@@ -91,12 +91,6 @@ def test_a_query_that_fails_says_why(tmp_path: Path) -> None:
             asked.integers("SELECT abs(value) FROM t ORDER BY id")
 
 
-@pytest.fixture
-def database(tmp_path: Path) -> Database:
-    """An empty database."""
-    return Database(f"sqlite:///{tmp_path / 'curate.db'}")
-
-
 @pytest.mark.parametrize("reachable", [True, False])
 def test_a_database_answers_by_whatever_is_there(
     database: Database, monkeypatch: pytest.MonkeyPatch, reachable: bool

@@ -1,7 +1,6 @@
 """The index by value that each policy's weights have."""
 
 import sqlite3
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,9 +18,8 @@ POLICIES = ("pspsl", "my.curation:Policy", "My.curation:Policy", 'it\'s "quoted"
 
 
 @pytest.fixture
-def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
+def database(database: Database) -> Database:
     """A database whose labels several policies have weighed."""
-    database = Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
     with database.writing() as connection:
         add_one_frame(connection)
         rows = [(1, 1, k, "Car", 0.5, *[1.0] * 7, None) for k in range(20)]

@@ -8,6 +8,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 import torch
+from support.killed import Killed, kill_at
 
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.detectors.pillars import PillarDetector
@@ -37,20 +38,6 @@ def encoded(labels, settings, step=0):
     """The batch of a step as the pillar detector takes it."""
     student = PillarDetector.new_student(settings.preset, labels.categories)
     return student.encode(Batches(labels, settings)[step], "cpu")
-
-
-class Killed(Exception):  # noqa: N818 - stands for a signal
-    """Ends a training in the middle."""
-
-
-def kill_at(last):
-    """A progress callback that ends the training after a step."""
-
-    def progress(step, steps, loss):
-        if step == last:
-            raise Killed
-
-    return progress
 
 
 def weights_of(path):
