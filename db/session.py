@@ -43,8 +43,11 @@ class Database:
         self.url = parse_url(url) if isinstance(url, str) else url
         self.engine = _engine(self.url)
         self._claims: list[Check] = []
-        with self._own_words():
-            self._migrate(backups)
+        with ExitStack() as failed:
+            failed.callback(self.close)
+            with self._own_words():
+                self._migrate(backups)
+            failed.pop_all()
 
     @property
     def name(self) -> str:

@@ -15,7 +15,7 @@ from db.session import Database
 PREFIX = "ix_weight_v_"
 
 # Building an index anew costs a sixth of a row's way in and out of it, measured at 10 million rows.
-_REBUILT_FROM = 100_000
+REBUILT_FROM = 100_000
 _REBUILT_SHARE = 1 / 5
 # The longest name that PostgreSQL keeps has 63 letters; SQLite's index names ignore their case.
 _PLAIN = re.compile(r"[a-z0-9_]{1,40}")
@@ -58,7 +58,7 @@ def replacing(connection: Connection, policy: str, count: int) -> Iterator[None]
     Where they are a good part of all that it has, SQLite's index is made anew afterwards: row by
     row, each entry is a seek of its own. A server's table stays open to others.
     """
-    worthwhile = connection.dialect.name == "sqlite" and count >= _REBUILT_FROM
+    worthwhile = connection.dialect.name == "sqlite" and count >= REBUILT_FROM
     if worthwhile:
         counted = bulk.table("label_count").c
         stored = select(func.sum(counted.labels)).where(counted.policy == policy)

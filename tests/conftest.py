@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from sqlalchemy import Connection, Engine, event
 from support import postgres_server
 from support.exported import block, label, truth, truth_block
 from support.paths import ROOT
@@ -25,6 +26,22 @@ settings.register_profile(
 )
 settings.register_profile("random", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("same")
+
+
+_connected: set[Engine] = set()
+
+
+@event.listens_for(Engine, "engine_connect")
+def _remember(connection: Connection) -> None:
+    _connected.add(connection.engine)
+
+
+@pytest.fixture(autouse=True)
+def _closed_databases() -> Iterator[None]:
+    """Closes each database that a test used, whoever opened it."""
+    yield
+    while _connected:
+        _connected.pop().dispose()
 
 
 def _shared(variable: str, name: str) -> Path:

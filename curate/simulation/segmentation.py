@@ -177,7 +177,7 @@ def _fit(images: np.ndarray, truth: np.ndarray, settings: SegmentationSettings) 
         optimiser.step()
         schedule.step()
         if step % 50 == 0:
-            _log.info("step %d of %d: loss %.4f", step, settings.steps, float(loss))
+            _log.info("step %d of %d: loss %.4f", step, settings.steps, loss.item())
     return net.eval()
 
 

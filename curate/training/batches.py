@@ -41,12 +41,12 @@ class Batches:
     def __getitem__(self, step: int) -> list[Sample]:
         """Return the augmented samples of a step."""
         augmented = []
-        for place, index in enumerate(self._chosen(step)):
+        for place, index in enumerate(self.chosen(step)):
             generator = np.random.default_rng([self._settings.seed, step, place])
             augmented.append(self._augmentation.apply(self._sample(index), self.bank, generator))
         return augmented
 
-    def _chosen(self, step: int) -> list[int]:
+    def chosen(self, step: int) -> list[int]:
         """The frames of a step: X_l and X_u each run through in an order new for every pass."""
         of_unlabeled = self._settings.unlabeled_batch_size if len(self.unlabeled) else 0
         chosen = []

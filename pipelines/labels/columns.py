@@ -149,10 +149,10 @@ def _read(
         own = [categories.setdefault(name, len(categories)) for name in kinds]
         keys.append(np.array([places, places_in_frame, own], dtype=np.int64).T)
         tables.append(np.array(columns, dtype=np.float64).T)
-    return _ordered(list(frames), tuple(categories), _joined(keys), _joined(tables), numbers)
+    return ordered(list(frames), tuple(categories), joined(keys), joined(tables), numbers)
 
 
-def _joined(chunks: list[np.ndarray]) -> np.ndarray:
+def joined(chunks: list[np.ndarray]) -> np.ndarray:
     """All chunks below each other; each is let go as soon as it is copied."""
     end = sum(map(len, chunks))
     whole = np.empty((end, chunks[0].shape[1]), chunks[0].dtype)
@@ -163,7 +163,7 @@ def _joined(chunks: list[np.ndarray]) -> np.ndarray:
     return whole
 
 
-def _ordered(
+def ordered(
     names: list[str],
     categories: tuple[str, ...],
     key: np.ndarray,

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from contracts.samples import assert_one_line, assert_same
+from support.killed import Killed, kill_at
 from support.paths import ROOT
 from support.trainable_toy import GridDetector, GridStudent
 
@@ -28,16 +29,6 @@ from curate.training.trainer import train
 from pipelines.registry import DETECTORS, trainable, trainable_names
 
 TOY = "support.trainable_toy:GridDetector"
-
-
-class Killed(Exception):  # noqa: N818 - stands for a signal
-    """Ends a training in the middle."""
-
-
-def kill(step: int, _steps: int, _loss: float) -> None:
-    """Ends a training after its third step."""
-    if step == 3:
-        raise Killed
 
 
 @pytest.fixture(params=[*trainable_names(), TOY])
@@ -71,7 +62,7 @@ def test_a_killed_training_ends_in_the_same_files(
     whole, killed = (tmp_path / name / f"a{detector.checkpoint_suffix}" for name in ("w", "k"))
     report = trained(detector, labels, whole, teacher=teacher, statistics_steps=2)
     with pytest.raises(Killed):
-        trained(detector, labels, killed, teacher=teacher, statistics_steps=2, progress=kill)
+        trained(detector, labels, killed, teacher=teacher, statistics_steps=2, progress=kill_at(3))
     assert snapshot_path(killed).exists()
     before = torch.random.get_rng_state()
     torch.manual_seed(4711)

@@ -2,7 +2,6 @@
 
 import math
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,8 @@ COUNT = 23
 
 
 @pytest.fixture
-def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
+def database(database: Database) -> Database:
     """A database with a few predictions."""
-    database = Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
     with database.writing() as connection:
         add_one_frame(connection)
         rows = [

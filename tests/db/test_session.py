@@ -26,12 +26,6 @@ ENGINES = ("sqlite", "postgresql")
 
 
 @pytest.fixture
-def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
-    """An empty database of either kind."""
-    return Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
-
-
-@pytest.fixture
 def sqlite_database(tmp_path: Path) -> Database:
     """An empty SQLite database."""
     return Database(f"sqlite:///{tmp_path / 'curate.db'}")

@@ -1,7 +1,6 @@
 """The index by value that each policy's weights have."""
 
 import sqlite3
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,9 +18,8 @@ POLICIES = ("pspsl", "my.curation:Policy", "My.curation:Policy", 'it\'s "quoted"
 
 
 @pytest.fixture
-def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
+def database(database: Database) -> Database:
     """A database whose labels several policies have weighed."""
-    database = Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
     with database.writing() as connection:
         add_one_frame(connection)
         rows = [(1, 1, k, "Car", 0.5, *[1.0] * 7, None) for k in range(20)]
@@ -72,7 +70,7 @@ def test_only_the_policys_own_index_is_made_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While its weights are replaced it is away, that of another stays; then both are there."""
-    monkeypatch.setattr(weight_index, "_REBUILT_FROM", 1)
+    monkeypatch.setattr(weight_index, "REBUILT_FROM", 1)
     database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
     for policy in ("pspsl", "spsl"):
         weight_index.prepare(database, policy)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,8 +18,6 @@ CLASSES = {"Car": (3,), "Pedestrian": (1,)}
 
 def _mapped() -> Frame:
     """A frame whose LiDAR knows its place in the map."""
-    from dataclasses import replace
-
     pose = vehicle_pose(0, 0)
     placed = np.eye(4)
     placed[:3, :3], placed[:3, 3] = pose.turn.as_matrix(), pose.place
@@ -40,7 +39,7 @@ def read_map_results(path: Path) -> None:
 
     detector = RecordedDetector(path)
     for name in detector.frame_ids():
-        detector._detections(name, detector._record.answer(name), lambda _: _mapped().calibration)
+        detector.predict(replace(_mapped(), frame_id=name))
 
 
 def write_tables(path: Path) -> None:

@@ -16,6 +16,11 @@ def run_workspace(workspace: Workspace, rounds: int | None = None, **options: An
     return list(run_all(workspace, graph_of(workspace), rounds, Silent(), **options))
 
 
+def run(workspace: Workspace) -> dict[str, int]:
+    """Run everything; frames (or round stages) done anew, by stage."""
+    return {report.stage: report.done for report in run_workspace(workspace)}
+
+
 def run_stage(
     workspace: Workspace, name: str, number: int | None = 1, policy: str = "pspsl"
 ) -> Report:

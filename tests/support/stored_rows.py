@@ -1,4 +1,4 @@
-"""All that a run has stored, in an order that does not depend on when it was written."""
+"""What a run has stored; all of it in an order that does not depend on when it was written."""
 
 from sqlalchemy import select
 
@@ -21,6 +21,12 @@ def dump(workspace: Workspace) -> list[tuple]:
             found = bulk.select(connection, select(*columns))
             rows += sorted(((table.name, *map(_exact, row)) for row in found), key=repr)
     return rows
+
+
+def rows(workspace: Workspace, sql: str) -> list[tuple]:
+    """The answer to a question."""
+    with workspace.database.reading() as connection:
+        return [tuple(row) for row in connection.exec_driver_sql(sql)]
 
 
 def _exact(value: object) -> object:

@@ -36,6 +36,11 @@ def toy_calibration() -> Calibration:
     return Calibration(projection, lidar_to_camera)
 
 
+def empty_frame(name: str) -> Frame:
+    """A frame of which only the name matters."""
+    return Frame(name, np.zeros((0, 4), np.float32), toy_calibration(), IMAGE_SIZE)
+
+
 def write_toy_kitti(root: Path, frames: int, val: int = 0, *, labels: bool = True) -> None:
     """Frames 000000.. with one object per category, each a cloud of equally bright points."""
     for folder in ("velodyne", "image_2", "calib", "label_2"):

@@ -1,6 +1,7 @@
 """Point clouds from files of several formats: x, y, z in metres and intensity in [0, 1]."""
 
 import tokenize
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,10 @@ def _read_npy(path: Path, columns: int) -> np.ndarray:
     try:
         # Mapped, not read: a header that claims more than the file holds costs no memory, and
         # neither pickles nor archives are taken for arrays.
-        table = np.lib.format.open_memmap(path, mode="r")
+        with warnings.catch_warnings():
+            # Python's of the header's literals, or numpy's that Python 2 wrote them.
+            warnings.simplefilter("ignore")
+            table = np.lib.format.open_memmap(path, mode="r")
     except FileNotFoundError:
         raise DataError(f"{path}: no such point file") from None
     except _NPY_DAMAGES as error:

@@ -21,7 +21,7 @@ from curate.geometry.poses import pose_matrix
 
 Record = Mapping[str, Any]
 
-_PIECE_BYTES = 8 << 20
+PIECE_BYTES = 8 << 20  # of a table that are text at a time
 _RECORD = re.compile(rb"\{[^{}]*\}")
 # How far the length of a quaternion may be from one; they are written with many digits.
 _UNIT_SLACK = 0.01
@@ -55,7 +55,7 @@ def scan_table(path: Path) -> Iterator[tuple[int, bytes]]:
     rest, place = b"", 0
     try:
         with path.open("rb") as file:
-            while piece := file.read(_PIECE_BYTES):
+            while piece := file.read(PIECE_BYTES):
                 text, end = rest + piece, 0
                 for match in _RECORD.finditer(text):
                     yield place + match.start(), match.group()

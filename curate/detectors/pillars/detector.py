@@ -27,8 +27,8 @@ from curate.geometry.nms import nms_bev
 if TYPE_CHECKING:
     from curate.detectors.pillars.training import PillarStudent
 
-# Scores, box codes and estimated IoU of one frame.
-_Answers = tuple[np.ndarray, np.ndarray, np.ndarray]
+Answers = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Scores, box codes and estimated IoU of one frame."""
 
 
 class PillarDetector:
@@ -63,9 +63,9 @@ class PillarDetector:
         self._minimum_score = minimum_score
         self._nms_iou = nms_iou
         self._answers = (
-            _onnx_answers(checkpoint, self._checkpoint, threads)
+            onnx_answers(checkpoint, self._checkpoint, threads)
             if device == "cpu"
-            else _torch_answers(checkpoint, self._checkpoint, device)
+            else torch_answers(checkpoint, self._checkpoint, device)
         )
 
     @classmethod
@@ -111,9 +111,7 @@ class PillarDetector:
         return replace(best_first, boxes=ground.raised(best_first.boxes))
 
 
-def _onnx_answers(
-    path: Path, checkpoint: Checkpoint, threads: int
-) -> Callable[[Pillars], _Answers]:
+def onnx_answers(path: Path, checkpoint: Checkpoint, threads: int) -> Callable[[Pillars], Answers]:
     """The checkpoint's ONNX graph in ONNX Runtime; made where it is missing or outdated."""
     import onnxruntime
     from onnxruntime.capi.onnxruntime_pybind11_state import (
@@ -143,7 +141,7 @@ def _onnx_answers(
         write_graph(path, checkpoint, digest)
         session = open_session()
 
-    def answers(pillars: Pillars) -> _Answers:
+    def answers(pillars: Pillars) -> Answers:
         inputs = {"features": pillars.features, "slots": pillars.slots[:, None]}
         scores, codes, ious = session.run(["scores", "codes", "ious"], inputs)
         return scores, codes, ious[..., 0]
@@ -151,9 +149,7 @@ def _onnx_answers(
     return answers
 
 
-def _torch_answers(
-    path: Path, checkpoint: Checkpoint, device: str
-) -> Callable[[Pillars], _Answers]:
+def torch_answers(path: Path, checkpoint: Checkpoint, device: str) -> Callable[[Pillars], Answers]:
     """The network itself, on a GPU."""
     import torch
 
@@ -167,7 +163,7 @@ def _torch_answers(
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None
 
-    def answers(pillars: Pillars) -> _Answers:
+    def answers(pillars: Pillars) -> Answers:
         with torch.inference_mode():
             features = torch.from_numpy(pillars.features).to(place)
             scores, codes, ious = network(features, torch.from_numpy(pillars.slots).to(place))

@@ -75,7 +75,7 @@ class PillarNetwork(nn.Module):
             frames: b.
         """
         cells_x, cells_y = self.preset.cells
-        canvas: Tensor = _SlotMaximum.apply(  # type: ignore[no-untyped-call]
+        canvas: Tensor = SlotMaximum.apply(  # type: ignore[no-untyped-call]
             self.points(features), slots, 4 * frames * cells_x * cells_y
         )
         maps = self.stem(canvas.view(frames, cells_x, cells_y, -1).permute(0, 3, 1, 2))
@@ -105,7 +105,7 @@ class SingleFrame(nn.Module):
         return torch.sigmoid(logits[0]), codes[0], torch.sigmoid(iou_logits[0])
 
 
-class _SlotMaximum(torch.autograd.Function):
+class SlotMaximum(torch.autograd.Function):
     """The maximum over the points of each slot, 0 in empty slots; inputs are not negative.
 
     autograd's own scatter_reduce divides the gradient among equal maxima in several passes over
@@ -115,6 +115,7 @@ class _SlotMaximum(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, slots: Tensor, count: int) -> Tensor:
+        """(count, c) of (n, c) values, whose rows go into these slots."""
         index = slots[:, None].expand(-1, values.shape[1])
         highest = values.new_zeros(count, values.shape[1])
         highest = highest.scatter_reduce(0, index, values, "amax", include_self=True)
@@ -123,6 +124,7 @@ class _SlotMaximum(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        """To each point that is its slot's maximum, the gradient of the slot."""
         values, slots, highest = ctx.saved_tensors
         won = values == highest.index_select(0, slots)
         return gradient.index_select(0, slots) * won, None, None

@@ -245,7 +245,7 @@ def test_tables_may_be_larger_than_a_piece(kept, monkeypatch):
 
     whole = NuScenesDataset(kept)
     name = sample_token(SCENES[1], 1)
-    monkeypatch.setattr(tables, "_PIECE_BYTES", 97)
+    monkeypatch.setattr(tables, "PIECE_BYTES", 97)
     pieces = NuScenesDataset(kept)
     assert pieces.frame_ids() == whole.frame_ids()
     np.testing.assert_array_equal(pieces.annotations(name).boxes, whole.annotations(name).boxes)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import DataError, LeakageError
 from curate.frames import Frame
 from curate.training.labels import WeightedLabels
@@ -97,11 +98,10 @@ def test_a_labeled_frame_without_objects_is_a_sample_too(make_labels):
     assert len(sample.points) > 0
 
 
-def test_a_reader_of_the_callers_own(make_labels):
+def test_a_reader_of_the_callers_own(make_labels, toy_kitti):
     """Frames of any data set can be served by a function."""
     path = make_labels(labeled=1)
-    original = WeightedLabels(path)
-    reference = original._read("000000")
+    reference = KittiDataset(toy_kitti).read("000000")
 
     def read(frame_id: str) -> Frame:
         return Frame(frame_id, reference.points[:50], reference.calibration, reference.image_size)

@@ -8,6 +8,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 import torch
+from support.killed import Killed, kill_at
 
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.detectors.pillars import PillarDetector
@@ -37,20 +38,6 @@ def encoded(labels, settings, step=0):
     """The batch of a step as the pillar detector takes it."""
     student = PillarDetector.new_student(settings.preset, labels.categories)
     return student.encode(Batches(labels, settings)[step], "cpu")
-
-
-class Killed(Exception):  # noqa: N818 - stands for a signal
-    """Ends a training in the middle."""
-
-
-def kill_at(last):
-    """A progress callback that ends the training after a step."""
-
-    def progress(step, steps, loss):
-        if step == last:
-            raise Killed
-
-    return progress
 
 
 def weights_of(path):
@@ -216,12 +203,12 @@ def test_frames_of_x_u_come_besides_those_of_x_l(make_labels, tiny):
     settings = quick(tiny, batch_size=2, unlabeled_batch_size=3)
     mixed = Batches(WeightedLabels(make_labels(2, 6)), settings)
     for step in range(5):
-        chosen = mixed._chosen(step)
+        chosen = mixed.chosen(step)
         assert [index in mixed.labeled for index in chosen] == [True] * 2 + [False] * 3
-    seen = {index for step in range(3) for index in mixed._chosen(step)}
+    seen = {index for step in range(3) for index in mixed.chosen(step)}
     assert seen == set(range(8))
     alone = Batches(WeightedLabels(make_labels(2, name="b.sqlite")), settings)
-    assert [index in alone.labeled for index in alone._chosen(7)] == [True] * 2
+    assert [index in alone.labeled for index in alone.chosen(7)] == [True] * 2
 
 
 def test_labels_of_weight_zero_can_become_background(make_labels, tiny):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.shown_labels import labels
 
 from curate.viewing.bird_eye import Region, draw_bird_eye
 from curate.viewing.legend import TITLE_HEIGHT
@@ -9,14 +10,6 @@ from curate.viewing.palette import GROUND_TRUTH, weight_colours
 from curate.viewing.tags import ShownLabels
 
 REGION = Region(0, 40, -20, 20, 10)
-
-
-def labels(boxes, weights):
-    """Cars with weights."""
-    boxes = np.array(boxes, dtype=np.float64).reshape(-1, 7)
-    count = len(boxes)
-    return ShownLabels(boxes, np.array(["Car"] * count, dtype=np.str_), np.full(count, 0.9),
-                       np.array(weights, dtype=np.float64))  # fmt: skip
 
 
 def near(picture, place, colour, reach=2):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.shown_labels import labels
 from support.toys import toy_calibration
 
 from curate.geometry.boxes import box_corners
@@ -9,7 +10,6 @@ from curate.geometry.projection import project_points
 from curate.viewing.legend import STRIP_HEIGHT, TITLE_HEIGHT
 from curate.viewing.overlay import box_strokes, draw_overlay
 from curate.viewing.palette import weight_colours
-from curate.viewing.tags import ShownLabels
 
 SIZE = (1200, 400)
 
@@ -19,14 +19,6 @@ def calibration():
     toy = toy_calibration()
     toy.projection[:] = [[600, 0, 600, 0], [0, 600, 200, 0], [0, 0, 1, 0]]
     return toy
-
-
-def labels(boxes, weights):
-    """Cars with weights."""
-    boxes = np.array(boxes, dtype=np.float64).reshape(-1, 7)
-    count = len(boxes)
-    return ShownLabels(boxes, np.array(["Car"] * count, dtype=np.str_), np.full(count, 0.9),
-                       np.array(weights, dtype=np.float64))  # fmt: skip
 
 
 def test_strokes_are_the_edges_of_the_projected_box():

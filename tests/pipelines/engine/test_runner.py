@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from support import toys
-from support.rounds import run_stage, run_workspace
+from support.rounds import run, run_stage, run_workspace
 from support.stored_rows import dump
 
 from curate.errors import WorkspaceError
@@ -24,11 +24,6 @@ def count(workspace: Workspace, table: str) -> int:
     """Rows of a table."""
     with workspace.database.reading() as connection:
         return connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar_one()
-
-
-def run(workspace: Workspace) -> dict[str, int]:
-    """Runs everything; frames (or round stages) done anew, by stage."""
-    return {report.stage: report.done for report in run_workspace(workspace)}
 
 
 def with_setting(workspace: Workspace, section: str, **changes: object) -> Workspace:

@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from support.pipelines_cli import Curate, in_process
+from support.pipelines_cli import Curate
 from support.rounds import run_workspace
 from support.toys import toy_document, write_toy_kitti
 
@@ -19,12 +19,6 @@ from pipelines.workspace.setup import initialise
 
 # So that a training takes no time: it is a program that writes a file.
 TRAINER = 'python3 -c \'import os; open(os.environ["CURATE_OUTPUT"], "w").write("student")\''
-
-
-@pytest.fixture
-def curate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Curate:
-    """The command line."""
-    return in_process(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="session")

@@ -5,19 +5,13 @@ from pathlib import Path
 
 import pytest
 from support.dataset_layouts import DRIVE, write_toy_raw
-from support.pipelines_cli import Curate, in_process
+from support.pipelines_cli import Curate
 from support.toys import write_toy_kitti
 
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.datasets.kitti.raw import KittiRawDataset
 from curate.errors import ConfigError, LeakageError
 from pipelines.workspace.setup import choose_split
-
-
-@pytest.fixture
-def curate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Curate:
-    """The command line."""
-    return in_process(monkeypatch, capsys)
 
 
 @pytest.fixture

@@ -68,7 +68,7 @@ def test_indices_that_were_left_out_of_a_large_load_are_back(
     schema = text("SELECT name, sql FROM sqlite_master WHERE type = 'index' ORDER BY name")
     with workspace.database.reading() as connection:
         before = [connection.execute(each).all() for each in (query, schema)]
-    monkeypatch.setattr(weight_index, "_REBUILT_FROM", 1)
+    monkeypatch.setattr(weight_index, "REBUILT_FROM", 1)
     solved(workspace, rounds=3)
     solved(workspace, rounds=4)
     with workspace.database.reading() as connection:

@@ -14,6 +14,7 @@ from support.exported import rows_of
 from support.paths import ROOT
 from support.pipelines_cli import Curate
 from support.rounds import state_of
+from support.stored_rows import rows
 from support.stored_tuples import store
 
 from curate.errors import DatabaseError
@@ -39,12 +40,6 @@ def advance(curate: Curate, workspace: Workspace, number: int) -> None:
     for command in ("predict", "repredict", "score", "solve"):
         code, _, err = curate(command, "-w", workspace.root, "--round", number)
         assert code == 0, err
-
-
-def rows(workspace: Workspace, sql: str) -> list[tuple]:
-    """The answer to a question."""
-    with workspace.database.reading() as connection:
-        return [tuple(row) for row in connection.exec_driver_sql(sql)]
 
 
 def change(workspace: Workspace, sql: str) -> None:

@@ -10,6 +10,7 @@ import pytest
 from support.paths import ROOT
 from support.pipelines_cli import Curate
 from support.rounds import run_stage, run_workspace, state_of
+from support.stored_rows import rows
 
 from curate.detectors.pillars.checkpoint import load_checkpoint
 from curate.errors import ConfigError, WorkspaceError
@@ -25,12 +26,6 @@ NAMES = [
     "baseline", "uda", "uda-cl", "sess", "3dioumatch", "spsl", "pspsl", "threshold", "st3d",
     "hssda",
 ]  # fmt: skip
-
-
-def rows(workspace: Workspace, sql: str) -> list[tuple]:
-    """The answer to a question."""
-    with workspace.database.reading() as connection:
-        return [tuple(row) for row in connection.exec_driver_sql(sql)]
 
 
 def run(workspace: Workspace) -> Workspace:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from sqlalchemy import text
 from support.pipelines_cli import Curate
-from support.rounds import run_stage, run_workspace
+from support.rounds import run, run_stage
 from support.toys import ToyPrior, ToySequences
 
 from curate.errors import ConfigError
@@ -25,11 +25,6 @@ from pipelines.workspace.workspace import Workspace
 
 OWN, TRACKS = "support.toys:ToyPrior", "support.toys:ToyTracks"
 ENGINES = ("sqlite", "postgresql")
-
-
-def run(workspace: Workspace) -> dict[str, int]:
-    """Runs everything; frames (or round stages) done anew, by stage."""
-    return {report.stage: report.done for report in run_workspace(workspace)}
 
 
 def rows(workspace: Workspace, columns: str = "*") -> list[dict[str, Any]]:

@@ -1,6 +1,7 @@
 """Point clouds in PCD and PLY: all forms of both, and headers that lie."""
 
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -126,3 +127,27 @@ def test_a_point_farther_than_any_lidar_sees(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", points)
     with pytest.raises(DataError, match=r"point 3 is 4\.5e\+06 m away"):
         read_cloud(tmp_path / "a.npy")
+
+
+def write_npy(path: Path, shape: str) -> Path:
+    """The points behind a header that says so of their shape."""
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    path.write_bytes(
+        b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header.encode() + POINTS.tobytes()
+    )
+    return path
+
+
+def test_python_2_wrote_long_integers(tmp_path: Path) -> None:
+    """They are read, and the user need not be told."""
+    np.testing.assert_array_equal(read_cloud(write_npy(tmp_path / "a.npy", "(40L, 4L)")), POINTS)
+
+
+def test_a_damaged_header_is_one_error_and_no_warning(tmp_path: Path) -> None:
+    """Python warns of a number that runs into a word."""
+    path = write_npy(tmp_path / "a.npy", "(1and 40, 4)")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        with pytest.raises(DataError, match=r"a\.npy: no readable"):
+            read_cloud(path)
+    assert not told

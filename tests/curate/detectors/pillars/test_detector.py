@@ -6,9 +6,9 @@ import torch
 
 from curate.detectors.pillars import PillarDetector
 from curate.detectors.pillars.checkpoint import graph_path, save_checkpoint
-from curate.detectors.pillars.detector import _onnx_answers, _torch_answers
+from curate.detectors.pillars.detector import onnx_answers, torch_answers
 from curate.detectors.pillars.encoding import encode_points
-from curate.detectors.pillars.network import PillarNetwork, _SlotMaximum, checkpoint_of
+from curate.detectors.pillars.network import PillarNetwork, SlotMaximum, checkpoint_of
 from curate.detectors.pillars.presets import PRESETS
 from curate.errors import ConfigError
 from curate.frames import Calibration, Frame
@@ -63,8 +63,8 @@ def test_onnx_runtime_and_torch_agree(tmp_path, preset, count):
     path, checkpoint = tmp_path / "net.safetensors", lively(preset)
     save_checkpoint(path, checkpoint)
     pillars = encode_points(cloud(count), PRESETS[preset])
-    by_onnx = _onnx_answers(path, checkpoint, 1)(pillars)
-    by_torch = _torch_answers(path, checkpoint, "cpu")(pillars)
+    by_onnx = onnx_answers(path, checkpoint, 1)(pillars)
+    by_torch = torch_answers(path, checkpoint, "cpu")(pillars)
     assert by_onnx[0].shape == (*PRESETS[preset].cells, 3)
     assert by_onnx[2].shape == PRESETS[preset].cells
     assert np.ptp(by_torch[1]) > 0.1
@@ -131,7 +131,7 @@ def test_the_slot_maximum_has_the_gradient_of_scatter_reduce():
     values = torch.rand(20, 3, generator=generator, requires_grad=True)
     slots = torch.randint(0, 6, (20,), generator=generator)
     weights = torch.rand(8, 3, generator=generator)
-    (_SlotMaximum.apply(values, slots, 8) * weights).sum().backward()
+    (SlotMaximum.apply(values, slots, 8) * weights).sum().backward()
     ours = values.grad.clone()
     values.grad = None
     index = slots[:, None].expand(-1, 3)

@@ -13,7 +13,7 @@ from support.toys import toy_calibration
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.datasets.kitti.labels import from_detections, write_objects
 from curate.detections import Detections, as_categories
-from curate.detectors.recorded import RecordedDetector, detector
+from curate.detectors.recorded import RecordedDetector
 from curate.errors import ConfigError, DataError
 from curate.frames import Calibration, Frame
 from curate.geometry.similarity import Similarity
@@ -186,7 +186,6 @@ def test_a_second_pass_gives_views(written):
 
 def test_without_a_second_pass_the_user_is_told_once(tmp_path, caplog):
     """Weights of 0 everywhere would be a riddle."""
-    detector._warn_once.cache_clear()
     record = RecordedDetector(write_openpcdet(tmp_path / "a.pkl"))
     with caplog.at_level(logging.WARNING):
         assert list(record.views("000001")) == list(record.views("000002")) == []
@@ -220,7 +219,6 @@ def test_a_frame_without_result_is_an_error(written):
 def test_a_result_for_a_frame_that_does_not_exist_is_reported(written, caplog):
     """Some: a warning that names them. All: an error that shows how frames are named."""
     path, _, options = written
-    detector._warn_once.cache_clear()
     with caplog.at_level(logging.WARNING):
         RecordedDetector(path, frame_ids=("000001", "000007"), **options)
     assert "1 of 2 results are for frames that the data set does not have (000002)" in caplog.text

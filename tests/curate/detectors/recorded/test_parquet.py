@@ -6,21 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.exported import BOXES, CATEGORIES, SCORES, toy_labels
-from support.toys import IMAGE_SIZE, toy_calibration
+from support.toys import empty_frame
 
-from curate.detectors.recorded import RecordedDetector, detector
+from curate.detectors.recorded import RecordedDetector
 from curate.errors import ConfigError, DataError
 from curate.exporters.parquet import ParquetExporter
-from curate.frames import Frame
 from curate.geometry.similarity import Similarity
 
 arrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
 parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
-
-
-def frame(name):
-    """A frame of which only the name matters."""
-    return Frame(name, np.zeros((0, 4), np.float32), toy_calibration(), IMAGE_SIZE)
 
 
 def table(**changes):
@@ -47,7 +41,7 @@ def test_our_own_export_is_a_record(tmp_path):
     ParquetExporter(rows_per_group=2).write(tmp_path / "labels.parquet", toy_labels())
     record = RecordedDetector(tmp_path / "labels.parquet")
     assert record.frame_ids() == ("000001",)
-    found = record.predict(frame("000001"))
+    found = record.predict(empty_frame("000001"))
     assert found.boxes.tolist() == [list(box) for box in BOXES]
     assert found.scores.tolist() == list(SCORES)
     assert found.categories.tolist() == list(CATEGORIES)
@@ -64,8 +58,8 @@ def test_rows_may_be_in_any_order_and_type(tmp_path):
     )
     record = RecordedDetector(path)
     assert record.frame_ids() == ("7", "8")
-    assert record.predict(frame("7")).boxes[:, 0].tolist() == [1, 3]
-    assert record.predict(frame("7")).boxes[1, 6] == pytest.approx(4.0 - 2 * np.pi)
+    assert record.predict(empty_frame("7")).boxes[:, 0].tolist() == [1, 3]
+    assert record.predict(empty_frame("7")).boxes[1, 6] == pytest.approx(4.0 - 2 * np.pi)
 
 
 def test_views_are_in_the_same_file(tmp_path):
@@ -79,17 +73,16 @@ def test_views_are_in_the_same_file(tmp_path):
         scale=[1.0, 1.05, 1.0],
     )
     record = RecordedDetector(path)
-    assert len(record.predict(frame("a"))) == 1
+    assert len(record.predict(empty_frame("a"))) == 1
     [(similarity, found)] = record.views("a")
     assert similarity == Similarity(flip_y=True, rotation_rad=0.3, scale=1.05)
     assert found.categories.tolist() == ["Pedestrian"]
-    assert len(record.predict(frame("b"))) == 0
+    assert len(record.predict(empty_frame("b"))) == 0
     assert len(record.views("b")) == 1
 
 
 def test_without_views_the_user_is_told_once(tmp_path, caplog):
     """An export of labels has none."""
-    detector._warn_once.cache_clear()
     record = RecordedDetector(write(tmp_path / "a.parquet"))
     with caplog.at_level(logging.WARNING):
         assert list(record.views("a")) == list(record.views("b")) == []
@@ -135,9 +128,9 @@ def test_a_bad_row_fails_its_frame_alone(tmp_path, changes, message):
     """Frame b lies in another row group."""
     record = RecordedDetector(write(tmp_path / "a.parquet", **changes))
     with pytest.raises(DataError, match=message) as caught:
-        record.predict(frame("a"))
+        record.predict(empty_frame("a"))
     assert "\n" not in str(caught.value)
-    record.predict(frame("b"))
+    record.predict(empty_frame("b"))
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1", b"no parquet at all"])
@@ -156,7 +149,7 @@ def test_damage_within_is_named(tmp_path):
     content[4:60] = bytes(56)
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"a\.parquet: ") as caught:
-        RecordedDetector(path).predict(frame("a"))
+        RecordedDetector(path).predict(empty_frame("a"))
     assert "\n" not in str(caught.value)
 
 
@@ -166,7 +159,7 @@ def test_a_table_takes_no_passes(tmp_path):
         RecordedDetector(write(tmp_path / "a.parquet"), passes=[{"path": "b", "flip_y": True}])
 
 
-def test_only_a_few_row_groups_are_held(tmp_path):
+def test_only_a_few_row_groups_are_held(tmp_path, monkeypatch):
     """Whatever the size of the file."""
     path = tmp_path / "a.parquet"
     one = table(frame=["a"] * 3)
@@ -177,8 +170,20 @@ def test_only_a_few_row_groups_are_held(tmp_path):
     parquet.write_table(rows, path, row_group_size=30)
     record = RecordedDetector(path)
     assert record.frame_ids() == tuple(names)
+    read, read_row_group = [], parquet.ParquetFile.read_row_group
+
+    def counted(file, number, **options):
+        read.append(number)
+        return read_row_group(file, number, **options)
+
+    monkeypatch.setattr(parquet.ParquetFile, "read_row_group", counted)
     for name in names:
-        assert len(record.predict(frame(name))) == 3
-    held = record._record._groups.cache_info()
-    assert held.currsize <= 2
-    assert held.misses == 30
+        assert len(record.predict(empty_frame(name))) == 3
+    assert read == list(range(30))
+    read.clear()
+    for name in reversed(names):
+        assert len(record.predict(empty_frame(name))) == 3
+    # Those that were still held need not be read again.
+    held = 30 - len(read)
+    assert held <= 2
+    assert read == list(reversed(range(30 - held)))

@@ -4,12 +4,11 @@ import pickle
 
 import numpy as np
 import pytest
-from support.toys import toy_calibration
+from support.toys import empty_frame
 
 from curate.detectors.base import RecordedViews
 from curate.detectors.recorded import RecordedDetector
 from curate.errors import DataError
-from curate.frames import Frame
 from curate.geometry.similarity import Similarity
 
 HEADER = "frame,view,flip_y,rotation_rad,scale,category,score,merged,x,y,z,length,width,height,yaw"
@@ -24,15 +23,10 @@ def write(path, *rows, header=HEADER):
     return path
 
 
-def frame(frame_id):
-    """A frame of which only the name matters."""
-    return Frame(frame_id, np.zeros((0, 4), np.float32), toy_calibration(), (120, 40))
-
-
 def test_answers_what_was_recorded(tmp_path):
     """View 0 is the prediction, the others are augmented copies with their similarity."""
     detector = RecordedDetector(write(tmp_path / "a.csv", PLAIN, MOVED))
-    found = detector.predict(frame("000001"))
+    found = detector.predict(empty_frame("000001"))
     assert found.boxes.tolist() == [[12.0, 4.2, -0.8, 3.9, 1.6, 1.5, -3.0]]
     assert found.scores.tolist() == [0.9]
     assert found.categories.tolist() == ["Car"]
@@ -47,7 +41,7 @@ def test_a_mark_in_front_of_a_spreadsheets_file_is_no_part_of_it(tmp_path):
     path = write(tmp_path / "a.csv", PLAIN, MOVED)
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     detector = RecordedDetector(path)
-    assert detector.predict(frame("000001")).scores.tolist() == [0.9]
+    assert detector.predict(empty_frame("000001")).scores.tolist() == [0.9]
     assert detector.views("000001")[0][1].scores.tolist() == [0.8]
 
 
@@ -56,9 +50,9 @@ def test_low_scores_are_left_out_of_every_view(tmp_path):
     low = PLAIN.replace("0.9", "0.1")
     path = write(tmp_path / "a.csv", PLAIN, low, MOVED, MOVED.replace("0.8", "0.09"))
     detector = RecordedDetector(path, minimum_score=0.1)
-    assert detector.predict(frame("000001")).scores.tolist() == [0.9, 0.1]
+    assert detector.predict(empty_frame("000001")).scores.tolist() == [0.9, 0.1]
     assert detector.views("000001")[0][1].scores.tolist() == [0.8]
-    assert len(RecordedDetector(path, minimum_score=0.95).predict(frame("000001"))) == 0
+    assert len(RecordedDetector(path, minimum_score=0.95).predict(empty_frame("000001"))) == 0
 
 
 def test_a_box_that_comes_twice_fails_its_frame(tmp_path):
@@ -71,13 +65,13 @@ def test_a_box_that_comes_twice_fails_its_frame(tmp_path):
     ]
     path = write(tmp_path / "a.csv", PLAIN, MOVED, other, *alike, MOVED)
     detector = RecordedDetector(path)
-    assert len(detector.predict(frame("000001"))) == 4
+    assert len(detector.predict(empty_frame("000001"))) == 4
     with pytest.raises(DataError, match=r"000001: the Car of .* at x 12.0, y 4.2 comes twice"):
         detector.views("000001")
     assert len(RecordedDetector(path, minimum_score=0.85).views("000001")[0][1]) == 0
     path.write_text(path.read_text() + f"{other}\n")
     with pytest.raises(DataError, match=r"000002: the Car of score 0.9 .* written twice"):
-        RecordedDetector(path).predict(frame("000002"))
+        RecordedDetector(path).predict(empty_frame("000002"))
 
 
 def test_views_come_in_the_order_of_their_numbers(tmp_path):
@@ -96,7 +90,7 @@ def test_views_come_in_the_order_of_their_numbers(tmp_path):
 def test_a_frame_with_other_views_only_has_no_detections(tmp_path):
     """It was recorded, and the detector found nothing in it."""
     detector = RecordedDetector(write(tmp_path / "a.csv", MOVED))
-    assert detector.predict(frame("000001")).boxes.shape == (0, 7)
+    assert detector.predict(empty_frame("000001")).boxes.shape == (0, 7)
 
 
 @pytest.mark.parametrize("rows", [(), (PLAIN,)])
@@ -106,7 +100,7 @@ def test_a_frame_that_was_never_recorded_is_an_error(tmp_path, rows):
     detector = RecordedDetector(path)
     message = f"no recorded detections for frame 000007 in {path}"
     with pytest.raises(DataError) as caught:
-        detector.predict(frame("000007"))
+        detector.predict(empty_frame("000007"))
     assert str(caught.value) == message
     with pytest.raises(DataError) as caught:
         detector.views("000007")
@@ -118,7 +112,7 @@ def test_other_columns_and_their_order_do_not_matter(tmp_path):
     header = "yaw,height,width,length,z,y,x,score,category,scale,rotation_rad,flip_y,view,frame"
     row = "4.0,1.5,1.6,3.9,-0.8,4.2,12.0,0.9,Car,1,0,0,0,000001"
     detector = RecordedDetector(write(tmp_path / "a.csv", row, header=header))
-    box = detector.predict(frame("000001")).boxes[0]
+    box = detector.predict(empty_frame("000001")).boxes[0]
     assert box[:6].tolist() == [12.0, 4.2, -0.8, 3.9, 1.6, 1.5]
     assert box[6] == pytest.approx(4.0 - 2 * np.pi)
 
@@ -172,7 +166,7 @@ def test_workers_can_have_a_copy(tmp_path):
     detector = RecordedDetector(write(tmp_path / "a.csv", PLAIN, MOVED))
     copy = pickle.loads(pickle.dumps(detector))
     np.testing.assert_array_equal(
-        copy.predict(frame("000001")).boxes, detector.predict(frame("000001")).boxes
+        copy.predict(empty_frame("000001")).boxes, detector.predict(empty_frame("000001")).boxes
     )
 
 
@@ -192,7 +186,7 @@ def test_real_views_fit_the_frame_after_the_inverse(kitti_root):
     detector = RecordedDetector(kitti_root / "recorded" / "pointgnn_T1.csv", minimum_score=0.9)
     sure = close = 0
     for frame_id in detector.frame_ids():
-        found = detector.predict(frame(frame_id))
+        found = detector.predict(empty_frame(frame_id))
         [(similarity, moved)] = detector.views(frame_id)
         if len(found) and len(moved):
             best = bev_iou(found.boxes, similarity.invert_boxes(moved.boxes)).max(axis=1)

@@ -1,0 +1,14 @@
+"""An empty database."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from db.session import Database
+
+
+@pytest.fixture
+def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
+    """An empty database: SQLite, or of either kind in modules with ENGINES."""
+    return Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")
