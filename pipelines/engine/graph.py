@@ -61,11 +61,6 @@ class Graph:
         """The stages whose rows belong to frames."""
         return (stage for stage in self.stages if isinstance(stage, FramesStage))
 
-    @property
-    def round_stages(self) -> Iterator[RoundStage]:
-        """The stages that are done once per round and policy."""
-        return (stage for stage in self.stages if isinstance(stage, RoundStage))
-
     def before(self, stage: Stage) -> tuple[FramesStage, ...]:
         """Return the stages of frames whose rows a stage needs, directly or through others."""
         needed = set(stage.reads)
