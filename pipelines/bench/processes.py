@@ -38,14 +38,14 @@ class JobProcesses:
                 return f"cannot be started: {error}"
             if process is None:
                 return "interrupted"
-            for line in process.stdout or ():
-                with contextlib.suppress(ValueError, KeyError):  # not ours, or cut by a kill
-                    message = json.loads(line)
-                    told(message["kind"], int(message["units"]))
-            code = process.wait()
+            with process:  # which closes its pipes
+                for line in process.stdout or ():
+                    with contextlib.suppress(ValueError, KeyError):  # not ours, or cut by a kill
+                        message = json.loads(line)
+                        told(message["kind"], int(message["units"]))
         with self._lock:
             self._running.discard(process)
-        return None if code == 0 else _reason(code, log)
+        return None if process.returncode == 0 else _reason(process.returncode, log)
 
     def end(self) -> None:
         """Kills what runs and starts nothing more; the next run goes on from there."""

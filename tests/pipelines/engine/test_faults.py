@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -159,28 +160,30 @@ def test_a_locked_database_says_who_holds_it(
 ) -> None:
     """By process and command line; when it is gone, the command goes on."""
     monkeypatch.setattr(session, "BUSY_TIMEOUT_MS", 300)
-    holder = _lock(workspace, 600)
-    code, _, err = curate("predict", "-w", workspace.root)
-    refuse_traceback(code, err, DatabaseError.exit_code)
-    assert f"process {holder.pid} ({sys.executable} -c" in err
-    holder.kill()
-    holder.wait()
+    with _lock(workspace, 600) as holder:
+        code, _, err = curate("predict", "-w", workspace.root)
+        refuse_traceback(code, err, DatabaseError.exit_code)
+        assert f"process {holder.pid} ({sys.executable} -c" in err
     assert curate("predict", "-w", workspace.root)[0] == 0
 
 
 def test_a_locked_database_is_waited_for(curate: Curate, workspace: Workspace) -> None:
     """A lock that is given up within half a minute is no error."""
-    holder = _lock(workspace, 1)
-    assert curate("predict", "-w", workspace.root)[0] == 0
-    assert holder.wait() == 0
+    with _lock(workspace, 1) as holder:
+        assert curate("predict", "-w", workspace.root)[0] == 0
+        assert holder.wait() == 0
 
 
-def _lock(workspace: Workspace, seconds: float) -> subprocess.Popen:
+@contextmanager
+def _lock(workspace: Workspace, seconds: float) -> Iterator[subprocess.Popen]:
     arguments = [sys.executable, "-c", LOCK, workspace.root / "curate.db", str(seconds)]
-    holder = subprocess.Popen(arguments, stdout=subprocess.PIPE)
-    assert holder.stdout is not None
-    assert holder.stdout.readline() == b"locked\n"
-    return holder
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE) as holder:
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == b"locked\n"
+            yield holder
+        finally:
+            holder.kill()
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="workers are found in /proc")
