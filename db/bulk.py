@@ -125,7 +125,8 @@ def blocks(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[
         result.close()
     else:
         options = {"yield_per": BLOCK_ROWS}
-        yield from connection.execute(statement, execution_options=options).partitions()
+        with connection.execute(statement, execution_options=options) as result:
+            yield from result.partitions()
 
 
 def select_columns(connection: Connection, statement: Select[Any]) -> dict[str, np.ndarray]:
