@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from pipelines.labels.columns import joined, ordered
 
-NUMBERS = ("score", "weight")
+NUMBERS = ("score", "loss", "weight")
 # How long an example takes says nothing on a busy machine.
 _PATIENT = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -32,7 +32,7 @@ def test_any_order_of_rows_gives_the_same_columns(order: list[int]) -> None:
 
 @_PATIENT
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=6))
-def test_chunks_arejoined_in_their_order(sizes: list[int]) -> None:
+def test_chunks_are_joined_in_their_order(sizes: list[int]) -> None:
     """Empty ones too, and the list is used up."""
     rows = np.arange(2 * sum(sizes)).reshape(-1, 2)
     chunks = [rows[sum(sizes[:i]) : sum(sizes[: i + 1])] for i in range(len(sizes))]
