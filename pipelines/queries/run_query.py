@@ -148,7 +148,7 @@ def _server_rows(
     connection: Connection, result: CursorResult[Any], end: float, seconds: float
 ) -> Iterator[tuple[Any, ...]]:
     """The rows as they come; the server's clock starts anew with each part, so ours runs, too."""
-    with connection:
+    with connection, closing(result):
         try:
             for row in result:
                 if time.monotonic() > end:

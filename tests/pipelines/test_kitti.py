@@ -45,7 +45,7 @@ def test_real_frames_get_weights_that_a_query_lists(
         assert code == 0, err
     sql = "SELECT frame, k, score, points, rho_anno, weight FROM weighted_labels ORDER BY weight"
     rows = json.loads(curate("query", sql, "--json", "-w", work)[1])
-    record = csv.DictReader((kitti_root / "recorded" / "pointgnn_T0.csv").open())
+    record = csv.DictReader((kitti_root / "recorded" / "pointgnn_T0.csv").read_text().splitlines())
     recorded = [row for row in record if row["frame"] in FRAMES[2:] and row["view"] == "0"]
     assert len(rows) == len(recorded)
     best = [row for row in rows if row["frame"] == "000008" and row["weight"] > 0.5]
