@@ -61,7 +61,7 @@ def _copy_file(path: Path, backup: Path) -> None:
         partial.replace(backup)
     except (sqlite3.Error, OSError) as error:
         partial.unlink(missing_ok=True)
-        raise _refusal(str(path), str(error), backup) from error
+        raise _failure_message(str(path), str(error), backup) from error
 
 
 def _dump(url: URL, name: str, backup: Path) -> None:
@@ -75,22 +75,22 @@ def _dump(url: URL, name: str, backup: Path) -> None:
             command, env=os.environ | secret, capture_output=True, text=True, check=False
         )
         if ended.returncode:
-            raise _refused_by_pg_dump(name, " ".join(ended.stderr.split()))
+            raise _pg_dump_failure(name, " ".join(ended.stderr.split()))
         partial.replace(backup)
     except OSError as error:
-        raise _refusal(name, str(error), backup) from error
+        raise _failure_message(name, str(error), backup) from error
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _refusal(name: str, reason: str, backup: Path) -> DatabaseError:
+def _failure_message(name: str, reason: str, backup: Path) -> DatabaseError:
     return DatabaseError(
         f"{name}: cannot be copied before its schema is migrated: {reason}; make room for "
         f"{backup.name}, let yourself write into its folder, and run the command again"
     )
 
 
-def _refused_by_pg_dump(name: str, reason: str) -> DatabaseError:
+def _pg_dump_failure(name: str, reason: str) -> DatabaseError:
     remedy = next((each for sign, each in _REMEDIES.items() if sign in reason), "mend that")
     return DatabaseError(
         f"{name}: cannot be copied before its schema is migrated: {reason}; {remedy}, and run the "

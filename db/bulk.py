@@ -96,14 +96,14 @@ def on_server(connection: Connection) -> bool:
 def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
     """All rows of a query as plain tuples."""
     result = connection.execute(statement)
-    if result.cursor is not None and _as_they_are(connection, statement):
+    if result.cursor is not None and _unchanged(connection, statement):
         rows: Sequence[Row] = result.cursor.fetchall()
         result.close()
         return rows
     return [tuple(row) for row in result]
 
 
-def _as_they_are(connection: Connection, statement: Select[Any]) -> bool:
+def _unchanged(connection: Connection, statement: Select[Any]) -> bool:
     """Whether SQLite's driver gives the values that are meant, as it does but for times.
 
     An object of SQLAlchemy per row takes as long as the row itself.
@@ -117,7 +117,7 @@ def _as_they_are(connection: Connection, statement: Select[Any]) -> bool:
 
 def blocks(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[Row]]:
     """The rows of a query, some at a time."""
-    if _as_they_are(connection, statement):
+    if _unchanged(connection, statement):
         result = connection.execute(statement)
         cursor = result.cursor
         while cursor is not None and (rows := cursor.fetchmany(FETCHED_ROWS)):

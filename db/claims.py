@@ -127,7 +127,9 @@ def _claim_session(connection: Connection, resource: Resource) -> None:
             return
         time.sleep(_PAUSE_S)
     found = connection.execute(_POSTGRES_OWNER, place).first()
-    raise _refusal(resource, f"{found[0]}, since {found[1]:%Y-%m-%d %H:%M:%S}" if found else "")
+    raise _conflict_message(
+        resource, f"{found[0]}, since {found[1]:%Y-%m-%d %H:%M:%S}" if found else ""
+    )
 
 
 @contextmanager
@@ -138,15 +140,15 @@ def _claimed_file(folder: Path, resource: Resource, owner: str) -> Iterator[Chec
     mode = fcntl.LOCK_SH if resource.shared else fcntl.LOCK_EX
     with _opened(path) as file:
         if not _try_lock(file, mode):
-            raise _refusal(resource, _file_owner(path))
+            raise _conflict_message(resource, _file_owner(path))
         if not resource.shared:
             file.truncate(0)
             file.write(f"{owner}, since {datetime.now().astimezone():%Y-%m-%d %H:%M:%S}")
             file.flush()
-        yield partial(_refuse_lost, path, file)
+        yield partial(_check_lock_file, path, file)
 
 
-def _refuse_lost(path: Path, file: "TextIOWrapper") -> None:
+def _check_lock_file(path: Path, file: "TextIOWrapper") -> None:
     """DatabaseError where the file that is locked is not the one that others would try."""
     try:
         same = os.path.samestat(path.stat(), os.fstat(file.fileno()))
@@ -193,7 +195,7 @@ def _file_owner(path: Path) -> str:
     return ""
 
 
-def _refusal(resource: Resource, owner: str) -> DatabaseError:
+def _conflict_message(resource: Resource, owner: str) -> DatabaseError:
     return DatabaseError(
         f"{resource.name} is being worked on by {owner or 'another process'}; "
         "wait until it has ended, or end it"

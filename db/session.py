@@ -45,7 +45,7 @@ class Database:
         self._claims: list[Check] = []
         with ExitStack() as failed:
             failed.callback(self.close)
-            with self._own_words():
+            with self._translate_errors():
                 self._migrate(backups)
             failed.pop_all()
 
@@ -59,7 +59,7 @@ class Database:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection for queries."""
-        with self._own_words(), self.engine.connect() as connection:
+        with self._translate_errors(), self.engine.connect() as connection:
             yield connection
 
     @contextmanager
@@ -76,7 +76,7 @@ class Database:
         writer = self.engine.execution_options(
             sqlite_begin="IMMEDIATE", sqlite_foreign_keys=not keys_known
         )
-        with self._own_words():
+        with self._translate_errors():
             for still_held in self._claims:
                 still_held()
             with writer.begin() as connection:
@@ -91,7 +91,7 @@ class Database:
         """
         resources = round_resources(number, policy)
         with ExitStack() as held:
-            with self._own_words():
+            with self._translate_errors():
                 still_held = held.enter_context(claimed(self.engine, resources, purpose))
             self._claims.append(still_held)
             held.callback(self._claims.remove, still_held)
@@ -109,9 +109,9 @@ class Database:
         with self.engine.connect() as connection:
             current = self._revision(connection, script)
             if current is None:
-                self._refuse_foreign_tables(connection)
+                self._check_tables(connection)
             elif current == head:
-                self._refuse_missing_tables(connection)
+                self._require_tables(connection)
             views_current = current == head and views_are_current(connection)
         self._write_ahead()
         if views_current:
@@ -137,7 +137,7 @@ class Database:
             with closing(self.engine.raw_connection()) as connection:
                 connection.cursor().execute("PRAGMA journal_mode = WAL")
 
-    def _refuse_missing_tables(self, connection: Connection) -> None:
+    def _require_tables(self, connection: Connection) -> None:
         """DatabaseError where somebody has dropped a table of this schema."""
         missing = sorted(set(Base.metadata.tables) - set(inspect(connection).get_table_names()))
         if missing:
@@ -145,7 +145,7 @@ class Database:
                 f"{self.name}: has no table {', '.join(missing)}; restore a backup of it"
             )
 
-    def _refuse_foreign_tables(self, connection: Connection) -> None:
+    def _check_tables(self, connection: Connection) -> None:
         """DatabaseError where a database without a schema of ours has tables.
 
         A server's database may hold others beside ours, a file is for curate alone.
@@ -174,7 +174,7 @@ class Database:
         return current
 
     @contextmanager
-    def _own_words(self) -> Iterator[None]:
+    def _translate_errors(self) -> Iterator[None]:
         """Turns the driver's errors into one line that names the database and the remedy."""
         try:
             yield
@@ -242,11 +242,11 @@ def _engine(url: URL) -> Engine:
         event.listen(engine, "connect", _set_pragmas)
         event.listen(engine, "begin", _begin)
     else:
-        event.listen(engine, "connect", _start_at_once)
+        event.listen(engine, "connect", _begin_immediate)
     return engine
 
 
-def _start_at_once(connection: Any, _record: Any) -> None:
+def _begin_immediate(connection: Any, _record: Any) -> None:
     # A server that compiles a question first takes longer for it than for most answers.
     connection.execute("SET jit = off")
     connection.commit()

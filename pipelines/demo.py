@@ -21,7 +21,7 @@ from curate.evaluation import kitti_ap
 from curate.evaluation.kitti_rules import LOOSE_OVERLAPS
 from pipelines.assessment.evaluation import detect_val, val_objects
 from pipelines.assessment.label_quality import label_quality
-from pipelines.engine.progress import Bar, reaching
+from pipelines.engine.progress import Bar, as_total
 from pipelines.engine.rounds import open_round
 from pipelines.engine.runner import run_round
 from pipelines.engine.schedule import run_all
@@ -138,7 +138,7 @@ def _simulate(demo: Demo, say: Say) -> None:
             demo.seed,
             val_frames=demo.val,
             workers=demo.processes,
-            progress=reaching(advance),
+            progress=as_total(advance),
         )
     say(f"   {total} frames in {_shown(demo.data)} ({time.perf_counter() - start:.1f} s)")
 
@@ -218,10 +218,10 @@ def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:
 
 
 def _draw(workspace: Workspace, say: Say) -> None:
-    from pipelines.reports.pictures import draw_telling_frame
+    from pipelines.reports.pictures import draw_example_frame
 
     try:
-        pictures = draw_telling_frame(workspace, 1)
+        pictures = draw_example_frame(workspace, 1)
     except WorkspaceError:  # a teacher of a few steps finds nothing
         say("   no picture: there are no labels; train for more --steps")
         return

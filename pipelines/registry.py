@@ -31,7 +31,7 @@ class Registry:
     protocol: str
     classes: Mapping[str, str]
 
-    def refuse_unknown(self, name: str, *others: str) -> None:
+    def check_name(self, name: str, *others: str) -> None:
         """ConfigError for a name that is neither registered, nor module:Class, nor in `others`."""
         if name not in (*self.classes, *others) and not name.partition(":")[2]:
             known = ", ".join(sorted((*self.classes, *others)))
@@ -43,7 +43,7 @@ class Registry:
         Raises:
             ConfigError: nobody knows the name, or what it names cannot be imported or called.
         """
-        self.refuse_unknown(name)
+        self.check_name(name)
         module_name, _, class_name = self.classes.get(name, name).partition(":")
         importer = importlib.import_module if name in self.classes else import_user_module
         try:

@@ -145,12 +145,12 @@ class OnnxDetector:
         scores = scores.astype(np.float64)
         if self.sigmoid:
             scores = 0.5 * (1 + np.tanh(scores / 2))  # does not overflow
-        self._refuse_impossible(scores, labels)
+        self._check_values(scores, labels)
         boxes = self.convention.to_boxes(boxes)
         index = labels.astype(np.int64) - self.first_label
         return Detections(boxes, scores, as_categories([self.classes[i] for i in index.tolist()]))
 
-    def _refuse_impossible(self, scores: np.ndarray, labels: np.ndarray) -> None:
+    def _check_values(self, scores: np.ndarray, labels: np.ndarray) -> None:
         """ModelError for scores and labels that no declared class can have."""
         if len(scores) == 0:
             return

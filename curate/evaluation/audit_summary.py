@@ -13,7 +13,7 @@ from curate.evaluation.judged_labels import ALL
 FEW_FRAMES = 30
 
 
-def in_words(audit: Audit, policies: Sequence[str], evidence: Sequence[str]) -> list[str]:
+def summary_sentences(audit: Audit, policies: Sequence[str], evidence: Sequence[str]) -> list[str]:
     """Sentences: how much is right, who judges best, and whether that is more than chance.
 
     Args:
@@ -25,13 +25,13 @@ def in_words(audit: Audit, policies: Sequence[str], evidence: Sequence[str]) -> 
         policies, evidence = evidence, ()
     by_policy = audit.whole()
     some = next(iter(by_policy.values()))
-    sentences = [_how_much_is_right(audit, some), *_what_was_left_out(audit, some)]
+    sentences = [_share_correct(audit, some), *_left_out(audit, some)]
     ranked = _by_auroc(by_policy, policies)
     if not ranked:
-        return [*sentences, *_why_nobody_is_judged(some)]
-    sentences += _who_judges_best(audit, ranked)
-    sentences += _what_evidence_does(audit, ranked[0], _by_auroc(by_policy, evidence))
-    return [*sentences, *_where_the_weight_lies([by_policy[name] for name in policies])]
+        return [*sentences, *_missing_policies(some)]
+    sentences += _best_policy(audit, ranked)
+    sentences += _effect_of_evidence(audit, ranked[0], _by_auroc(by_policy, evidence))
+    return [*sentences, *_weight_by_correctness([by_policy[name] for name in policies])]
 
 
 def as_numbers(audit: Audit) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _how_much_is_right(audit: Audit, some: Figures) -> str:
+def _share_correct(audit: Audit, some: Figures) -> str:
     place = f"{audit.frames} frames with {some.objects} objects"
     if not some.labels:
         return f"There is no label on {place}, so there is nothing to audit."
@@ -94,7 +94,7 @@ def _how_much_is_right(audit: Audit, some: Figures) -> str:
     )
 
 
-def _what_was_left_out(audit: Audit, some: Figures) -> Iterator[str]:
+def _left_out(audit: Audit, some: Figures) -> Iterator[str]:
     if some.neutral:
         yield (
             f"{some.neutral} more are neither right nor wrong, as they lie on a neighbouring "
@@ -107,13 +107,13 @@ def _what_was_left_out(audit: Audit, some: Figures) -> Iterator[str]:
         )
 
 
-def _why_nobody_is_judged(some: Figures) -> Iterator[str]:
+def _missing_policies(some: Figures) -> Iterator[str]:
     if some.labels and some.right in (0, some.labels):
         every = "right" if some.right else "wrong"
         yield f"All labels are {every}, so no weight can tell right from wrong here."
 
 
-def _who_judges_best(audit: Audit, ranked: Sequence[Figures]) -> Iterator[str]:
+def _best_policy(audit: Audit, ranked: Sequence[Figures]) -> Iterator[str]:
     best = ranked[0]
     first = f"Of the policies, {best.policy} judges best: AUROC {_figure(best.auroc)}"
     if len(ranked) == 1:
@@ -123,7 +123,7 @@ def _who_judges_best(audit: Audit, ranked: Sequence[Figures]) -> Iterator[str]:
     yield f"{first}, before {ranked[1].policy} with {ranked[1].auroc.value:.3f}; {_verdict(found)}."
 
 
-def _what_evidence_does(audit: Audit, best: Figures, evidence: Sequence[Figures]) -> Iterator[str]:
+def _effect_of_evidence(audit: Audit, best: Figures, evidence: Sequence[Figures]) -> Iterator[str]:
     better = [found for found in evidence if found.auroc.value > best.auroc.value]
     if better:
         found = audit.compare(better[0].policy, best.policy)
@@ -133,7 +133,7 @@ def _what_evidence_does(audit: Audit, best: Figures, evidence: Sequence[Figures]
         )
 
 
-def _where_the_weight_lies(policies: Sequence[Figures]) -> Iterator[str]:
+def _weight_by_correctness(policies: Sequence[Figures]) -> Iterator[str]:
     defined = [found for found in policies if not math.isnan(found.weighted_precision.value)]
     order = sorted(defined, key=lambda found: -found.weighted_precision.value)
     if not order:

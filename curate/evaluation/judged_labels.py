@@ -71,7 +71,7 @@ class JudgedLabels:
     def joined(cls, parts: Sequence[Self]) -> Self:
         """The frames of all parts, one after the other."""
         starts = np.cumsum([0, *(part.frames for part in parts)])
-        numbered = [cls.of_no_frame()] + [
+        numbered = [cls.no_frames()] + [
             replace(
                 part,
                 frame_index=part.frame_index + start,
@@ -87,7 +87,7 @@ class JudgedLabels:
         return cls(int(starts[-1]), **columns)
 
     @classmethod
-    def of_no_frame(cls) -> Self:
+    def no_frames(cls) -> Self:
         """Neither labels nor objects."""
         numbers, names = np.zeros(0), as_categories([])
         keys, truths = numbers.astype(np.int64), numbers.astype(bool)

@@ -195,7 +195,7 @@ class _Match:
         in_dont_care = (self._dont_care > min_overlap) & (metric == "image")
         totals = tally(candidates, contest, thresholds, in_dont_care, self._gains[metric])
         positives = np.maximum(totals[:, 0] + totals[:, 1], 1)
-        return _best_from_here_on(totals[:, 0] / positives), _best_from_here_on(
+        return _running_maximum(totals[:, 0] / positives), _running_maximum(
             totals[:, 2] / positives
         )
 
@@ -245,7 +245,7 @@ def _percent(precision: np.ndarray) -> np.ndarray:
     return means
 
 
-def _best_from_here_on(values: np.ndarray) -> np.ndarray:
+def _running_maximum(values: np.ndarray) -> np.ndarray:
     """(41,) running maximum from the end of (t,) values, 0 after the last."""
     curve = np.zeros(_POSITIONS)
     curve[: len(values)] = np.maximum.accumulate(values[::-1])[::-1]

@@ -29,10 +29,10 @@ def read_folders(
     """
     labelled, answered = _frame_ids(labels), _frame_ids(results)
     wanted = labelled if frame_ids is None else set(frame_ids)
-    _refuse_missing(wanted - labelled, labels, "label")
+    _require_files(wanted - labelled, labels, "label")
     if frame_ids is None:
-        _refuse_missing(answered - labelled, labels, "label")
-    _refuse_missing(wanted - answered, results, "result")
+        _require_files(answered - labelled, labels, "label")
+    _require_files(wanted - answered, results, "result")
     ordered = tuple(sorted(wanted))
     return (
         ordered,
@@ -52,7 +52,7 @@ def _frame_ids(folder: Path) -> set[str]:
     return found
 
 
-def _refuse_missing(missing: set[str], folder: Path, kind: str) -> None:
+def _require_files(missing: set[str], folder: Path, kind: str) -> None:
     """Raises `DataError` where frames have no file."""
     if not missing:
         return

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from curate.errors import DataError, LeakageError, one_line
 from curate.exporters.base import named
-from curate.exporters.sqlite import refuse_locked, tables
+from curate.exporters.sqlite import raise_if_locked, tables
 from curate.weighting.base import ZeroWeight
 
 _VERSIONS = ("1", "2")
@@ -58,10 +58,10 @@ def open_label_file(path: Path) -> Iterator[sqlite3.Connection]:
             rows.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_CELL)
             rows.execute("PRAGMA trusted_schema = OFF")
             rows.execute("PRAGMA cell_size_check = ON")
-            _refuse_foreign_tables(rows, path)
+            _check_tables(rows, path)
             yield rows
     except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
-        refuse_locked(path, error)
+        raise_if_locked(path, error)
         raise DataError(
             f"{path}: not a label file: {one_line(error)}; delete it and export it again"
         ) from None
@@ -119,7 +119,7 @@ def read_zero_weight(meta: Mapping[str, str], path: Path) -> ZeroWeight:
             )
 
 
-def refuse_leakage(rows: sqlite3.Connection, path: Path) -> None:
+def check_leakage(rows: sqlite3.Connection, path: Path) -> None:
     """LeakageError where a label file holds ground truth of frames that are not labeled."""
     leaked = rows.execute(
         "SELECT DISTINCT frame FROM ground_truth WHERE frame NOT IN "
@@ -147,7 +147,7 @@ def read_frames(path: Path) -> LabelFileFrames:
     return LabelFileFrames(splits, frozenset(truth), sum(truth.values()), labels)
 
 
-def _refuse_foreign_tables(rows: sqlite3.Connection, path: Path) -> None:
+def _check_tables(rows: sqlite3.Connection, path: Path) -> None:
     """DataError where a table is not the one that an export makes."""
     found = dict(rows.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     for name, statement in _statements().items():

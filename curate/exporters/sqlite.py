@@ -110,7 +110,7 @@ def format_version(columns: Sequence[Column]) -> str:
     return "1" if len(columns) == len(WEIGHTED_LABELS) else "2"
 
 
-def refuse_locked(path: Path, error: Exception) -> None:
+def raise_if_locked(path: Path, error: Exception) -> None:
     """DataError where a label file could not be read for another program's lock."""
     if "locked" in str(error):
         raise DataError(
@@ -138,7 +138,7 @@ def _is_former(former: Path, path: Path) -> bool:
         with closing(sqlite3.connect(f"{former.absolute().as_uri()}?mode=ro", uri=True)) as opened:
             return opened.execute(query).fetchone() is not None
     except sqlite3.Error as error:
-        refuse_locked(path, error)
+        raise_if_locked(path, error)
         return False
 
 

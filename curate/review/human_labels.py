@@ -45,7 +45,7 @@ class HumanLabels:
 
 
 @dataclass(frozen=True)
-class Spoken:
+class CoveredPredictions:
     """Which human label speaks for each of m predictions.
 
     Attributes:
@@ -60,7 +60,9 @@ class Spoken:
     leads: np.ndarray
 
 
-def speak_for(boxes: np.ndarray, categories: np.ndarray, labels: HumanLabels) -> Spoken:
+def match_human_labels(
+    boxes: np.ndarray, categories: np.ndarray, labels: HumanLabels
+) -> CoveredPredictions:
     """Which predictions of a frame the human labels speak for; objects come before refusals.
 
     Args:
@@ -71,7 +73,7 @@ def speak_for(boxes: np.ndarray, categories: np.ndarray, labels: HumanLabels) ->
     label = np.full(len(boxes), -1, dtype=np.int64)
     iou, leads = np.zeros(len(boxes)), np.zeros(len(boxes), dtype=bool)
     if len(labels) == 0 or len(boxes) == 0:
-        return Spoken(label, iou, leads)
+        return CoveredPredictions(label, iou, leads)
     with_box, with_seen = bev_iou(boxes, labels.boxes), bev_iou(boxes, _known(labels.seen))
     overlap = np.maximum(with_box, with_seen)
     refused = labels.decisions == REJECTED
@@ -86,7 +88,7 @@ def speak_for(boxes: np.ndarray, categories: np.ndarray, labels: HumanLabels) ->
         mine = np.flatnonzero(label == row)
         if len(mine):
             leads[mine[np.argmax(iou[mine])]] = True
-    return Spoken(label, iou, leads)
+    return CoveredPredictions(label, iou, leads)
 
 
 def superseded(former: HumanLabels, later: HumanLabels) -> np.ndarray:
@@ -102,7 +104,7 @@ def superseded(former: HumanLabels, later: HumanLabels) -> np.ndarray:
     return result
 
 
-def entangled(labels: HumanLabels) -> list[tuple[int, int]]:
+def overlapping_objects(labels: HumanLabels) -> list[tuple[int, int]]:
     """Pairs of rows of objects that lie in each other, which no two objects do."""
     objects = np.flatnonzero(labels.decisions != REJECTED)
     overlap = np.triu(bev_iou(labels.boxes[objects], labels.boxes[objects]), 1)

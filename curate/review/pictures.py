@@ -24,12 +24,12 @@ class NumberedLabels(ShownLabels):
     @property
     def emphasis(self) -> np.ndarray:
         """(n,) in [0, 1]; what is asked about stands out."""
-        return np.where(self._asked, 1.0, 0.25 + 0.25 * self.weights)
+        return np.where(self._is_requested, 1.0, 0.25 + 0.25 * self.weights)
 
     def caption(self, index: int) -> tuple[str, str]:
         """The number, marked where an opinion is wanted; category, score and weight."""
         score, weight = self.scores[index], self.weights[index]
-        mark = " ?" if self._asked[index] else ""
+        mark = " ?" if self._is_requested[index] else ""
         return f"{index + 1}{mark}", f"{self.categories[index]} s {score:.2f} v {weight:.2f}"
 
     def short_caption(self, index: int) -> str:
@@ -37,7 +37,7 @@ class NumberedLabels(ShownLabels):
         return str(index + 1)
 
     @property
-    def _asked(self) -> np.ndarray:
+    def _is_requested(self) -> np.ndarray:
         return np.zeros(len(self), dtype=bool) if self.asked is None else self.asked
 
 

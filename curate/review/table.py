@@ -22,7 +22,7 @@ _WORDS = {"accept": ACCEPTED, "accepted": ACCEPTED, "reject": REJECTED, "rejecte
 
 
 @dataclass
-class Words:
+class ExplicitDecisions:
     """What was said outright of a frame's boxes.
 
     Attributes:
@@ -48,7 +48,7 @@ def write_table(folder: Path, sheet: Sheet) -> None:
     replace_file(folder / TABLE, text.getvalue().encode())
 
 
-def read_table(folder: Path, sheet: Sheet) -> dict[str, Words]:
+def read_table(folder: Path, sheet: Sheet) -> dict[str, ExplicitDecisions]:
     """What was said, by frame; nothing where the table is missing.
 
     Raises:
@@ -66,7 +66,7 @@ def read_table(folder: Path, sheet: Sheet) -> dict[str, Words]:
     rows = csv.DictReader(io.StringIO(text), delimiter=delimiter)
     if not {"frame", "box", "decision"} <= set(rows.fieldnames or ()):
         raise DataError(f"{path}:1: needs the columns frame, box and decision")
-    found: dict[str, Words] = {}
+    found: dict[str, ExplicitDecisions] = {}
     for row in rows:
         word = (row["decision"] or "").strip().lower()
         if word:
@@ -75,12 +75,12 @@ def read_table(folder: Path, sheet: Sheet) -> dict[str, Words]:
 
 
 def _take(
-    row: dict[str, str], word: str, place: str, sheet: Sheet, found: dict[str, Words]
+    row: dict[str, str], word: str, place: str, sheet: Sheet, found: dict[str, ExplicitDecisions]
 ) -> None:
     if word not in _WORDS:
         raise DataError(f"{place}: decision {word!r}; write accept or reject, or nothing")
     name = _frame(row["frame"], place, sheet)
-    words = found.setdefault(name, Words())
+    words = found.setdefault(name, ExplicitDecisions())
     if (row["box"] or "").strip().lower() == ALL:
         if _WORDS[word] == REJECTED:
             raise DataError(f"{place}: a frame cannot be rejected; reject its boxes")

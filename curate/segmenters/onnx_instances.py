@@ -16,8 +16,8 @@ from curate.files.onnx_session import are_numbers
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes, free_id
-from curate.segmenters.onnx_answers import KINDS, Instance
 from curate.segmenters.onnx_images import ImageModel, image_of
+from curate.segmenters.onnx_outputs import KINDS, Instance
 from curate.segmenters.pasting import Box, paste_mask
 
 _OUTPUTS = {name: name for name in ("boxes", "labels", "scores", "masks")}
@@ -76,7 +76,7 @@ class OnnxInstanceSegmenter:
         size = (pixels.shape[1], pixels.shape[0])
         class_ids = np.full((height, width), free_id(self.classes), dtype=np.uint8)
         wanted = {one for ids in self.classes.values() for one in ids}
-        for one in self._instances(self._ask(pixels), size):
+        for one in self._instances(self._run_model(pixels), size):
             within = _scaled(one.box, scale)
             covers = _scaled((0, 0, *size), scale) if one.is_whole else within
             part, mask = paste_mask(
@@ -118,7 +118,7 @@ class OnnxInstanceSegmenter:
         fitted[: kept[1], : kept[0]] = cv2.resize(image, kept, interpolation=kind)
         return fitted, scale
 
-    def _ask(self, pixels: np.ndarray) -> dict[str, np.ndarray]:
+    def _run_model(self, pixels: np.ndarray) -> dict[str, np.ndarray]:
         """What the model answers, by what it means."""
         found = self._model.run(pixels, tuple(self._outputs.values()))
         answer = dict(zip(self._outputs, found, strict=True))

@@ -19,11 +19,11 @@ from curate.detections import as_categories
 from curate.detectors.base import Sample
 from curate.errors import DataError
 from curate.exporters.label_file import (
+    check_leakage,
     open_label_file,
     read_categories,
     read_meta,
     read_zero_weight,
-    refuse_leakage,
 )
 from curate.frames import Frame
 from curate.geometry.projection import in_view
@@ -59,7 +59,7 @@ class WeightedLabels(Dataset[Sample]):
 
     def _load(self, rows: sqlite3.Connection, path: Path) -> None:
         self.meta = read_meta(rows, path)
-        refuse_leakage(rows, path)
+        check_leakage(rows, path)
         self.categories = read_categories(self.meta, path)
         self.zero_weight = read_zero_weight(self.meta, path)
         frames = rows.execute("SELECT frame, split FROM frame ORDER BY frame").fetchall()

@@ -14,7 +14,7 @@ from sqlalchemy import select
 from curate.detections import Detections
 from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.audit import Audit, audit
-from curate.evaluation.audit_summary import in_words
+from curate.evaluation.audit_summary import summary_sentences
 from curate.evaluation.judged_labels import AuditedFrame, JudgedLabels, judge_frames
 from curate.evaluation.kitti_rules import MIN_OVERLAPS
 from curate.evaluation.reliability import JudgeSettings, Overlap
@@ -140,10 +140,10 @@ def run_audit(
     return AuditedRound(request, contexts[0], figures, tuple(reports))
 
 
-def in_plain_words(found: AuditedRound) -> list[str]:
+def describe_audit(found: AuditedRound) -> list[str]:
     """What the audit means, with its own limits."""
     request = found.request
-    words = in_words(found.figures, request.policies, request.evidence)
+    words = summary_sentences(found.figures, request.policies, request.evidence)
     if request.split == "labeled" and not request.folds:
         words.append(
             "The point prior has its thresholds from these very frames, which may flatter it; "

@@ -3,7 +3,7 @@
 from curate.errors import DataError
 from pipelines.bench.running import Say
 from pipelines.bench.settings import SYNTHETIC, Bench
-from pipelines.engine.progress import Progress, reaching
+from pipelines.engine.progress import Progress, as_total
 from pipelines.workspace.workspace import open_dataset
 
 
@@ -30,6 +30,6 @@ def _simulate(
     from curate.simulation import simulate
 
     with progress.track("simulate", frames + val) as advance:
-        seed, show = bench.settings.data_seed or 0, reaching(advance)
+        seed, show = bench.settings.data_seed or 0, as_total(advance)
         simulate(bench.data, frames + val, seed, val_frames=val, workers=workers, progress=show)
     say(f"{frames} simulated training frames and {val} for validation in {bench.data}")

@@ -49,16 +49,16 @@ class Metered:
                 units += step
             untold += step
             if now - told >= TELL_EVERY_S:
-                self._tell(kind, untold)
+                self._report(kind, untold)
                 told, untold = now, 0
 
         yield advance
-        self._tell(kind, untold)
+        self._report(kind, untold)
         if begun is not None:
             before = self._measured.get(kind, (0, 0.0))
             self._measured[kind] = (before[0] + units, before[1] + time.monotonic() - begun)
 
-    def _tell(self, kind: str, units: int) -> None:
+    def _report(self, kind: str, units: int) -> None:
         if units:
             self._stream.write(json.dumps({"kind": kind, "units": units}) + "\n")
             self._stream.flush()

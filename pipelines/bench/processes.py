@@ -13,7 +13,7 @@ from pathlib import Path
 from pipelines.bench.grid import Job
 
 # Takes a kind of work and how many units of it are done.
-Told = Callable[[str, int], None]
+ProgressCallback = Callable[[str, int], None]
 LOGS = "logs"
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -27,7 +27,7 @@ class JobProcesses:
         self._ended = False
         self._lock = threading.Lock()
 
-    def __call__(self, job: Job, told: Told) -> str | None:
+    def __call__(self, job: Job, told: ProgressCallback) -> str | None:
         """Runs a job to its end; gives None, or in one line why it failed."""
         log = self._root / LOGS / f"{job.name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from curate.errors import CellsFailed, WorkspaceError
 from pipelines.bench import grid
 from pipelines.bench.costs import FIRST_GUESS, Costs
 from pipelines.bench.grid import Job, Sizes
-from pipelines.bench.processes import Told
+from pipelines.bench.processes import ProgressCallback
 from pipelines.bench.results import read_result, read_results
 from pipelines.bench.settings import Bench
 from pipelines.engine.progress import Advance, Progress
@@ -26,7 +26,7 @@ _PARTS = 1000  # of the grid's bar
 class RunJob(Protocol):
     """Where jobs are done."""
 
-    def __call__(self, job: Job, told: Told) -> str | None:
+    def __call__(self, job: Job, told: ProgressCallback) -> str | None:
         """Runs a job to its end; gives None, or in one line why it failed."""
         ...
 
@@ -105,7 +105,7 @@ class _GridRun:
                     for job in self._ready()[: workers - len(running)]:
                         self.waiting.remove(job)
                         self._announce(job)
-                        running[pool.submit(run_job, job, self._bar.teller(job))] = job
+                        running[pool.submit(run_job, job, self._bar.progress_of(job))] = job
                     ended, _ = wait(running, return_when=FIRST_COMPLETED)
                     for future in ended:
                         self._end(running.pop(future), future.result())
@@ -164,7 +164,7 @@ class _GridBar:
         self._advance = advance
         self._lock = threading.Lock()
 
-    def teller(self, job: Job) -> Told:
+    def progress_of(self, job: Job) -> ProgressCallback:
         """Takes a job's finished units."""
 
         def told(kind: str, units: int) -> None:

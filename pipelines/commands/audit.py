@@ -65,7 +65,7 @@ def audit(
     from curate.evaluation.reliability import Overlap
     from curate.viewing.canvas import save_png
     from curate.viewing.reliability_diagram import draw_reliability
-    from pipelines.assessment.audit import AuditRequest, in_plain_words, picture_path, run_audit
+    from pipelines.assessment.audit import AuditRequest, describe_audit, picture_path, run_audit
     from pipelines.assessment.store import store_audit
     from pipelines.engine.progress import Bar
 
@@ -85,7 +85,7 @@ def audit(
     store_audit(opened, found)
     picture = picture_path(opened, found)
     save_png(picture, draw_reliability(found.figures, _title(found)))
-    words = in_plain_words(found)
+    words = describe_audit(found)
     if as_json:
         about = {
             "round": found.context.number,

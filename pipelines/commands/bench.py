@@ -115,9 +115,9 @@ def bench(
         if not report:
             _run(chosen, workers or os.cpu_count() or 1, quiet=as_json)
     except CellsFailed:
-        _tell(BenchReport(chosen), overlaps, as_json=as_json)
+        _announce(BenchReport(chosen), overlaps, as_json=as_json)
         raise
-    _tell(BenchReport(chosen), overlaps, as_json=as_json)
+    _announce(BenchReport(chosen), overlaps, as_json=as_json)
 
 
 def bench_cell(
@@ -218,7 +218,7 @@ def _run(bench: "Bench", workers: int, *, quiet: bool) -> None:
         run_grid(bench, JobProcesses(bench.root), workers, say, Bar())
 
 
-def _tell(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
+def _announce(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
     """Writes the files, and prints the tables."""
     from pipelines.bench.report import shown
 

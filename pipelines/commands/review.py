@@ -9,7 +9,7 @@ from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption
 from pipelines.reports.terminal import print_json, print_table
 
 if TYPE_CHECKING:
-    from pipelines.review.importing import Taken
+    from pipelines.review.importing import ReviewImport
 
 group = typer.Typer(
     name="review",
@@ -54,15 +54,15 @@ def export_review(
     """
     from pipelines.engine.progress import Bar
     from pipelines.registry import EDITORS
-    from pipelines.review.exporting import hand_out
-    from pipelines.review.selection import Wish, make_sheet
+    from pipelines.review.exporting import write_review
+    from pipelines.review.selection import ReviewRequest, make_sheet
 
     editor = EDITORS.build(form, offered={}, options={})
     opened = open_workspace(workspace)
-    wish = Wish(count, order, _names(frames), _names(category))
+    request = ReviewRequest(count, order, _names(frames), _names(category))
     chosen = policy or opened.config.run.method
-    sheet = make_sheet(opened, round_number, chosen, form, wish)
-    hand_out(opened, directory, sheet, editor, Bar())
+    sheet = make_sheet(opened, round_number, chosen, form, request)
+    write_review(opened, directory, sheet, editor, Bar())
     if as_json:
         print_json(
             {
@@ -113,9 +113,9 @@ def import_review(
 
     Example: curate review import to-review --dry-run
     """
-    from pipelines.review.importing import take_back
+    from pipelines.review.importing import apply_review
 
-    taken = take_back(
+    taken = apply_review(
         open_workspace(workspace),
         directory,
         answer=answer,
@@ -127,7 +127,7 @@ def import_review(
     if as_json:
         print_json(taken)
     else:
-        typer.echo(_told(taken))
+        typer.echo(_describe_import(taken))
 
 
 @group.command("list")
@@ -186,7 +186,7 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(filter(None, (name.strip() for name in text.split(","))))
 
 
-def _told(taken: "Taken") -> str:
+def _describe_import(taken: "ReviewImport") -> str:
     decisions = (
         f"{taken.accepted} accepted, {taken.rejected} rejected, {taken.moved} moved, "
         f"{taken.added} added, {taken.untouched} untouched"

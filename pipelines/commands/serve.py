@@ -50,10 +50,10 @@ def serve(
         taken = listen(host, port)
         if not is_loopback(host):
             typer.echo(f"warning: whoever reaches {host} reads these labels and pictures", err=True)
-        answer(pages, taken, lambda url: _tell(served, url), browse=browse)
+        answer(pages, taken, lambda url: _announce(served, url), browse=browse)
 
 
-def _tell(served: "Served", url: str) -> None:
+def _announce(served: "Served", url: str) -> None:
     for name, path in served.files.items():
         typer.echo(f"{name}: {path}")
     typer.echo(f"serving at {url} until Ctrl-C")

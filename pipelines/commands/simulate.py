@@ -26,10 +26,10 @@ def simulate(
     Example: curate simulate data/simulated --frames 400 --seed 0
     """
     from curate.simulation import simulate as run
-    from pipelines.engine.progress import Bar, reaching
+    from pipelines.engine.progress import Bar, as_total
 
     with Bar().track("simulate", frames) as advance:
-        shown = reaching(advance)
+        shown = as_total(advance)
         run(directory, frames, seed, val_frames=val, workers=workers, progress=shown)
     typer.echo(
         f"{frames} frames in {directory}, as KITTI lays them out; labels in training/label_2"

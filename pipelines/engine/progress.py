@@ -21,7 +21,7 @@ class Progress(Protocol):
         ...
 
 
-class Reach(Protocol):
+class TotalProgress(Protocol):
     """Takes how much is done in all, and of how much."""
 
     def __call__(self, done: int, total: int, note: str = "", /) -> None:
@@ -38,7 +38,7 @@ class Silent:
         yield lambda _step, _note: None
 
 
-def reaching(advance: Advance) -> Reach:
+def as_total(advance: Advance) -> TotalProgress:
     """Moves `advance` for work that tells how much is done in all, not how much more."""
     before = 0
 

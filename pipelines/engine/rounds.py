@@ -129,7 +129,7 @@ def find_teacher(
     trainable = trainable_detector(workspace.config)
     brought = not is_pretrained(workspace)
     if brought and number == 1:
-        key, teacher = _brought(workspace)
+        key, teacher = _external_detector(workspace)
         if to_work and trainable:
             trainable.detector.check_checkpoint(teacher.path)
         return key, teacher
@@ -142,7 +142,7 @@ def find_teacher(
         found = bulk.select(connection, query)
     before = "curate pretrain" if number == 1 else f"curate train-round --round {number - 1}"
     if not found and brought and not is_student_trained(workspace):
-        return _brought(workspace)
+        return _external_detector(workspace)
     if not found:
         raise WorkspaceError(f"round {number} has no teacher yet; run `{before}`")
     key, path, digest, detector = found[0]
@@ -192,7 +192,7 @@ def register_checkpoint(
         connection.execute(table.insert().values(round=round_number, policy=policy, **row))
 
 
-def _brought(workspace: Workspace) -> tuple[int, Teacher]:
+def _external_detector(workspace: Workspace) -> tuple[int, Teacher]:
     """The detector that the user brought, which answers in every round."""
     path = workspace.config.detector.path
     if path is None:

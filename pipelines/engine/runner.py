@@ -29,7 +29,14 @@ from pipelines.engine.executors.base import (
 from pipelines.engine.executors.serial import SerialExecutor
 from pipelines.engine.plan import Plan, TaskKey, WaitingFrame, digest, is_current
 from pipelines.engine.progress import Progress
-from pipelines.engine.stage import FirstStage, FramesStage, Product, Recall, RoundJob, SequenceStage
+from pipelines.engine.stage import (
+    FirstStage,
+    FramesStage,
+    Product,
+    ReusableMeasurements,
+    RoundJob,
+    SequenceStage,
+)
 from pipelines.workspace.workspace import Workspace
 
 READ_AHEAD = 256  # frames whose earlier rows are read at once
@@ -224,7 +231,7 @@ def _frame_jobs(
     with_predictions: bool,
     frames: Iterable[WaitingFrame],
     skip: Callable[[Sequence[int]], None],
-    recall: Recall | None = None,
+    recall: ReusableMeasurements | None = None,
 ) -> Iterator[FrameJob]:
     """The jobs of frames, with their predictions and measurements where they are needed.
 

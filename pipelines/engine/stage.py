@@ -82,7 +82,7 @@ class Product:
 
 
 @dataclass(frozen=True)
-class Recall:
+class ReusableMeasurements:
     """How a stage goes on from what it once measured, where only the formula has changed.
 
     Attributes:
@@ -145,7 +145,7 @@ class FrameStage:
     writes: tuple[str, ...]
     settings: Callable[[Workspace, RoundContext], Settings]
     function: Callable[[Workspace, RoundContext], FrameFunction]
-    recall: Recall | None = None
+    recall: ReusableMeasurements | None = None
     check: Callable[[Workspace], None] | None = None
     prepare: Callable[[Workspace], None] | None = None
 

@@ -22,7 +22,7 @@ class Finding:
     remedy: str = ""
 
 
-def refuse(finding: Finding) -> None:
+def raise_finding(finding: Finding) -> None:
     """LeakageError where a rule is broken."""
     if not finding.held:
         raise LeakageError(f"{finding.rule}: {finding.told}; {finding.remedy}")

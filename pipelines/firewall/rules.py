@@ -6,7 +6,7 @@ from pathlib import Path
 from curate.errors import DataError
 from curate.exporters.label_file import LabelFileFrames, read_frames
 from pipelines.firewall.files import duplicates, label_files, object_bank
-from pipelines.firewall.finding import Finding, refuse
+from pipelines.firewall.finding import Finding, raise_finding
 from pipelines.firewall.splits import recorded_splits, sequences_apart, unchanged_lists
 from pipelines.firewall.truth import copied_truth, predicted_rounds, stored_truth
 from pipelines.workspace.split_record import SplitRecord
@@ -46,14 +46,14 @@ def enforce(workspace: Workspace, round_number: int = 0, file: Path | None = Non
     """
     record = SplitRecord.read(workspace)
     for finding in _of_the_database(workspace, record):
-        refuse(finding)
+        raise_finding(finding)
     if round_number:
-        refuse(copied_truth(workspace, record, [round_number], thorough=False))
+        raise_finding(copied_truth(workspace, record, [round_number], thorough=False))
     files: Mapping[Path, LabelFileFrames] = {}
     if file is not None and file.exists():
         files = {file: read_frames(file)}
-    refuse(label_files(workspace, record, files))
-    refuse(object_bank(workspace, record, files))
+    raise_finding(label_files(workspace, record, files))
+    raise_finding(object_bank(workspace, record, files))
 
 
 def _of_the_database(workspace: Workspace, record: SplitRecord) -> Iterator[Finding]:

@@ -59,7 +59,7 @@ def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterato
         .order_by(labels.frame, labels.k)
     )
     with workspace.database.reading() as connection:
-        refuse_bad_weights(connection, round_number, policy)
+        check_weights(connection, round_number, policy)
         rows = bulk.select(connection, query)
     if not rows:
         raise WorkspaceError(
@@ -77,7 +77,7 @@ def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterato
         )
 
 
-def refuse_bad_weights(
+def check_weights(
     connection: Connection, round_number: int, policy: str, frame: str | None = None
 ) -> None:
     """DataError where a weight of a round, or of one frame in it, is not in [0, 1].

@@ -14,7 +14,7 @@ from db import bulk
 from db.evidence import weighted_label_columns
 from db.models import BOX_COLUMNS
 from db.views import weighted_labels
-from pipelines.labels.by_frame import refuse_bad_weights
+from pipelines.labels.by_frame import check_weights
 from pipelines.workspace.workspace import Workspace
 
 _CHUNK = 50_000
@@ -71,7 +71,7 @@ def read_columns(workspace: Workspace, round_number: int, policy: str) -> LabelC
         DataError: a weight is not in [0, 1].
     """
     with workspace.database.reading() as connection:
-        refuse_bad_weights(connection, round_number, policy)
+        check_weights(connection, round_number, policy)
         found = _read(workspace, connection, round_number, policy)
     if not len(found):
         raise unweighted(round_number, policy)
@@ -101,7 +101,7 @@ def read_blocks(
     labels = dict.fromkeys(rounds, 0)
     with workspace.database.reading() as connection:
         for each in labels:
-            refuse_bad_weights(connection, each, policy)
+            check_weights(connection, each, policy)
         names = sorted(row[0] for row in bulk.select(connection, select(frame)))
         for block in batched(names, _BLOCK_FRAMES):
             found = {each: _read(workspace, connection, each, policy, block) for each in labels}

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, select
 
 from curate.detections import as_categories
 from curate.files.batches import batched
-from curate.review.human_labels import REJECTED, HumanLabels, speak_for
+from curate.review.human_labels import REJECTED, HumanLabels, match_human_labels
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.workspace.workspace import Workspace
@@ -161,7 +161,7 @@ def _match_rows(
     round_number: int, frame_id: int, predicted: Sequence[bulk.Row], stored: StoredLabels
 ) -> Iterable[dict[str, Any]]:
     boxes = np.array([row[2:] for row in predicted], dtype=np.float64)
-    spoken = speak_for(boxes, as_categories([row[1] for row in predicted]), stored.labels)
+    spoken = match_human_labels(boxes, as_categories([row[1] for row in predicted]), stored.labels)
     for place in np.flatnonzero(spoken.label >= 0).tolist():
         yield {
             "round": round_number,

@@ -11,7 +11,7 @@ from curate.review.human_labels import REJECTED
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
-from pipelines.labels.by_frame import refuse_bad_weights
+from pipelines.labels.by_frame import check_weights
 from pipelines.labels.human_labels import human_boxes
 from pipelines.workspace.workspace import Workspace
 
@@ -130,7 +130,7 @@ def _weights(
     key, name = frame
     here = (table.c.round == round_number, table.c.policy == policy, table.c.frame_id == key)
     with workspace.database.reading() as connection:
-        refuse_bad_weights(connection, round_number, policy, name)
+        check_weights(connection, round_number, policy, name)
         found = bulk.select(connection, select(table.c.k, table.c.v).where(*here))
     weights = np.full(count, 0.0 if found else np.nan)
     for k, v in found:

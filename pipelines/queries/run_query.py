@@ -55,11 +55,11 @@ def ask(
         DatabaseError: the database cannot be opened.
     """
     if url.get_backend_name() == "sqlite":
-        return _ask_sqlite(Path(str(url.database)), sql, seconds)
-    return _ask_server(url, sql, seconds)
+        return _query_sqlite(Path(str(url.database)), sql, seconds)
+    return _query_server(url, sql, seconds)
 
 
-def _ask_sqlite(
+def _query_sqlite(
     path: Path, sql: str, seconds: float
 ) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
     try:
@@ -83,7 +83,7 @@ def _ask_sqlite(
         cursor = connection.execute(sql)
     except (sqlite3.Error, sqlite3.Warning, UnicodeEncodeError, ValueError) as error:
         connection.close()
-        raise _own_words(path, error, seconds) from error
+        raise _sqlite_error_message(path, error, seconds) from error
     if cursor.description is None:
         connection.close()
         raise ConfigError("query: not a question; write a SELECT")
@@ -98,10 +98,12 @@ def _rows(
         try:
             yield from cursor
         except sqlite3.Error as error:
-            raise _own_words(path, error, seconds) from error
+            raise _sqlite_error_message(path, error, seconds) from error
 
 
-def _own_words(path: Path, error: Exception, seconds: float) -> ConfigError | DatabaseError:
+def _sqlite_error_message(
+    path: Path, error: Exception, seconds: float
+) -> ConfigError | DatabaseError:
     message = one_line(error)
     if "file is not a database" in message or "malformed" in message:
         return DatabaseError(f"{path}: {message}; restore a backup of the file")
@@ -117,7 +119,7 @@ def may_read(action: int, _first: str | None, second: str | None, *_: str | None
     return sqlite3.SQLITE_OK if action in ALLOWED else sqlite3.SQLITE_DENY
 
 
-def _ask_server(
+def _query_server(
     url: URL, sql: str, seconds: float
 ) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
     """The answer of a PostgreSQL server, a part at a time.
@@ -140,7 +142,7 @@ def _ask_server(
         result = reading.exec_driver_sql(sql)
     except DBAPIError as error:
         connection.close()
-        raise _servers_words(error, seconds) from error
+        raise _server_error_message(error, seconds) from error
     return list(result.keys()), _server_rows(reading, result, end, seconds)
 
 
@@ -157,10 +159,10 @@ def _server_rows(
                     raise ConfigError("query: string or blob too big")
                 yield tuple(row)
         except DBAPIError as error:
-            raise _servers_words(error, seconds) from error
+            raise _server_error_message(error, seconds) from error
 
 
-def _servers_words(error: DBAPIError, seconds: float) -> ConfigError:
+def _server_error_message(error: DBAPIError, seconds: float) -> ConfigError:
     if getattr(error.orig, "sqlstate", None) == _TIMED_OUT:
         return _given_up(seconds)
     return ConfigError(_explain(joined_lines(error.orig)))

@@ -18,10 +18,10 @@ from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import weighted_labels
 from pipelines.assembly import open_prior, open_sequence_source
-from pipelines.labels.by_frame import refuse_bad_weights, weighted_round
+from pipelines.labels.by_frame import check_weights, weighted_round
 from pipelines.labels.sources import Source, sources_of
 from pipelines.registry import PRIORS
-from pipelines.review.decisions import tell_decision
+from pipelines.review.decisions import describe_decision
 from pipelines.stages.methods import ZERO_WEIGHT_WORDS, zero_weight_of
 from pipelines.workspace.config import Config, make_config
 from pipelines.workspace.workspace import Workspace
@@ -112,7 +112,7 @@ def explain_label(
 
 def _human(workspace: Workspace, label: dict[str, Any]) -> Explanation:
     """What people decided; with the numbers behind the policy's own weight where they rejected."""
-    told = tell_decision(workspace, label)
+    told = describe_decision(workspace, label)
     if label["weight"] == 0 and told.policy_weight is not None:
         alone = _computed(workspace, {**label, "weight": told.policy_weight})
         return replace(alone, label=label, lines=(*alone.lines, told.lines[0]))
@@ -142,7 +142,7 @@ def _label(
     with workspace.database.reading() as connection:
         view = weighted_labels(connection)
         labels = view.c
-        refuse_bad_weights(connection, round_number or 1, policy, frame)
+        check_weights(connection, round_number or 1, policy, frame)
         key = {"round": round_number, "frame": frame, "k": k, "policy": policy}
         query = select(view).where(*(labels[name] == key[name] for name in key))
         row = connection.execute(query).fetchone()

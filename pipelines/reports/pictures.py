@@ -17,7 +17,7 @@ from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
 
-def draw_telling_frame(workspace: Workspace, round_number: int) -> list[Path]:
+def draw_example_frame(workspace: Workspace, round_number: int) -> list[Path]:
     """A bird's eye view and an image overlay of the frame that shows most of all weights."""
     policy = workspace.config.run.method
     frames = list(read_labels(workspace, round_number, policy))

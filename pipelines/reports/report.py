@@ -154,7 +154,7 @@ def _shown(
             workspace,
             each.frame,
             LabelShown(each.box, each.numbers["weight"]),
-            _told(
+            _describe_label(
                 each,
                 priors,
                 rejected=(each.frame, each.k) in rejected,
@@ -166,7 +166,9 @@ def _shown(
     return Section(title, "" if figures else "There is none.", figures=figures)
 
 
-def _told(label: RankedLabel, priors: Sequence[str], *, rejected: bool, repredicted: bool) -> str:
+def _describe_label(
+    label: RankedLabel, priors: Sequence[str], *, rejected: bool, repredicted: bool
+) -> str:
     """What a label is, its numbers, and what took its weight away."""
     own = label.numbers
     numbers = ", ".join(

@@ -11,7 +11,7 @@ from pipelines.workspace.workspace import Workspace
 
 
 @dataclass(frozen=True)
-class Told:
+class LabelDecision:
     """A decision about a label of `weighted_labels`.
 
     Attributes:
@@ -23,7 +23,7 @@ class Told:
     policy_weight: float | None
 
 
-def tell_decision(workspace: Workspace, label: dict[str, Any]) -> Told:
+def describe_decision(workspace: Workspace, label: dict[str, Any]) -> LabelDecision:
     """Who decided what, and what the policy would have said.
 
     Args:
@@ -55,4 +55,4 @@ def tell_decision(workspace: Workspace, label: dict[str, Any]) -> Told:
         lines.append(
             f"  policy         {label['policy']} alone gives the prediction {policy_weight:.4f}"
         )
-    return Told(tuple(lines), policy_weight)
+    return LabelDecision(tuple(lines), policy_weight)

@@ -44,7 +44,7 @@ _EDITORS = {
 }
 
 
-def hand_out(
+def write_review(
     workspace: Workspace, folder: Path, sheet: Sheet, editor: Editor, progress: Progress
 ) -> None:
     """Writes the folder of a review and remembers it.

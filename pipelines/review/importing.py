@@ -13,18 +13,18 @@ from sqlalchemy import Connection, select
 
 from curate.detections import as_categories
 from curate.errors import ConfigError, DataError, LeakageError
-from curate.review.answer import Answer, Decision, EditedBox, check_boxes, read_answer
+from curate.review.edits import Answer, Decision, EditedBox, check_boxes, read_answer
 from curate.review.human_labels import (
     ACCEPTED,
     ADDED,
     MOVED,
     REJECTED,
     HumanLabels,
-    entangled,
+    overlapping_objects,
     superseded,
 )
 from curate.review.sheet import MANIFEST, Sheet, ShownFrame, read_sheet
-from curate.review.table import Words, read_table
+from curate.review.table import ExplicitDecisions, read_table
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.labels.human_labels import SEEN_COLUMNS, read_human_labels, refresh_all_matches
@@ -41,7 +41,7 @@ LabelRow = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Taken:
+class ReviewImport:
     """What an import did, or would do.
 
     Attributes:
@@ -70,7 +70,7 @@ class Taken:
     dry_run: bool
 
 
-def take_back(
+def apply_review(
     workspace: Workspace,
     folder: Path,
     *,
@@ -79,7 +79,7 @@ def take_back(
     reviewer: str | None = None,
     from_round: int | None = None,
     dry_run: bool = False,
-) -> Taken:
+) -> ReviewImport:
     """Reads an answer and stores its decisions in place of those of an earlier import of it.
 
     Args:
@@ -111,7 +111,7 @@ def take_back(
         with workspace.database.writing() as connection:
             _store(connection, sheet.id, rows, who)
     decided = [decision.decision for each in answers for decision in each.decisions]
-    return Taken(
+    return ReviewImport(
         review=sheet.id,
         frames=len(answers),
         without_answer=len(sheet.frames) - len(answers),
@@ -161,23 +161,23 @@ def _answers(
             raise ConfigError(f"--accept: frame '{name}' is not in this review")
     answers = []
     for shown in sheet.frames:
-        said = words.get(shown.frame, Words())
+        said = words.get(shown.frame, ExplicitDecisions())
         if shown.frame not in edited and not (said.boxes or said.accept_rest):
             continue
         boxes = edited.get(shown.frame, _as_shown(shown))
         check_boxes(boxes, sheet.categories)
         rest = said.accept_rest or not {shown.frame, ALL_FRAMES}.isdisjoint(accept)
         answers.append(read_answer(shown, boxes, said.boxes, accept_rest=rest))
-    _refuse_entangled(answers)
+    _check_overlaps(answers)
     return answers
 
 
-def _refuse_entangled(answers: Sequence[Answer]) -> None:
+def _check_overlaps(answers: Sequence[Answer]) -> None:
     """DataError where two objects of an answer lie in each other."""
     found = []
     for answer in answers:
         rows = [_row(0, decision, 1) for decision in answer.decisions]
-        for pair in entangled(_by_frame(rows)[0]) if rows else ():
+        for pair in overlapping_objects(_by_frame(rows)[0]) if rows else ():
             one, other = (_called(answer.decisions[place]) for place in pair)
             found.append(f"{one} and {other} of frame {answer.frame}")
     if found:

@@ -27,7 +27,7 @@ Asked = Collection[tuple[str, int]]
 
 
 @dataclass(frozen=True)
-class Wish:
+class ReviewRequest:
     """Which labels are wanted.
 
     Attributes:
@@ -45,7 +45,7 @@ class Wish:
 
 
 def make_sheet(
-    workspace: Workspace, round_number: int | None, policy: str, editor: str, wish: Wish
+    workspace: Workspace, round_number: int | None, policy: str, editor: str, request: ReviewRequest
 ) -> Sheet:
     """The wanted labels with the other kept labels of their frames around them.
 
@@ -54,20 +54,20 @@ def make_sheet(
         round_number: None for the last that the policy has weighted.
         policy: whose weights.
         editor: name of the format.
-        wish: see `Wish`.
+        request: see `ReviewRequest`.
 
     Raises:
         ConfigError: no such order, frame or category.
         LeakageError: a frame is not unlabeled.
         WorkspaceError: the policy has weighted nothing, or no label is wanted.
     """
-    _check(workspace, wish)
+    _check(workspace, request)
     number = _weighted_round(workspace, round_number, policy)
-    asked = _changed(workspace, number, policy, wish) if wish.order == "changed" else None
+    asked = _changed(workspace, number, policy, request) if request.order == "changed" else None
     with workspace.database.reading() as connection:
         if asked is None:
-            asked = _first(connection, number, policy, wish)
-        names = sorted({*wish.frames, *(frame for frame, _ in asked)})
+            asked = _first(connection, number, policy, request)
+        names = sorted({*request.frames, *(frame for frame, _ in asked)})
         frames = tuple(
             ShownFrame(name, tuple(_shown(connection, number, policy, name, asked)))
             for name in names
@@ -83,15 +83,15 @@ def make_sheet(
     return Sheet(number, policy, editor, categories, frames)
 
 
-def _check(workspace: Workspace, wish: Wish) -> None:
-    if wish.order not in ORDERS:
-        raise ConfigError(f"--by {wish.order}: use one of {', '.join(ORDERS)}")
+def _check(workspace: Workspace, request: ReviewRequest) -> None:
+    if request.order not in ORDERS:
+        raise ConfigError(f"--by {request.order}: use one of {', '.join(ORDERS)}")
     known = workspace.config.dataset.categories
-    for category in wish.categories:
+    for category in request.categories:
         if category not in known:
             raise ConfigError(f"--category {category}: use some of {', '.join(known)}")
     everywhere, unlabeled = workspace.frames(*SPLITS), workspace.frames("unlabeled")
-    for frame in wish.frames:
+    for frame in request.frames:
         if frame not in everywhere:
             raise ConfigError(f"--frames: no frame is named '{frame}' here")
         if frame not in unlabeled:
@@ -113,7 +113,7 @@ def _weighted_round(workspace: Workspace, number: int | None, policy: str) -> in
     return found
 
 
-def _first(connection: Connection, number: int, policy: str, wish: Wish) -> Asked:
+def _first(connection: Connection, number: int, policy: str, request: ReviewRequest) -> Asked:
     """The labels that come first in the wanted order."""
     labels = WEIGHTED_LABELS.c
     orders: dict[str, list[ColumnElement]] = {
@@ -123,15 +123,15 @@ def _first(connection: Connection, number: int, policy: str, wish: Wish) -> Aske
     query = select(labels.frame, labels.k).where(
         labels.round == number, labels.policy == policy, labels.provenance == "detector"
     )
-    if wish.frames:
-        query = query.where(labels.frame.in_(wish.frames))
-    if wish.categories:
-        query = query.where(labels.category.in_(wish.categories))
-    query = query.order_by(*orders[wish.order], labels.frame, labels.k).limit(wish.count)
+    if request.frames:
+        query = query.where(labels.frame.in_(request.frames))
+    if request.categories:
+        query = query.where(labels.category.in_(request.categories))
+    query = query.order_by(*orders[request.order], labels.frame, labels.k).limit(request.count)
     return {(str(frame), int(k)) for frame, k in bulk.select(connection, query)}
 
 
-def _changed(workspace: Workspace, number: int, policy: str, wish: Wish) -> Asked:
+def _changed(workspace: Workspace, number: int, policy: str, request: ReviewRequest) -> Asked:
     """The labels whose weight changed most since the round before."""
     if number < 2:
         raise ConfigError("--by changed: round 1 has no round before it; use --by uncertain")
@@ -143,12 +143,12 @@ def _changed(workspace: Workspace, number: int, policy: str, wish: Wish) -> Aske
     for row in rows[rows >= 0].tolist():
         key = after.frame_names[after.frames[row]], int(after.k[row])
         category = after.category_names[after.categories[row]]
-        wanted = (not wish.frames or key[0] in wish.frames) and (
-            not wish.categories or category in wish.categories
+        wanted = (not request.frames or key[0] in request.frames) and (
+            not request.categories or category in request.categories
         )
         if wanted and key not in human:
             asked[key] = None
-        if len(asked) == wish.count:
+        if len(asked) == request.count:
             break
     return asked.keys()
 

@@ -44,7 +44,7 @@ def working_database(declared: Sequence[Declaration] = ()) -> dict[str, Any]:
     return {
         "description": "Predictions, their evidence, their weights, and what was done",
         "tables": tables,
-        "queries": _questions(exported=False),
+        "queries": _query_meanings(exported=False),
     }
 
 
@@ -57,7 +57,7 @@ def exported_file() -> dict[str, Any]:
     return {
         "description": "The exported weighted labels that a training reads",
         "tables": tables,
-        "queries": _questions(exported=True),
+        "queries": _query_meanings(exported=True),
     }
 
 
@@ -85,7 +85,7 @@ def _of_model(model: type[Base]) -> dict[str, Any]:
     }
 
 
-def _questions(*, exported: bool) -> dict[str, Any]:
+def _query_meanings(*, exported: bool) -> dict[str, Any]:
     """The named queries that a database can answer."""
     return {
         name: {"title": name, "description": f"{query.description}.", "sql": query.sql}

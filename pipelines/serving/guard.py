@@ -53,16 +53,16 @@ def guard(application: Application, host: str) -> Application:
         if scope["type"] != "http":
             await application(scope, receive, send)
             return
-        refusal = _refusal(scope, names)
+        refusal = _rejection(scope, names)
         if refusal is not None:
-            await _refuse(_with_headers(send), *refusal)
+            await _reject(_with_headers(send), *refusal)
             return
         await application(scope, receive, _with_headers(send))
 
     return guarded
 
 
-def _refusal(scope: Scope, names: frozenset[str] | None) -> tuple[int, str] | None:
+def _rejection(scope: Scope, names: frozenset[str] | None) -> tuple[int, str] | None:
     """Status and reason where a request is refused."""
     headers = {name.lower(): value.decode("latin-1") for name, value in scope["headers"]}
     if scope["method"] not in _METHODS:
@@ -85,7 +85,7 @@ def _host_name(header: str) -> str:
     return name if colon and port.isdigit() else header
 
 
-async def _refuse(send: Send, status: int, reason: str) -> None:
+async def _reject(send: Send, status: int, reason: str) -> None:
     body = f"{reason}\n".encode()
     headers = [(b"content-type", b"text/plain"), (b"content-length", str(len(body)).encode())]
     await send({"type": "http.response.start", "status": status, "headers": headers})

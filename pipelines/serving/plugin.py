@@ -103,7 +103,7 @@ class CuratePlugin:
     async def _page(self, datasette: Any, request: Any) -> Response:
         """The page of a frame, with the explanation of a label where one is asked for."""
         try:
-            shown, k = await asyncio.to_thread(self._asked, request)
+            shown, k = await asyncio.to_thread(self._requested, request)
             told = await asyncio.to_thread(self._explanation, shown, k)
         except CurateError as error:
             page = await datasette.render_template(
@@ -125,7 +125,7 @@ class CuratePlugin:
     async def _picture(self, request: Any) -> Response:
         """The picture of a frame."""
         try:
-            shown, _ = await asyncio.to_thread(self._asked, request)
+            shown, _ = await asyncio.to_thread(self._requested, request)
             content = await asyncio.to_thread(self._pages.picture, shown)
         except CurateError as error:
             return Response.text(str(error), status=404)
@@ -137,7 +137,7 @@ class CuratePlugin:
             raise ConfigError("no workspace at hand")
         return self._frames
 
-    def _asked(self, request: Any) -> tuple[ShownFrame, int | None]:
+    def _requested(self, request: Any) -> tuple[ShownFrame, int | None]:
         """The frame and the label that a request names; every part is looked up, none is a path."""
         wanted = {name: request.args.get(name) or None for name in ("frame", "policy")}
         numbers = {name: _number(request.args.get(name)) for name in ("id", "round", "k")}

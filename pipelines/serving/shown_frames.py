@@ -111,7 +111,7 @@ class FramePages:
         frame = bulk.table("frame")
         here = frame.c.id == key if name is None else frame.c.frame == name
         query = select(frame.c.id, frame.c.frame, frame.c.split).where(here)
-        rows = self._ask(query)
+        rows = self._execute(query)
         if not rows:
             raise ConfigError(f"no frame {key if name is None else repr(name)} in this workspace")
         return rows[0][0], rows[0][1], rows[0][2]
@@ -125,13 +125,13 @@ class FramePages:
             .distinct()
             .order_by(weight.c.round, weight.c.policy)
         )
-        return tuple((int(row[0]), str(row[1])) for row in self._ask(query))
+        return tuple((int(row[0]), str(row[1])) for row in self._execute(query))
 
     def _neighbour(self, name: str, split: str, step: int) -> str | None:
         frame = bulk.table("frame").c.frame
         beyond, order = (frame > name, frame) if step > 0 else (frame < name, frame.desc())
         query = select(frame).where(beyond, bulk.table("frame").c.split == split)
-        rows = self._ask(query.order_by(order).limit(1))
+        rows = self._execute(query.order_by(order).limit(1))
         return str(rows[0][0]) if rows else None
 
     def _labels(
@@ -160,9 +160,9 @@ class FramePages:
             .where(prediction.c.round == number, prediction.c.frame_id == key)
             .order_by(prediction.c.k)
         )
-        return names, tuple(self._ask(query))
+        return names, tuple(self._execute(query))
 
-    def _ask(self, query: Any) -> list[bulk.Row]:
+    def _execute(self, query: Any) -> list[bulk.Row]:
         with self._workspace.database.reading() as connection:
             return list(bulk.select(connection, query))
 

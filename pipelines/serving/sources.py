@@ -28,7 +28,7 @@ def choose(argument: Path | None, option: Path | None, file: Path | None) -> Ser
         return _of_workspace(Workspace.open(folder))
     if not file.is_file():
         raise ConfigError(f"--file {file}: no such file; `curate export` writes one")
-    return Served(file.name, {EXPORTED: file}, None, _at_hand(folder))
+    return Served(file.name, {EXPORTED: file}, None, _find_workspace(folder))
 
 
 def _of_workspace(workspace: Workspace) -> Served:
@@ -47,7 +47,7 @@ def _of_workspace(workspace: Workspace) -> Served:
     return Served(f"curate: {workspace.root.name}", files, working, workspace)
 
 
-def _at_hand(folder: Path | None) -> Workspace | None:
+def _find_workspace(folder: Path | None) -> Workspace | None:
     """The workspace, for pictures; none is needed unless it is named."""
     if folder is not None:
         return Workspace.open(folder)

@@ -28,7 +28,7 @@ from pipelines.assembly import open_policy
 from pipelines.engine.progress import Progress
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.firewall.rules import enforce
-from pipelines.labels.by_frame import refuse_bad_weights
+from pipelines.labels.by_frame import check_weights
 from pipelines.labels.human_labels import fingerprint
 from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace, sha256
@@ -70,7 +70,7 @@ def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
     """
     enforce(workspace, context.number, file(workspace, context, policy))
     with workspace.database.reading() as connection:
-        refuse_bad_weights(connection, context.number, policy)
+        check_weights(connection, context.number, policy)
 
 
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:

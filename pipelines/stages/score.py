@@ -28,7 +28,7 @@ from pipelines.engine.executors.base import FrameJob, FrameRows, SequenceJob
 from pipelines.engine.stage import (
     FramesStage,
     FrameStage,
-    Recall,
+    ReusableMeasurements,
     RoundContext,
     SequenceStage,
     Settings,
@@ -36,7 +36,7 @@ from pipelines.engine.stage import (
 from pipelines.labels.sources import Source, prepare_table, source_of, sources_of
 from pipelines.registry import PRIORS
 from pipelines.workspace.config import Config
-from pipelines.workspace.workspace import Workspace, glance, open_dataset, sha256
+from pipelines.workspace.workspace import Workspace, open_dataset, sha256, stat_fingerprint
 
 
 @dataclass
@@ -73,7 +73,7 @@ class Score:
         return {source_of(self.source).table: {"k": list(range(count)), **found}}
 
 
-class Rate(Score):
+class Rescore(Score):
     """Rates the labels of a frame from what was measured before."""
 
     def open(self) -> None:
@@ -147,11 +147,11 @@ def stage(source: Source) -> FramesStage:
         writes=(source.table,),
         settings=partial(_settings, source),
         function=partial(_function, Score, name),
-        recall=Recall(
+        recall=ReusableMeasurements(
             reads=("frame", "prediction"),
             settings=partial(_measured_settings, source),
             read=partial(_read_measured, source),
-            function=partial(_function, Rate, name),
+            function=partial(_function, Rescore, name),
         ),
         check=partial(_check, name),
         prepare=partial(prepare_table, source=source),
@@ -211,7 +211,7 @@ def _measured_settings(source: Source, workspace: Workspace, _context: RoundCont
 def _identity(path: Path | None) -> str:
     """What tells a model, or a folder of saved maps, from another one in its place."""
     if path is not None and path.is_dir():
-        return glance(path)
+        return stat_fingerprint(path)
     return sha256(path) if path is not None and path.is_file() else str(path)
 
 

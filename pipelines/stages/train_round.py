@@ -11,7 +11,7 @@ from curate.errors import ConfigError
 from curate.frames import Frame
 from db import bulk
 from pipelines.assembly import device, trainable_detector, trained_detector
-from pipelines.engine.progress import Progress, reaching
+from pipelines.engine.progress import Progress, as_total
 from pipelines.engine.rounds import register_checkpoint
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
@@ -182,7 +182,7 @@ def train_with_progress(
     from curate.training.trainer import train
 
     with progress.track(output.stem, settings.steps) as advance:
-        reach = reaching(advance)
+        reach = as_total(advance)
 
         def show(step: int, steps: int, loss: float) -> None:
             reach(step, steps, f"loss {loss:.2f}")

@@ -121,7 +121,7 @@ class SolveSection(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _name_the_new_place(cls, section: Any) -> Any:
+    def _point_to_new_path(cls, section: Any) -> Any:
         if isinstance(section, Mapping) and "policy" in section:
             raise ValueError(f'policy has moved: write method = "{section["policy"]}" in [run]')
         return section

@@ -61,7 +61,7 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
         DataError: a label or calibration file of X_l or val is damaged.
         WorkspaceError: the workspace exists with other frames or settings.
     """
-    _refuse_absent(config)
+    _check_models_exist(config)
     dataset = open_dataset(config)
     split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
     truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
@@ -79,10 +79,10 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
     return workspace
 
 
-def _refuse_absent(config: Config) -> None:
+def _check_models_exist(config: Config) -> None:
     """ConfigError for a detector or segmenter that nobody knows or whose file is not there."""
-    registry.DETECTORS.refuse_unknown(config.detector.name)
-    registry.SEGMENTERS.refuse_unknown(config.segmenter.name, "none", "simulated")
+    registry.DETECTORS.check_name(config.detector.name)
+    registry.SEGMENTERS.check_name(config.segmenter.name, "none", "simulated")
     needs_path = {"detector": ("onnx", "recorded"), "segmenter": tuple(registry.SEGMENTERS.classes)}
     for section, names in needs_path.items():
         name, path = getattr(config, section).name, getattr(config, section).path
@@ -90,10 +90,10 @@ def _refuse_absent(config: Config) -> None:
             raise ConfigError(f"{section} '{name}' needs a path: give --{section}-path")
         if path is not None and not path.exists():
             raise ConfigError(f"--{section}-path {path}: no such file")
-    _refuse_undeclared_classes(config)
+    _check_classes_declared(config)
 
 
-def _refuse_undeclared_classes(config: Config) -> None:
+def _check_classes_declared(config: Config) -> None:
     """ConfigError where nobody says what the numbers of a segmenter's classes mean."""
     name, section = config.segmenter.name, config.segmenter
     if section.classes is not None:
@@ -148,11 +148,11 @@ def choose_split(
     found = Split(tuple(sorted(chosen)), tuple(rest), tuple(sorted(held_out)))
     for frame in (*found.labeled, *found.unlabeled, *found.val):
         check_frame_id(frame)
-    _refuse_straddling(sequences, found)
+    _check_sequences_apart(sequences, found)
     return found
 
 
-def _refuse_straddling(sequences: Mapping[str, str], split: Split) -> None:
+def _check_sequences_apart(sequences: Mapping[str, str], split: Split) -> None:
     """LeakageError where a sequence is in two splits."""
     shared = straddling(sequences, {name: getattr(split, name) for name in SPLITS})
     for (one, other), names in shared.items():

@@ -97,7 +97,7 @@ class SplitRecord:
     @property
     def changed(self) -> Mapping[str, str]:
         """What changed in each split since init; nothing where all is as it was."""
-        return _told(
+        return _describe_changes(
             (found.name, found.frames, self.splits.get(found.name, ()))
             for found in self.lists
             if found.source == "chosen"
@@ -107,7 +107,7 @@ class SplitRecord:
 def changed_lists(workspace: Workspace, record: SplitRecord) -> Mapping[str, str]:
     """What changed in each list outside the workspace; a file that is gone has not changed."""
     own = workspace.dataset.splits()
-    return _told(
+    return _describe_changes(
         (f"the data set's {found.name}", found.frames, own.get(found.name, ()))
         if found.path is None
         else (str(found.path), found.frames, _read(found.path))
@@ -116,7 +116,7 @@ def changed_lists(workspace: Workspace, record: SplitRecord) -> Mapping[str, str
     )
 
 
-def _told(lists: Iterable[tuple[str, SplitList, Iterable[str]]]) -> Mapping[str, str]:
+def _describe_changes(lists: Iterable[tuple[str, SplitList, Iterable[str]]]) -> Mapping[str, str]:
     """What changed in the lists that did change, by name."""
     told = {name: changes(before, SplitList.of(now)) for name, before, now in lists}
     return {name: what for name, what in told.items() if what}

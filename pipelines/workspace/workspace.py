@@ -162,7 +162,7 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-def glance(path: Path) -> str:
+def stat_fingerprint(path: Path) -> str:
     """What tells that a folder of many large files was changed, without reading them.
 
     Names, sizes and times of change: files that were copied count as changed.

@@ -14,7 +14,7 @@ from support.reviews import CYCLIST, small_sheet
 from curate.errors import DataError
 from curate.frames import Frame
 from curate.geometry.similarity import wrap_angle
-from curate.review.answer import check_boxes, read_answer
+from curate.review.edits import check_boxes, read_answer
 from curate.review.sheet import Sheet
 from pipelines.registry import EDITORS
 

@@ -26,8 +26,8 @@ from curate.datasets.kitti.dataset import (
 )
 from curate.datasets.kitti.labels import read_objects, to_annotations, to_detections
 from curate.datasets.kitti.raw import read_raw_calibration
-from curate.detectors.recorded.answers import Reading
-from curate.detectors.recorded.formats import read_answers
+from curate.detectors.recorded.formats import read_results
+from curate.detectors.recorded.results import ReadOptions
 from curate.detectors.recorded.table import TableRecord
 from curate.errors import CurateError
 from curate.exporters.sqlite import SqliteExporter
@@ -202,7 +202,7 @@ def _json(path: Path) -> None:
 
 
 def _read_list(path: Path) -> None:
-    answers = read_answers(path, "list", Reading(("Car",)))
+    answers = read_results(path, "list", ReadOptions(("Car",)))
     for name in answers:
         answers[name]
 

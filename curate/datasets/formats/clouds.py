@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from curate.datasets.formats.cloud_formats import read_pcd, read_ply
-from curate.datasets.kitti.dataset import read_bytes, refuse_far_points
+from curate.datasets.kitti.dataset import check_point_range, read_bytes
 from curate.errors import DataError, one_line
 
 # What a damaged header makes numpy raise.
@@ -50,7 +50,7 @@ def read_cloud(path: Path, columns: int = 4, intensity_scale: float = 1.0) -> np
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is left out
         points[:, : min(table.shape[1], 4)] = table[:, :4]
     points = points[np.isfinite(points).all(axis=1)]
-    refuse_far_points(path, points)
+    check_point_range(path, points)
     points[:, 3] = np.clip(points[:, 3] / intensity_scale, 0, 1)
     return points
 

@@ -175,11 +175,11 @@ def read_points(path: Path) -> np.ndarray:
             f"{path}: {len(bad)} of {len(points)} points are NaN or infinite, "
             f"the first is point {bad[0]}; remove them from the file"
         )
-    refuse_far_points(path, points)
+    check_point_range(path, points)
     return points
 
 
-def refuse_far_points(path: Path, points: np.ndarray) -> None:
+def check_point_range(path: Path, points: np.ndarray) -> None:
     """DataError where a finite point of (n, >=3) is farther than any LiDAR sees."""
     far = np.abs(points[:, :3]).max(initial=0)
     if far > FARTHEST_METRES:

@@ -65,7 +65,7 @@ class PillarDetector:
         self._answers = (
             onnx_answers(checkpoint, self._checkpoint, threads)
             if device == "cpu"
-            else torch_answers(checkpoint, self._checkpoint, device)
+            else torch_forward(checkpoint, self._checkpoint, device)
         )
 
     @classmethod
@@ -149,7 +149,7 @@ def onnx_answers(path: Path, checkpoint: Checkpoint, threads: int) -> Callable[[
     return answers
 
 
-def torch_answers(path: Path, checkpoint: Checkpoint, device: str) -> Callable[[Pillars], Answers]:
+def torch_forward(path: Path, checkpoint: Checkpoint, device: str) -> Callable[[Pillars], Answers]:
     """The network itself, on a GPU."""
     import torch
 

@@ -11,10 +11,15 @@ import numpy as np
 
 from curate.datasets.kitti.labels import KittiObjects, to_detections
 from curate.detections import Detections, as_categories
-from curate.detectors.recorded.answers import Answer, Placed, Reading, as_detections
-from curate.detectors.recorded.formats import refuse_unknown_kind, tell_kind
+from curate.detectors.recorded.formats import check_kind, detect_kind
 from curate.detectors.recorded.parquet import ParquetRecord
 from curate.detectors.recorded.passes import PassesRecord
+from curate.detectors.recorded.results import (
+    ForeignBoxes,
+    ReadOptions,
+    RecordedResult,
+    as_detections,
+)
 from curate.detectors.recorded.table import TableRecord
 from curate.errors import ConfigError, DataError
 from curate.frames import Calibration, Frame
@@ -46,11 +51,11 @@ class Record(Protocol):
         """The recorded frames, in sorted order."""
         ...
 
-    def answer(self, frame_id: str) -> Answer:
+    def answer(self, frame_id: str) -> RecordedResult:
         """For the frame as it is; DataError where nothing was recorded."""
         ...
 
-    def views(self, frame_id: str) -> Sequence[tuple[Similarity, Answer]]:
+    def views(self, frame_id: str) -> Sequence[tuple[Similarity, RecordedResult]]:
         """For each augmented copy, in its own frame of reference."""
         ...
 
@@ -99,7 +104,7 @@ class RecordedDetector:
         calibration: Callable[[str], Calibration] | None = None,
         wants_views: bool = True,
     ) -> None:
-        refuse_unknown_kind(kind)
+        check_kind(kind)
         if axes not in _TURNS:
             raise ConfigError(f"detector.options.axes '{axes}': use one of {', '.join(_TURNS)}")
         self.path = Path(path)
@@ -109,9 +114,9 @@ class RecordedDetector:
         self._calibration = calibration
         self._wants_views = wants_views
         listed = self.path.parent / frame_list if frame_list else None
-        self._record = _open(self.path, kind, Reading(tuple(classes), listed), passes)
+        self._record = _open(self.path, kind, ReadOptions(tuple(classes), listed), passes)
         if frame_ids:
-            self._report_strays(frame_ids)
+            self._report_unmatched(frame_ids)
 
     def frame_ids(self) -> tuple[str, ...]:
         """The recorded frames, in sorted order."""
@@ -147,7 +152,7 @@ class RecordedDetector:
     def _detections(
         self,
         frame_id: str,
-        answer: Answer,
+        answer: RecordedResult,
         calibration: Callable[[str], Calibration] | None,
     ) -> Detections:
         """The answer in the LiDAR frame, with our names, from the lowest score on."""
@@ -161,11 +166,11 @@ class RecordedDetector:
             names = [self.rename.get(name, name) for name in answer.categories.tolist()]
             answer = replace(answer, categories=as_categories(names))
         kept = answer.select(np.flatnonzero(answer.scores >= self.minimum_score))
-        _refuse_repeated(f"{self.path}: frame {frame_id}", kept)
+        _check_repeated(f"{self.path}: frame {frame_id}", kept)
         return kept
 
     def _placed(
-        self, frame_id: str, answer: KittiObjects | Placed, calibration: Calibration
+        self, frame_id: str, answer: KittiObjects | ForeignBoxes, calibration: Calibration
     ) -> Detections:
         """The answer in the LiDAR's frame of reference."""
         if not isinstance(answer, KittiObjects):
@@ -174,7 +179,7 @@ class RecordedDetector:
         place = f"{self.path}: frame {frame_id}"
         return as_detections(place, found.boxes, found.scores, found.categories)
 
-    def _report_strays(self, frame_ids: Sequence[str]) -> None:
+    def _report_unmatched(self, frame_ids: Sequence[str]) -> None:
         """Says which recorded frames the data set does not have; DataError where it has none."""
         known = set(frame_ids)
         recorded = sum(1 for _ in self._record.frame_ids())
@@ -192,7 +197,7 @@ class RecordedDetector:
             )
 
 
-def _refuse_repeated(place: str, found: Detections) -> None:
+def _check_repeated(place: str, found: Detections) -> None:
     """DataError where a box comes twice, as all do in a file that was appended to itself."""
     numbers = np.column_stack([found.boxes, found.scores]).tolist()
     seen: set[tuple[Any, ...]] = set()
@@ -206,8 +211,10 @@ def _refuse_repeated(place: str, found: Detections) -> None:
         seen.add((category, *box))
 
 
-def _open(path: Path, kind: str, reading: Reading, passes: Sequence[Mapping[str, Any]]) -> Record:
-    told = tell_kind(path) if kind == "auto" else kind
+def _open(
+    path: Path, kind: str, reading: ReadOptions, passes: Sequence[Mapping[str, Any]]
+) -> Record:
+    told = detect_kind(path) if kind == "auto" else kind
     if told not in _TABLES:
         return PassesRecord.read(path, told, reading, passes)
     if passes:

@@ -4,16 +4,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from curate.detectors.recorded.answers import Answers, Reading
 from curate.detectors.recorded.json_files import holds_object, read_json, stream_results
 from curate.detectors.recorded.kitti_results import KittiResults
 from curate.detectors.recorded.mmdetection3d import holds_boxes, read_mmdetection3d
 from curate.detectors.recorded.nuscenes import read_nuscenes
 from curate.detectors.recorded.openpcdet import read_openpcdet
 from curate.detectors.recorded.plain_pickle import read_plain_pickle
+from curate.detectors.recorded.results import Answers, ReadOptions
 from curate.errors import ConfigError, DataError
 
-_LISTS: Mapping[str, Callable[[Path, Sequence[Any], Reading], Answers]] = {
+_LISTS: Mapping[str, Callable[[Path, Sequence[Any], ReadOptions], Answers]] = {
     "openpcdet": read_openpcdet,
     "mmdetection3d": read_mmdetection3d,
 }
@@ -25,7 +25,7 @@ _EXPECTED = (
 )
 
 
-def tell_kind(path: Path) -> str:
+def detect_kind(path: Path) -> str:
     """The kind of a record by its suffix: of `KINDS`, or "list" where only the contents tell.
 
     Raises:
@@ -41,7 +41,7 @@ def tell_kind(path: Path) -> str:
     return kinds[path.suffix.lower()]
 
 
-def read_answers(path: Path, kind: str, reading: Reading) -> Answers:
+def read_results(path: Path, kind: str, reading: ReadOptions) -> Answers:
     """The answers of one pass in any format but tables.
 
     Args:
@@ -63,11 +63,11 @@ def read_answers(path: Path, kind: str, reading: Reading) -> Answers:
     if not isinstance(held, list | tuple):
         raise DataError(f"{path}: holds a {type(held).__name__}, not a list of frames")
     if kind == "list":
-        kind = _tell_list(path, held)
+        kind = _detect_list_kind(path, held)
     return _LISTS[kind](path, held, reading)
 
 
-def _tell_list(path: Path, entries: Sequence[Any]) -> str:
+def _detect_list_kind(path: Path, entries: Sequence[Any]) -> str:
     """The kind of a list by its first entry."""
     if not entries:
         raise DataError(f"{path}: holds no frames")
@@ -94,7 +94,7 @@ def _read(path: Path) -> Any:
     return read_json(path) if path.suffix.lower() == ".json" else read_plain_pickle(path)
 
 
-def refuse_unknown_kind(kind: str) -> None:
+def check_kind(kind: str) -> None:
     """ConfigError for a kind that nobody reads."""
     if kind not in (*KINDS, "auto"):
         raise ConfigError(f"detector.options.kind '{kind}': use one of auto, {', '.join(KINDS)}")

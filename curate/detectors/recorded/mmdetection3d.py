@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from curate.detections import Detections
-from curate.detectors.recorded.answers import Answers, Reading, as_detections
+from curate.detectors.recorded.results import Answers, ReadOptions, as_detections
 from curate.errors import ConfigError, DataError
 
 # An entry may hold its boxes one level deeper, and names them in one of two ways.
@@ -21,7 +21,7 @@ BOX_KEYS = ("boxes_3d", "bboxes_3d")
 _FRAME_KEYS = ("frame_id", "sample_idx", "lidar_path")
 
 
-def read_mmdetection3d(path: Path, entries: Sequence[Any], reading: Reading) -> Answers:
+def read_mmdetection3d(path: Path, entries: Sequence[Any], reading: ReadOptions) -> Answers:
     """The detections of each frame.
 
     Args:

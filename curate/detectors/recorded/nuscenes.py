@@ -16,7 +16,7 @@ import numpy as np
 
 from curate.datasets.nuscenes.names import CATEGORIES
 from curate.detections import Detections, as_categories
-from curate.detectors.recorded.answers import as_detections
+from curate.detectors.recorded.results import as_detections
 from curate.errors import DataError
 from curate.frames import Calibration
 from curate.geometry.poses import boxes_in_frame, rotation_matrices
@@ -89,7 +89,7 @@ def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str
     long = wide = 0
     for token, boxes in results:
         one = _frame(path, token, boxes, names)
-        _refuse_rotations(one)
+        _check_rotations(one)
         own = one.numbers[np.isin(one.names, _LONG), 3:5]
         long += len(own)
         wide += int(np.sum(own[:, 0] > own[:, 1]))
@@ -142,7 +142,7 @@ def _words(text: Any) -> str:
     return " ".join(text.split())[:80] if isinstance(text, str) else f"a {type(text).__name__}"
 
 
-def _refuse_rotations(found: MapBoxes) -> None:
+def _check_rotations(found: MapBoxes) -> None:
     """DataError at the first rotation that is no upright box's."""
     turns = found.numbers[:, 6:10]
     lengths = np.linalg.norm(turns, axis=1)

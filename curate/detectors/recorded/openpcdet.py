@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from curate.detectors.recorded.answers import Answer, Answers, Reading, as_detections
+from curate.detectors.recorded.results import Answers, ReadOptions, RecordedResult, as_detections
 from curate.errors import DataError
 
 KEYS = ("frame_id", "name", "score", "boxes_lidar")
 
 
-def read_openpcdet(path: Path, entries: Sequence[Any], _reading: Reading) -> Answers:
+def read_openpcdet(path: Path, entries: Sequence[Any], _reading: ReadOptions) -> Answers:
     """The detections of each frame.
 
     Args:
@@ -24,7 +24,7 @@ def read_openpcdet(path: Path, entries: Sequence[Any], _reading: Reading) -> Ans
     Raises:
         DataError: an entry lacks a key or holds what cannot be, or a frame comes twice.
     """
-    found: dict[str, Answer] = {}
+    found: dict[str, RecordedResult] = {}
     for number, entry in enumerate(entries):
         place = f"{path}: entry {number}"
         missing = [key for key in KEYS if not isinstance(entry, dict) or key not in entry]

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from curate.detections import Detections
-from curate.detectors.recorded.answers import as_detections
+from curate.detectors.recorded.results import as_detections
 from curate.errors import DataError, one_line
 from curate.exporters.base import BOX_COLUMNS
 from curate.files.parquet import load_parquet
@@ -69,8 +69,8 @@ class ParquetRecord:
         missing = [name for name in wanted if name not in names]
         if missing:
             raise DataError(f"{path}: no column {', '.join(missing)}; it has {', '.join(names)}")
-        _refuse_types(path, file.schema_arrow, wanted)
-        _refuse_unfolding(path, file.metadata)
+        _check_types(path, file.schema_arrow, wanted)
+        _check_expansion(path, file.metadata)
         return cls(path, bool(own), _runs(path, file))
 
     def frame_ids(self) -> tuple[str, ...]:
@@ -104,7 +104,7 @@ class ParquetRecord:
         if not self.has_views:
             return {0: (Similarity(), found)}
         told = np.column_stack([columns[name] for name in VIEW_COLUMNS])
-        _refuse_views(place, told)
+        _check_views(place, told)
         views = {}
         for number in np.unique(told[:, 0]):
             own = np.flatnonzero(told[:, 0] == number)
@@ -129,7 +129,7 @@ def _open(path: Path) -> Any:
         raise DataError(f"{path}: no readable Parquet: {one_line(error)}") from None
 
 
-def _refuse_types(path: Path, schema: Any, names: Sequence[str]) -> None:
+def _check_types(path: Path, schema: Any, names: Sequence[str]) -> None:
     """DataError where a column holds neither names nor numbers as it should."""
     arrow, _ = load_parquet()
     for name in names:
@@ -142,7 +142,7 @@ def _refuse_types(path: Path, schema: Any, names: Sequence[str]) -> None:
             raise DataError(f"{path}: column {name} is of type {kind}")
 
 
-def _refuse_unfolding(path: Path, metadata: Any) -> None:
+def _check_expansion(path: Path, metadata: Any) -> None:
     """DataError where a file claims far more than its bytes can hold."""
     size = path.stat().st_size
     if metadata.num_rows * _FEWEST_BYTES_PER_ROW > size:
@@ -218,7 +218,7 @@ def _named(chunk: Any) -> np.ndarray:
     return named
 
 
-def _refuse_views(place: str, told: np.ndarray) -> None:
+def _check_views(place: str, told: np.ndarray) -> None:
     """DataError where the four columns of views contradict each other."""
     view, flip_y, _, scale = told.T
     identity = (told[:, 1:] == [0, 0, 1]).all(axis=1)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from curate.detectors.recorded.answers import Answer, Answers, Reading
-from curate.detectors.recorded.formats import read_answers
+from curate.detectors.recorded.formats import read_results
+from curate.detectors.recorded.results import Answers, ReadOptions, RecordedResult
 from curate.errors import ConfigError, DataError
 from curate.geometry.similarity import Similarity
 
@@ -29,7 +29,7 @@ class PassesRecord:
 
     @classmethod
     def read(
-        cls, path: Path, kind: str, reading: Reading, passes: Sequence[Mapping[str, Any]]
+        cls, path: Path, kind: str, reading: ReadOptions, passes: Sequence[Mapping[str, Any]]
     ) -> "PassesRecord":
         """All passes, in the same format.
 
@@ -50,8 +50,8 @@ class PassesRecord:
             place = path.parent / one["path"]
             if not place.exists():
                 raise DataError(f"{place}: no such record; see detector.options.passes")
-            augmented.append((place, similarity, read_answers(place, kind, reading)))
-        return cls(path, read_answers(path, kind, reading), augmented)
+            augmented.append((place, similarity, read_results(place, kind, reading)))
+        return cls(path, read_results(path, kind, reading), augmented)
 
     @property
     def has_views(self) -> bool:
@@ -62,11 +62,11 @@ class PassesRecord:
         """The frames of the first pass, in sorted order."""
         return tuple(sorted(self.plain))
 
-    def answer(self, frame_id: str) -> Answer:
+    def answer(self, frame_id: str) -> RecordedResult:
         """What the first pass found; DataError where it has no such frame."""
         return _of(self.plain, frame_id, self.path)
 
-    def views(self, frame_id: str) -> Sequence[tuple[Similarity, Answer]]:
+    def views(self, frame_id: str) -> Sequence[tuple[Similarity, RecordedResult]]:
         """What the further passes found; DataError where one has no such frame."""
         return [
             (similarity, _of(answers, frame_id, path))
@@ -74,7 +74,7 @@ class PassesRecord:
         ]
 
 
-def _of(answers: Answers, frame_id: str, path: Path) -> Answer:
+def _of(answers: Answers, frame_id: str, path: Path) -> RecordedResult:
     if frame_id not in answers:
         raise DataError(f"no recorded detections for frame {frame_id} in {path}")
     return answers[frame_id]

@@ -41,7 +41,7 @@ _STORES = frozenset({"PUT", "BINPUT", "LONG_BINPUT"})
 _DEEPEST = 40
 
 
-class _RefusedError(Exception):
+class _RejectedError(Exception):
     """The pickle names something that is not in the table."""
 
 
@@ -58,10 +58,10 @@ def read_plain_pickle(path: Path) -> Any:
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from error
     try:
-        _refuse_absurd(content)
+        _check_claimed_sizes(content)
         held = _PlainUnpickler(io.BytesIO(content)).load()
         _unfolded(held, 16 * len(content) + 1000)
-    except _RefusedError as refused:
+    except _RejectedError as refused:
         raise DataError(
             f"{path}: refused, the pickle names {refused}; only numpy arrays and plain containers "
             "are read: save tensors and boxes as arrays (boxes.tensor.numpy())"
@@ -72,7 +72,7 @@ def read_plain_pickle(path: Path) -> Any:
     return held
 
 
-def _refuse_absurd(content: bytes) -> None:
+def _check_claimed_sizes(content: bytes) -> None:
     """UnpicklingError for what the interpreter of pickles would take at its word, at any cost.
 
     A length beyond the end of the file is a ValueError of pickletools; a number in the table of
@@ -137,7 +137,7 @@ class _PlainUnpickler(pickle.Unpickler):
         """The stand-in for a name."""
         name = f"{module_name}.{global_name}"
         if name not in _ADMITTED:
-            raise _RefusedError(repr(name[:80]).strip("'\""))
+            raise _RejectedError(repr(name[:80]).strip("'\""))
         return _ADMITTED[name]
 
 
@@ -166,7 +166,7 @@ class _Type:
     def __init__(self, name: str, _align: object = False, _copy: object = True) -> None:
         self.made = np.dtype(str(name))
         if self.made.kind not in _KINDS:
-            raise _RefusedError(f"numpy.dtype {name}")
+            raise _RejectedError(f"numpy.dtype {name}")
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         if state[1] in {"<", ">"}:

@@ -22,7 +22,7 @@ from typing import BinaryIO
 import numpy as np
 
 from curate.detections import Detections, as_categories
-from curate.detectors.recorded.answers import LARGEST
+from curate.detectors.recorded.results import LARGEST
 from curate.errors import DataError, one_line
 from curate.files.batches import batched
 from curate.geometry.similarity import Similarity, wrap_angle
@@ -181,7 +181,7 @@ def _views_of(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -
         DataError: a row has a value that cannot be, or rows of one view do not agree.
     """
     numbers = _parse_numbers(path, rows, lines)
-    _refuse_impossible(path, lines, numbers)
+    _check_values(path, lines, numbers)
     similarities, scores = numbers[:, 1:4], numbers[:, 4]
     boxes = numbers[:, 5:].copy()
     boxes[:, 6] = wrap_angle(boxes[:, 6])
@@ -211,7 +211,7 @@ def _parse_numbers(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[in
     return numbers
 
 
-def _refuse_impossible(path: Path, lines: Sequence[int], numbers: np.ndarray) -> None:
+def _check_values(path: Path, lines: Sequence[int], numbers: np.ndarray) -> None:
     """DataError at the first row that no detector can have answered."""
     view, flip_y, rotation_rad, scale, score = numbers[:, :5].T
     identity = (flip_y == 0) & (rotation_rad == 0) & (scale == 1)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import ClassVar, Protocol
 
 from curate.frames import Frame
-from curate.review.answer import EditedBox
+from curate.review.edits import EditedBox
 from curate.review.sheet import Sheet
 
 Reader = Callable[[str], Frame]

@@ -24,10 +24,10 @@ import numpy as np
 from curate.errors import DataError
 from curate.frames import Frame
 from curate.geometry.similarity import wrap_angle
-from curate.review.answer import EditedBox
 from curate.review.editors.base import Reader
 from curate.review.editors.documents import numbers, write_json
-from curate.review.editors.names import refuse_strangers
+from curate.review.editors.names import check_frame_names
+from curate.review.edits import EditedBox
 from curate.review.sheet import Sheet, ShownFrame
 
 ANNOTATIONS = "annotations.zip"
@@ -69,7 +69,7 @@ class CvatEditor:
                 boxes = found.setdefault(name, [])
                 for i, each in enumerate(item.get("annotations") or (), start=1):
                     boxes += _read_cuboid(each, names, f"{place}: frame {name}, annotation {i}")
-        refuse_strangers(path, found, sheet)
+        check_frame_names(path, found, sheet)
         return found
 
 

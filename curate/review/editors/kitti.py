@@ -23,9 +23,9 @@ from curate.datasets.kitti.labels import (
 )
 from curate.detections import Detections
 from curate.errors import DataError
-from curate.review.answer import EditedBox
 from curate.review.editors.base import Reader
-from curate.review.editors.names import refuse_strangers
+from curate.review.editors.names import check_frame_names
+from curate.review.edits import EditedBox
 from curate.review.sheet import Sheet
 
 
@@ -56,7 +56,7 @@ class KittiEditor:
         paths = {
             path.stem: path for path in sorted(folder.glob("*.txt")) if path.name[0] not in "._"
         }
-        refuse_strangers(folder, paths, sheet)
+        check_frame_names(folder, paths, sheet)
         return {name: _read_file(path, sheet, name, read) for name, path in paths.items()}
 
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from curate.errors import DataError
 from curate.geometry.similarity import wrap_angle
-from curate.review.answer import EditedBox
 from curate.review.editors.base import Reader
 from curate.review.editors.documents import numbers, write_json
-from curate.review.editors.names import refuse_strangers
+from curate.review.editors.names import check_frame_names
+from curate.review.edits import EditedBox
 from curate.review.sheet import Sheet, ShownFrame, read_json
 
 _COLOURS = ("#FFD23F", "#3BCEAC", "#EE4266", "#9DA2AB", "#4C9BE8", "#B388EB")
@@ -66,7 +66,7 @@ class LabelCloudEditor:
             path.stem: path for path in sorted(folder.glob("*.json")) if path.name[0] not in "._"
         }
         paths.pop("review", None)
-        refuse_strangers(folder, paths, sheet)
+        check_frame_names(folder, paths, sheet)
         return {name: _read_file(path) for name, path in paths.items()}
 
 

@@ -7,7 +7,7 @@ from curate.errors import DataError
 from curate.review.sheet import Sheet
 
 
-def refuse_strangers(place: Path, names: Iterable[str], sheet: Sheet) -> None:
+def check_frame_names(place: Path, names: Iterable[str], sheet: Sheet) -> None:
     """DataError where an answer holds frames that the review does not."""
     shown = {frame.frame for frame in sheet.frames}
     strangers = sorted(set(names) - shown)

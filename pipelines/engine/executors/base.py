@@ -152,7 +152,7 @@ class JobQueue:
         """The next job; None where there is none."""
         return self._again.popleft() if self._again else next(self._next, None)
 
-    def give_back(self, jobs: Iterable[Job]) -> None:
+    def return_jobs(self, jobs: Iterable[Job]) -> None:
         """Takes jobs back that nobody has begun."""
         self._again.extend(jobs)
 
@@ -160,11 +160,13 @@ class JobQueue:
         """A worker has loaded its models."""
         self._dead_openings = 0
 
-    def bury(self, in_hand: Sequence[Job], reason: str, *, opened: bool) -> Iterator[Outcome]:
+    def record_crash(
+        self, in_flight: Sequence[Job], reason: str, *, opened: bool
+    ) -> Iterator[Outcome]:
         """Takes back what a dead worker had in hand; a frame that was tried too often has failed.
 
         Args:
-            in_hand: its jobs in their order; it had begun the first, if any.
+            in_flight: its jobs in their order; it had begun the first, if any.
             reason: how it died.
             opened: whether it had loaded its models.
 
@@ -178,10 +180,10 @@ class JobQueue:
                     f"{self._openings} workers in a row died while they loaded their models, the "
                     f"last {reason}; run again with fewer workers, finished frames are kept"
                 )
-            self.give_back(in_hand)
+            self.return_jobs(in_flight)
             return
-        begun, rest = in_hand[:1], in_hand[1:]
-        self.give_back(rest)
+        begun, rest = in_flight[:1], in_flight[1:]
+        self.return_jobs(rest)
         for job in begun:
             self._deaths[job.title] += 1
             if self._deaths[job.title] < TRIES:

@@ -49,8 +49,8 @@ class ProcessExecutor:
         packed = pickle.dumps(function)
         try:
             while True:
-                self._hand_out(packed, queue)
-                busy = {worker.connection: worker for worker in self._crew if worker.in_hand}
+                self._dispatch(packed, queue)
+                busy = {worker.connection: worker for worker in self._crew if worker.in_flight}
                 if not busy:
                     return
                 speaking = wait(list(busy), PULSE_S)
@@ -58,26 +58,26 @@ class ProcessExecutor:
                     if connection in speaking or not worker.process.is_alive():
                         yield from self._collect(worker, queue)
         finally:
-            for worker in [worker for worker in self._crew if worker.in_hand]:
+            for worker in [worker for worker in self._crew if worker.in_flight]:
                 self._dismiss(worker)
 
     def close(self) -> None:
         """Ends the workers."""
         for worker in self._crew:
-            worker.retire()
+            worker.shut_down()
         for worker in list(self._crew):
             worker.process.join(PULSE_S)
             self._dismiss(worker)
 
-    def _hand_out(self, packed: bytes, queue: JobQueue) -> None:
+    def _dispatch(self, packed: bytes, queue: JobQueue) -> None:
         while (job := queue.take()) is not None:
-            idle = min(self._crew, key=lambda worker: len(worker.in_hand), default=None)
-            if len(self._crew) < self.workers and (idle is None or idle.in_hand):
+            idle = min(self._crew, key=lambda worker: len(worker.in_flight), default=None)
+            if len(self._crew) < self.workers and (idle is None or idle.in_flight):
                 self._crew.append(idle := _Worker())
-            if idle is None or len(idle.in_hand) == IN_HAND:
-                queue.give_back([job])
+            if idle is None or len(idle.in_flight) == IN_HAND:
+                queue.return_jobs([job])
                 return
-            idle.give(packed, job)
+            idle.send(packed, job)
 
     def _collect(self, worker: "_Worker", queue: JobQueue) -> Iterator[Outcome]:
         """What a worker answers; what it leaves behind if it is dead."""
@@ -88,7 +88,9 @@ class ProcessExecutor:
         if isinstance(answer, EOFError | OSError):
             worker.process.join(PULSE_S)
             self._dismiss(worker)
-            yield from queue.bury(list(worker.in_hand), worker.end(), opened=worker.opened)
+            yield from queue.record_crash(
+                list(worker.in_flight), worker.end(), opened=worker.opened
+            )
             return
         if isinstance(answer, CurateError):
             raise answer
@@ -96,7 +98,7 @@ class ProcessExecutor:
             worker.opened = True
             queue.opened()
         else:
-            yield Outcome(worker.in_hand.popleft(), *answer)
+            yield Outcome(worker.in_flight.popleft(), *answer)
 
     def _dismiss(self, worker: "_Worker") -> None:
         self._crew.remove(worker)
@@ -114,20 +116,20 @@ class _Worker:
         self.process = context.Process(target=_serve, args=(theirs,))
         self.process.start()
         theirs.close()
-        self.in_hand: deque[Job] = deque()
+        self.in_flight: deque[Job] = deque()
         self.opened = False
         self._packed = b""
 
-    def give(self, packed: bytes, job: Job) -> None:
+    def send(self, packed: bytes, job: Job) -> None:
         """Hands a job over, and before it the function, where that is another one."""
-        self.in_hand.append(job)
+        self.in_flight.append(job)
         with contextlib.suppress(OSError):  # it has died; its end of the pipe will tell
             if packed != self._packed:
                 self._packed, self.opened = packed, False
                 self.connection.send(packed)
             self.connection.send(job)
 
-    def retire(self) -> None:
+    def shut_down(self) -> None:
         """Lets it end by itself, which a model may need to put its things in order."""
         with contextlib.suppress(OSError):
             self.connection.send(None)

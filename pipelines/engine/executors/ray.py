@@ -62,7 +62,7 @@ class RayExecutor:
             _join(self._ray, address, workers)
         # A dead actor is replaced by another one, so that it is known which frame it had begun.
         options = {**self._needs, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
-        self._holder = self._ray.remote(**options)(Holder)
+        self._holder = self._ray.remote(**options)(RayWorker)
         self._crew: list[_Actor] = []
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
@@ -76,14 +76,14 @@ class RayExecutor:
         packed = pickle.dumps(function)
         placed_at = time.monotonic()
         try:
-            while self._hand_out(packed, queue):
+            while self._dispatch(packed, queue):
                 heads = {actor.head(): actor for actor in self._crew if actor.answers}
                 ready, _ = self._ray.wait(list(heads), num_returns=1, timeout=PULSE_S)
                 for ref in ready:
                     yield from self._collect(heads[ref], queue)
                 if any(actor.placed for actor in self._crew):
                     placed_at = time.monotonic()
-                self._refuse_to_wait_for_ever(placed_at)
+                self._check_placement_timeout(placed_at)
         finally:
             for actor in [actor for actor in self._crew if actor.answers]:
                 self._dismiss(actor)
@@ -95,7 +95,7 @@ class RayExecutor:
         if self._own:
             self._ray.shutdown()
 
-    def _hand_out(self, packed: bytes, queue: JobQueue) -> bool:
+    def _dispatch(self, packed: bytes, queue: JobQueue) -> bool:
         """Gives every actor that has loaded its models work; False where all is done."""
         while (job := queue.take()) is not None:
             while len(self._crew) < self.workers:
@@ -104,9 +104,9 @@ class RayExecutor:
                 actor.open(packed)
             able = [actor for actor in self._crew if actor.opened and len(actor.jobs) < IN_HAND]
             if not able:
-                queue.give_back([job])
+                queue.return_jobs([job])
                 return True
-            min(able, key=lambda actor: len(actor.jobs)).give(job)
+            min(able, key=lambda actor: len(actor.jobs)).send(job)
         return any(actor.jobs for actor in self._crew)
 
     def _collect(self, actor: "_Actor", queue: JobQueue) -> Iterator[Outcome]:
@@ -118,7 +118,7 @@ class RayExecutor:
         except self._ray.exceptions.RayError as error:
             jobs, opened = list(actor.jobs), actor.opened
             self._dismiss(actor)
-            yield from queue.bury(jobs, _reason(error), opened=opened)
+            yield from queue.record_crash(jobs, _reason(error), opened=opened)
             return
         if isinstance(answer, CurateError):
             raise answer
@@ -135,7 +135,7 @@ class RayExecutor:
         self._crew.remove(actor)
         self._ray.kill(actor.handle)
 
-    def _refuse_to_wait_for_ever(self, placed_at: float) -> None:
+    def _check_placement_timeout(self, placed_at: float) -> None:
         if time.monotonic() - placed_at > self.start_timeout_s:
             offered = self._ray.cluster_resources()
             raise CurateError(
@@ -145,7 +145,7 @@ class RayExecutor:
             )
 
 
-class Holder:
+class RayWorker:
     """What runs in an actor: the function of the stage at hand, with its models."""
 
     def __init__(self, search_path: Sequence[str]) -> None:
@@ -200,7 +200,7 @@ class _Actor:
             self._packed, self.opened = packed, False
             self.answers.append(self.handle.open.remote(packed))
 
-    def give(self, job: Job) -> None:
+    def send(self, job: Job) -> None:
         """Hands a job over."""
         self.jobs.append(job)
         self.answers.append(self.handle.work.remote(job))

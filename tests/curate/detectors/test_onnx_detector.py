@@ -40,7 +40,7 @@ def upside_down(outputs):
     }
 
 
-def in_words(outputs):
+def summary_sentences(outputs):
     """A postprocess that names the classes."""
     return {**outputs, "labels": np.array(["Car"] * len(outputs["labels"]))}
 
@@ -139,7 +139,12 @@ def test_functions_of_the_user_come_before_and_after(path):
         ({}, {"labels": np.array([0, 1, 7])}, ModelError, "labels 0 to 7, but classes Car,"),
         ({}, {"labels": np.array([0, 1])}, ModelError, r"labels \[2\]; expected"),
         ({}, {"scores": np.zeros((3, 0))}, ModelError, r"scores \[3, 0\], labels \[0\]; expected"),
-        ({"postprocess": f"{__name__}:in_words"}, {}, ModelError, "answers <U3 where numbers were"),
+        (
+            {"postprocess": f"{__name__}:summary_sentences"},
+            {},
+            ModelError,
+            "answers <U3 where numbers were",
+        ),
         ({"postprocess": f"{__name__}:between_classes"}, {}, ModelError, "labels 0.5 to 1.5, but"),
         ({"convention": {"order": "xyz"}}, {}, ConfigError, "order 'xyz': use lwh"),
         ({"convention": {"handed": "left"}}, {}, ConfigError, "unexpected keyword"),

@@ -151,7 +151,7 @@ def test_the_order_of_frames_does_not_change_a_figure():
 
 def test_no_labels_and_no_objects_are_no_failure():
     """Counts of 0 and figures that are undefined."""
-    nothing = JudgedLabels.of_no_frame()
+    nothing = JudgedLabels.no_frames()
     found = small_audit({name: np.zeros(0) for name in WEIGHTS}, nothing).whole()["good"]
     assert (found.labels, found.right, found.objects) == (0, 0, 0)
     for name in ("share_right", "auroc", "weighted_precision", "weighted_recall"):

@@ -6,19 +6,19 @@ import numpy as np
 from support.audited import many_labels, six_labels, small_audit
 
 from curate.evaluation.audit import audit
-from curate.evaluation.audit_summary import as_numbers, in_words
+from curate.evaluation.audit_summary import as_numbers, summary_sentences
 from curate.evaluation.judged_labels import JudgedLabels
 
 
 def words(labels, weights, policies, evidence=()):
     """All sentences as one text."""
     found = audit(labels, weights, ("Car", "Cyclist"), np.random.default_rng(0), replicates=200)
-    return " ".join(in_words(found, policies, evidence))
+    return " ".join(summary_sentences(found, policies, evidence))
 
 
 def test_it_says_how_much_is_right_and_what_was_left_out():
     """In all and by category, with the neutral labels and a warning for few frames."""
-    text = " ".join(in_words(small_audit(), ("good", "bad", "all"), ()))
+    text = " ".join(summary_sentences(small_audit(), ("good", "bad", "all"), ()))
     assert text.startswith("2 of 5 labels are right, 40.0 % (")
     assert "on 3 frames with 5 objects (Car 50.0 %, Cyclist 0.0 %)" in text
     assert "1 more are neither right nor wrong" in text
@@ -38,7 +38,7 @@ def test_it_names_the_best_judge_and_the_next():
 
 def test_it_says_where_the_weight_lies():
     """The best policy by that measure first, with the share of each."""
-    text = " ".join(in_words(small_audit(), ("all", "good"), ()))
+    text = " ".join(summary_sentences(small_audit(), ("all", "good"), ()))
     assert "from good, 89.5 %" in text
     assert text.endswith("lies on right labels; all 40.0 %.")
 
@@ -63,7 +63,7 @@ def test_nothing_to_tell_apart_is_said():
     wrong.right[:] = False
     text = words(wrong, {"all": np.ones(6)}, ("all",))
     assert "All labels are wrong, so no weight can tell right from wrong" in text
-    nothing = words(JudgedLabels.of_no_frame(), {"all": np.zeros(0)}, ("all",))
+    nothing = words(JudgedLabels.no_frames(), {"all": np.zeros(0)}, ("all",))
     assert nothing == "There is no label on 0 frames with 0 objects, so there is nothing to audit."
 
 

@@ -9,8 +9,8 @@ from curate.review.human_labels import (
     REFUSED_IOU,
     SAME_OBJECT_IOU,
     HumanLabels,
-    entangled,
-    speak_for,
+    match_human_labels,
+    overlapping_objects,
     superseded,
 )
 
@@ -34,7 +34,9 @@ def along(share: float) -> np.ndarray:
 def test_an_object_takes_whatever_overlaps_it() -> None:
     """Of any category, from an IoU of 0.1 on; what overlaps most leads."""
     boxes = np.stack([along(SAME_OBJECT_IOU + 0.02), along(0.8), along(SAME_OBJECT_IOU - 0.02)])
-    spoken = speak_for(boxes, as_categories(["Car", "Van", "Car"]), labels(("added", "Car", BOX)))
+    spoken = match_human_labels(
+        boxes, as_categories(["Car", "Van", "Car"]), labels(("added", "Car", BOX))
+    )
     assert spoken.label.tolist() == [0, 0, -1]
     assert spoken.leads.tolist() == [False, True, False]
     np.testing.assert_allclose(spoken.iou, [SAME_OBJECT_IOU + 0.02, 0.8, 0], atol=1e-9)
@@ -44,7 +46,7 @@ def test_a_refusal_holds_for_its_category_and_place() -> None:
     """From an IoU of 0.3 on; the same place with another category is a claim of its own."""
     boxes = np.stack([along(REFUSED_IOU + 0.02), along(REFUSED_IOU - 0.02), BOX])
     names = as_categories(["Car", "Car", "Pedestrian"])
-    spoken = speak_for(boxes, names, labels(("rejected", "Car", BOX)))
+    spoken = match_human_labels(boxes, names, labels(("rejected", "Car", BOX)))
     assert spoken.label.tolist() == [0, -1, -1]
     assert not spoken.leads.any()
 
@@ -52,16 +54,20 @@ def test_a_refusal_holds_for_its_category_and_place() -> None:
 def test_objects_come_before_refusals() -> None:
     """Where both could speak for a prediction, it is the object that does."""
     both = labels(("rejected", "Car", BOX), ("accepted", "Car", along(0.4)))
-    assert speak_for(BOX[None], as_categories(["Car"]), both).label.tolist() == [1]
+    assert match_human_labels(BOX[None], as_categories(["Car"]), both).label.tolist() == [1]
 
 
 def test_without_boxes_nothing_is_spoken_for() -> None:
     """Empty on either side."""
     assert (
-        len(speak_for(np.zeros((0, 7)), as_categories([]), labels(("added", "Car", BOX))).label)
+        len(
+            match_human_labels(
+                np.zeros((0, 7)), as_categories([]), labels(("added", "Car", BOX))
+            ).label
+        )
         == 0
     )
-    assert speak_for(BOX[None], as_categories(["Car"]), labels()).label.tolist() == [-1]
+    assert match_human_labels(BOX[None], as_categories(["Car"]), labels()).label.tolist() == [-1]
 
 
 @settings(deadline=None)
@@ -71,7 +77,7 @@ def test_every_object_leads_at_most_one_prediction(places: list[tuple[float, flo
     boxes = np.tile(BOX, (len(places), 1))
     boxes[:, :2] = places
     human = labels(*(("accepted", "Car", box) for box in boxes[::2]))
-    spoken = speak_for(boxes, as_categories(["Car"] * len(boxes)), human)
+    spoken = match_human_labels(boxes, as_categories(["Car"] * len(boxes)), human)
     assert (spoken.label[::2] >= 0).all()
     led = spoken.label[spoken.leads]
     assert len(led) == len(set(led.tolist()))
@@ -89,5 +95,7 @@ def test_a_later_decision_takes_the_place_of_an_earlier_one() -> None:
 
 def test_objects_in_each_other_are_found() -> None:
     """A refused box may lie in an object."""
-    assert entangled(labels(("accepted", "Car", BOX), ("accepted", "Van", along(0.9)))) == [(0, 1)]
-    assert entangled(labels(("accepted", "Car", BOX), ("rejected", "Van", BOX))) == []
+    assert overlapping_objects(
+        labels(("accepted", "Car", BOX), ("accepted", "Van", along(0.9)))
+    ) == [(0, 1)]
+    assert overlapping_objects(labels(("accepted", "Car", BOX), ("rejected", "Van", BOX))) == []

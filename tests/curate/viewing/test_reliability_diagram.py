@@ -55,6 +55,6 @@ def test_undefined_figures_are_drawn_as_nothing():
     wrong.right[:] = False
     for found in (
         small_audit(labels=wrong),
-        small_audit({"all": np.zeros(0)}, JudgedLabels.of_no_frame()),
+        small_audit({"all": np.zeros(0)}, JudgedLabels.no_frames()),
     ):
         assert draw_reliability(found, "title").ndim == 3

@@ -3,13 +3,13 @@
 import pytest
 
 from pipelines.engine import progress
-from pipelines.engine.progress import reaching
+from pipelines.engine.progress import as_total
 
 
 def test_totals_become_steps() -> None:
     """Whoever tells how much is done in all moves a bar that takes how much more is done."""
     moves: list[tuple[int, str]] = []
-    reach = reaching(lambda step, note: moves.append((step, note)))
+    reach = as_total(lambda step, note: moves.append((step, note)))
     reach(3, 10)
     reach(3, 10, "waits")
     reach(10, 10, "done")

@@ -65,8 +65,8 @@ def boxed_instances(
     fits = boxes.ndim == 2 and boxes.shape[1] in (4, 5) and masks.ndim == 3
     if not fits or {labels.shape, scores.shape, masks.shape[:1]} != {boxes.shape[:1]}:
         raise ModelError(_misfit(answer, "boxes [n, 4], labels [n], scores [n], masks [n, h, w]"))
-    _refuse_strange(boxes, scores, labels.astype(np.float64))
-    _refuse_cells(masks)
+    _check_instances(boxes, scores, labels.astype(np.float64))
+    _check_masks(masks)
     whole = (0.0, 0.0, float(size[0]), float(size[1]))
     is_whole = masks.shape[1:] == (size[1], size[0])
     for i in _rising(scores, minimum_score):
@@ -91,8 +91,8 @@ def prototype_instances(
     labels = rows[:, 4 : 4 + classes].argmax(axis=1)
     scores = rows[np.arange(len(rows)), 4 + labels]
     corners = np.column_stack([rows[:, :2] - rows[:, 2:4] / 2, rows[:, :2] + rows[:, 2:4] / 2])
-    _refuse_strange(corners, scores, labels.astype(np.float64))
-    _refuse_cells(prototypes)
+    _check_instances(corners, scores, labels.astype(np.float64))
+    _check_masks(prototypes)
     first = np.array(_rising(scores, minimum_score), dtype=np.int64)
     left_top = np.column_stack([corners[first, :2], rows[first, 2:4]])
     kept = cv2.dnn.NMSBoxesBatched(
@@ -126,7 +126,7 @@ def _rising(scores: np.ndarray, minimum_score: float) -> list[int]:
     return rising
 
 
-def _refuse_strange(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray) -> None:
+def _check_instances(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray) -> None:
     """ModelError for numbers that are none, or labels that are no whole ones."""
     if not (np.abs(boxes) < _FARTHEST).all() or not np.isfinite(scores).all():
         raise ModelError(f"answers a box or score that is NaN, infinite or beyond {_FARTHEST:g}")
@@ -135,7 +135,7 @@ def _refuse_strange(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray) -
         raise ModelError(f"answers label {labels[~whole][0]}, which is no whole number")
 
 
-def _refuse_cells(masks: np.ndarray) -> None:
+def _check_masks(masks: np.ndarray) -> None:
     """ModelError for masks without cells, or with more than any image needs."""
     height, width = masks.shape[-2:]
     if len(masks) and not (0 < height <= _MOST_CELLS and 0 < width <= _MOST_CELLS):

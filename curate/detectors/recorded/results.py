@@ -17,7 +17,7 @@ from curate.geometry.similarity import wrap_angle
 LARGEST = 1e6
 
 
-class Placed(Protocol):
+class ForeignBoxes(Protocol):
     """Boxes in another frame of reference, waiting for the calibration of their frame."""
 
     def in_lidar(self, calibration: Calibration) -> Detections:
@@ -25,15 +25,15 @@ class Placed(Protocol):
         ...
 
 
-Answer = Detections | KittiObjects | Placed
+RecordedResult = Detections | KittiObjects | ForeignBoxes
 """Of one frame; what is not in the LiDAR's frame of reference waits for the calibration."""
 
-Answers = Mapping[str, Answer]
+Answers = Mapping[str, RecordedResult]
 """Of one pass of a detector over a data set, by frame."""
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReadOptions:
     """What some formats leave to the reader.
 
     Attributes:

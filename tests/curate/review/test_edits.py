@@ -6,7 +6,7 @@ import pytest
 from support.reviews import CAR, CATEGORIES, WALKER, small_sheet
 
 from curate.errors import DataError
-from curate.review.answer import Answer, EditedBox, check_boxes, read_answer
+from curate.review.edits import Answer, EditedBox, check_boxes, read_answer
 
 FRAME = small_sheet().frames[0]
 
