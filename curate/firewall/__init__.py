@@ -1,1 +1,1 @@
-"""The leakage firewall: what may be on both sides of a split, and what may not."""
+"""The leakage firewall: finds data that two splits must not share."""

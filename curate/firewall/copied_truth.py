@@ -1,17 +1,17 @@
-"""Ground truth that passes for a detection: a box that repeats an annotator's to the millimetre."""
+"""Find detections that are copies of ground truth boxes."""
 
 import numpy as np
 
 from curate.detections import Annotations
 
-# A detector that is this near in position, size and heading at once has seen the label.
+# No detector is this close in position, size and heading at once without having seen the label.
 _TOLERANCE = 1e-3  # metres and radians
 
 
 def copied_boxes(boxes: np.ndarray, truth: Annotations) -> np.ndarray:
-    """(n,) bool, which of (n, 7) boxes repeat a box of the ground truth; both in the LiDAR frame.
+    """Return (n,) bool: which of (n, 7) boxes equal a ground truth box, both in the LiDAR frame.
 
-    A heading turned by half a turn still counts as the same box.
+    A yaw that differs by half a turn still counts as the same box.
     """
     known = truth.boxes[np.isfinite(truth.boxes).all(axis=1)]
     if len(boxes) == 0 or len(known) == 0:

@@ -1,7 +1,7 @@
-"""The same recording under two names: files of equal size and content in different splits.
+"""Find one recording under two names: files with the same content in different splits.
 
-Files are told apart by size, then by the hash of their first bytes, and only where both are equal
-by all of their content. Hashes of heads are kept between runs, by path, size and time of change.
+Files are compared by size, then by the hash of their first bytes, and only if both are equal by
+their whole content. The hashes of first bytes are cached between runs by path, size and mtime.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ from curate.files.atomic import replace_file
 _log = logging.getLogger(__name__)
 
 HEAD_BYTES = 1 << 16
-# A smaller file is an empty sweep or a blank image, and alike without being the same recording.
+# Smaller files are empty sweeps or blank images, which are equal without being one recording.
 SMALLEST_BYTES = 256
 
 
@@ -25,7 +25,7 @@ class SplitFile:
     """A file of a frame.
 
     Attributes:
-        split: that the frame belongs to.
+        split: of the frame.
         frame: its name.
         path: of the file.
     """
@@ -36,7 +36,7 @@ class SplitFile:
 
 
 class HeadHashes:
-    """Hashes of the first bytes of files, kept in a JSON file; a damaged one is made anew.
+    """A cache of the hashes of files' first bytes, in a JSON file; a damaged cache is rebuilt.
 
     Args:
         path: of the JSON file.
@@ -48,7 +48,7 @@ class HeadHashes:
         self._changed = False
 
     def of(self, path: Path, size: int, changed_ns: int) -> str:
-        """The hash of the first bytes of a file, read only where it has changed."""
+        """Return the hash of a file's first bytes; the file is read only if it has changed."""
         known = self._known.get(str(path))
         if isinstance(known, list) and known[:2] == [size, changed_ns] and len(known) == 3:
             return str(known[2])
@@ -59,7 +59,7 @@ class HeadHashes:
         return head
 
     def save(self) -> None:
-        """Keeps what was learned."""
+        """Write the cache if it has changed."""
         if self._changed:
             replace_file(self._path, json.dumps(self._known).encode())
 
@@ -67,9 +67,9 @@ class HeadHashes:
 def find_duplicates(
     files: Iterable[SplitFile], heads: HeadHashes
 ) -> list[tuple[SplitFile, SplitFile]]:
-    """Pairs of files of different splits that hold the same, one pair per content and split.
+    """Return pairs of equal files in different splits, one pair per content and split.
 
-    Files that are not there, or too small to tell anything, are left out.
+    Files that are missing or smaller than `SMALLEST_BYTES` are skipped.
     """
     by_size: dict[int, list[tuple[SplitFile, int]]] = {}
     for file in files:
@@ -92,7 +92,7 @@ def find_duplicates(
 
 
 def _pairs(alike: list[SplitFile]) -> list[tuple[SplitFile, SplitFile]]:
-    """Of files with equal heads, those that are equal to the end, across splits."""
+    """Return the pairs across splits, among files with equal first bytes, that are equal."""
     if len({file.split for file in alike}) < 2:
         return []
     first: dict[str, dict[str, SplitFile]] = {}
@@ -113,6 +113,6 @@ def _read_known(path: Path) -> dict[str, list[int | str]]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, RecursionError):
-        _log.warning("%s is damaged; hashing anew", path)
+        _log.warning("%s is damaged; hashing all files again", path)
         return {}
     return dict(known) if isinstance(known, Mapping) else {}

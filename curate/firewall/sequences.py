@@ -1,4 +1,4 @@
-"""Sequences: neighbours within a drive look almost the same, so a drive belongs to one split."""
+"""Sequences: frames of one drive look almost the same, so a drive belongs to one split."""
 
 from collections.abc import Iterable, Mapping
 from itertools import combinations
@@ -11,10 +11,10 @@ from curate.errors import ConfigError
 def straddling(
     sequences: Mapping[str, str], splits: Mapping[str, Iterable[str]]
 ) -> Mapping[tuple[str, str], list[str]]:
-    """The sequences that two splits share, for each pair of splits that shares some.
+    """Return the sequences that two splits share, by pair of splits.
 
     Args:
-        sequences: the sequence of each frame; frames without one are not in it.
+        sequences: the sequence of each frame; frames without a sequence are absent.
         splits: the frames of each split.
     """
     held = {
@@ -31,23 +31,23 @@ def choose_sequences(
     count: int,
     generator: np.random.Generator,
 ) -> list[str]:
-    """Whole sequences in random order, so many that their frames come nearest to a count.
+    """Choose whole sequences at random until their number of frames is closest to a count.
 
     Args:
-        sequences: the sequence of each frame; a frame without one stands for itself.
+        sequences: the sequence of each frame; a frame without one is its own sequence.
         pool: the frames to choose from.
-        count: how many of them are wanted, at least one.
+        count: number of frames to choose, at least one.
         generator: draws the order.
 
     Raises:
-        ConfigError: any choice would be all or nothing.
+        ConfigError: if all frames belong to one sequence, so that it is all or nothing.
     """
     groups = group_by_sequence(sequences, pool)
     if len(groups) == 1 and 0 < count < len(next(iter(groups.values()))):
         raise ConfigError(
-            f"all {len(next(iter(groups.values())))} frames are of sequence {next(iter(groups))}; "
-            "a share of it would put near-duplicate frames on both sides: record more sequences, "
-            "or split by frame all the same with --split-by frame"
+            f"all {len(next(iter(groups.values())))} frames belong to sequence "
+            f"{next(iter(groups))}; splitting it would put near-duplicate frames on both sides. "
+            "Add more sequences, or split by frame anyway with --split-by frame"
         )
     chosen: list[str] = []
     for name in generator.permutation(sorted(groups)).tolist():
@@ -59,7 +59,7 @@ def choose_sequences(
 def group_by_sequence(
     sequences: Mapping[str, str], frames: Iterable[str]
 ) -> Mapping[str, list[str]]:
-    """The frames of each sequence; a frame without one stands for itself."""
+    """Return the frames of each sequence; a frame without one is its own sequence."""
     groups: dict[str, list[str]] = {}
     for frame in frames:
         groups.setdefault(sequences.get(frame, frame), []).append(frame)

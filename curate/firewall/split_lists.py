@@ -1,4 +1,4 @@
-"""Lists of frames, their hash, and what changed between two of them in words."""
+"""Split lists: the frames of a split, their hash, and a description of changes."""
 
 import hashlib
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from curate.exporters.base import named
 
 @dataclass(frozen=True)
 class SplitList:
-    """Some frames by name, each once and sorted, so that the hash depends on nothing else.
+    """Frame names, unique and sorted, so that the hash depends on nothing else.
 
     Attributes:
         frames: their names.
@@ -19,22 +19,22 @@ class SplitList:
 
     @classmethod
     def of(cls, frames: Iterable[str]) -> "SplitList":
-        """The list of some frames in any order."""
+        """Return the list of some frames, given in any order."""
         return cls(tuple(sorted(set(frames))))
 
     @classmethod
     def from_text(cls, text: str) -> "SplitList":
-        """The inverse of `text`."""
+        """Return the list written as `text`."""
         return cls(tuple(text.splitlines()))
 
     @property
     def text(self) -> str:
-        """A name per line."""
+        """One name per line."""
         return "".join(f"{frame}\n" for frame in self.frames)
 
     @property
     def sha256(self) -> str:
-        """Of the text, in hexadecimal."""
+        """SHA-256 of the text, in hexadecimal."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -42,11 +42,11 @@ class SplitList:
 
 
 def changes(before: SplitList, now: SplitList) -> str:
-    """What was added and removed, with a few names; empty where nothing was."""
+    """Describe added and removed frames with a few names; empty if nothing changed."""
     added, removed = set(now.frames) - set(before.frames), set(before.frames) - set(now.frames)
-    told = [
+    parts = [
         f"{len(frames)} {how} ({named(frames)})"
         for how, frames in (("added", added), ("removed", removed))
         if frames
     ]
-    return " and ".join(told)
+    return " and ".join(parts)

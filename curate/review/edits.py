@@ -1,9 +1,9 @@
-"""What an edited frame says: its boxes set against those that were shown.
+"""Turn an edited frame into decisions by comparing its boxes with the boxes that were shown.
 
-A box that came back as it was shown is unchanged, which by itself says nothing: it may not have
-been looked at. Of the others, those that overlap are paired, the largest overlap first: moved. What
-was shown and has gone is rejected, what is new is added. A box that was moved so far that it no
-longer overlaps is rejected there and added here.
+- A box that comes back unchanged is not a decision: nobody may have looked at it.
+- Other boxes that overlap a shown box are paired with it, largest overlap first: moved.
+- A shown box without a partner is rejected, a new box without a partner is added.
+- A box that was moved so far that it no longer overlaps is therefore rejected and added.
 """
 
 from collections.abc import Sequence
@@ -24,12 +24,12 @@ _FURTHEST_METRES, _LONGEST_METRES = 500.0, 50.0
 
 @dataclass(frozen=True)
 class EditedBox:
-    """A box of an answer.
+    """A box that a person has edited.
 
     Attributes:
-        category: as it was written.
+        category: as written in the file.
         box: x, y, z, length, width, height, yaw in the LiDAR frame.
-        place: file and line or number, for messages.
+        place: file and line or object number, for messages.
     """
 
     category: str
@@ -39,14 +39,14 @@ class EditedBox:
 
 @dataclass(frozen=True)
 class Decision:
-    """What a person decided about one object.
+    """A person's decision about one object.
 
     Attributes:
-        number: of the shown box, from 1; None for an added one.
+        number: of the shown box, from 1; None for an added box.
         decision: accepted, rejected, moved or added.
         category: of the object.
-        box: (7,) of the object in the LiDAR frame; the refused one where it is rejected.
-        seen: (7,) as it was shown; None for an added one.
+        box: (7,) in the LiDAR frame; the shown box if it was rejected.
+        seen: (7,) the box as shown; None for an added box.
     """
 
     number: int | None
@@ -57,13 +57,13 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A frame that came back.
+class FrameEdits:
+    """The decisions about one frame.
 
     Attributes:
         frame: its name.
-        decisions: what was decided.
-        untouched: how many shown boxes nothing was said about.
+        decisions: one per object that a person decided about.
+        untouched: number of shown boxes without a decision.
     """
 
     frame: str
@@ -71,43 +71,43 @@ class Answer:
     untouched: int
 
 
-def read_answer(
+def compare_frame(
     shown: ShownFrame,
     edited: Sequence[EditedBox],
-    said: "dict[int, str] | None" = None,
+    explicit: "dict[int, str] | None" = None,
     *,
     accept_rest: bool = False,
-) -> Answer:
-    """What the person decided.
+) -> FrameEdits:
+    """Return the decisions that an edited frame contains.
 
     Args:
-        shown: the frame as it was exported.
-        edited: its boxes as they came back.
-        said: what was said outright of some boxes by number: accepted or rejected.
-        accept_rest: unchanged boxes on which nothing else was said are accepted.
+        shown: the frame as exported.
+        edited: its boxes after editing.
+        explicit: decisions from the review table by box number: accepted or rejected.
+        accept_rest: accept unchanged boxes without an explicit decision.
 
     Raises:
-        DataError: a box was accepted outright and is gone, or was rejected and has been moved.
+        DataError: if a box is marked as accepted but deleted, or marked as rejected but moved.
     """
-    said = said or {}
+    explicit = explicit or {}
     unchanged, moved = _pairs(shown, edited)
     decisions, untouched = [], 0
     for place, box in enumerate(shown.boxes):
-        word = said.get(place + 1)
+        word = explicit.get(place + 1)
         if place in moved:
             now = edited[moved[place]]
             if word == REJECTED:
                 raise DataError(
-                    f"{now.place}: box {place + 1} of frame {shown.frame} has been moved and is "
-                    "marked as rejected; do one of both"
+                    f"{now.place}: box {place + 1} of frame {shown.frame} is moved and also marked "
+                    "as rejected; undo one of the two"
                 )
             found = Decision(place + 1, MOVED, now.category, now.box, box.box)
         elif word == REJECTED or (place not in unchanged and word is None):
             found = Decision(place + 1, REJECTED, box.category, box.box, box.box)
         elif place not in unchanged:
             raise DataError(
-                f"frame {shown.frame}: box {place + 1} is marked as accepted and has been deleted; "
-                "do one of both"
+                f"frame {shown.frame}: box {place + 1} is marked as accepted but deleted; undo one "
+                "of the two"
             )
         elif not box.human and (word == ACCEPTED or accept_rest):
             found = Decision(place + 1, ACCEPTED, box.category, box.box, box.box)
@@ -121,40 +121,40 @@ def read_answer(
         for place, new in enumerate(edited)
         if place not in known
     ]
-    return Answer(shown.frame, tuple(decisions), untouched)
+    return FrameEdits(shown.frame, tuple(decisions), untouched)
 
 
 def check_boxes(edited: Sequence[EditedBox], categories: Sequence[str]) -> None:
-    """Refuses boxes that cannot be.
+    """Check that edited boxes are possible.
 
     Raises:
-        DataError: a number is not finite, a side is not positive or too long, a box is too far
-            away, or its category is unknown.
+        DataError: if a number is not finite, a side is not positive or too long, a box is too far
+            from the LiDAR, or a category is unknown.
     """
     for each in edited:
         if each.category not in categories:
             raise DataError(
-                f"{each.place}: unknown category {each.category!r}; known here are "
-                f"{', '.join(categories)}"
+                f"{each.place}: unknown category {each.category!r}; the categories of this review "
+                f"are {', '.join(categories)}"
             )
         box = np.array(each.box)
         if box.shape != (7,) or not np.isfinite(box).all():
-            raise DataError(f"{each.place}: a box has a number that is not finite; correct it")
+            raise DataError(f"{each.place}: the box has a value that is not finite; correct it")
         if box[3:6].min() <= 0 or box[3:6].max() > _LONGEST_METRES:
             sides = " x ".join(f"{side:g}" for side in box[3:6])
             raise DataError(
-                f"{each.place}: sides of {sides} m; they must be above 0 and at most "
-                f"{_LONGEST_METRES:g}"
+                f"{each.place}: the sides are {sides} m; each must be above 0 and at most "
+                f"{_LONGEST_METRES:g} m"
             )
         if np.abs(box[:3]).max() > _FURTHEST_METRES:
             raise DataError(
-                f"{each.place}: a box {np.abs(box[:3]).max():g} m away from the LiDAR; its "
-                "coordinates are in another frame of reference"
+                f"{each.place}: the box is {np.abs(box[:3]).max():g} m away from the LiDAR; its "
+                "coordinates are probably in another frame of reference"
             )
 
 
 def _pairs(shown: ShownFrame, edited: Sequence[EditedBox]) -> tuple[dict[int, int], dict[int, int]]:
-    """Places of shown boxes with those of edited ones: unchanged, and moved."""
+    """Return indices of shown boxes with those of edited boxes: the unchanged, and the moved."""
     before = shown.array
     after = np.array([each.box for each in edited], dtype=np.float64).reshape(-1, 7)
     same_name = np.array([[box.category == new.category for new in edited] for box in shown.boxes])
@@ -170,7 +170,7 @@ def _pairs(shown: ShownFrame, edited: Sequence[EditedBox]) -> tuple[dict[int, in
 
 
 def _greedy(gain: np.ndarray, least: float) -> dict[int, int]:
-    """Rows and columns one to one, the greatest gain first, none below the least."""
+    """Pair rows with columns one to one, largest gain first; no pair gains less than `least`."""
     gain = gain.copy()
     pairs: dict[int, int] = {}
     while gain.size and gain.max() >= least:

@@ -1,4 +1,4 @@
-"""The picture of a frame under review: image and bird's eye view with numbered boxes."""
+"""Images of frames under review: camera image and bird's eye view with numbered boxes."""
 
 from dataclasses import dataclass
 
@@ -13,27 +13,27 @@ from curate.viewing.tags import ShownLabels
 
 @dataclass(frozen=True)
 class NumberedLabels(ShownLabels):
-    """Labels whose captions begin with their number.
+    """Labels with their number as the first part of their caption.
 
     Attributes:
-        asked: (n,) bool, on which an opinion is wanted; they stand out.
+        asked: (n,) bool, labels for which a decision is requested; they are highlighted.
     """
 
     asked: np.ndarray | None = None
 
     @property
     def emphasis(self) -> np.ndarray:
-        """(n,) in [0, 1]; what is asked about stands out."""
+        """(n,) in [0, 1]; 1 where a decision is requested."""
         return np.where(self._is_requested, 1.0, 0.25 + 0.25 * self.weights)
 
     def caption(self, index: int) -> tuple[str, str]:
-        """The number, marked where an opinion is wanted; category, score and weight."""
+        """Return the number, with a mark if a decision is requested, and category, s and v."""
         score, weight = self.scores[index], self.weights[index]
         mark = " ?" if self._is_requested[index] else ""
         return f"{index + 1}{mark}", f"{self.categories[index]} s {score:.2f} v {weight:.2f}"
 
     def short_caption(self, index: int) -> str:
-        """The number alone."""
+        """Return the number alone."""
         return str(index + 1)
 
     @property
@@ -42,10 +42,10 @@ class NumberedLabels(ShownLabels):
 
 
 def draw_review(frame: Frame, shown: ShownFrame, *, title: str = "") -> np.ndarray:
-    """(height, width, 3) uint8 RGB: the boxes with numbers, human labels dashed.
+    """Draw the numbered boxes, human labels dashed; return (height, width, 3) uint8 RGB.
 
     Raises:
-        DataError: the frame has no image.
+        DataError: if the frame has no image.
     """
     human = np.array([box.human for box in shown.boxes], dtype=bool)
     labels = NumberedLabels(

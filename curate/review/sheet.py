@@ -1,7 +1,7 @@
-"""What a review shows: frames with numbered boxes, written to and read from review.json.
+"""The manifest of a review, review.json: its frames with numbered boxes.
 
-The manifest holds every box as it was shown, so that the answer can be understood after the round
-has gone on; its id is a hash of its content, so that a changed one is noticed.
+The manifest stores every box as it was shown, so that the edits can be read even after the round
+was computed again. Its id is a hash of its content, so that a changed manifest is detected.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ FORMAT = "curate review 1"
 
 @dataclass(frozen=True)
 class ShownBox:
-    """A box that a person is shown.
+    """A box that is shown to a person.
 
     Attributes:
         k: number of the prediction in its round, or of the human label in `weighted_labels`.
@@ -30,8 +30,8 @@ class ShownBox:
         box: x, y, z, length, width, height, yaw in the LiDAR frame.
         score: of the detector; 1 for a human label.
         weight: of the policy; 1 for a human label.
-        asked: whether an opinion on it is wanted; the others are context.
-        human: whether it is a human label already.
+        asked: whether a decision is requested; the other boxes are context.
+        human: whether it already is a human label.
     """
 
     k: int
@@ -45,7 +45,7 @@ class ShownBox:
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """The boxes of a frame; number i of a person's view is place i - 1 here."""
+    """The boxes of a frame; the person sees box i - 1 as number i."""
 
     frame: str
     boxes: tuple[ShownBox, ...]
@@ -61,11 +61,11 @@ class Sheet:
     """A review.
 
     Attributes:
-        round: whose labels.
-        policy: whose weights.
+        round: e, the round of the labels.
+        policy: the policy of the weights.
         editor: name of the format.
-        categories: that an answer may name.
-        frames: what is shown.
+        categories: allowed in the edited files.
+        frames: the shown frames.
     """
 
     round: int
@@ -76,61 +76,63 @@ class Sheet:
 
     @property
     def boxes(self) -> int:
-        """How many boxes are shown."""
+        """Number of shown boxes."""
         return sum(len(frame.boxes) for frame in self.frames)
 
     @property
     def asked(self) -> int:
-        """On how many boxes an opinion is wanted."""
+        """Number of boxes for which a decision is requested."""
         return sum(box.asked for frame in self.frames for box in frame.boxes)
 
     @property
     def id(self) -> str:
-        """A hash of all of it."""
+        """Hash of the content."""
         text = json.dumps(asdict(self), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def write_sheet(folder: Path, sheet: Sheet) -> None:
-    """Writes the manifest of a review."""
+    """Write the manifest of a review."""
     document = {"format": FORMAT, "id": sheet.id, **asdict(sheet)}
     replace_file(folder / MANIFEST, (json.dumps(document, indent=1) + "\n").encode())
 
 
 def read_sheet(folder: Path) -> Sheet:
-    """The manifest of a review.
+    """Read the manifest of a review.
 
     Raises:
-        DataError: it is missing, damaged, or has been changed.
+        DataError: if it is missing, damaged or changed.
     """
     path = folder / MANIFEST
     document = read_json(path, "; import the folder that `curate review export` wrote")
     if not isinstance(document, Mapping) or document.get("format") != FORMAT:
-        raise DataError(f"{path}: is no manifest of a review; import the folder as exported")
+        raise DataError(f"{path}: not a review manifest; import the folder as it was exported")
     try:
         sheet = _sheet(document)
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path}: is damaged ({error!r}); take it back from the export") from None
+        raise DataError(
+            f"{path}: damaged ({error!r}); restore the file that was exported"
+        ) from None
     if sheet.id != document.get("id"):
         raise DataError(
-            f"{path}: has been changed since the export; take it back, corrections go into the "
-            "label files"
+            f"{path}: changed since the export; restore it and write corrections into the label "
+            "files instead"
         )
     return sheet
 
 
 def read_json(path: Path, remedy: str = "") -> Any:
-    """The content of a JSON file.
+    """Return the content of a JSON file.
 
     Raises:
-        DataError: it is missing or damaged.
+        DataError: if it is missing or damaged.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise DataError(f"{path}: no such file{remedy}") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: is no readable JSON: {one_line(error)}") from None
+        raise DataError(f"{path}: invalid JSON: {one_line(error)}") from None
 
 
 def _sheet(document: Mapping[str, Any]) -> Sheet:

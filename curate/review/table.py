@@ -1,8 +1,8 @@
-"""review.csv: a row per box, where a person may write what they think of it.
+"""review.csv: one row per box, where a person may write a decision.
 
-The column `decision` takes `accept` or `reject`. The row `all` of a frame takes `accept` for all of
-its boxes that came back unchanged and on which nothing else is said. A box on which nothing is said
-and that came back unchanged counts as not looked at.
+The column `decision` takes `accept` or `reject`. `accept` in the row `all` of a frame accepts every
+unchanged box of the frame that has no decision of its own. An unchanged box without a decision
+counts as not looked at.
 """
 
 import csv
@@ -23,11 +23,11 @@ _WORDS = {"accept": ACCEPTED, "accepted": ACCEPTED, "reject": REJECTED, "rejecte
 
 @dataclass
 class ExplicitDecisions:
-    """What was said outright of a frame's boxes.
+    """The decisions written in the table for one frame.
 
     Attributes:
-        boxes: by number: accepted or rejected.
-        accept_rest: whether all others that came back unchanged are accepted.
+        boxes: accepted or rejected, by box number.
+        accept_rest: whether all other unchanged boxes are accepted.
     """
 
     boxes: dict[int, str] = field(default_factory=dict)
@@ -35,7 +35,7 @@ class ExplicitDecisions:
 
 
 def write_table(folder: Path, sheet: Sheet) -> None:
-    """Writes the table with an empty column `decision`."""
+    """Write the table with an empty column `decision`."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -49,10 +49,11 @@ def write_table(folder: Path, sheet: Sheet) -> None:
 
 
 def read_table(folder: Path, sheet: Sheet) -> dict[str, ExplicitDecisions]:
-    """What was said, by frame; nothing where the table is missing.
+    """Return the decisions by frame; none if the table is missing.
 
     Raises:
-        DataError: a row names no frame or box of the review, or says something else.
+        DataError: if a row specifies a frame or box that is not in the review, or its decision is
+            neither accept nor reject.
     """
     path = folder / TABLE
     if not path.is_file():
@@ -60,12 +61,12 @@ def read_table(folder: Path, sheet: Sheet) -> dict[str, ExplicitDecisions]:
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is not a text file (byte {error.start})") from None
-    # Spreadsheets of some countries save semicolons.
+        raise DataError(f"{path}: not a UTF-8 text file (byte {error.start})") from None
+    # In some languages spreadsheets save CSV with semicolons.
     delimiter = ";" if ";" in text.partition("\n")[0] else ","
     rows = csv.DictReader(io.StringIO(text), delimiter=delimiter)
     if not {"frame", "box", "decision"} <= set(rows.fieldnames or ()):
-        raise DataError(f"{path}:1: needs the columns frame, box and decision")
+        raise DataError(f"{path}:1: the columns frame, box and decision are required")
     found: dict[str, ExplicitDecisions] = {}
     for row in rows:
         word = (row["decision"] or "").strip().lower()
@@ -78,12 +79,12 @@ def _take(
     row: dict[str, str], word: str, place: str, sheet: Sheet, found: dict[str, ExplicitDecisions]
 ) -> None:
     if word not in _WORDS:
-        raise DataError(f"{place}: decision {word!r}; write accept or reject, or nothing")
+        raise DataError(f"{place}: invalid decision {word!r}; write accept, reject or nothing")
     name = _frame(row["frame"], place, sheet)
     words = found.setdefault(name, ExplicitDecisions())
     if (row["box"] or "").strip().lower() == ALL:
         if _WORDS[word] == REJECTED:
-            raise DataError(f"{place}: a frame cannot be rejected; reject its boxes")
+            raise DataError(f"{place}: a whole frame cannot be rejected; reject its boxes")
         words.accept_rest = True
         return
     count = len(next(frame for frame in sheet.frames if frame.frame == name).boxes)
@@ -94,7 +95,7 @@ def _take(
 
 
 def _frame(name: str, place: str, sheet: Sheet) -> str:
-    """The frame of a row; spreadsheets take leading zeros away."""
+    """Return the frame of a row; spreadsheets remove leading zeros."""
     names = [frame.frame for frame in sheet.frames]
     alike = [each for each in names if each.lstrip("0") == name.strip().lstrip("0")]
     if name in names:

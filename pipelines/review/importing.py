@@ -13,7 +13,7 @@ from sqlalchemy import Connection, select
 
 from curate.detections import as_categories
 from curate.errors import ConfigError, DataError, LeakageError
-from curate.review.edits import Answer, Decision, EditedBox, check_boxes, read_answer
+from curate.review.edits import Decision, EditedBox, FrameEdits, check_boxes, compare_frame
 from curate.review.human_labels import (
     ACCEPTED,
     ADDED,
@@ -151,7 +151,7 @@ def _keys(workspace: Workspace, folder: Path, sheet: Sheet) -> dict[str, int]:
 
 def _answers(
     workspace: Workspace, folder: Path, sheet: Sheet, answer: Path, accept: Collection[str]
-) -> list[Answer]:
+) -> list[FrameEdits]:
     editor = EDITORS.build(sheet.editor, offered={}, options={})
     edited = editor.read(answer, sheet, partial(workspace.dataset.read, points=False))
     words = read_table(folder, sheet)
@@ -167,12 +167,12 @@ def _answers(
         boxes = edited.get(shown.frame, _as_shown(shown))
         check_boxes(boxes, sheet.categories)
         rest = said.accept_rest or not {shown.frame, ALL_FRAMES}.isdisjoint(accept)
-        answers.append(read_answer(shown, boxes, said.boxes, accept_rest=rest))
+        answers.append(compare_frame(shown, boxes, said.boxes, accept_rest=rest))
     _check_overlaps(answers)
     return answers
 
 
-def _check_overlaps(answers: Sequence[Answer]) -> None:
+def _check_overlaps(answers: Sequence[FrameEdits]) -> None:
     """DataError where two objects of an answer lie in each other."""
     found = []
     for answer in answers:

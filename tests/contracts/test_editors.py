@@ -14,7 +14,7 @@ from support.reviews import CYCLIST, small_sheet
 from curate.errors import DataError
 from curate.frames import Frame
 from curate.geometry.similarity import wrap_angle
-from curate.review.edits import check_boxes, read_answer
+from curate.review.edits import check_boxes, compare_frame
 from curate.review.sheet import Sheet
 from pipelines.registry import EDITORS
 
@@ -105,7 +105,7 @@ def test_what_nobody_touched_comes_back_as_it_was(exported) -> None:
         assert [box.category for box in found[shown.frame]] == [box.category for box in shown.boxes]
         np.testing.assert_allclose(boxes[:, :6], shown.array[:, :6], atol=1e-3)
         assert np.abs(wrap_angle(boxes[:, 6] - shown.array[:, 6])).max() < 1e-3
-        assert read_answer(shown, found[shown.frame]).decisions == ()
+        assert compare_frame(shown, found[shown.frame]).decisions == ()
 
 
 def test_a_frame_that_did_not_come_back_was_not_looked_at(exported) -> None:

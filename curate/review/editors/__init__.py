@@ -1,1 +1,1 @@
-"""The formats in which boxes go to people and come back."""
+"""File formats of annotation tools: boxes are written for them and edited boxes read back."""

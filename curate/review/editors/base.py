@@ -1,4 +1,4 @@
-"""What every editor's format offers: boxes out with what it takes to see them, and boxes back."""
+"""The protocol of an editor: writes boxes with their point clouds and images, reads edits."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ from curate.review.edits import EditedBox
 from curate.review.sheet import Sheet
 
 Reader = Callable[[str], Frame]
-"""A frame with its points, its image and its calibration, by name."""
+"""Returns a frame with its points, image and calibration, by name."""
 
 
 class Editor(Protocol):
@@ -18,18 +18,18 @@ class Editor(Protocol):
     name: ClassVar[str]
 
     def write(self, folder: Path, sheet: Sheet, read: Reader) -> None:
-        """Writes the boxes, and what the tool shows them in, into an existing folder."""
+        """Write the boxes and the point clouds or images they lie in into an existing folder."""
         ...
 
-    def read(self, answer: Path, sheet: Sheet, read: Reader) -> Mapping[str, Sequence[EditedBox]]:
-        """The boxes that came back, by frame; a frame that is not there was not looked at.
+    def read(self, edited: Path, sheet: Sheet, read: Reader) -> Mapping[str, Sequence[EditedBox]]:
+        """Return the edited boxes by frame; a frame that is missing was not looked at.
 
         Args:
-            answer: the folder as it was exported and edited, or what the tool wrote elsewhere.
-            sheet: what was shown.
-            read: for formats in the camera's frame of reference.
+            edited: the exported folder after editing, or the output of the tool elsewhere.
+            sheet: the manifest of the review.
+            read: reads a frame, for formats in the camera's frame of reference.
 
         Raises:
-            DataError: a file is missing or damaged, or belongs to a frame that was not shown.
+            DataError: if a file is missing or damaged, or belongs to a frame that was not shown.
         """
         ...

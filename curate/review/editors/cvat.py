@@ -6,9 +6,9 @@ categories.label.labels, and items whose annotations of type cuboid_3d hold labe
 rotation (Euler angles, radians) and scale (the sides along the box's own x, y and z). CVAT finds
 the frame of an item by its id, the name of the point file without its ending.
 
-task.zip makes the task, labels.json is its labels for the tab Raw, annotations.zip is uploaded into
-it. What CVAT exports as "Datumaro 3D 1.0" is the answer; it takes the place of annotations.zip, or
-is named with `--answer`.
+task.zip creates the task, labels.json goes into its tab Raw, annotations.zip is uploaded to it. The
+export of CVAT as "Datumaro 3D 1.0" holds the edits: save it as annotations.zip, or pass its path
+with `--answer`.
 """
 
 import io
@@ -34,7 +34,7 @@ ANNOTATIONS = "annotations.zip"
 _MEMBER = "annotations/default.json"
 _LARGEST_BYTES = 2**28
 _UPRIGHT_RADIANS = 0.01
-# Datumaro's number of that kind; without it, it takes every item for an image and refuses.
+# Datumaro's media type "point cloud"; without it Datumaro takes every item for an image and fails.
 _POINT_CLOUD = 6
 
 
@@ -55,12 +55,12 @@ class CvatEditor:
 
     def read(
         self,
-        answer: Path,
+        edited: Path,
         sheet: Sheet,
         read: Reader,  # noqa: ARG002 - its boxes are in the LiDAR frame
     ) -> Mapping[str, Sequence[EditedBox]]:
         """See `curate.review.editors.base.Editor`."""
-        path = answer / ANNOTATIONS if answer.is_dir() else answer
+        path = edited / ANNOTATIONS if edited.is_dir() else edited
         found: dict[str, list[EditedBox]] = {}
         for document, place in _documents(path):
             names = _label_names(document, place)
@@ -74,7 +74,7 @@ class CvatEditor:
 
 
 def pcd_bytes(points: np.ndarray) -> bytes:
-    """(n, 4) float32 x, y, z, intensity as a binary PCD file, version 0.7."""
+    """Return (n, 4) float32 x, y, z, intensity as the bytes of a binary PCD 0.7 file."""
     count = len(points)
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity\n"
@@ -124,10 +124,10 @@ def _item(sheet: Sheet, number: int, shown: ShownFrame) -> dict[str, Any]:
 
 
 def _documents(path: Path) -> Iterator[tuple[Mapping[str, Any], str]]:
-    """The Datumaro documents of an answer, and how a message calls each.
+    """Yield the Datumaro documents of a file, each with its place for messages.
 
     Raises:
-        DataError: it is missing, damaged, too large, or holds none.
+        DataError: if the file is missing, damaged, too large, or has no document.
     """
     if not path.is_file():
         raise DataError(f"{path}: no such file; export the task from CVAT as Datumaro 3D 1.0")
@@ -141,27 +141,29 @@ def _documents(path: Path) -> Iterator[tuple[Mapping[str, Any], str]]:
             if member.filename.startswith("annotations/") and member.filename.endswith(".json"):
                 place = f"{path}: {member.filename}"
                 if member.file_size > _LARGEST_BYTES:
-                    raise DataError(f"{place}: {member.file_size} bytes are too many for a review")
+                    raise DataError(
+                        f"{place}: {member.file_size} bytes; at most {_LARGEST_BYTES} are read"
+                    )
                 try:
                     yield _parsed(archive.read(member), place), place
                 except (zipfile.BadZipFile, RuntimeError, OSError) as error:
-                    raise DataError(f"{place}: is damaged: {error}; export it again") from None
+                    raise DataError(f"{place}: damaged ({error}); export it again") from None
                 found = True
     if not found:
-        raise DataError(f"{path}: holds no annotations/*.json; export it as Datumaro 3D 1.0")
+        raise DataError(f"{path}: has no annotations/*.json; export it as Datumaro 3D 1.0")
 
 
 def _parsed(content: bytes, place: str) -> Mapping[str, Any]:
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{place}: is no readable JSON: {' '.join(str(error).split())}") from None
+        raise DataError(f"{place}: invalid JSON: {' '.join(str(error).split())}") from None
     if (
         not isinstance(document, Mapping)
         or not isinstance(document.get("items"), list)
         or not all(isinstance(item, Mapping) for item in document["items"])
     ):
-        raise DataError(f"{place}: holds no items; export it from CVAT as Datumaro 3D 1.0")
+        raise DataError(f"{place}: has no list of items; export it from CVAT as Datumaro 3D 1.0")
     return document
 
 
@@ -169,22 +171,22 @@ def _label_names(document: Mapping[str, Any], place: str) -> list[str]:
     try:
         return [str(label["name"]) for label in document["categories"]["label"]["labels"]]
     except (KeyError, TypeError):
-        raise DataError(f"{place}: names no labels; export it from CVAT as Datumaro 3D") from None
+        raise DataError(f"{place}: lists no labels; export it from CVAT as Datumaro 3D") from None
 
 
 def _read_cuboid(each: Any, names: Sequence[str], place: str) -> list[EditedBox]:
-    """The box of an annotation; none for one of another type."""
+    """Return the box of an annotation, or nothing for an annotation of another type."""
     if not isinstance(each, Mapping):
-        raise DataError(f"{place}: is no annotation")
+        raise DataError(f"{place}: not an annotation")
     if each.get("type") != "cuboid_3d":
         return []
     position = numbers(each.get("position"), ("x", "y", "z"), f"{place}, position")
     rotation = numbers(each.get("rotation"), ("x", "y", "z"), f"{place}, rotation")
     scale = numbers(each.get("scale"), ("x", "y", "z"), f"{place}, scale")
     if np.abs(wrap_angle(np.array(rotation[:2]))).max() > _UPRIGHT_RADIANS:
-        raise DataError(f"{place}: is tilted about x or y; boxes turn about z only")
+        raise DataError(f"{place}: rotated about x or y; only rotation about z is supported")
     number = each.get("label_id")
     if not isinstance(number, int) or not 0 <= number < len(names):
-        raise DataError(f"{place}: label_id {number!r} is none of its labels")
+        raise DataError(f"{place}: label_id {number!r} is not in the file's list of labels")
     yaw = float(wrap_angle(np.array(rotation[2])))
     return [EditedBox(names[number], (*position, *scale, yaw), place)]

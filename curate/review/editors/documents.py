@@ -1,4 +1,4 @@
-"""Numbers of foreign JSON documents, and documents of our own."""
+"""Write JSON documents, and read numbers from JSON of other tools."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -9,15 +9,15 @@ from curate.errors import DataError
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Writes a document that people may read."""
+    """Write an indented JSON document."""
     path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 def numbers(value: Any, names: Sequence[str], place: str) -> list[float]:
-    """The numbers of a mapping by name, or of a list in their order.
+    """Return the numbers of a mapping by name, or of a list in this order.
 
     Raises:
-        DataError: one is missing or no number.
+        DataError: if one is missing or not a number.
     """
     if isinstance(value, Mapping):
         value = [value.get(name) for name in names]
@@ -26,5 +26,5 @@ def numbers(value: Any, names: Sequence[str], place: str) -> list[float]:
         or len(value) != len(names)
         or any(isinstance(each, bool) or not isinstance(each, int | float) for each in value)
     ):
-        raise DataError(f"{place}: needs numbers for {', '.join(names)}, not {value!r}")
+        raise DataError(f"{place}: expected numbers for {', '.join(names)}, got {value!r}")
     return [float(each) for each in value]

@@ -1,8 +1,8 @@
-"""KITTI's text format: a line per box, to be edited with anything that writes KITTI labels.
+"""KITTI's text format: one line per box, for any tool that writes KITTI labels.
 
-DIRECTORY/label_2/FRAME.txt holds a line of 15 fields per box, line i is box i of the picture;
-DIRECTORY/calib/FRAME.txt is the frame's calibration, which its camera coordinates refer to. Lines
-with a 16th field, a score, are read as well; DontCare regions are passed over.
+DIRECTORY/label_2/FRAME.txt has a line of 15 fields per box; line i is box i of the image.
+DIRECTORY/calib/FRAME.txt is the calibration that its camera coordinates refer to. Lines with a
+16th field, a score, are accepted too; DontCare regions are skipped.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,11 +48,11 @@ class KittiEditor:
             write_objects(folder / "label_2" / f"{shown.frame}.txt", unscored)
             write_calibration(folder / "calib" / f"{shown.frame}.txt", frame.calibration)
 
-    def read(self, answer: Path, sheet: Sheet, read: Reader) -> Mapping[str, Sequence[EditedBox]]:
+    def read(self, edited: Path, sheet: Sheet, read: Reader) -> Mapping[str, Sequence[EditedBox]]:
         """See `curate.review.editors.base.Editor`."""
-        folder = answer / "label_2" if (answer / "label_2").is_dir() else answer
+        folder = edited / "label_2" if (edited / "label_2").is_dir() else edited
         if not folder.is_dir():
-            raise DataError(f"{folder}: no such folder; name the one that holds FRAME.txt files")
+            raise DataError(f"{folder}: no such folder; pass the one that has the FRAME.txt files")
         paths = {
             path.stem: path for path in sorted(folder.glob("*.txt")) if path.name[0] not in "._"
         }
@@ -80,5 +80,5 @@ def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[Edited
 
 
 def _text(path: Path) -> str:
-    """What is no text is refused by the reader of KITTI's files, in its own words."""
+    """Return the text; the reader of KITTI files reports what is not text."""
     return path.read_bytes().decode("utf-8-sig", errors="replace")

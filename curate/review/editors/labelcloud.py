@@ -54,14 +54,14 @@ class LabelCloudEditor:
 
     def read(
         self,
-        answer: Path,
+        edited: Path,
         sheet: Sheet,
         read: Reader,  # noqa: ARG002 - its boxes are in the LiDAR frame
     ) -> Mapping[str, Sequence[EditedBox]]:
         """See `curate.review.editors.base.Editor`."""
-        folder = answer / "labels" if (answer / "labels").is_dir() else answer
+        folder = edited / "labels" if (edited / "labels").is_dir() else edited
         if not folder.is_dir():
-            raise DataError(f"{folder}: no such folder; name the one that holds FRAME.json files")
+            raise DataError(f"{folder}: no such folder; pass the one that has the FRAME.json files")
         paths = {
             path.stem: path for path in sorted(folder.glob("*.json")) if path.name[0] not in "._"
         }
@@ -96,7 +96,7 @@ def _read_file(path: Path) -> list[EditedBox]:
     document = read_json(path)
     objects = document.get("objects") if isinstance(document, Mapping) else None
     if not isinstance(objects, list):
-        raise DataError(f"{path}: holds no list 'objects'; save it from labelCloud as centroid_abs")
+        raise DataError(f"{path}: has no list 'objects'; save it from labelCloud as centroid_abs")
     return [_read_object(each, f"{path}: object {i}") for i, each in enumerate(objects, start=1)]
 
 
@@ -109,6 +109,6 @@ def _read_object(each: Any, place: str) -> EditedBox:
     ]
     tilt_x, tilt_y, turn = numbers(each.get("rotations"), ("x", "y", "z"), place)
     if max(abs((tilt + 180) % 360 - 180) for tilt in (tilt_x, tilt_y)) > _UPRIGHT_DEGREES:
-        raise DataError(f"{place}: is tilted about x or y; boxes turn about z only")
+        raise DataError(f"{place}: rotated about x or y; only rotation about z is supported")
     yaw = float(wrap_angle(np.deg2rad(turn)))
     return EditedBox(each["name"], (*values, yaw), place)

@@ -1,4 +1,4 @@
-"""Frames of an answer, checked against those that were shown."""
+"""Check the frames of edited files against the frames of the review."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,11 +8,11 @@ from curate.review.sheet import Sheet
 
 
 def check_frame_names(place: Path, names: Iterable[str], sheet: Sheet) -> None:
-    """DataError where an answer holds frames that the review does not."""
+    """Raise DataError if edited files hold a frame that the review does not."""
     shown = {frame.frame for frame in sheet.frames}
-    strangers = sorted(set(names) - shown)
-    if strangers:
+    unexpected = sorted(set(names) - shown)
+    if unexpected:
         raise DataError(
-            f"{place}: holds frame '{strangers[0]}', which this review does not; take it out, or "
-            "import the answer of the right review"
+            f"{place}: frame '{unexpected[0]}' is not in this review; remove it, or import the "
+            "files of the right review"
         )

@@ -6,7 +6,7 @@ import pytest
 from support.reviews import CAR, CATEGORIES, WALKER, small_sheet
 
 from curate.errors import DataError
-from curate.review.edits import Answer, EditedBox, check_boxes, read_answer
+from curate.review.edits import EditedBox, FrameEdits, check_boxes, compare_frame
 
 FRAME = small_sheet().frames[0]
 
@@ -21,28 +21,28 @@ def back(**changes: tuple[float, ...] | None) -> list[EditedBox]:
     return boxes
 
 
-def said(answer: Answer) -> list[tuple[int | None, str]]:
+def said(answer: FrameEdits) -> list[tuple[int | None, str]]:
     """Numbers and decisions."""
     return [(each.number, each.decision) for each in answer.decisions]
 
 
 def test_an_unchanged_box_has_not_been_looked_at() -> None:
     """Nothing becomes a human label by being sent back."""
-    answer = read_answer(FRAME, back())
+    answer = compare_frame(FRAME, back())
     assert (said(answer), answer.untouched) == ([], 3)
 
 
 def test_rounding_is_no_change() -> None:
     """A millimetre, and yaw by a whole turn."""
     rounded = (*(round(value, 3) for value in CAR[:6]), CAR[6] + 6.28319)
-    assert said(read_answer(FRAME, back(box1=rounded)[::-1])) == []
+    assert said(compare_frame(FRAME, back(box1=rounded)[::-1])) == []
 
 
 def test_moved_deleted_and_new_boxes_are_decisions() -> None:
     """What overlaps is the same object; the rest is gone or new."""
     moved = (CAR[0] + 0.4, *CAR[1:])
     new = EditedBox("Cyclist", (12.0, 9.0, -0.6, 1.8, 0.6, 1.7, 0.0), "file:9")
-    answer = read_answer(FRAME, [*back(box1=moved, box2=None), new])
+    answer = compare_frame(FRAME, [*back(box1=moved, box2=None), new])
     assert said(answer) == [(1, "moved"), (2, "rejected"), (None, "added")]
     first, second, third = answer.decisions
     assert (first.box, first.seen) == (moved, CAR)
@@ -52,14 +52,14 @@ def test_moved_deleted_and_new_boxes_are_decisions() -> None:
 def test_a_box_moved_out_of_its_place_is_rejected_there_and_added_here() -> None:
     """Without overlap nobody can tell that it is the same."""
     far = (CAR[0] + 9, *CAR[1:])
-    assert said(read_answer(FRAME, back(box1=far))) == [(1, "rejected"), (None, "added")]
+    assert said(compare_frame(FRAME, back(box1=far))) == [(1, "rejected"), (None, "added")]
 
 
 def test_another_category_is_a_correction() -> None:
     """The box stays."""
     edited = back()
     edited[1] = replace(edited[1], category="Cyclist")
-    answer = read_answer(FRAME, edited)
+    answer = compare_frame(FRAME, edited)
     assert said(answer) == [(2, "moved")]
     assert (answer.decisions[0].category, answer.decisions[0].box) == ("Cyclist", WALKER)
 
@@ -67,26 +67,26 @@ def test_another_category_is_a_correction() -> None:
 def test_words_accept_and_reject() -> None:
     """The accepted box is the one that was shown, to the last digit."""
     rounded = tuple(round(value, 3) for value in CAR)
-    answer = read_answer(FRAME, back(box1=rounded), {1: "accepted", 2: "rejected"})
+    answer = compare_frame(FRAME, back(box1=rounded), {1: "accepted", 2: "rejected"})
     assert said(answer) == [(1, "accepted"), (2, "rejected")]
     assert answer.decisions[0].box == CAR
 
 
 def test_accepting_the_rest_leaves_human_labels_alone() -> None:
     """They are decided already."""
-    answer = read_answer(FRAME, back(), accept_rest=True)
+    answer = compare_frame(FRAME, back(), accept_rest=True)
     assert (said(answer), answer.untouched) == ([(1, "accepted"), (2, "accepted")], 1)
 
 
 def test_a_human_label_may_be_corrected() -> None:
     """As any other box."""
-    assert said(read_answer(FRAME, back(box3=None))) == [(3, "rejected")]
+    assert said(compare_frame(FRAME, back(box3=None))) == [(3, "rejected")]
 
 
 @pytest.mark.parametrize(
     ("edited", "words", "fault"),
     [
-        (back(box1=None), {1: "accepted"}, "marked as accepted and has been deleted"),
+        (back(box1=None), {1: "accepted"}, "marked as accepted but deleted"),
         (back(box1=(CAR[0] + 0.4, *CAR[1:])), {1: "rejected"}, "file:1.*marked as rejected"),
     ],
 )
@@ -95,15 +95,15 @@ def test_words_against_deeds_are_refused(
 ) -> None:
     """Which of both was meant is not guessed."""
     with pytest.raises(DataError, match=fault):
-        read_answer(FRAME, edited, words)
+        compare_frame(FRAME, edited, words)
 
 
 @pytest.mark.parametrize(
     ("category", "box", "fault"),
     [
-        ("Tram", CAR, "unknown category 'Tram'; known here are Car, Pedestrian, Cyclist"),
+        ("Tram", CAR, "unknown category 'Tram'; the categories of this review are Car, Pedestrian, Cyclist"),
         ("Car", (float("nan"), *CAR[1:]), "not finite"),
-        ("Car", (*CAR[:3], 0.0, *CAR[4:]), "sides of 0 x 1.8 x 1.6"),
+        ("Car", (*CAR[:3], 0.0, *CAR[4:]), "the sides are 0 x 1.8 x 1.6"),
         ("Car", (*CAR[:3], 400.0, *CAR[4:]), "at most 50"),
         ("Car", (481_000.0, *CAR[1:]), "another frame of reference"),
     ],

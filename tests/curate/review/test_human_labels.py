@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from curate.detections import as_categories
 from curate.review.human_labels import (
-    REFUSED_IOU,
+    REJECTED_IOU,
     SAME_OBJECT_IOU,
     HumanLabels,
     match_human_labels,
@@ -44,7 +44,7 @@ def test_an_object_takes_whatever_overlaps_it() -> None:
 
 def test_a_refusal_holds_for_its_category_and_place() -> None:
     """From an IoU of 0.3 on; the same place with another category is a claim of its own."""
-    boxes = np.stack([along(REFUSED_IOU + 0.02), along(REFUSED_IOU - 0.02), BOX])
+    boxes = np.stack([along(REJECTED_IOU + 0.02), along(REJECTED_IOU - 0.02), BOX])
     names = as_categories(["Car", "Car", "Pedestrian"])
     spoken = match_human_labels(boxes, names, labels(("rejected", "Car", BOX)))
     assert spoken.label.tolist() == [0, -1, -1]

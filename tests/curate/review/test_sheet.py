@@ -23,10 +23,10 @@ def test_a_manifest_comes_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "fault"),
     [
-        ('"category": "Car"', '"category": "Van"', "has been changed since the export"),
-        ('"frames"', '"pages"', "is damaged"),
-        ("curate review 1", "curate review 9", "is no manifest"),
-        ("{", "", "is no readable JSON"),
+        ('"category": "Car"', '"category": "Van"', "changed since the export"),
+        ('"frames"', '"pages"', "damaged"),
+        ("curate review 1", "curate review 9", "not a review manifest"),
+        ("{", "", "invalid JSON"),
     ],
 )
 def test_a_manifest_that_is_not_as_it_was_is_refused(
@@ -83,11 +83,11 @@ def test_what_spreadsheets_do_to_a_table_does_no_harm(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "word", "before", "after", "fault"),
     [
-        ("f000001_1", "maybe", "", "", "3: decision 'maybe'; write accept or reject"),
-        ("f000001_all", "reject", "", "", "2: a frame cannot be rejected"),
+        ("f000001_1", "maybe", "", "", "3: invalid decision 'maybe'; write accept, reject"),
+        ("f000001_all", "reject", "", "", "2: a whole frame cannot be rejected"),
         ("f000001_2", "accept", "000001,2", "000001,7", "frame 000001 has boxes 1 to 3, not '7'"),
         ("f000001_2", "accept", "000001,2", "000009,2", "frame '000009' is not in this review"),
-        ("f000001_2", "accept", "decision", "opinion", "1: needs the columns"),
+        ("f000001_2", "accept", "decision", "opinion", "1: the columns frame, box and decision are required"),
     ],
 )
 def test_rows_without_meaning_are_refused(

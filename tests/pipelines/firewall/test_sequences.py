@@ -92,7 +92,7 @@ def test_one_drive_cannot_be_shared(curate: Curate, tmp_path: Path) -> None:
         "--labeled", "0.25",
     )  # fmt: skip
     assert code == ConfigError.exit_code
-    assert "all 4 frames are of sequence" in err
+    assert "all 4 frames belong to sequence" in err
 
 
 def test_kitti_object_knows_its_drives_by_the_mapping(tmp_path: Path) -> None:
