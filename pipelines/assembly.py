@@ -1,13 +1,14 @@
 """The one place where sections of the configuration become objects of curate."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.consistency import ConsistencySettings
 from curate.detectors.base import Detector, TrainableDetector, choose_preset
-from curate.errors import ConfigError
+from curate.errors import ConfigError, CurateError
 from curate.frames import Calibration
 from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
@@ -23,24 +24,51 @@ Kind = TypeVar("Kind")
 SHIPPED_SEGMENTER = Path(__file__).parent.parent / "curate/segmenters/models/simulated.onnx"
 
 
+@contextmanager
+def _naming(key: str) -> Iterator[None]:
+    """Put the key whose value is wrong in front of the message."""
+    try:
+        yield
+    except CurateError as error:
+        raise type(error)(f"{key}: {error}") from error
+
+
 def open_detector(config: Config, path: Path) -> Detector:
-    """The detector behind a checkpoint or a file that the user brought."""
+    """Return the detector behind a checkpoint, a model or result files."""
     section = config.detector
     detector: Detector = registry.DETECTORS.build(
-        section.name,
-        path,
-        offered={
-            "minimum_score": lambda: section.minimum_score,
-            "device": lambda: device(config),
-            "categories": lambda: config.dataset.categories,
-            "threads": lambda: 1,
-            "frame_ids": lambda: open_dataset(config).frame_ids(),
-            "calibration": lambda: _calibrations(config),
-            "wants_views": lambda: wants_views(config),
-        },
-        options=section.options,
+        section.name, path, offered=_offered_to_detectors(config), options=section.options
     )
     return detector
+
+
+def check_detector(config: Config) -> None:
+    """Check that the detector's class can be used with its options, without loading a model.
+
+    Raises:
+        ConfigError: if it cannot be imported, does not accept its options, or does not have the
+            configured preset.
+    """
+    with _naming("detector.name"):
+        registry.DETECTORS.check(
+            config.detector.name,
+            config.detector.path,
+            offered=_offered_to_detectors(config),
+            options=config.detector.options,
+        )
+    trainable_detector(config)
+
+
+def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:
+    return {
+        "minimum_score": lambda: config.detector.minimum_score,
+        "device": lambda: device(config),
+        "categories": lambda: config.dataset.categories,
+        "threads": lambda: 1,
+        "frame_ids": lambda: open_dataset(config).frame_ids(),
+        "calibration": lambda: _calibrations(config),
+        "wants_views": lambda: wants_views(config),
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,6 +158,23 @@ def open_segmenter(config: Config) -> Segmenter:
     return segmenter
 
 
+def check_segmenter(config: Config) -> None:
+    """Check that the segmenter's class can be used with its options, without loading a model.
+
+    Raises:
+        ConfigError: if it cannot be imported or does not accept its options.
+    """
+    name = "onnx" if config.segmenter.name == "simulated" else config.segmenter.name
+    if name != "none":
+        with _naming("segmenter.name"):
+            registry.SEGMENTERS.check(
+                name,
+                segmenter_path(config),
+                offered=("classes", "seed"),
+                options=config.segmenter.options,
+            )
+
+
 def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, ...]]:
     from curate.segmenters.classes import CLASS_MAPS, class_map
 
@@ -160,6 +205,38 @@ def open_policy(config: Config, name: str) -> Policy:
         options=section.options.get(name, {}),
     )
     return policy
+
+
+def check_policy(config: Config, name: str) -> None:
+    """Check that a policy can be made with its settings.
+
+    Raises:
+        ConfigError: if it cannot be imported, or rejects its options.
+    """
+    with _naming("run.method" if name == config.run.method else "--policy"):
+        open_policy(config, name)
+
+
+def check_executor(config: Config) -> None:
+    """Check that the executor's class can be used with its options, without starting it.
+
+    Raises:
+        ConfigError: if it cannot be imported or does not accept its options.
+    """
+    section = config.run
+    options = section.executor_options.get(section.executor, {})
+    with _naming("run.executor"):
+        registry.EXECUTORS.check(section.executor, offered=("workers",), options=options)
+
+
+def check_labels_format(config: Config) -> None:
+    """Check that the labels can be exported in the format that the user's trainer gets.
+
+    Raises:
+        ConfigError: if the exporter cannot be imported or made.
+    """
+    with _naming("train.labels_format"):
+        registry.EXPORTERS.build(config.train.labels_format, offered={}, options={})
 
 
 def consistency_settings(config: Config) -> ConsistencySettings:
@@ -196,6 +273,19 @@ def open_sequence_source(config: Config, name: str) -> SequenceSource:
         name, offered={}, options=config.run.prior_options.get(name, {})
     )
     return source
+
+
+def check_prior(config: Config, name: str) -> None:
+    """Check that a source of evidence can be made with its options; its segmenter is opened.
+
+    Raises:
+        CurateError: if it cannot be imported or made, or its segmenter cannot be opened.
+    """
+    with _naming("run.priors"):
+        if hasattr(registry.PRIORS.load(name), "score_sequence"):
+            open_sequence_source(config, name)
+        else:
+            open_prior(config, name, dict.fromkeys(config.dataset.categories, 1.0))
 
 
 def point_settings(config: Config) -> PointSettings:

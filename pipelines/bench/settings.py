@@ -13,6 +13,7 @@ from curate.files.atomic import replace_file
 from pipelines.registry import trainable, trainable_names
 from pipelines.stages.methods import METHODS, with_method
 from pipelines.workspace.config import AtLeastOne, Config, Section, change_setting, make_config
+from pipelines.workspace.config_faults import describe_faults
 
 SYNTHETIC = "synthetic"
 SETTINGS_FILE = "bench.json"
@@ -159,7 +160,7 @@ def read_bench(root: Path) -> Bench | None:
         return Bench(root, settings, Axes.model_validate(document["grid"]))
     except (ValueError, KeyError, TypeError) as error:
         reason = (
-            "; ".join(str(fault["msg"]) for fault in error.errors())
+            describe_faults(error, Axes if error.title == "Axes" else BenchSettings)
             if isinstance(error, ValidationError)
             else error
         )

@@ -16,10 +16,17 @@ from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
 from curate.files.batches import batched
 from curate.firewall.sequences import choose_sequences, group_by_sequence, straddling
-from curate.segmenters.classes import CLASS_MAPS, class_map
+from curate.segmenters.classes import CLASS_MAPS
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
+from pipelines.assembly import (
+    check_detector,
+    check_executor,
+    check_labels_format,
+    check_policy,
+    check_segmenter,
+)
 from pipelines.workspace.config import Config
 from pipelines.workspace.split_record import split_rows
 from pipelines.workspace.workspace import SPLITS, Workspace, open_dataset
@@ -61,7 +68,7 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
         DataError: a label or calibration file of X_l or val is damaged.
         WorkspaceError: the workspace exists with other frames or settings.
     """
-    _check_models_exist(config)
+    _check_extensions(config)
     dataset = open_dataset(config)
     split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
     truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
@@ -79,10 +86,13 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
     return workspace
 
 
-def _check_models_exist(config: Config) -> None:
-    """ConfigError for a detector or segmenter that nobody knows or whose file is not there."""
-    registry.DETECTORS.check_name(config.detector.name)
-    registry.SEGMENTERS.check_name(config.segmenter.name, "none", "simulated")
+def _check_extensions(config: Config) -> None:
+    """Check that detector, segmenter, policy, executor and label format can be used.
+
+    Raises:
+        ConfigError: if a class cannot be imported or does not accept its options, a file is
+            missing, or nothing says what the segmenter's class numbers mean.
+    """
     needs_path = {"detector": ("onnx", "recorded"), "segmenter": tuple(registry.SEGMENTERS.classes)}
     for section, names in needs_path.items():
         name, path = getattr(config, section).name, getattr(config, section).path
@@ -90,24 +100,23 @@ def _check_models_exist(config: Config) -> None:
             raise ConfigError(f"{section} '{name}' needs a path: give --{section}-path")
         if path is not None and not path.exists():
             raise ConfigError(f"--{section}-path {path}: no such file")
-    _check_classes_declared(config)
-
-
-def _check_classes_declared(config: Config) -> None:
-    """ConfigError where nobody says what the numbers of a segmenter's classes mean."""
-    name, section = config.segmenter.name, config.segmenter
-    if section.classes is not None:
-        class_map(section.classes)
-    elif (
-        name in registry.SEGMENTERS.classes
+    name, segmenter = config.segmenter.name, config.segmenter
+    if (
+        segmenter.classes is None
+        and name in registry.SEGMENTERS.classes
         and registry.SEGMENTERS.takes(name, "classes")
-        and "classes" not in section.options
+        and "classes" not in segmenter.options
     ):
         raise ConfigError(
             f"segmenter '{name}': say what its class numbers mean: --segmenter-classes "
             f"{', '.join(CLASS_MAPS)}; or a table of your own: --set "
             '"segmenter.options.classes={Car=[7]}"'
         )
+    check_detector(config)
+    check_segmenter(config)
+    check_policy(config, config.run.method)
+    check_executor(config)
+    check_labels_format(config)
 
 
 def choose_split(

@@ -17,7 +17,8 @@ from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from db.session import Database, parse_url
 from pipelines import registry
-from pipelines.workspace.config import Config, make_config, read_config, write_config
+from pipelines.workspace.config import Config, make_config, read_config
+from pipelines.workspace.config_file import write_config
 
 CONFIG_NAME = "curate.toml"
 SPLITS = ("labeled", "unlabeled", "val")
