@@ -98,7 +98,9 @@ class DatasetSection(Section):
 class DetectorSection(Section):
     """The detector that makes the predictions."""
 
-    name: DetectorName = Field(default="pillars", description="Detector.")
+    name: DetectorName = Field(
+        default="pillars", description="Detector to use; see docs/detectors.md."
+    )
     path: Path | None = Field(
         default=None,
         description="Checkpoint, model or result files of your own detector. Without it, curate "
@@ -129,7 +131,7 @@ class SegmenterSection(Section):
 
     name: SegmenterName = Field(
         default="none",
-        description="Segmenter. 'simulated' is the model for simulated images that curate ships; "
+        description="Segmenter to use. 'simulated' is the model for simulated images that curate ships; "
         "'none' needs run.priors without 'semantic'.",
     )
     path: Path | None = Field(
@@ -209,12 +211,12 @@ class PointsSection(Section):
     )
     fixed: PointCount = Field(
         default=5.0,
-        description="m_th of every category, for statistic = 'fixed'.",
+        description="Threshold m_th of every category, for statistic = 'fixed'.",
         json_schema_extra=_unit("points"),
     )
     fallback: PointCount = Field(
         default=5.0,
-        description="m_th of a category without ground truth in X_l.",
+        description="Threshold m_th of a category without ground truth in X_l.",
         json_schema_extra=_unit("points"),
     )
 
@@ -228,7 +230,7 @@ class SemanticSection(Section):
     )
     outside: Literal["neutral", "drop"] = Field(
         default="neutral",
-        description="rho_anno of a box outside the image: 'neutral' is s, 'drop' is 0.",
+        description="Trust rho_anno of a box outside the image: 'neutral' is s, 'drop' is 0.",
     )
 
 

@@ -40,13 +40,11 @@ def write_config(path: Path, config: Config) -> None:
 
 def _setting_lines(setting: Setting, values: Mapping[str, object]) -> Iterator[str]:
     accepted = setting.accepted
-    unit = f" {setting.unit}" if setting.unit not in {"", "1"} else ""
-    more = ""
-    if accepted.choices:
-        more = f" {str(accepted).capitalize()}."
-    elif accepted.range or unit:
-        more = f" ({accepted.range or accepted.type}{unit and ','}{unit})"
-    yield from _comment(setting.meaning + more)
+    limits = str(accepted) if accepted.choices else accepted.range
+    if limits:
+        unit = f", in {setting.unit}" if setting.unit not in {"", "1"} else ""
+        limits = f" {limits[0].upper()}{limits[1:]}{unit}."
+    yield from _comment(setting.meaning + limits)
     if setting.key in values:
         yield f"{setting.key} = {toml(values[setting.key])}"
     else:
