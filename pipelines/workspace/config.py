@@ -131,8 +131,8 @@ class SegmenterSection(Section):
 
     name: SegmenterName = Field(
         default="none",
-        description="Segmenter to use. 'simulated' is the model for simulated images that curate ships; "
-        "'none' needs run.priors without 'semantic'.",
+        description="Segmenter to use. 'simulated' is the model for simulated images that curate "
+        "ships; 'none' needs run.priors without 'semantic'.",
     )
     path: Path | None = Field(
         default=None,
