@@ -91,7 +91,9 @@ def trainable_detector(config: Config) -> Trainable | None:
         ConfigError: if the detector has no preset of the configured name, or its class cannot be
             used.
     """
-    detector, preset = registry.trainable(config.detector.name), config.train.preset
+    with _naming("detector.name"):
+        detector = registry.trainable(config.detector.name)
+    preset = config.train.preset
     if detector is None:
         return None
     try:
