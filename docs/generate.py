@@ -147,7 +147,7 @@ A misspelled section, key or value is an error that names the file, the key and 
 
 Editors that know the `#:schema` line, such as those with Taplo or Even Better TOML, complete and
 check the file. The schema, [{SCHEMA_NAME}]({SCHEMA_NAME}), lies beside `curate.toml`, so this works
-without a network.
+without a network. After an update of curate, the same `curate init` command writes the new schema.
 
 In the tables, "-" as default means that the setting is required, an empty cell that it is unset.
 Unit 1 is a number without dimension.

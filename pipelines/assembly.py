@@ -1,4 +1,4 @@
-"""The one place where sections of the configuration become objects of curate."""
+"""The one place that makes objects from sections of the configuration, and checks that it can."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
@@ -115,18 +115,18 @@ def trained_detector(config: Config) -> Trainable:
 
 
 def wants_views(config: Config) -> bool:
-    """Whether the method weighs by the consistency loss; the priors alone need no second pass."""
+    """Return whether the method reads the consistency loss; the priors alone do not need it."""
     return config.run.method != "pspsl" or config.solve.self_paced
 
 
 def _calibrations(config: Config) -> Callable[[str], Calibration]:
-    """The calibration of a frame by its name."""
+    """Return a function that reads the calibration of a frame."""
     dataset = open_dataset(config)
     return lambda frame_id: dataset.read(frame_id, points=False).calibration
 
 
 def device(config: Config) -> str:
-    """Where the detector runs: "cpu" or "cuda"."""
+    """Return where the detector runs: "cpu" or "cuda"."""
     if config.detector.device != "auto":
         return config.detector.device
     import torch
@@ -135,11 +135,11 @@ def device(config: Config) -> str:
 
 
 def open_segmenter(config: Config) -> Segmenter:
-    """The segmenter.
+    """Return the segmenter.
 
     Raises:
-        ConfigError: none is configured, or a setting is missing or wrong.
-        CurateError: its model or folder is missing or of another kind.
+        ConfigError: if none is configured, or a setting is missing or wrong.
+        CurateError: if its model or folder is missing or of another kind.
     """
     section = config.segmenter
     path = segmenter_path(config)
@@ -182,7 +182,7 @@ def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, .
 
     if classes is None:
         raise ConfigError(
-            f"segmenter '{segmenter}': nobody says what its class numbers mean: set "
+            f"segmenter '{segmenter}': the meaning of its class numbers is not set: set "
             f"segmenter.classes to one of {', '.join(CLASS_MAPS)}, or segmenter.options.classes "
             "to a table like {Car = [7]}"
         )
@@ -190,12 +190,12 @@ def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, .
 
 
 def segmenter_path(config: Config) -> Path | None:
-    """The segmenter's model or folder; the project ships the one for simulated images."""
+    """Return the segmenter's model or folder; curate ships the model for simulated images."""
     return SHIPPED_SEGMENTER if config.segmenter.name == "simulated" else config.segmenter.path
 
 
 def open_policy(config: Config, name: str) -> Policy:
-    """A policy with its settings."""
+    """Return a policy with its settings."""
     section = config.solve
     policy: Policy = registry.POLICIES.build(
         name,
@@ -242,20 +242,20 @@ def check_labels_format(config: Config) -> None:
 
 
 def consistency_settings(config: Config) -> ConsistencySettings:
-    """How predictions and repredictions are compared."""
+    """Return how predictions and repredictions are compared."""
     return _from_section(ConsistencySettings, config.repredict)
 
 
 def open_prior(
     config: Config, name: str, thresholds: Mapping[str, float], *, measures: bool = True
 ) -> EvidenceSource:
-    """A prior with its settings.
+    """Return a prior with its settings.
 
     Args:
-        config: all sections.
-        name: of the prior.
-        thresholds: points per category, learned from X_l; read by priors that name them.
-        measures: whether it will look at frames, for which alone a segmenter is opened.
+        config: the configuration.
+        name: name of the prior.
+        thresholds: points per category, learned from X_l; passed to priors with this argument.
+        measures: whether the prior will look at frames; only then its segmenter is opened.
     """
     prior: EvidenceSource = registry.PRIORS.build(
         name,
@@ -270,7 +270,7 @@ def open_prior(
 
 
 def open_sequence_source(config: Config, name: str) -> SequenceSource:
-    """A source of evidence that looks at whole sequences, with its options."""
+    """Return a source of evidence that looks at whole sequences, with its options."""
     source: SequenceSource = registry.PRIORS.build(
         name, offered={}, options=config.run.prior_options.get(name, {})
     )
@@ -291,16 +291,16 @@ def check_prior(config: Config, name: str) -> None:
 
 
 def point_settings(config: Config) -> PointSettings:
-    """How points per category are learned from X_l."""
+    """Return how points per category are learned from X_l."""
     return _from_section(PointSettings, config.points)
 
 
 def semantic_settings(config: Config) -> SemanticSettings:
-    """How the semantic prior turns pixels into trust."""
+    """Return how the semantic prior turns pixels into trust."""
     return _from_section(SemanticSettings, config.semantic)
 
 
 def _from_section(settings: type[Kind], section: Any) -> Kind:
-    """A settings object from the section's values of the same names."""
+    """Return a settings object with the section's values of the same names."""
     names = [field.name for field in dataclasses.fields(settings)]  # type: ignore[arg-type]
     return settings(**{name: getattr(section, name) for name in names})

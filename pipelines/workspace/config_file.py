@@ -34,8 +34,13 @@ def write_config(path: Path, config: Config) -> None:
         lines += ["", f"[{name}]", *_comment(section.__doc__ or ""), ""]
         for setting in settings_of(section):
             lines += _setting_lines(setting, values[name])
-    replace_file(path.with_name(SCHEMA_NAME), _SCHEMA.read_bytes())
+    write_schema(path.parent)
     replace_file(path, (_HEADER + "\n".join(lines) + "\n").encode())
+
+
+def write_schema(folder: Path) -> None:
+    """Write the JSON Schema of this version of curate into the folder of a `curate.toml`."""
+    replace_file(folder / SCHEMA_NAME, _SCHEMA.read_bytes())
 
 
 def _setting_lines(setting: Setting, values: Mapping[str, object]) -> Iterator[str]:
