@@ -1,13 +1,14 @@
-"""The one place where sections of the configuration become objects of curate."""
+"""The one place that makes objects from sections of the configuration, and checks that it can."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.consistency import ConsistencySettings
 from curate.detectors.base import Detector, TrainableDetector, choose_preset
-from curate.errors import ConfigError
+from curate.errors import ConfigError, CurateError
 from curate.frames import Calibration
 from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
@@ -23,24 +24,51 @@ Kind = TypeVar("Kind")
 SHIPPED_SEGMENTER = Path(__file__).parent.parent / "curate/segmenters/models/simulated.onnx"
 
 
+@contextmanager
+def _naming(key: str) -> Iterator[None]:
+    """Put the key whose value is wrong in front of the message."""
+    try:
+        yield
+    except CurateError as error:
+        raise type(error)(f"{key}: {error}") from error
+
+
 def open_detector(config: Config, path: Path) -> Detector:
-    """The detector behind a checkpoint or a file that the user brought."""
+    """Return the detector behind a checkpoint, a model or result files."""
     section = config.detector
     detector: Detector = registry.DETECTORS.build(
-        section.name,
-        path,
-        offered={
-            "minimum_score": lambda: section.minimum_score,
-            "device": lambda: device(config),
-            "categories": lambda: config.dataset.categories,
-            "threads": lambda: 1,
-            "frame_ids": lambda: open_dataset(config).frame_ids(),
-            "calibration": lambda: _calibrations(config),
-            "wants_views": lambda: wants_views(config),
-        },
-        options=section.options,
+        section.name, path, offered=_offered_to_detectors(config), options=section.options
     )
     return detector
+
+
+def check_detector(config: Config) -> None:
+    """Check that the detector's class can be used with its options, without loading a model.
+
+    Raises:
+        ConfigError: if it cannot be imported, does not accept its options, or does not have the
+            configured preset.
+    """
+    with _naming("detector.name"):
+        registry.DETECTORS.check(
+            config.detector.name,
+            config.detector.path,
+            offered=_offered_to_detectors(config),
+            options=config.detector.options,
+        )
+    trainable_detector(config)
+
+
+def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:
+    return {
+        "minimum_score": lambda: config.detector.minimum_score,
+        "device": lambda: device(config),
+        "categories": lambda: config.dataset.categories,
+        "threads": lambda: 1,
+        "frame_ids": lambda: open_dataset(config).frame_ids(),
+        "calibration": lambda: _calibrations(config),
+        "wants_views": lambda: wants_views(config),
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +91,9 @@ def trainable_detector(config: Config) -> Trainable | None:
         ConfigError: if the detector has no preset of the configured name, or its class cannot be
             used.
     """
-    detector, preset = registry.trainable(config.detector.name), config.train.preset
+    with _naming("detector.name"):
+        detector = registry.trainable(config.detector.name)
+    preset = config.train.preset
     if detector is None:
         return None
     try:
@@ -85,18 +115,18 @@ def trained_detector(config: Config) -> Trainable:
 
 
 def wants_views(config: Config) -> bool:
-    """Whether the method weighs by the consistency loss; the priors alone need no second pass."""
+    """Return whether the method reads the consistency loss; the priors alone do not need it."""
     return config.run.method != "pspsl" or config.solve.self_paced
 
 
 def _calibrations(config: Config) -> Callable[[str], Calibration]:
-    """The calibration of a frame by its name."""
+    """Return a function that reads the calibration of a frame."""
     dataset = open_dataset(config)
     return lambda frame_id: dataset.read(frame_id, points=False).calibration
 
 
 def device(config: Config) -> str:
-    """Where the detector runs: "cpu" or "cuda"."""
+    """Return where the detector runs: "cpu" or "cuda"."""
     if config.detector.device != "auto":
         return config.detector.device
     import torch
@@ -105,11 +135,11 @@ def device(config: Config) -> str:
 
 
 def open_segmenter(config: Config) -> Segmenter:
-    """The segmenter.
+    """Return the segmenter.
 
     Raises:
-        ConfigError: none is configured, or a setting is missing or wrong.
-        CurateError: its model or folder is missing or of another kind.
+        ConfigError: if none is configured, or a setting is missing or wrong.
+        CurateError: if its model or folder is missing or of another kind.
     """
     section = config.segmenter
     path = segmenter_path(config)
@@ -130,12 +160,29 @@ def open_segmenter(config: Config) -> Segmenter:
     return segmenter
 
 
+def check_segmenter(config: Config) -> None:
+    """Check that the segmenter's class can be used with its options, without loading a model.
+
+    Raises:
+        ConfigError: if it cannot be imported or does not accept its options.
+    """
+    name = "onnx" if config.segmenter.name == "simulated" else config.segmenter.name
+    if name != "none":
+        with _naming("segmenter.name"):
+            registry.SEGMENTERS.check(
+                name,
+                segmenter_path(config),
+                offered=("classes", "seed"),
+                options=config.segmenter.options,
+            )
+
+
 def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, ...]]:
     from curate.segmenters.classes import CLASS_MAPS, class_map
 
     if classes is None:
         raise ConfigError(
-            f"segmenter '{segmenter}': nobody says what its class numbers mean: set "
+            f"segmenter '{segmenter}': the meaning of its class numbers is not set: set "
             f"segmenter.classes to one of {', '.join(CLASS_MAPS)}, or segmenter.options.classes "
             "to a table like {Car = [7]}"
         )
@@ -143,12 +190,12 @@ def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, .
 
 
 def segmenter_path(config: Config) -> Path | None:
-    """The segmenter's model or folder; the project ships the one for simulated images."""
+    """Return the segmenter's model or folder; curate ships the model for simulated images."""
     return SHIPPED_SEGMENTER if config.segmenter.name == "simulated" else config.segmenter.path
 
 
 def open_policy(config: Config, name: str) -> Policy:
-    """A policy with its settings."""
+    """Return a policy with its settings."""
     section = config.solve
     policy: Policy = registry.POLICIES.build(
         name,
@@ -162,21 +209,53 @@ def open_policy(config: Config, name: str) -> Policy:
     return policy
 
 
+def check_policy(config: Config, name: str) -> None:
+    """Check that a policy can be made with its settings.
+
+    Raises:
+        ConfigError: if it cannot be imported, or rejects its options.
+    """
+    with _naming("run.method" if name == config.run.method else "--policy"):
+        open_policy(config, name)
+
+
+def check_executor(config: Config) -> None:
+    """Check that the executor's class can be used with its options, without starting it.
+
+    Raises:
+        ConfigError: if it cannot be imported or does not accept its options.
+    """
+    section = config.run
+    options = section.executor_options.get(section.executor, {})
+    with _naming("run.executor"):
+        registry.EXECUTORS.check(section.executor, offered=("workers",), options=options)
+
+
+def check_labels_format(config: Config) -> None:
+    """Check that the labels can be exported in the format that the user's trainer gets.
+
+    Raises:
+        ConfigError: if the exporter cannot be imported or made.
+    """
+    with _naming("train.labels_format"):
+        registry.EXPORTERS.build(config.train.labels_format, offered={}, options={})
+
+
 def consistency_settings(config: Config) -> ConsistencySettings:
-    """How predictions and repredictions are compared."""
+    """Return how predictions and repredictions are compared."""
     return _from_section(ConsistencySettings, config.repredict)
 
 
 def open_prior(
     config: Config, name: str, thresholds: Mapping[str, float], *, measures: bool = True
 ) -> EvidenceSource:
-    """A prior with its settings.
+    """Return a prior with its settings.
 
     Args:
-        config: all sections.
-        name: of the prior.
-        thresholds: points per category, learned from X_l; read by priors that name them.
-        measures: whether it will look at frames, for which alone a segmenter is opened.
+        config: the configuration.
+        name: name of the prior.
+        thresholds: points per category, learned from X_l; passed to priors with this argument.
+        measures: whether the prior will look at frames; only then its segmenter is opened.
     """
     prior: EvidenceSource = registry.PRIORS.build(
         name,
@@ -191,24 +270,37 @@ def open_prior(
 
 
 def open_sequence_source(config: Config, name: str) -> SequenceSource:
-    """A source of evidence that looks at whole sequences, with its options."""
+    """Return a source of evidence that looks at whole sequences, with its options."""
     source: SequenceSource = registry.PRIORS.build(
         name, offered={}, options=config.run.prior_options.get(name, {})
     )
     return source
 
 
+def check_prior(config: Config, name: str) -> None:
+    """Check that a source of evidence can be made with its options; its segmenter is opened.
+
+    Raises:
+        CurateError: if it cannot be imported or made, or its segmenter cannot be opened.
+    """
+    with _naming("run.priors"):
+        if hasattr(registry.PRIORS.load(name), "score_sequence"):
+            open_sequence_source(config, name)
+        else:
+            open_prior(config, name, dict.fromkeys(config.dataset.categories, 1.0))
+
+
 def point_settings(config: Config) -> PointSettings:
-    """How points per category are learned from X_l."""
+    """Return how points per category are learned from X_l."""
     return _from_section(PointSettings, config.points)
 
 
 def semantic_settings(config: Config) -> SemanticSettings:
-    """How the semantic prior turns pixels into trust."""
+    """Return how the semantic prior turns pixels into trust."""
     return _from_section(SemanticSettings, config.semantic)
 
 
 def _from_section(settings: type[Kind], section: Any) -> Kind:
-    """A settings object from the section's values of the same names."""
+    """Return a settings object with the section's values of the same names."""
     names = [field.name for field in dataclasses.fields(settings)]  # type: ignore[arg-type]
     return settings(**{name: getattr(section, name) for name in names})

@@ -6,11 +6,12 @@ current folder.
 
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, get_origin
 
 from curate.errors import ConfigError, CurateError, one_line
+from curate.spelling import did_you_mean
 from pipelines.user_modules import import_user_module
 
 if TYPE_CHECKING:
@@ -32,10 +33,17 @@ class Registry:
     classes: Mapping[str, str]
 
     def check_name(self, name: str, *others: str) -> None:
-        """ConfigError for a name that is neither registered, nor module:Class, nor in `others`."""
-        if name not in (*self.classes, *others) and not name.partition(":")[2]:
-            known = ", ".join(sorted((*self.classes, *others)))
-            raise ConfigError(f"unknown {self.kind} '{name}': use one of {known}, or module:Class")
+        """Check a name without importing anything.
+
+        Raises:
+            ConfigError: if it is neither registered, nor `module:Class`, nor one of the others.
+        """
+        names = sorted((*self.classes, *others))
+        if name not in names and not name.partition(":")[2]:
+            raise ConfigError(
+                f"unknown {self.kind} '{name}': use one of {', '.join(names)}, or module:Class"
+                f"{did_you_mean(name, names)}"
+            )
 
     def load(self, name: str) -> Any:
         """The class behind a name.
@@ -47,7 +55,7 @@ class Registry:
         module_name, _, class_name = self.classes.get(name, name).partition(":")
         importer = importlib.import_module if name in self.classes else import_user_module
         try:
-            found = getattr(importer(module_name), class_name)
+            module = importer(module_name)
         except (ImportError, AttributeError, ConfigError) as error:
             raise ConfigError(f"{self.kind} '{name}' cannot be imported: {error}") from error
         except (Exception, SystemExit) as error:  # the module may be the user's, and do anything
@@ -56,8 +64,15 @@ class Registry:
                 f"{self.kind} '{name}' cannot be imported: its module raises "
                 f"{type(error).__name__}: {words}"
             ) from error
+        if not hasattr(module, class_name):
+            public = [each for each, value in vars(module).items() if isinstance(value, type)]
+            raise ConfigError(
+                f"{self.kind} '{name}' cannot be imported: {module_name} has no '{class_name}'"
+                f"{did_you_mean(class_name, public)}"
+            )
+        found = getattr(module, class_name)
         if not callable(found):
-            raise ConfigError(f"{self.kind} '{name}' is no class but {found!r:.80}")
+            raise ConfigError(f"{self.kind} '{name}' is not a class but {found!r:.80}")
         missing = [member for member in _members(self.protocol) if not hasattr(found, member)]
         if isinstance(found, type) and missing:
             raise ConfigError(
@@ -70,6 +85,38 @@ class Registry:
         """Whether the constructor behind a name has an argument of that name."""
         return argument in inspect.signature(self.load(name)).parameters
 
+    def check(
+        self, name: str, *given: Any, offered: Collection[str], options: Mapping[str, Any]
+    ) -> Any:
+        """Return the class behind a name, once it is known to accept its arguments.
+
+        Args:
+            name: see `build`.
+            given: see `build`.
+            offered: names of the keyword arguments that the caller can make.
+            options: see `build`.
+
+        Raises:
+            ConfigError: if it cannot be imported, does not know an option, or needs an argument
+                that nobody gives.
+        """
+        factory = self.load(name)
+        parameters = inspect.signature(factory).parameters
+        anything = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
+        unknown = [] if anything else [key for key in options if key not in parameters]
+        if unknown:
+            known = list(parameters)[len(given) :]
+            raise ConfigError(
+                f"{self.kind} '{name}' has no option '{unknown[0]}'"
+                f"{did_you_mean(unknown[0], known)}; it has {', '.join(known) or 'none'}"
+            )
+        made = dict.fromkeys(key for key in offered if key in parameters)
+        try:
+            inspect.signature(factory).bind(*given, **{**made, **options})
+        except TypeError as error:
+            raise ConfigError(f"{self.kind} '{name}': {error}") from error
+        return factory
+
     def build(
         self,
         name: str,
@@ -77,28 +124,23 @@ class Registry:
         offered: Mapping[str, Callable[[], Any]],
         options: Mapping[str, Any],
     ) -> Any:
-        """An instance.
+        """Return an instance.
 
         Args:
             name: a registered name or `package.module:Class`.
             given: positional arguments, passed as they are.
-            offered: keyword arguments, of which those are made that the constructor names.
-            options: the user's keyword arguments, all of which the constructor must know.
+            offered: keyword arguments, of which those are made that the constructor has.
+            options: the user's keyword arguments, all of which the constructor must have.
 
         Raises:
-            ConfigError: the constructor does not know an option, needs one that is missing, or
-                raises; every error of `CurateError` passes as it is.
+            ConfigError: see `check`, or if the constructor raises; every `CurateError` passes as
+                it is.
         """
-        factory = self.load(name)
-        signature = inspect.signature(factory)
-        wanted = signature.parameters.keys() - options.keys()
+        factory = self.check(name, *given, offered=offered.keys(), options=options)
+        wanted = inspect.signature(factory).parameters.keys() - options.keys()
         keywords = {key: make() for key, make in offered.items() if key in wanted}
         try:
-            signature.bind(*given, **(keywords := keywords | dict(options)))
-        except TypeError as error:
-            raise ConfigError(f"{self.kind} '{name}': {error}; takes {signature}") from error
-        try:
-            return factory(*given, **keywords)
+            return factory(*given, **keywords, **options)
         except CurateError:
             raise
         except Exception as error:  # the class may be the user's, and raise anything

@@ -31,6 +31,7 @@ _DETECT = (
         writes=("prediction",),
         settings=predict.settings,
         function=predict.function,
+        check=predict.check,
     ),
     FrameStage(
         "repredict",
@@ -39,6 +40,7 @@ _DETECT = (
         writes=("reprediction_view", "reprediction", "consistency"),
         settings=repredict.settings,
         function=repredict.function,
+        check=predict.check,
     ),
 )
 _DECIDE = (
@@ -69,6 +71,7 @@ _DECIDE = (
         settings=train_round.settings,
         run=train_round.run,
         file=train_round.file,
+        check=train_round.check,
         guard=export.guard,
         needs=("export",),
     ),

@@ -13,6 +13,7 @@ from curate.errors import ConfigError
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.similarity import Similarity
+from curate.spelling import did_you_mean
 from curate.weighting.base import ZeroWeight
 
 if TYPE_CHECKING:
@@ -171,5 +172,6 @@ def choose_preset(detector: type[TrainableDetector], name: str | None) -> str:
     chosen = next(iter(detector.presets), "") if name is None else name
     if chosen not in detector.presets:
         known = ", ".join(detector.presets)
-        raise ConfigError(f"unknown preset {chosen!r}; choose one of {known}")
+        meant = did_you_mean(chosen, detector.presets)
+        raise ConfigError(f"unknown preset {chosen!r}; choose one of {known}{meant}")
     return chosen

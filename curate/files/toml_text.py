@@ -1,5 +1,9 @@
-"""Reading TOML that may be hostile: tomllib takes memory by the square of a dotted key's length."""
+"""TOML: values written, and documents read that may be hostile.
 
+tomllib takes memory by the square of a dotted key's length.
+"""
+
+import json
 import re
 import tomllib
 from typing import Any
@@ -27,3 +31,22 @@ def parse_toml(text: str) -> dict[str, Any]:
         line = text.count("\n", 0, found.start()) + 1
         raise ValueError(f"a key of more than {MOST_PARTS} parts (at line {line})")
     return tomllib.loads(text)
+
+
+def toml(value: Any) -> str:
+    """Return a value in TOML's notation."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        # TOML's strings are escaped as JSON's are, and U+007F besides.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml, value))}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{toml_key(k)} = {toml(v)}' for k, v in value.items())}}}"
+    return repr(value)
+
+
+def toml_key(key: str) -> str:
+    """Return a key in TOML's notation, in quotes only where it needs them."""
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml(key)

@@ -12,6 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from curate.errors import ConfigError
+from curate.spelling import did_you_mean
 
 ClassMap = Mapping[str, tuple[int, ...]]
 
@@ -44,7 +45,8 @@ def class_map(name: str) -> ClassMap:
     """
     if name not in CLASS_MAPS:
         known = ", ".join(sorted(CLASS_MAPS))
-        raise ConfigError(f"unknown class set {name!r}: use one of {known}")
+        meant = did_you_mean(name, CLASS_MAPS)
+        raise ConfigError(f"unknown class set {name!r}: use one of {known}{meant}")
     return CLASS_MAPS[name]
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from curate.datasets.base import sequences_of
 from curate.errors import ConfigError
 from curate.firewall.sequences import group_by_sequence
-from pipelines.workspace.config import Config, read_config, write_config
+from pipelines.workspace.config import Config, read_config
+from pipelines.workspace.config_file import write_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import CONFIG_NAME, Workspace
 

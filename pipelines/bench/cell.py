@@ -24,7 +24,7 @@ from pipelines.engine.runner import Report, open_executor, run_first, run_frames
 from pipelines.engine.schedule import run_all
 from pipelines.round import graph_of, open_plan
 from pipelines.stages.methods import METHODS
-from pipelines.workspace.config import write_config
+from pipelines.workspace.config_file import write_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import CONFIG_NAME, SPLITS, Workspace
 

@@ -10,9 +10,11 @@ from pydantic import ValidationError
 
 from curate.errors import ConfigError, DataError, WorkspaceError
 from curate.files.atomic import replace_file
+from curate.spelling import did_you_mean
 from pipelines.registry import trainable, trainable_names
 from pipelines.stages.methods import METHODS, with_method
 from pipelines.workspace.config import AtLeastOne, Config, Section, change_setting, make_config
+from pipelines.workspace.config_faults import describe_faults
 
 SYNTHETIC = "synthetic"
 SETTINGS_FILE = "bench.json"
@@ -134,7 +136,8 @@ def check_axes(axes: Axes) -> Axes:
             raise ConfigError(f"--{name} {','.join(map(str, values))}: give one or more, each once")
     unknown = [name for name in axes.methods if name not in METHODS]
     if unknown:
-        raise ConfigError(f"--methods {unknown[0]}: use some of {', '.join(METHODS)}")
+        meant = did_you_mean(unknown[0], METHODS)
+        raise ConfigError(f"--methods {unknown[0]}: use some of {', '.join(METHODS)}{meant}")
     for ratio in axes.ratios:
         if not 0 < ratio <= 1:
             raise ConfigError(f"--ratios {ratio:g}: a share is above 0 and at most 1")
@@ -159,7 +162,7 @@ def read_bench(root: Path) -> Bench | None:
         return Bench(root, settings, Axes.model_validate(document["grid"]))
     except (ValueError, KeyError, TypeError) as error:
         reason = (
-            "; ".join(str(fault["msg"]) for fault in error.errors())
+            describe_faults(error, Axes if error.title == "Axes" else BenchSettings)
             if isinstance(error, ValidationError)
             else error
         )

@@ -23,9 +23,12 @@ def run_frame_command(
 ) -> None:
     """Runs frame stages for a split; None stands for the configured priors."""
     from curate.errors import ConfigError
+    from pipelines.assembly import check_executor
+    from pipelines.engine.plan import Plan
     from pipelines.engine.progress import Bar
+    from pipelines.engine.rounds import open_round
     from pipelines.engine.runner import open_executor, run_frames
-    from pipelines.round import open_plan
+    from pipelines.round import graph_of
     from pipelines.workspace.workspace import SPLITS
 
     workspace = open_workspace(folder, executor, workers)
@@ -36,11 +39,13 @@ def run_frame_command(
     unknown = [name for name in names if name not in (*priors, "predict", "repredict")]
     if unknown:
         raise ConfigError(f"--prior {unknown[0]}: not among run.priors {list(priors)}")
-    plan = open_plan(workspace, round_number)
-    wanted = [plan.graph.of_frames(name) for name in names]
+    check_executor(workspace.config)
+    graph = graph_of(workspace)
+    wanted = [graph.of_frames(name) for name in names]
     for stage in wanted:
         if stage.check:
             stage.check(workspace)
+    plan = Plan(workspace, open_round(workspace, round_number), graph)
     reports = []
     with open_executor(workspace) as work:
         for stage in wanted:
@@ -59,12 +64,19 @@ def run_round_command(
     as_json: bool,
 ) -> None:
     """Runs a round stage for a policy."""
+    from pipelines.engine.plan import Plan
     from pipelines.engine.progress import Bar
+    from pipelines.engine.rounds import open_round
     from pipelines.engine.runner import run_round
-    from pipelines.round import open_plan
+    from pipelines.round import graph_of
 
-    plan = open_plan(workspace, round_number)
-    report = run_round(plan, name, policy or workspace.config.run.method, Bar())
+    policy = policy or workspace.config.run.method
+    graph = graph_of(workspace)
+    check = graph.of_rounds(name).check
+    if check:
+        check(workspace, policy)
+    plan = Plan(workspace, open_round(workspace, round_number), graph)
+    report = run_round(plan, name, policy, Bar())
     if not as_json:
         print_report(report)
     end([report], as_json=as_json)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from pipelines.assembly import check_executor
 from pipelines.engine.graph import Graph
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
@@ -54,8 +55,9 @@ def check_stages(workspace: Workspace, graph: Graph, policy: str, *, evidence: b
     """Check what can be known to be wrong with the stages' settings before any work.
 
     Raises:
-        CurateError: if a stage could not work.
+        CurateError: if a stage or the executor could not work.
     """
+    check_executor(workspace.config)
     for stage in graph.stages:
         if isinstance(stage, RoundStage) and stage.check:
             stage.check(workspace, policy)

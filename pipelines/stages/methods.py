@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from curate.errors import ConfigError
+from curate.spelling import did_you_mean
 from curate.weighting.base import ZeroWeight
 from pipelines.assembly import open_policy
 from pipelines.registry import POLICIES
@@ -72,6 +73,7 @@ def method_named(name: str) -> Method:
         return Method(name, "student", "a policy")
     raise ConfigError(
         f"unknown method {name!r}: use one of {', '.join(METHODS)}, or a policy module:Class"
+        f"{did_you_mean(name, METHODS)}"
     )
 
 

@@ -14,7 +14,7 @@ from curate.errors import ModelError
 from curate.frames import Frame
 from curate.geometry.projection import in_view
 from db.models import BOX_COLUMNS
-from pipelines.assembly import open_detector
+from pipelines.assembly import check_detector, open_detector
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
 from pipelines.workspace.config import Config
@@ -149,6 +149,15 @@ def _named_paths(options: object) -> Iterator[str]:
     elif isinstance(options, list | tuple):
         for each in options:
             yield from _named_paths(each)
+
+
+def check(workspace: Workspace) -> None:
+    """Check that the detector's class can be used with its options.
+
+    Raises:
+        ConfigError: if it cannot.
+    """
+    check_detector(workspace.config)
 
 
 def function(workspace: Workspace, context: RoundContext) -> Predict:

@@ -18,8 +18,8 @@ from curate.priors.base import Evidence, Measured, SequenceFrame, check_evidence
 from curate.priors.points import learn_thresholds
 from db import bulk
 from pipelines.assembly import (
+    check_prior,
     open_prior,
-    open_segmenter,
     open_sequence_source,
     point_settings,
     segmenter_path,
@@ -168,9 +168,8 @@ def stages(names: Sequence[str]) -> tuple[FramesStage, ...]:
 
 
 def _check(name: str, workspace: Workspace) -> None:
-    """ConfigError where the segmenter of a prior that needs one cannot be opened."""
-    if PRIORS.takes(name, "segmenter"):
-        open_segmenter(workspace.config)
+    """Check that a source can be made with its options, and that its segmenter opens."""
+    check_prior(workspace.config, name)
 
 
 def _declared(source: Source) -> Settings:

@@ -9,7 +9,7 @@ from sqlalchemy import Connection
 
 from curate.weighting.base import Evidence, Weights
 from db import bulk, weight_index
-from pipelines.assembly import open_policy
+from pipelines.assembly import check_policy, open_policy
 from pipelines.engine.progress import Progress
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.labels.evidence import LabelKeys, read_evidence, read_memory, solved_fingerprint
@@ -42,7 +42,7 @@ def check(workspace: Workspace, policy: str) -> None:
     Raises:
         ConfigError: if it cannot.
     """
-    open_policy(workspace.config, policy)
+    check_policy(workspace.config, policy)
 
 
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:

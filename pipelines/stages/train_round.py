@@ -1,16 +1,23 @@
 """train-round: the student, from the exported labels and the teacher."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection
 
-from curate.errors import ConfigError
+from curate.errors import ConfigError, one_line
 from curate.frames import Frame
+from curate.spelling import did_you_mean
 from db import bulk
-from pipelines.assembly import device, trainable_detector, trained_detector
+from pipelines.assembly import (
+    check_labels_format,
+    device,
+    trainable_detector,
+    trained_detector,
+)
 from pipelines.engine.progress import Progress, as_total
 from pipelines.engine.rounds import register_checkpoint
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
@@ -66,6 +73,20 @@ def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
         suffix = trainable.detector.checkpoint_suffix
     name = f"round-{context.number:02d}-{policy}{suffix}"
     return workspace.root / "checkpoints" / name
+
+
+def check(workspace: Workspace, policy: str) -> None:
+    """Check the settings of the trainer, curate's or the user's.
+
+    Raises:
+        ConfigError: if there is no such label format, or the trainer does not know a setting.
+    """
+    config = workspace.config
+    if config.train.command is not None:
+        check_labels_format(config)
+    elif trainable_detector(config):
+        section, method = config.train, method_of(config, policy)
+        training_settings(workspace, section.round_steps, section.round_learning_rate, 1, method)
 
 
 def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
@@ -164,8 +185,13 @@ def training_settings(
     try:
         return TrainingSettings(**{**known, **section.options})
     except TypeError as error:
-        reason = str(error).rpartition(") ")[-1]
-        raise ConfigError(f"train.options of curate.toml: {reason}") from None
+        names = [field.name for field in fields(TrainingSettings) if field.name not in known]
+        unknown = [name for name in section.options if name not in {*names, *known}]
+        reason = f"unknown setting '{unknown[0]}'" if unknown else one_line(error)
+        meant = did_you_mean(unknown[0], names) if unknown else ""
+        raise ConfigError(
+            f"train.options of curate.toml: {reason}{meant}; it accepts {', '.join(names)}"
+        ) from None
 
 
 def train_with_progress(

@@ -1,6 +1,10 @@
-"""The configuration of a workspace, `curate.toml`: sections, defaults, and what they may hold."""
+"""The configuration of a workspace, `curate.toml`: every setting with its meaning, unit and range.
 
-import json
+docs/config.md, the comments in `curate.toml`, the JSON Schema and the error messages are all made
+from the fields of these classes.
+"""
+
+import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,23 +21,41 @@ from pydantic import (
 
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, one_line
-from curate.files.atomic import replace_file
 from curate.files.toml_text import parse_toml
+from pipelines import registry
+from pipelines.workspace.config_faults import describe_faults
+from pipelines.workspace.names import KnownClassSet, KnownName
 
 Share = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Scale = Annotated[float, Field(gt=0, le=100)]
 AtLeastOne = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=0)]
+PointCount = Annotated[float, Field(ge=1, allow_inf_nan=False)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Options = dict[str, Any]
 
+DatasetKind = Annotated[str, KnownName(registry.DATASETS)]
+DetectorName = Annotated[str, KnownName(registry.DETECTORS)]
+SegmenterName = Annotated[str, KnownName(registry.SEGMENTERS, ("none", "simulated"))]
+PriorName = Annotated[str, KnownName(registry.PRIORS)]
+PolicyName = Annotated[str, KnownName(registry.POLICIES)]
+ExporterName = Annotated[str, KnownName(registry.EXPORTERS)]
+ExecutorName = Annotated[str, KnownName(registry.EXECUTORS)]
+
 DEFAULT_PRIORS = ("points", "semantic")
+
+
+def _unit(unit: str) -> dict[str, Any]:
+    """Return the unit of a field; "1" for a number without dimension."""
+    return {"unit": unit}
 
 
 def _each_once(names: tuple[str, ...]) -> tuple[str, ...]:
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise ValueError(f"{repeated[0]} is named twice")
+        raise ValueError(f"'{repeated[0]}' is named twice")
     return names
 
 
@@ -44,127 +66,331 @@ def _rising(limits: tuple[float, float]) -> tuple[float, float]:
 
 
 class Section(BaseModel):
-    """A section refuses keys that it does not know."""
+    """A table of settings that rejects keys it does not know."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class DatasetSection(Section):
-    """Where the frames are."""
+    """Where the frames are and which categories count."""
 
-    kind: str = "kitti"
-    root: Path
-    categories: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_each_once)] = (
-        CATEGORIES
+    kind: DatasetKind = Field(default="kitti", description="Layout of the data set.")
+    root: Path = Field(
+        description="Folder of the data set. A relative path starts at the workspace."
     )
-    split_by: Literal["sequence", "frame"] = "sequence"  # frame: neighbours on both sides
-    follow_links: bool = False  # true: links may lead out of root
-    options: Options = {}
+    categories: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_each_once)] = Field(
+        default=CATEGORIES,
+        description="Categories to detect. Labels of all others are not used.",
+    )
+    split_by: Literal["sequence", "frame"] = Field(
+        default="sequence",
+        description="What goes into one split as a whole. With 'frame', near-duplicate frames of a "
+        "sequence end up in several splits.",
+    )
+    follow_links: bool = Field(
+        default=False, description="Whether links in the data set may lead out of its folder."
+    )
+    options: Options = Field(
+        default={}, description="Further arguments of the data set's class; see docs/datasets.md."
+    )
 
 
 class DetectorSection(Section):
-    """Who guesses."""
+    """The detector that makes the predictions."""
 
-    name: str = "pillars"
-    path: Path | None = None  # of a detector that the user brings
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    minimum_score: Share = 0.1
-    camera_view: bool = True  # the detector sees only the points that the camera sees
-    options: Options = {}
+    name: DetectorName = Field(
+        default="pillars", description="Detector to use; see docs/detectors.md."
+    )
+    path: Path | None = Field(
+        default=None,
+        description="Checkpoint, model or result files of your own detector. Without it, curate "
+        "trains the first teacher.",
+        examples=["results/predictions.pkl"],
+    )
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        default="auto",
+        description="Where the detector runs and trains. 'auto' uses a GPU where there is one.",
+    )
+    minimum_score: Share = Field(
+        default=0.1,
+        description="Predictions with a lower score are dropped. Keep it low: the weight decides "
+        "which labels count.",
+        json_schema_extra=_unit("1"),
+    )
+    camera_view: bool = Field(
+        default=True,
+        description="Whether the detector gets only the points that the camera sees.",
+    )
+    options: Options = Field(
+        default={}, description="Further arguments of the detector's class; see docs/detectors.md."
+    )
 
 
 class SegmenterSection(Section):
-    """Who names pixels."""
+    """The segmenter whose semantic maps the semantic prior reads."""
 
-    name: str = "none"
-    path: Path | None = None
-    classes: str | None = None  # whose numbers: voc, coco, cityscapes, ... (docs/segmenters.md)
-    options: Options = {}
+    name: SegmenterName = Field(
+        default="none",
+        description="Segmenter to use. 'simulated' is the model for simulated images that curate "
+        "ships; 'none' needs run.priors without 'semantic'.",
+    )
+    path: Path | None = Field(
+        default=None,
+        description="Model, folder of saved maps, or file of masks.",
+        examples=["models/segmenter.onnx"],
+    )
+    classes: Annotated[str, KnownClassSet()] | None = Field(
+        default=None,
+        description="Class set that says what the segmenter's class numbers mean; see "
+        "docs/segmenters.md.",
+        examples=["cityscapes"],
+    )
+    options: Options = Field(
+        default={},
+        description="Further arguments of the segmenter's class; see docs/segmenters.md.",
+    )
 
 
 class RepredictSection(Section):
-    """The augmented copies A(x), and the consistency loss between the answers."""
+    """The augmented copies A(x) of a frame, and the consistency loss between their predictions."""
 
-    views: AtLeastOne = 1
-    flip_probability: Share = 0.5
-    rotation_limit_rad: Annotated[float, Field(ge=0)] = 0.7853981633974483
-    scale_range: Annotated[tuple[Scale, Scale], AfterValidator(_rising)] = (0.95, 1.05)
-    score_weight: Annotated[float, Field(ge=0)] = 1.0
-    box_weight: Annotated[float, Field(ge=0)] = 2.0
-    beta: Positive = 1 / 9
-    minimum_iou: Annotated[float, Field(ge=0, lt=1)] = 0.1
+    views: AtLeastOne = Field(
+        default=1,
+        description="Augmented copies of each frame. L is the mean over those that matched.",
+        json_schema_extra=_unit("copies"),
+    )
+    flip_probability: Share = Field(
+        default=0.5,
+        description="Probability that a copy is flipped over the x axis.",
+        json_schema_extra=_unit("1"),
+    )
+    rotation_limit_rad: Annotated[float, Field(ge=0, le=math.pi)] = Field(
+        default=0.7853981633974483,
+        description="A copy is rotated about z by at most this angle, either way.",
+        json_schema_extra=_unit("rad"),
+    )
+    scale_range: Annotated[tuple[Scale, Scale], AfterValidator(_rising)] = Field(
+        default=(0.95, 1.05),
+        description="Limits of the factor by which a copy is scaled.",
+        json_schema_extra=_unit("1"),
+    )
+    score_weight: NonNegative = Field(
+        default=1.0,
+        description="Weight of -ln s' in L, where s' is the score of the reprediction.",
+        json_schema_extra=_unit("1"),
+    )
+    box_weight: NonNegative = Field(
+        default=2.0,
+        description="Weight of the smooth L1 loss of the box residual in L.",
+        json_schema_extra=_unit("1"),
+    )
+    beta: Positive = Field(
+        default=1 / 9,
+        description="Residual at which smooth L1 turns from a parabola into a line.",
+        json_schema_extra=_unit("1"),
+    )
+    minimum_iou: Annotated[float, Field(ge=0, lt=1)] = Field(
+        default=0.1,
+        description="A prediction and a reprediction match only above this BEV IoU.",
+        json_schema_extra=_unit("1"),
+    )
 
 
 class PointsSection(Section):
-    """Eq. 8."""
+    """The point prior rho_diff (Eq. 8): how many LiDAR points a label of a category should hold."""
 
-    statistic: Literal["median", "mean", "quantile", "fixed"] = "median"
-    quantile: Share = 0.5
-    fixed: Annotated[float, Field(ge=1)] = 5.0
-    fallback: Annotated[float, Field(ge=1)] = 5.0
+    statistic: Literal["median", "mean", "quantile", "fixed"] = Field(
+        default="median",
+        description="How m_th follows from the points in the ground-truth boxes of X_l. 'fixed' "
+        "uses points.fixed instead.",
+    )
+    quantile: Share = Field(
+        default=0.5,
+        description="Quantile of the point counts, for statistic = 'quantile'.",
+        json_schema_extra=_unit("1"),
+    )
+    fixed: PointCount = Field(
+        default=5.0,
+        description="Threshold m_th of every category, for statistic = 'fixed'.",
+        json_schema_extra=_unit("points"),
+    )
+    fallback: PointCount = Field(
+        default=5.0,
+        description="Threshold m_th of a category without ground truth in X_l.",
+        json_schema_extra=_unit("points"),
+    )
 
 
 class SemanticSection(Section):
-    """Eq. 9."""
+    """The semantic prior rho_anno (Eq. 9), from the score s and the share S/A of class pixels."""
 
-    mean: Literal["geometric", "product", "arithmetic"] = "geometric"
-    outside: Literal["neutral", "drop"] = "neutral"
+    mean: Literal["geometric", "product", "arithmetic"] = Field(
+        default="geometric",
+        description="How s and S/A are combined: sqrt(s S/A), s S/A or (s + S/A) / 2.",
+    )
+    outside: Literal["neutral", "drop"] = Field(
+        default="neutral",
+        description="Trust rho_anno of a box outside the image: 'neutral' is s, 'drop' is 0.",
+    )
 
 
 class SolveSection(Section):
-    """The settings of policies; which of them weighs is `run.method`."""
+    """How policies weigh the labels. Which policy weighs is set by run.method."""
 
-    scope: Literal["round", "category", "frame"] = "round"  # which labels share one lambda
-    quantile: Annotated[float, Field(gt=0, le=1)] | None = None  # in place of Eq. 4's maximum
-    self_paced: bool = True  # false: pspsl weighs by the priors alone
-    options: dict[str, Options] = {}  # by policy, e.g. options.threshold.threshold = 0.3
+    scope: Literal["round", "category", "frame"] = Field(
+        default="round",
+        description="Labels that share one lambda (Eq. 4). Read by spsl and pspsl.",
+    )
+    quantile: Annotated[float, Field(gt=0, le=1)] | None = Field(
+        default=None,
+        description="Quantile of the losses that takes the place of max(L) in Eq. 4. Without it, "
+        "the maximum is used. Read by spsl and pspsl.",
+        json_schema_extra=_unit("1"),
+        examples=[0.95],
+    )
+    self_paced: bool = Field(
+        default=True,
+        description="Whether pspsl uses the factor 1 - L / lambda. With false, the priors alone "
+        "weigh, and no repredictions are needed.",
+    )
+    options: dict[PolicyName, Options] = Field(
+        default={},
+        description="Arguments of each policy by its name, such as {threshold = {threshold = "
+        "0.4}}; see docs/methods.md.",
+    )
 
     @model_validator(mode="before")
     @classmethod
-    def _point_to_new_path(cls, section: Any) -> Any:
+    def _reject_policy(cls, section: Any) -> Any:
         if isinstance(section, Mapping) and "policy" in section:
             raise ValueError(f'policy has moved: write method = "{section["policy"]}" in [run]')
         return section
 
 
 class TrainSection(Section):
-    """How the detector learns."""
+    """How the detector is trained."""
 
-    preset: str = "auto"  # auto: the detector's first, see docs/config.md
-    pretrain_steps: AtLeastOne = 1200
-    round_steps: AtLeastOne = 1200
-    batch_size: AtLeastOne = 2  # frames of X_l per step
-    unlabeled_batch_size: Annotated[int, Field(ge=0)] = 2  # frames of X_u per step, besides
-    learning_rate: Positive = 5e-3  # peak, from scratch
-    round_learning_rate: Positive = 3e-3  # peak, from the teacher
-    threads: AtLeastOne = 1
-    zero_weight: Literal["method", "ignore", "background"] = "method"  # see docs/methods.md
-    start: Literal["teacher", "scratch"] = "teacher"
-    teacher: Literal["method", "student", "ema"] = "method"  # what teaches the next round
-    ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999  # per 1/10,000 of the training
-    statistics_steps: AtLeastOne = 20  # between two points of the training's curves
-    pasted: Annotated[int, Field(ge=0)] = 4  # of the object bank, per category; 0 = no bank
-    command: str | None = None  # of your own trainer, see docs/training.md
-    labels_format: str = "sqlite"  # in which it gets the labels; an exporter's name
-    options: Options = {}
+    preset: str = Field(
+        default="auto",
+        description="Preset of the detector's network. 'auto' is its first; see docs/config.md.",
+    )
+    pretrain_steps: AtLeastOne = Field(
+        default=1200,
+        description="Optimiser steps of the first teacher, on X_l.",
+        json_schema_extra=_unit("steps"),
+    )
+    round_steps: AtLeastOne = Field(
+        default=1200,
+        description="Optimiser steps of the student of each round.",
+        json_schema_extra=_unit("steps"),
+    )
+    batch_size: AtLeastOne = Field(
+        default=2, description="Frames of X_l per step.", json_schema_extra=_unit("frames")
+    )
+    unlabeled_batch_size: Count = Field(
+        default=2,
+        description="Frames of X_u per step, in addition to those of X_l.",
+        json_schema_extra=_unit("frames"),
+    )
+    learning_rate: Positive = Field(
+        default=5e-3,
+        description="Peak learning rate of the first teacher.",
+        json_schema_extra=_unit("1"),
+    )
+    round_learning_rate: Positive = Field(
+        default=3e-3,
+        description="Peak learning rate of the students.",
+        json_schema_extra=_unit("1"),
+    )
+    threads: AtLeastOne = Field(
+        default=1, description="CPU threads of a training.", json_schema_extra=_unit("threads")
+    )
+    zero_weight: Literal["method", "ignore", "background"] = Field(
+        default="method",
+        description="What a label of weight 0 is to the student. 'method': what the policy says; "
+        "see docs/methods.md.",
+    )
+    start: Literal["teacher", "scratch"] = Field(
+        default="teacher", description="What the student of a round starts from."
+    )
+    teacher: Literal["method", "student", "ema"] = Field(
+        default="method",
+        description="What teaches the next round: the student or the moving average of its "
+        "weights. 'method': as the method has it.",
+    )
+    ema_decay: Annotated[float, Field(ge=0, lt=1)] = Field(
+        default=0.999,
+        description="Decay of the moving average per ten-thousandth of a training.",
+        json_schema_extra=_unit("1"),
+    )
+    statistics_steps: AtLeastOne = Field(
+        default=20,
+        description="Steps between two points of the training's curves.",
+        json_schema_extra=_unit("steps"),
+    )
+    pasted: Count = Field(
+        default=4,
+        description="Objects of each category that are pasted into a frame from the object bank. "
+        "0 trains without the bank.",
+        json_schema_extra=_unit("objects"),
+    )
+    command: str | None = Field(
+        default=None,
+        description="Command of your own trainer; see docs/training.md.",
+        examples=["python train.py {labels} {output}"],
+    )
+    labels_format: ExporterName = Field(
+        default="sqlite", description="Format in which your own trainer gets the labels."
+    )
+    options: Options = Field(
+        default={},
+        description="Further settings of curate's trainer, such as {snapshot_seconds = 60.0}.",
+    )
 
 
 class RunSection(Section):
-    """Which method learns, and how the work is organised."""
+    """Which method is used, and how the work is organised."""
 
-    method: str = "pspsl"  # see docs/methods.md
-    rounds: AtLeastOne = 3
-    seed: Seed = 0
-    priors: Annotated[tuple[str, ...], AfterValidator(_each_once)] = DEFAULT_PRIORS
-    prior_options: dict[str, Options] = {}  # of your own priors, by name
-    executor: str = "serial"  # or process, ray; see docs/scale.md
-    executor_options: dict[str, Options] = {}  # by executor, e.g. executor_options.ray.num_gpus = 1
-    workers: AtLeastOne = 1
-    database: str | None = None  # an SQLAlchemy URL; default: curate.db in the workspace
+    method: PolicyName = Field(
+        default="pspsl", description="Method that weighs the labels; see docs/methods.md."
+    )
+    rounds: AtLeastOne = Field(
+        default=3, description="Number of rounds E.", json_schema_extra=_unit("rounds")
+    )
+    seed: Seed = Field(
+        default=0,
+        description="Seed of the split, the training and the augmented copies.",
+        json_schema_extra=_unit("1"),
+    )
+    priors: Annotated[tuple[PriorName, ...], AfterValidator(_each_once)] = Field(
+        default=DEFAULT_PRIORS,
+        description="Priors and other sources of evidence; see docs/evidence.md.",
+    )
+    prior_options: dict[PriorName, Options] = Field(
+        default={}, description="Arguments of each prior by its name."
+    )
+    executor: ExecutorName = Field(
+        default="serial", description="Executor that works on the frames; see docs/scale.md."
+    )
+    executor_options: dict[ExecutorName, Options] = Field(
+        default={},
+        description="Arguments of each executor by its name, such as {ray = {num_gpus = 1}}.",
+    )
+    workers: AtLeastOne = Field(
+        default=1,
+        description="Workers, each with a model of its own. More than one need an executor other "
+        "than serial.",
+        json_schema_extra=_unit("workers"),
+    )
+    database: str | None = Field(
+        default=None,
+        description="SQLAlchemy URL of the database. Without it, curate.db in the workspace.",
+        examples=["postgresql+psycopg://user@host/curate"],
+    )
 
 
 class Config(Section):
-    """All sections."""
+    """The settings of a workspace."""
 
     dataset: DatasetSection
     detector: DetectorSection = DetectorSection()
@@ -178,13 +404,13 @@ class Config(Section):
 
 
 def read_config(path: Path) -> Config:
-    """The configuration in a TOML file.
+    """Return the configuration in a TOML file.
 
     Raises:
-        ConfigError: the file is not TOML, or some settings are wrong; all of them are named.
+        ConfigError: if the file is not TOML or some settings are wrong; all of them are listed.
     """
     if path.exists() and not path.is_file():
-        raise ConfigError(f"{path}: is no file but a folder, a pipe or a device; remove it")
+        raise ConfigError(f"{path}: is not a file but a folder, a pipe or a device; remove it")
     try:
         document = parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -197,25 +423,22 @@ def read_config(path: Path) -> Config:
 
 
 def make_config(document: Mapping[str, Any], source: str) -> Config:
-    """The configuration in a document.
+    """Return the configuration in a document.
 
     Raises:
-        ConfigError: some settings are wrong; all of them are named, with their source.
+        ConfigError: if some settings are wrong; all of them are listed, after the source.
     """
     try:
         return Config.model_validate(document)
     except ValidationError as error:
-        faults = "; ".join(
-            f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors()
-        )
-        raise ConfigError(f"{source}: {faults}") from error
+        raise ConfigError(f"{source}: {describe_faults(error, Config)}") from error
 
 
 def change_setting(document: dict[str, Any], setting: str) -> None:
-    """Sets section.key=value in a document; the value as in TOML, anything else is a string.
+    """Set section.key=value in a document. A value that is not TOML is a string.
 
     Raises:
-        ConfigError: it is not of that form.
+        ConfigError: if it is not of that form, or there is no such key or value.
     """
     place, equals, text = setting.partition("=")
     *sections, key = place.strip().split(".")
@@ -225,31 +448,18 @@ def change_setting(document: dict[str, Any], setting: str) -> None:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text.strip()
+    alone: dict[str, Any] = {"dataset": {"root": "."}}
+    for each in (alone, document):
+        _put(each, sections, key, value)
+    try:
+        Config.model_validate(alone)
+    except ValidationError as error:
+        raise ConfigError(f"--set {describe_faults(error, Config)}") from error
+
+
+def _put(document: dict[str, Any], sections: list[str], key: str, value: Any) -> None:
     for section in sections:
         if not isinstance(document.get(section), dict):
             document[section] = {}
         document = document[section]
     document[key] = value
-
-
-def write_config(path: Path, config: Config) -> None:
-    """Writes every setting as TOML, defaults included, so that a user sees what can be set."""
-    document = config.model_dump(mode="json", exclude_none=True)
-    lines = []
-    for section, settings in document.items():
-        lines += [f"[{section}]", *(f"{key} = {toml(value)}" for key, value in settings.items())]
-        lines.append("")
-    replace_file(path, "\n".join(lines).encode())
-
-
-def toml(value: Any) -> str:
-    """A value in TOML's notation."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)  # TOML's strings are escaped as JSON's are
-    if isinstance(value, list):
-        return f"[{', '.join(map(toml, value))}]"
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{toml(k)} = {toml(v)}' for k, v in value.items())}}}"
-    return repr(value)

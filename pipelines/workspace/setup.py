@@ -1,4 +1,4 @@
-"""Setting a workspace up: which frames are labeled, and their ground truth."""
+"""Set-up of a workspace: the split of the frames, and the ground truth of labeled frames."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,10 +16,17 @@ from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
 from curate.files.batches import batched
 from curate.firewall.sequences import choose_sequences, group_by_sequence, straddling
-from curate.segmenters.classes import CLASS_MAPS, class_map
+from curate.segmenters.classes import CLASS_MAPS
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
+from pipelines.assembly import (
+    check_detector,
+    check_executor,
+    check_labels_format,
+    check_policy,
+    check_segmenter,
+)
 from pipelines.workspace.config import Config
 from pipelines.workspace.split_record import split_rows
 from pipelines.workspace.workspace import SPLITS, Workspace, open_dataset
@@ -31,14 +38,14 @@ FRAMES_AT_ONCE = 1024
 
 @dataclass(frozen=True)
 class Split:
-    """Frame names per split; no frame is in two."""
+    """Frame names per split; no frame is in two of them."""
 
     labeled: tuple[str, ...]
     unlabeled: tuple[str, ...]
     val: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        """Raises LeakageError where two splits share a frame."""
+        """Raise LeakageError if two splits share a frame."""
         for one, other in (("labeled", "unlabeled"), ("labeled", "val"), ("unlabeled", "val")):
             shared = sorted(set(getattr(self, one)) & set(getattr(self, other)))
             if shared:
@@ -46,22 +53,22 @@ class Split:
 
 
 def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
-    """A workspace with its frames and the ground truth of X_l and val.
+    """Return a workspace with its frames and the ground truth of X_l and val.
 
-    Everything is read before anything is written, so a damaged file leaves no half workspace.
+    Everything is read before anything is written: a damaged file leaves no incomplete workspace.
 
     Args:
-        root: the workspace's folder.
+        root: folder of the workspace.
         config: its settings.
         labeled: share of the training frames, e.g. "0.04", or a file with a frame name per line.
-        val: likewise, of the frames outside the data set's own val list; "" for that list.
+        val: the same for val frames; "" for the data set's own val list.
 
     Raises:
-        ConfigError: a share or a list is wrong, or a detector or segmenter is not there.
-        DataError: a label or calibration file of X_l or val is damaged.
-        WorkspaceError: the workspace exists with other frames or settings.
+        ConfigError: if a share or a list is wrong, or a class or file is not there.
+        DataError: if a label or calibration file of X_l or val is damaged.
+        WorkspaceError: if the workspace exists with other frames or settings.
     """
-    _check_models_exist(config)
+    _check_extensions(config)
     dataset = open_dataset(config)
     split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
     truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
@@ -74,15 +81,18 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
             f"{workspace.root}: exists with another split of the frames; choose another folder"
         )
     lists = {"labeled": labeled, "val": val}
-    files = {name: Path(wish) for name, wish in lists.items() if wish and Path(wish).is_file()}
+    files = {name: Path(each) for name, each in lists.items() if each and Path(each).is_file()}
     _store(workspace, dataset, split, truth, files)
     return workspace
 
 
-def _check_models_exist(config: Config) -> None:
-    """ConfigError for a detector or segmenter that nobody knows or whose file is not there."""
-    registry.DETECTORS.check_name(config.detector.name)
-    registry.SEGMENTERS.check_name(config.segmenter.name, "none", "simulated")
+def _check_extensions(config: Config) -> None:
+    """Check that detector, segmenter, policy, executor and label format can be used.
+
+    Raises:
+        ConfigError: if a class cannot be imported or does not accept its options, a file is
+            missing, or nothing says what the segmenter's class numbers mean.
+    """
     needs_path = {"detector": ("onnx", "recorded"), "segmenter": tuple(registry.SEGMENTERS.classes)}
     for section, names in needs_path.items():
         name, path = getattr(config, section).name, getattr(config, section).path
@@ -90,36 +100,37 @@ def _check_models_exist(config: Config) -> None:
             raise ConfigError(f"{section} '{name}' needs a path: give --{section}-path")
         if path is not None and not path.exists():
             raise ConfigError(f"--{section}-path {path}: no such file")
-    _check_classes_declared(config)
-
-
-def _check_classes_declared(config: Config) -> None:
-    """ConfigError where nobody says what the numbers of a segmenter's classes mean."""
-    name, section = config.segmenter.name, config.segmenter
-    if section.classes is not None:
-        class_map(section.classes)
-    elif (
-        name in registry.SEGMENTERS.classes
+    name, segmenter = config.segmenter.name, config.segmenter
+    if (
+        segmenter.classes is None
+        and name in registry.SEGMENTERS.classes
         and registry.SEGMENTERS.takes(name, "classes")
-        and "classes" not in section.options
+        and "classes" not in segmenter.options
     ):
         raise ConfigError(
             f"segmenter '{name}': say what its class numbers mean: --segmenter-classes "
             f"{', '.join(CLASS_MAPS)}; or a table of your own: --set "
             '"segmenter.options.classes={Car=[7]}"'
         )
+    check_detector(config)
+    check_segmenter(config)
+    check_policy(config, config.run.method)
+    check_executor(config)
+    check_labels_format(config)
 
 
 def choose_split(
     dataset: Dataset, labeled: str, val: str, seed: int, split_by: str = "sequence"
 ) -> Split:
-    """Which frames are labeled, unlabeled and val.
+    """Return which frames are labeled, unlabeled and val.
 
-    Where the data set knows sequences, a sequence goes into one split as a whole; `split_by`
-    "frame" draws frames all the same.
+    If the data set has sequences, each goes into one split as a whole, unless `split_by` is
+    "frame".
 
     Raises:
-        LeakageError: given lists put a sequence into two splits.
+        ConfigError: if a share or a list is wrong.
+        DataError: if the data set has no frames.
+        LeakageError: if lists of the user put a sequence into two splits.
     """
     lists = dataset.splits()
     frames = lists.get("train") or dataset.frame_ids()
@@ -148,49 +159,48 @@ def choose_split(
     found = Split(tuple(sorted(chosen)), tuple(rest), tuple(sorted(held_out)))
     for frame in (*found.labeled, *found.unlabeled, *found.val):
         check_frame_id(frame)
-    _check_sequences_apart(sequences, found)
+    _check_sequences(sequences, found)
     return found
 
 
-def _check_sequences_apart(sequences: Mapping[str, str], split: Split) -> None:
-    """LeakageError where a sequence is in two splits."""
+def _check_sequences(sequences: Mapping[str, str], split: Split) -> None:
+    """Raise LeakageError if a sequence is in two splits."""
     shared = straddling(sequences, {name: getattr(split, name) for name in SPLITS})
     for (one, other), names in shared.items():
         raise LeakageError(
             f"{len(names)} sequences ({named(names)}) have frames in both {one} and {other}, which "
             "are near-duplicates of each other: give whole sequences (a list may hold their "
-            "names), or split by frame all the same with --split-by frame"
+            "names), or split by frame with --split-by frame"
         )
 
 
 def _choose(
     dataset: Dataset,
     pool: Sequence[str],
-    wish: str,
+    selection: str,
     generator: np.random.Generator,
     split: str,
     sequences: Mapping[str, str],
 ) -> list[str]:
-    """Frames by share or by list, in whole sequences where there are any.
-
-    Only frames with a label file can be chosen.
-    """
-    if Path(wish).is_file():
-        return _listed(dataset, pool, Path(wish), split)
+    """Return frames with a label file, by share or by list, in whole sequences if there are any."""
+    if Path(selection).is_file():
+        return _listed(dataset, pool, Path(selection), split)
     try:
-        share = float(wish)
+        share = float(selection)
     except ValueError:
         share = -1.0
     if not 0 <= share <= 1:
-        raise ConfigError(f"--{split} {wish}: give a share between 0 and 1, or a file of frame ids")
+        raise ConfigError(
+            f"--{split} {selection}: give a share between 0 and 1, or a file of frame ids"
+        )
     if share == 0:
         return []
     with_label = [name for name in sorted(pool) if dataset.files(name).label]
     count = max(1, round(share * len(pool)))
     if count > len(with_label):
         raise ConfigError(
-            f"--{split} {wish} asks for {count} frames, but only {len(with_label)} of {len(pool)} "
-            "have a label file; give a smaller share (0 for none)"
+            f"--{split} {selection} asks for {count} frames, but only {len(with_label)} of "
+            f"{len(pool)} have a label file; give a smaller share (0 for none)"
         )
     if sequences:
         groups = group_by_sequence(sequences, pool)
@@ -198,19 +208,19 @@ def _choose(
         of = [frame for name in sorted(whole) for frame in groups[name]]
         if not of:
             raise ConfigError(
-                f"--{split} {wish}: no sequence has a label file for each of its frames; give a "
-                f"list of frames, or split by frame with --split-by frame"
+                f"--{split} {selection}: no sequence has a label file for each of its frames; give "
+                "a list of frames, or split by frame with --split-by frame"
             )
         return choose_sequences(sequences, of, count, generator)
     return list(generator.permutation(with_label)[:count].tolist())
 
 
 def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
-    """The frames that a file names, each once; a sequence of the pool stands for its frames."""
+    """Return the frames that a file lists, each once; a sequence stands for its frames."""
     try:
         names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--{split} {path}: no list of frame ids: {error}") from error
+        raise ConfigError(f"--{split} {path}: is not a list of frame ids: {error}") from error
     groups = group_by_sequence(sequences_of(dataset, pool), pool)
     names = [frame for name in names for frame in groups.get(name, (name,))]
     unknown = sorted(set(names) - set(pool))
@@ -246,7 +256,7 @@ def _store(
 
 
 def _frame_rows(workspace: Workspace, dataset: Dataset, split: Split) -> Iterator[dict[str, Any]]:
-    """The rows of `frame`, one at a time; not even the path of a label is kept for X_u."""
+    """Yield the rows of `frame`; for X_u, not even the path of a label file is stored."""
     root, kind = workspace.config.dataset.root, workspace.config.dataset.kind
     for name in SPLITS:
         for frame in getattr(split, name):
@@ -263,7 +273,7 @@ def _frame_rows(workspace: Workspace, dataset: Dataset, split: Split) -> Iterato
 
 
 def _truth_rows(frame_id: int, split: str, found: Annotations) -> list[dict[str, Any]]:
-    """The rows of `ground_truth`; DontCare regions have no box."""
+    """Return the rows of `ground_truth`; DontCare regions have no box."""
     rows = []
     for k in range(len(found)):
         box = [None if np.isnan(number) else float(number) for number in found.boxes[k]]

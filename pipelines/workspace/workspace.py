@@ -17,7 +17,8 @@ from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from db.session import Database, parse_url
 from pipelines import registry
-from pipelines.workspace.config import Config, make_config, read_config, write_config
+from pipelines.workspace.config import Config, make_config, read_config
+from pipelines.workspace.config_file import write_config, write_schema
 
 CONFIG_NAME = "curate.toml"
 SPLITS = ("labeled", "unlabeled", "val")
@@ -64,7 +65,9 @@ class Workspace:
             raise WorkspaceError(f"{path}: holds other settings; edit it, or choose another folder")
         for folder in ("checkpoints", "exports", "pictures", "reports"):
             (root / folder).mkdir(parents=True, exist_ok=True)
-        if not path.exists():
+        if path.exists():
+            write_schema(root)
+        else:
             write_config(path, config)
         return cls(root, config, Database(_url(root, config), root))
 

@@ -168,7 +168,8 @@ def _read_folder(path: Path) -> None:
 
 
 def _config(path: Path) -> None:
-    from pipelines.workspace.config import Config, write_config
+    from pipelines.workspace.config import Config
+    from pipelines.workspace.config_file import write_config
 
     write_config(path, Config.model_validate({"dataset": {"root": "data"}}))
 

@@ -60,7 +60,8 @@ def test_names_in_other_letters_fail_every_frame_with_the_remedy(
     assert setting is not None
     toml = work / "curate.toml"
     table = 'options = {rename = {car = "Car", pedestrian = "Pedestrian", cyclist = "Cyclist"}}'
-    toml.write_text(re.sub(r"(?<=camera_view = true\n)options = \{\}", table, toml.read_text()))
+    head, section, rest = toml.read_text().partition("[detector]")
+    toml.write_text(head + section + rest.replace("options = {}", table, 1))
     code, out, err = curate("predict", "-w", work)
     assert code == 0, err
     assert "18 rows" in out

@@ -267,7 +267,7 @@ def test_a_list_may_name_a_frame_twice(
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\x90\xff\x00", "no list of frame ids"),
+        (b"\x90\xff\x00", "is not a list of frame ids"),
         (b"000099\n", "not among the training frames"),
         (b"000002\n", "000002 has no label file"),
     ],

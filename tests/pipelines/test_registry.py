@@ -14,7 +14,7 @@ from pipelines.registry import DETECTORS, PRIORS
         ("raise RuntimeError('no\\nlicence')", "raises RuntimeError: no licence"),
         ("raise SystemExit(0)", "raises SystemExit: 0"),
         ("def f(", "raises SyntaxError"),
-        ("Mine = 3", "is no class but 3"),
+        ("Mine = 3", "is not a class but 3"),
         ("", "cannot be imported"),
         ("class Mine: ...", "has no predict; see curate.detectors.base.Detector"),
     ],

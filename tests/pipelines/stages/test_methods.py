@@ -18,7 +18,8 @@ from pipelines.engine.rounds import find_teacher
 from pipelines.labels.evidence import read_memory
 from pipelines.registry import POLICIES
 from pipelines.stages.methods import METHODS, method_named, method_of, with_method, zero_weight_of
-from pipelines.workspace.config import Config, make_config, write_config
+from pipelines.workspace.config import Config, make_config
+from pipelines.workspace.config_file import write_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace, sha256
 

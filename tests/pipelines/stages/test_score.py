@@ -20,7 +20,7 @@ from curate.errors import ConfigError
 from pipelines.labels.sources import source_of
 from pipelines.registry import PRIORS
 from pipelines.round import round_graph
-from pipelines.workspace.config import write_config
+from pipelines.workspace.config_file import write_config
 from pipelines.workspace.workspace import Workspace
 
 OWN, TRACKS = "support.toys:ToyPrior", "support.toys:ToyTracks"

@@ -1,0 +1,97 @@
+"""Faults in a configuration in words: which key, what it accepts, and what was probably meant."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from curate.files.toml_text import toml, toml_key
+from curate.spelling import did_you_mean
+from pipelines.workspace.reference import Accepted, accepted_by
+
+_LONGEST = 80  # characters of a wrong value that are shown
+
+
+def describe_faults(error: ValidationError, model: type[BaseModel]) -> str:
+    """Return all faults that pydantic found in a document, as one line in our words."""
+    found: dict[str, str] = {}
+    for fault in error.errors(include_url=False):
+        place, words = _describe(fault, model)
+        found.setdefault(place, words)  # a list with three wrong items is one fault
+    return "; ".join(f"{place}{words}" for place, words in found.items())
+
+
+def _describe(fault: ErrorDetails, model: type[BaseModel]) -> tuple[str, str]:
+    """Return the place of a fault, and what is wrong there."""
+    path = [str(part) for part in fault["loc"] if part != "[key]"]
+    known, field, depth = _walk(model, path)
+    if fault["type"] == "extra_forbidden":
+        return _unknown_key(path, model, known)
+    accepted = Accepted("table") if field is None or _model_of(field) else accepted_by(field)
+    if accepted.type != "table":
+        path, inside = path[:depth], path[depth:]
+    else:
+        inside = []
+    place = ".".join(map(toml_key, path)) or "the configuration"
+    if fault["type"] == "missing" and not inside:
+        meaning = field.description if field else None
+        return place, f" is missing{f': {meaning}' if meaning else ''}".rstrip(".")
+    if fault["type"] == "value_error":
+        return place, f": {fault['ctx']['error']}"
+    value = fault["input"]
+    meant = did_you_mean(value, accepted.choices) if isinstance(value, str) else ""
+    finite = "; it must be finite" if fault["type"] == "finite_number" else ""
+    wrong = f": {_shown(value)} in the list" if inside else f" = {_shown(value)}"
+    return place, f"{wrong}: use {accepted}{finite}{meant}"
+
+
+def _unknown_key(
+    path: Sequence[str], model: type[BaseModel], known: Sequence[str]
+) -> tuple[str, str]:
+    """Return the place and the message for a key or a section that does not exist."""
+    *section, key = path
+    owner = f"[{'.'.join(section)}]" if section else "the configuration"
+    noun = "key" if section else "section"
+    meant = did_you_mean(key, known) or _elsewhere(key, model)
+    words = f": unknown {noun}{meant}; {owner} has {', '.join(known)}"
+    return ".".join(map(toml_key, path)), words
+
+
+def _elsewhere(key: str, model: type[BaseModel]) -> str:
+    """Return a hint to the sections that do have a key of this name."""
+    found = [
+        f"{name}.{key}"
+        for name, field in model.model_fields.items()
+        if (section := _model_of(field)) and key in section.model_fields
+    ]
+    return f"; did you mean {' or '.join(found)}?" if found else ""
+
+
+def _walk(
+    model: type[BaseModel], path: Sequence[str]
+) -> tuple[Sequence[str], FieldInfo | None, int]:
+    """Return where a path leads: the keys of its innermost section, its field, and their depth."""
+    field, depth = None, 0
+    for part in path:
+        found = model.model_fields.get(part)
+        if found is None:
+            break
+        field, depth = found, depth + 1
+        inner = _model_of(field)
+        if inner is None:
+            break
+        model = inner
+    return tuple(model.model_fields), field, depth
+
+
+def _model_of(field: FieldInfo) -> type[BaseModel] | None:
+    kind = field.annotation
+    return kind if isinstance(kind, type) and issubclass(kind, BaseModel) else None
+
+
+def _shown(value: Any) -> str:
+    """Return a wrong value as TOML, shortened, on one line."""
+    text = " ".join((toml(value) if not isinstance(value, Mapping) else "a table").split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

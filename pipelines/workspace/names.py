@@ -1,0 +1,82 @@
+"""Names in the configuration that stand for registered or user-supplied classes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+from curate.errors import ConfigError
+from pipelines.registry import Registry
+
+
+@dataclass(frozen=True)
+class KnownName:
+    """Marks a text as the name of an extension, or as `module:Class`.
+
+    Whether a class can be imported is checked where it is used: a command that does not need it
+    does not import it.
+
+    Attributes:
+        registry: the registered extensions.
+        others: names with a meaning of their own.
+    """
+
+    registry: Registry
+    others: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names that can be used."""
+        return (*self.registry.classes, *self.others)
+
+    def __get_pydantic_core_schema__(
+        self, source: type[Any], handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        choices = [{"enum": list(self.names)}, {"pattern": "^[^:]+:.+$"}]
+        return {**handler(schema), "anyOf": choices}
+
+    def _checked(self, name: str) -> str:
+        return _as_value_error(lambda: self.registry.check_name(name, *self.others), name)
+
+
+@dataclass(frozen=True)
+class KnownClassSet:
+    """Marks a text as the name of a class set of segmenters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names that can be used; they are loaded here, as they need numpy."""
+        from curate.segmenters.classes import CLASS_MAPS
+
+        return tuple(CLASS_MAPS)
+
+    def __get_pydantic_core_schema__(
+        self, source: type[Any], handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return {**handler(schema), "enum": list(self.names)}
+
+    def _checked(self, name: str) -> str:
+        from curate.segmenters.classes import class_map
+
+        return _as_value_error(lambda: class_map(name), name)
+
+
+def _as_value_error(check: Callable[[], object], name: str) -> str:
+    """Return a name that passes a check; ValueError, which pydantic collects, if it does not."""
+    try:
+        check()
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    return name

@@ -1,0 +1,191 @@
+"""Wrong names in the configuration are found before any work, by every command that needs them."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from sqlalchemy import text
+from support.pipelines_cli import Curate
+
+from curate.errors import ConfigError
+from pipelines.workspace.workspace import Workspace
+
+STAGES = ("predict", "repredict", "score", "solve", "export", "train-round", "run")
+
+
+def edit(workspace: Workspace, *changes: tuple[str, str]) -> None:
+    """Replace lines of `curate.toml`; each line must be there."""
+    path = workspace.root / "curate.toml"
+    content = path.read_text()
+    for old, new in changes:
+        assert old in content
+        content = content.replace(old, new, 1)
+    path.write_text(content)
+
+
+def fails_before_any_work(curate: Curate, workspace: Workspace, *command: str) -> str:
+    """Return the message of a command that must end with a configuration error."""
+    code, out, err = curate(*command, "-w", workspace.root)
+    assert (code, out, err.count("\n")) == (ConfigError.exit_code, "", 1), err
+    with workspace.database.reading() as connection:
+        for table in ("round", "task", "prediction"):
+            query = text(f"SELECT count(*) FROM {table}")
+            assert connection.execute(query).scalar_one() == 0, table
+    return err
+
+
+@pytest.mark.parametrize("command", STAGES)
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('name = "support.toys:ToyDetector"', 'name = "pilars"', "detector.name: unknown detector"),
+        ('executor = "serial"', 'executor = "proces"', "run.executor: unknown executor"),
+        ('labels_format = "sqlite"', 'labels_format = "kiti"', "train.labels_format: unknown"),
+        ('method = "pspsl"', 'method = "pspls"', "run.method: unknown policy"),
+        ('kind = "kitti"', 'kind = "kitty"', "dataset.kind: unknown dataset"),
+    ],
+)
+def test_a_misspelled_name_stops_every_stage(
+    curate: Curate, workspace: Workspace, command: str, old: str, new: str, words: str
+) -> None:
+    """With the file, the key and the name that was probably meant."""
+    edit(workspace, (old, new))
+    err = fails_before_any_work(curate, workspace, command)
+    assert f"{workspace.root / 'curate.toml'}: {words}" in err
+    assert "; did you mean '" in err
+
+
+UNUSABLE = [
+    (
+        ("predict", "repredict", "run"),
+        ("support.toys:ToyDetector", "support.toys:ToyDetectr"),
+        "cannot be imported: support.toys has no 'ToyDetectr'; did you mean 'ToyDetector'?",
+    ),
+    (
+        ("predict", "repredict", "score", "run"),
+        ('executor = "serial"', 'executor = "no_such_package:Executor"'),
+        "run.executor: executor 'no_such_package:Executor' cannot be imported: No module named",
+    ),
+    (
+        ("solve", "run"),
+        ('method = "pspsl"', 'method = "support.toys:NoPolicy"'),
+        "run.method: policy 'support.toys:NoPolicy' cannot be imported",
+    ),
+    (
+        ("solve", "run"),
+        ("options = {}\n\n[train]", "options = {pspsl = {self_pased = false}}\n\n[train]"),
+        "run.method: policy 'pspsl' has no option 'self_pased'; did you mean 'self_paced'?",
+    ),
+    (
+        ("score", "run"),
+        ("support.toys:ToySegmenter", "support.toys:NoSegmenter"),
+        "run.priors: segmenter 'support.toys:NoSegmenter' cannot be imported",
+    ),
+    (
+        ("score", "run"),
+        ("prior_options = {}", "prior_options = {points = {thresolds = {}}}"),
+        "run.priors: prior 'points' has no option 'thresolds'; did you mean 'thresholds'?",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("command", "change", "words"),
+    [(command, change, words) for commands, change, words in UNUSABLE for command in commands],
+)
+def test_a_class_that_cannot_be_used_is_found_before_any_work(
+    curate: Curate, workspace: Workspace, command: str, change: tuple[str, str], words: str
+) -> None:
+    """By each command that uses it."""
+    edit(workspace, change)
+    assert words in fails_before_any_work(curate, workspace, command)
+
+
+def test_a_format_for_the_users_trainer_is_found_before_any_work(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """Not after frames have been predicted and scored."""
+    edit(
+        workspace,
+        ('# command = "python train.py {labels} {output}"', 'command = "./train.sh"'),
+        ('labels_format = "sqlite"', 'labels_format = "support.toys:NoFormat"'),
+    )
+    for command in ("train-round", "run"):
+        err = fails_before_any_work(curate, workspace, command)
+        assert "train.labels_format: exporter 'support.toys:NoFormat' cannot be imported" in err
+
+
+@pytest.mark.parametrize("command", ["predict", "run"])
+def test_a_detector_whose_constructor_fails_stops_the_first_stage(
+    curate: Curate,
+    workspace: Workspace,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+) -> None:
+    """It is one error of the command, not one failed frame after the other."""
+    (tmp_path / "failing_detector.py").write_text(
+        "class Mine:\n"
+        "    def __init__(self, path):\n        raise OSError('no licence')\n"
+        "    def predict(self, frame): ...\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    edit(workspace, ("support.toys:ToyDetector", "failing_detector:Mine"))
+    code, out, err = curate(command, "-w", workspace.root)
+    assert (code, out) == (ConfigError.exit_code, "")
+    assert "detector 'failing_detector:Mine' cannot be made: OSError: no licence" in err
+    with workspace.database.reading() as connection:
+        assert connection.execute(text("SELECT count(*) FROM task")).scalar_one() == 0
+
+
+def test_an_option_of_the_command_line_is_checked_like_the_file(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """Executor and policy."""
+    err = fails_before_any_work(curate, workspace, "predict", "--executor", "proces")
+    assert "command line: run.executor: unknown executor 'proces'" in err
+    assert "did you mean 'process'?" in err
+    err = fails_before_any_work(curate, workspace, "solve", "--policy", "threshhold")
+    assert "--policy: unknown policy 'threshhold'" in err
+    assert "did you mean 'threshold'?" in err
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("detector.options={pat=1}", "detector.name: detector 'pillars' has no option 'pat'"),
+        ("run.executor=no_such_package:X", "run.executor: executor 'no_such_package:X' cannot be"),
+        ("train.labels_format=no_such_package:X", "train.labels_format: exporter 'no_such_package"),
+        ("run.method=no_such_package:X", "run.method: policy 'no_such_package:X' cannot be"),
+        ("solve.options.pspsl.scoop=1", "policy 'pspsl' has no option 'scoop'; did you mean 'scop"),
+        ("segmenter.name=no_such_package:X", "segmenter.name: segmenter 'no_such_package:X' cann"),
+        ("train.preset=kiti", "train.preset of detector 'pillars': unknown preset 'kiti'"),
+    ],
+)
+def test_a_workspace_is_not_made_with_a_class_that_cannot_be_used(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, change: str, words: str
+) -> None:
+    """`curate init` checks all of them, without loading a model."""
+    code, out, err = curate("init", tmp_path / "w", "--root", toy_kitti, "--set", change)
+    assert (code, out, err.count("\n")) == (ConfigError.exit_code, "", 1)
+    assert words in err
+    assert not (tmp_path / "w").exists()
+
+
+def test_a_query_does_not_import_what_it_does_not_need(
+    curate: Curate, workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not the user's detector, policy or executor: those may be broken or slow."""
+    (tmp_path / "slow_module.py").write_text("raise SystemExit('was imported')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    edit(
+        workspace,
+        ("support.toys:ToyDetector", "slow_module:Detector"),
+        ('method = "pspsl"', 'method = "slow_module:Policy"'),
+        ('executor = "serial"', 'executor = "slow_module:Executor"'),
+        ('labels_format = "sqlite"', 'labels_format = "slow_module:Exporter"'),
+    )
+    code, out, err = curate("query", "SELECT count(*) AS n FROM frame", "-w", workspace.root)
+    assert (code, err) == (0, "")
+    assert "12" in out
+    assert "slow_module" not in sys.modules
