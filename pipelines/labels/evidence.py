@@ -134,6 +134,5 @@ def solved_fingerprint(workspace: Workspace, round_number: int, policy: str) -> 
     task = bulk.table("task")
     mine = {"round": round_number, "stage": "solve", "variant": policy}
     query = select(task.c.fingerprint).where(*(task.c[name] == at for name, at in mine.items()))
-    with workspace.database.reading() as connection:
-        found = bulk.select(connection, query)
+    found = workspace.database.rows(query)
     return found[0][0] if found else None

@@ -106,8 +106,7 @@ def fingerprint(workspace: Workspace, round_number: int) -> str | None:
     table = bulk.table("human_label")
     names = ("frame_id", "decision", "category", *BOX_COLUMNS, *SEEN_COLUMNS)
     query = select(*(table.c[name] for name in names)).where(table.c.from_round <= round_number)
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, query)
+    rows = workspace.database.rows(query)
     return hashlib.sha256(repr(sorted(map(repr, rows))).encode()).hexdigest()[:32] if rows else None
 
 
@@ -115,8 +114,7 @@ def counts(workspace: Workspace, round_number: int) -> dict[str, int]:
     """How many human labels of each decision count in a round."""
     table = bulk.table("human_label")
     query = select(table.c.decision).where(table.c.from_round <= round_number)
-    with workspace.database.reading() as connection:
-        found = [row[0] for row in bulk.select(connection, query)]
+    found = [row[0] for row in workspace.database.rows(query)]
     return {name: found.count(name) for name in sorted(set(found))}
 
 

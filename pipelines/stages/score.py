@@ -248,9 +248,8 @@ def _read_measured(
         .order_by(table.c.frame_id, table.c.k)
     )
     found: dict[int, list[bulk.Row]] = {key: [] for key in frame_ids}
-    with workspace.database.reading() as connection:
-        for key, *row in bulk.select(connection, query):
-            found[key].append(tuple(row))
+    for key, *row in workspace.database.rows(query):
+        found[key].append(tuple(row))
     return {
         key: dict(zip(names, map(_array, zip(*rows, strict=True)), strict=True))
         for key, rows in found.items()

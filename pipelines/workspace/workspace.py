@@ -92,8 +92,7 @@ class Workspace:
         """Frame names and their keys, in the order of the names."""
         frame = bulk.table("frame")
         query = select(frame.c.frame, frame.c.id).where(frame.c.split.in_(splits))
-        with self.database.reading() as connection:
-            return dict(bulk.select(connection, query.order_by(frame.c.frame)))
+        return dict(self.database.rows(query.order_by(frame.c.frame)))
 
     def ground_truth(self, *splits: str) -> dict[str, Annotations]:
         """The stored ground truth per frame; there is none of unlabeled frames."""
@@ -106,9 +105,8 @@ class Workspace:
             .order_by(frame.c.frame, truth.c.k)
         )
         found: dict[str, list[bulk.Row]] = {name: [] for name in self.frames(*splits)}
-        with self.database.reading() as connection:
-            for name, *row in bulk.select(connection, query):
-                found[name].append(tuple(row))
+        for name, *row in self.database.rows(query):
+            found[name].append(tuple(row))
         return {name: _annotations(rows) for name, rows in found.items()}
 
     def predictions(self, round_number: int, frame_ids: Sequence[int]) -> dict[int, Detections]:
@@ -125,9 +123,8 @@ class Workspace:
             .order_by(table.c.frame_id, table.c.k)
         )
         found: dict[int, list[bulk.Row]] = {key: [] for key in frame_ids}
-        with self.database.reading() as connection:
-            for key, *row in bulk.select(connection, query):
-                found[key].append(tuple(row))
+        for key, *row in self.database.rows(query):
+            found[key].append(tuple(row))
         return {key: Detections.from_rows(rows) for key, rows in found.items()}
 
 
