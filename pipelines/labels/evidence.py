@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import FromClause, Select, and_, select
 
-from curate.detections import empty_boxes
+from curate.detections import Columns, empty_boxes
 from curate.errors import WorkspaceError
 from curate.weighting.base import Evidence, Memory
 from db import bulk
@@ -17,7 +17,7 @@ from pipelines.workspace.workspace import Workspace
 
 
 @dataclass(frozen=True)
-class LabelKeys:
+class LabelKeys(Columns):
     """The keys and categories of the n labels of some frames, by frame and k.
 
     Attributes:
@@ -29,9 +29,6 @@ class LabelKeys:
     frame_id: np.ndarray
     k: np.ndarray
     category: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.k)
 
 
 def read_evidence(
