@@ -101,6 +101,14 @@ def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
     return [tuple(row) for row in result]
 
 
+def grouped(rows: Iterable[Row], keys: Iterable[Any] = ()) -> dict[Any, list[Row]]:
+    """Return the rows by their first value, without it; an empty list for a key without rows."""
+    found: dict[Any, list[Row]] = {key: [] for key in keys}
+    for key, *row in rows:
+        found.setdefault(key, []).append(tuple(row))
+    return found
+
+
 def _unchanged(connection: Connection, statement: Select[Any]) -> bool:
     """Whether SQLite's driver gives the values that are meant, as it does but for times.
 

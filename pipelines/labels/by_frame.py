@@ -62,10 +62,7 @@ def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterato
         check_weights(connection, round_number, policy)
         rows = bulk.select(connection, query)
     if not rows:
-        raise WorkspaceError(
-            f"round {round_number} has no labels weighted by {policy}; "
-            f"run `curate solve --policy {policy}`"
-        )
+        raise unweighted(round_number, policy)
     for frame, group in groupby(rows, key=lambda row: str(row[0])):
         own = list(group)
         counts = [row[-1] for row in own]
@@ -75,6 +72,14 @@ def read_labels(workspace: Workspace, round_number: int, policy: str) -> Iterato
             np.array([row[10] for row in own], dtype=np.float64),
             None if None in counts else np.array(counts),
         )
+
+
+def unweighted(round_number: int, policy: str) -> WorkspaceError:
+    """What is wrong where a policy has weighted nothing in a round."""
+    return WorkspaceError(
+        f"round {round_number} has no labels weighted by {policy}; "
+        f"run `curate solve --policy {policy} --round {round_number}`"
+    )
 
 
 def check_weights(

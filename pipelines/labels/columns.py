@@ -7,14 +7,13 @@ from itertools import chain
 import numpy as np
 from sqlalchemy import Connection, select
 
-from curate.errors import WorkspaceError
 from curate.evaluation.label_changes import RoundLabels
 from curate.files.batches import batched
 from db import bulk
 from db.evidence import weighted_label_columns
 from db.models import BOX_COLUMNS
 from db.views import weighted_labels
-from pipelines.labels.by_frame import check_weights
+from pipelines.labels.by_frame import check_weights, unweighted
 from pipelines.workspace.workspace import Workspace
 
 _CHUNK = 50_000
@@ -110,14 +109,6 @@ def read_blocks(
     for each, count in labels.items():
         if not count:
             raise unweighted(each, policy)
-
-
-def unweighted(round_number: int, policy: str) -> WorkspaceError:
-    """What is wrong where a policy has weighted nothing in a round."""
-    return WorkspaceError(
-        f"round {round_number} has no labels weighted by {policy}; "
-        f"run `curate solve --round {round_number} --policy {policy}`"
-    )
 
 
 def _read(

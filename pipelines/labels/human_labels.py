@@ -58,11 +58,11 @@ def read_human_labels(
         query = query.where(table.c.from_round <= until_round)
     if but_of is not None:
         query = query.where(table.c.review != but_of)
-    found: dict[int, list[bulk.Row]] = {}
-    for frame_id, *row in bulk.select(connection, query):
-        if frame_ids is None or frame_id in frame_ids:
-            found.setdefault(frame_id, []).append(tuple(row))
-    return {frame_id: _stored(rows) for frame_id, rows in found.items()}
+    return {
+        frame_id: _stored(rows)
+        for frame_id, rows in bulk.grouped(bulk.select(connection, query)).items()
+        if frame_ids is None or frame_id in frame_ids
+    }
 
 
 def refresh_matches(
@@ -149,10 +149,7 @@ def _predictions(
         .where(table.c.round == round_number, table.c.frame_id.in_(frame_ids))
         .order_by(table.c.frame_id, table.c.k)
     )
-    found: dict[int, list[bulk.Row]] = {}
-    for frame_id, *row in bulk.select(connection, query):
-        found.setdefault(frame_id, []).append(tuple(row))
-    return found
+    return bulk.grouped(bulk.select(connection, query))
 
 
 def _match_rows(

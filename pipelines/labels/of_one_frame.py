@@ -11,7 +11,7 @@ from curate.review.human_labels import REJECTED
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
-from pipelines.labels.by_frame import check_weights
+from pipelines.labels.by_frame import check_weights, unweighted
 from pipelines.labels.human_labels import human_boxes
 from pipelines.workspace.workspace import Workspace
 
@@ -81,10 +81,7 @@ def labeled_by(workspace: Workspace, round_number: int, policy: str, limit: int)
     )
     names = [row[0] for row in workspace.database.rows(query)]
     if not names:
-        raise WorkspaceError(
-            f"round {round_number} has no labels weighted by {policy}; "
-            f"run `curate solve --round {round_number} --policy {policy}`"
-        )
+        raise unweighted(round_number, policy)
     return names
 
 

@@ -12,7 +12,7 @@ from curate.viewing.frame_view import draw_frame
 from curate.viewing.overlay import draw_overlay
 from curate.viewing.tags import ShownLabels
 from pipelines.labels.by_frame import FrameLabels, read_labels
-from pipelines.labels.of_one_frame import chosen_round, read_frame
+from pipelines.labels.of_one_frame import FrameBoxes, chosen_round, read_frame
 from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
@@ -64,14 +64,7 @@ def frame_picture(workspace: Workspace, name: str, round_number: int, policy: st
     found = read_frame(workspace, name, round_number, policy)
     frame = workspace.dataset.read(name, image=True)
     counts = count_points_in_boxes(frame.points, found.labels.boxes)
-    labels = ShownLabels(
-        found.labels.boxes,
-        found.labels.categories,
-        found.labels.scores,
-        found.weights,
-        counts,
-        zero_weight_of(workspace.config, policy),
-    )
+    labels = shown_labels(workspace, policy, found, counts)
     title = f"frame {name} ({found.split}), round {round_number}, weights by {policy}"
     return draw_frame(
         frame,
@@ -83,19 +76,22 @@ def frame_picture(workspace: Workspace, name: str, round_number: int, policy: st
     )
 
 
+def shown_labels(
+    workspace: Workspace, policy: str, found: FrameBoxes | FrameLabels, points: np.ndarray | None
+) -> ShownLabels:
+    """Return the labels of a frame as pictures show them, with the (n,) points in each."""
+    labels, meaning = found.labels, zero_weight_of(workspace.config, policy)
+    return ShownLabels(
+        labels.boxes, labels.categories, labels.scores, found.weights, points, meaning
+    )
+
+
 def draw_labels(workspace: Workspace, round_number: int, shown: FrameLabels) -> list[Path]:
     """Both pictures of a frame, in the folder `pictures`."""
     frame = workspace.dataset.read(shown.frame, image=True)
     if frame.image is None:
         raise DataError(f"frame {shown.frame}: the data set has no image")
-    labels = ShownLabels(
-        shown.labels.boxes,
-        shown.labels.categories,
-        shown.labels.scores,
-        shown.weights,
-        shown.points,
-        zero_weight_of(workspace.config, workspace.config.run.method),
-    )
+    labels = shown_labels(workspace, workspace.config.run.method, shown, shown.points)
     title = f"frame {shown.frame}, round {round_number}, weights by {workspace.config.run.method}"
     stem = f"round-{round_number:02d}-{shown.frame}"
     pictures = {

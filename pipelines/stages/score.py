@@ -247,12 +247,9 @@ def _read_measured(
         .where(table.c.round == context.number, table.c.frame_id.in_(frame_ids))
         .order_by(table.c.frame_id, table.c.k)
     )
-    found: dict[int, list[bulk.Row]] = {key: [] for key in frame_ids}
-    for key, *row in workspace.database.rows(query):
-        found[key].append(tuple(row))
     return {
         key: dict(zip(names, map(_array, zip(*rows, strict=True)), strict=True))
-        for key, rows in found.items()
+        for key, rows in bulk.grouped(workspace.database.rows(query), frame_ids).items()
     }
 
 

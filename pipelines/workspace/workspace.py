@@ -104,9 +104,7 @@ class Workspace:
             .where(frame.c.split.in_(splits))
             .order_by(frame.c.frame, truth.c.k)
         )
-        found: dict[str, list[bulk.Row]] = {name: [] for name in self.frames(*splits)}
-        for name, *row in self.database.rows(query):
-            found[name].append(tuple(row))
+        found = bulk.grouped(self.database.rows(query), self.frames(*splits))
         return {name: _annotations(rows) for name, rows in found.items()}
 
     def predictions(self, round_number: int, frame_ids: Sequence[int]) -> dict[int, Detections]:
@@ -122,9 +120,7 @@ class Workspace:
             .where(table.c.round == round_number, table.c.frame_id.in_(frame_ids))
             .order_by(table.c.frame_id, table.c.k)
         )
-        found: dict[int, list[bulk.Row]] = {key: [] for key in frame_ids}
-        for key, *row in self.database.rows(query):
-            found[key].append(tuple(row))
+        found = bulk.grouped(self.database.rows(query), frame_ids)
         return {key: Detections.from_rows(rows) for key, rows in found.items()}
 
 
