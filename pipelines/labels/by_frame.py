@@ -78,7 +78,7 @@ def unweighted(round_number: int, policy: str) -> WorkspaceError:
     """What is wrong where a policy has weighted nothing in a round."""
     return WorkspaceError(
         f"round {round_number} has no labels weighted by {policy}; "
-        f"run `curate solve --policy {policy} --round {round_number}`"
+        f"run `curate solve --round {round_number} --policy {policy}`"
     )
 
 

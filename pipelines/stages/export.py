@@ -10,6 +10,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Select, column, select
 
 import curate
+from curate.errors import WorkspaceError
 from curate.exporters.base import (
     GROUND_TRUTH_COLUMNS,
     Block,
@@ -27,7 +28,7 @@ from pipelines.assembly import open_policy
 from pipelines.engine.progress import Progress
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.firewall.rules import enforce
-from pipelines.labels.by_frame import check_weights, unweighted
+from pipelines.labels.by_frame import check_weights
 from pipelines.labels.human_labels import fingerprint
 from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace, sha256
@@ -125,7 +126,10 @@ def export_as(
     enforce(workspace, round_number)
     labels = label_set(workspace, round_number, policy)
     if all(each.split == "labeled" for each in labels.frames):
-        raise unweighted(round_number, policy)
+        raise WorkspaceError(
+            f"round {round_number} has no labels weighted by {policy}; "
+            f"run `curate solve --policy {policy}`"
+        )
     return exporter.write(path, labels)
 
 

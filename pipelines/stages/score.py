@@ -229,12 +229,11 @@ def _sequence_function(name: str, workspace: Workspace, _context: RoundContext) 
 def _learned(workspace: Workspace) -> Mapping[str, float]:
     """m_th of each category, from X_l."""
     truth = workspace.ground_truth("labeled")
-    learned = learn_thresholds(
+    return learn_thresholds(
         ((workspace.dataset.read(frame), annotations) for frame, annotations in truth.items()),
         workspace.config.dataset.categories,
         point_settings(workspace.config),
     )
-    return learned.values
 
 
 def _read_measured(
