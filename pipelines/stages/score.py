@@ -136,7 +136,7 @@ def stage(source: Source) -> FramesStage:
             reads=("frame", "prediction"),
             writes=(source.table,),
             settings=partial(_sequence_settings, source),
-            function=partial(_sequence_function, name),
+            function=lambda workspace, _context: ScoreSequence(workspace.config, name),
             prepare=partial(prepare_table, source=source),
         )
     learns = ("ground_truth",) if PRIORS.takes(name, "thresholds") else ()
@@ -219,11 +219,6 @@ def _function(kind: type[Score], name: str, workspace: Workspace, _context: Roun
     """What score does with a frame; X_l is read here, once."""
     thresholds = _learned(workspace) if PRIORS.takes(name, "thresholds") else {}
     return kind(workspace.config, name, thresholds)
-
-
-def _sequence_function(name: str, workspace: Workspace, _context: RoundContext) -> ScoreSequence:
-    """What score does with a sequence."""
-    return ScoreSequence(workspace.config, name)
 
 
 def _learned(workspace: Workspace) -> Mapping[str, float]:

@@ -45,9 +45,7 @@ class Workspace:
             WorkspaceError: there is none.
             ConfigError: its configuration is wrong.
         """
-        root = folder.resolve() if folder else _find(Path.cwd())
-        if not (root / CONFIG_NAME).is_file():
-            raise WorkspaceError(f"{root}: no workspace here; make one with `curate init {root}`")
+        root = _root(folder)
         config = _anchored(root, read_config(root / CONFIG_NAME))
         return cls(root, config, Database(_url(root, config), root))
 
@@ -179,10 +177,14 @@ def _anchored(root: Path, config: Config) -> Config:
     return config.model_copy(update=changes)
 
 
-def _find(start: Path) -> Path:
-    for folder in (start, *start.parents):
+def _root(chosen: Path | None) -> Path:
+    """The folder of the workspace in `chosen`, else in the current folder or one above it."""
+    start = chosen.resolve() if chosen else Path.cwd()
+    for folder in (start,) if chosen else (start, *start.parents):
         if (folder / CONFIG_NAME).is_file():
             return folder
+    if chosen:
+        raise WorkspaceError(f"{start}: no workspace here; make one with `curate init {start}`")
     raise WorkspaceError(
         f"no {CONFIG_NAME} in {start} or above it; make a workspace with `curate init DIR`, "
         "or name one with --workspace DIR"
@@ -213,7 +215,5 @@ def _annotations(rows: Sequence[Sequence[Any]]) -> Annotations:
 
 def database_url(folder: Path | None) -> URL:
     """The URL of a workspace's database, without opening or migrating it."""
-    root = folder.resolve() if folder else _find(Path.cwd())
-    if not (root / CONFIG_NAME).is_file():
-        raise WorkspaceError(f"{root}: no workspace here; make one with `curate init {root}`")
+    root = _root(folder)
     return _url(root, read_config(root / CONFIG_NAME))
