@@ -34,7 +34,9 @@ Bound = Annotated[float | None, mapped_column(comment="bound of its interval")]
 
 
 class Base(DeclarativeBase):
-    """Root of the models."""
+    """Root of the models; their keys say where rows lie, unless a model says otherwise."""
+
+    __table_args__: Any = {"sqlite_with_rowid": False}  # noqa: RUF012 - as SQLAlchemy has it
 
     type_annotation_map: ClassVar = {str: Text, float: Float(53)}
 
@@ -101,7 +103,6 @@ class SplitList(Base):
     """The lists of frames as `curate init` found and chose them; the firewall compares."""
 
     __tablename__ = "split_list"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     source: Mapped[str] = mapped_column(
         primary_key=True, comment="chosen | dataset (its own) | file (given to init)"
@@ -167,7 +168,6 @@ class TrainingStatistics(Base):
     """The curves of a training: loss terms, learning rate and gradient norm of every few steps."""
 
     __tablename__ = "training_statistics"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     round: Mapped[int] = mapped_column(
         primary_key=True, autoincrement=False, comment="as of the checkpoint"
@@ -186,6 +186,7 @@ class Round(Base):
     """One round e of E: the teacher's answers, their evidence, their weights, the student."""
 
     __tablename__ = "round"
+    __table_args__ = ()
 
     number: Mapped[Key]
     rounds: Mapped[int] = mapped_column(comment="E: e/E is the age of Eq. 4")
@@ -219,7 +220,6 @@ class RepredictionView(Base):
     """The similarity A of one augmented view of a frame."""
 
     __tablename__ = "reprediction_view"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
     frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
@@ -302,7 +302,6 @@ class EvidenceSource(Base):
     """What an evidence source has declared that has a table `prior_NAME` of its own."""
 
     __tablename__ = "evidence_source"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     name: Mapped[str] = mapped_column(primary_key=True, comment="its table is prior_NAME")
     source: Mapped[str] = mapped_column(comment="as run.priors names it")
@@ -341,7 +340,6 @@ class LabelCount(Base):
     """
 
     __tablename__ = "label_count"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
     policy: Mapped[str] = mapped_column(primary_key=True)
@@ -356,6 +354,7 @@ class Review(Base):
     """Labels that were handed to an editor, and when the answer was taken back."""
 
     __tablename__ = "review"
+    __table_args__ = ()
 
     id: Mapped[str] = mapped_column(primary_key=True, comment="hash of its manifest")
     round: Mapped[int] = mapped_column(comment="whose labels")
@@ -491,14 +490,12 @@ class Audit(_Audited, _Judgement, Base):
     """
 
     __tablename__ = "audit"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
 
 class AuditSlice(_Audited, _Judgement, Base):
     """The same for a range of distances from the LiDAR, or of LiDAR points in the label."""
 
     __tablename__ = "audit_slice"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     kind: Mapped[str] = mapped_column(primary_key=True, comment="distance | points")
     low: Mapped[float] = mapped_column(primary_key=True, comment="metres or points, included")
@@ -511,7 +508,6 @@ class AuditBin(_Audited, Base):
     """The labels of an audit whose weight lies in a bin; the last bin holds its upper edge."""
 
     __tablename__ = "audit_bin"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     low: Mapped[float] = mapped_column(primary_key=True, comment="weight, included")
     high: Mapped[float] = mapped_column(comment="weight, not included")
@@ -563,7 +559,6 @@ class EvaluationAp(Base):
     """KITTI average precision of the detections of val frames."""
 
     __tablename__ = "evaluation_ap"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     source: Mapped[str] = mapped_column(
         primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
@@ -580,7 +575,6 @@ class LabelFile(Base):
     """An exported label file as it was written; the firewall notices what changed since."""
 
     __tablename__ = "label_file"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     path: Mapped[str] = mapped_column(primary_key=True, comment="relative to the workspace")
     round: Mapped[int] = mapped_column(comment="0 = ground truth of X_l alone")
@@ -592,7 +586,6 @@ class ViewDefinition(Base):
     """The views as they were made last; those with another definition are made anew."""
 
     __tablename__ = "view_definition"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     name: Mapped[str] = mapped_column(primary_key=True, comment="of the view")
     sha256: Mapped[str] = mapped_column(comment="of its definition")
