@@ -5,7 +5,7 @@ and yaw in radians, counter-clockwise from the x axis in (-pi, pi], all in the L
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 import numpy as np
@@ -24,7 +24,19 @@ def as_categories(names: Sequence[str] | np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Detections:
+class Columns:
+    """Arrays with a row per object each; rows are chosen from all of them together."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def select(self, index: np.ndarray) -> Self:
+        """The rows at `index` (integers or a mask), in that order."""
+        return type(self)(*(getattr(self, column.name)[index] for column in fields(self)))
+
+
+@dataclass(frozen=True)
+class Detections(Columns):
     """What a detector answers for one frame.
 
     Attributes:
@@ -44,15 +56,6 @@ class Detections:
         """Fills in estimates that were left out."""
         if len(self.iou) == 0:
             object.__setattr__(self, "iou", np.full(len(self.boxes), np.nan))
-
-    def __len__(self) -> int:
-        return len(self.boxes)
-
-    def select(self, index: np.ndarray) -> Self:
-        """The detections at `index` (integers or a mask), in that order."""
-        return type(self)(
-            self.boxes[index], self.scores[index], self.categories[index], self.iou[index]
-        )
 
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[Any]]) -> Self:
@@ -74,7 +77,7 @@ class Detections:
 
 
 @dataclass(frozen=True)
-class Annotations:
+class Annotations(Columns):
     """The ground truth of one frame, in the LiDAR frame.
 
     DontCare regions have category "DontCare", a 2D box, and NaN in `boxes`.
@@ -95,29 +98,8 @@ class Annotations:
     alpha: np.ndarray
     boxes_2d: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.boxes)
-
-    def select(self, index: np.ndarray) -> Self:
-        """The annotations at `index` (integers or a mask), in that order."""
-        return type(self)(
-            self.boxes[index],
-            self.categories[index],
-            self.truncated[index],
-            self.occluded[index],
-            self.alpha[index],
-            self.boxes_2d[index],
-        )
-
     @classmethod
     def empty(cls) -> Self:
         """No annotations."""
-        nothing = np.zeros(0)
-        return cls(
-            empty_boxes(),
-            as_categories([]),
-            nothing,
-            nothing.astype(np.int64),
-            nothing,
-            np.zeros((0, 4)),
-        )
+        numbers, levels = np.zeros(0), np.zeros(0, dtype=np.int64)
+        return cls(empty_boxes(), as_categories([]), numbers, levels, numbers, np.zeros((0, 4)))

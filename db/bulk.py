@@ -1,7 +1,6 @@
 """The one bulk reader and writer: named columns in, columns or tuples out."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from itertools import chain, repeat
 from typing import Any
 
@@ -16,7 +15,6 @@ Row = tuple[Any, ...]
 BLOCK_ROWS = 50_000
 FETCHED_ROWS = 1000  # from SQLite at a time: more do not stay in the processor's cache
 
-_BULK_CACHE_KIB = 64 * 1024
 # What the view weighted_labels and the counts are made of.
 _ASKED_TABLES = (
     "weight", "label_count", "prediction", "consistency", "point_prior", "semantic_prior", "frame",
@@ -103,6 +101,14 @@ def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
     return [tuple(row) for row in result]
 
 
+def grouped(rows: Iterable[Row], keys: Iterable[Any] = ()) -> dict[Any, list[Row]]:
+    """Return the rows by their first value, without it; an empty list for a key without rows."""
+    found: dict[Any, list[Row]] = {key: [] for key in keys}
+    for key, *row in rows:
+        found.setdefault(key, []).append(tuple(row))
+    return found
+
+
 def _unchanged(connection: Connection, statement: Select[Any]) -> bool:
     """Whether SQLite's driver gives the values that are meant, as it does but for times.
 
@@ -141,19 +147,6 @@ def select_columns(connection: Connection, statement: Select[Any]) -> dict[str, 
         for (name, kind), values in zip(kinds.items(), zip(*rows, strict=True), strict=True):
             parts[name].append(np.array(values, dtype=kind))
     return {name: np.concatenate(parts.pop(name)) for name in kinds}
-
-
-@contextmanager
-def roomy(connection: Connection) -> Iterator[None]:
-    """Within it SQLite has room for the pages in work, and sorts an index on a second core."""
-    usual = connection.exec_driver_sql("PRAGMA cache_size").scalar_one()
-    connection.exec_driver_sql(f"PRAGMA cache_size = -{_BULK_CACHE_KIB}")
-    connection.exec_driver_sql("PRAGMA threads = 1")
-    try:
-        yield
-    finally:
-        connection.exec_driver_sql(f"PRAGMA cache_size = {usual}")
-        connection.exec_driver_sql("PRAGMA threads = 0")
 
 
 def refresh_statistics(connection: Connection) -> None:

@@ -92,18 +92,15 @@ def read_declarations(connection: Connection) -> tuple[Declaration, ...]:
     )
 
 
-def declare(connection: Connection, declaration: Declaration) -> bool:
+def declare(connection: Connection, declaration: Declaration) -> None:
     """Make the table of a source where there is none, and record its declaration.
 
     A table of the same name with other columns, or of another class, is made anew, and the tasks of
-    that source are deleted: evidence can be computed again.
-
-    Returns:
-        Whether anything changed; the views are then to be made anew.
+    that source are deleted: evidence can be computed again. The caller makes the views anew.
     """
     former = {each.name: each for each in read_declarations(connection)}.get(declaration.name)
     if declaration.name in OWN_TABLES or former == declaration:
-        return False
+        return
     if former is not None:
         connection.execute(DropTable(evidence_table(former)))
         task = Base.metadata.tables["task"]
@@ -117,7 +114,6 @@ def declare(connection: Connection, declaration: Declaration) -> bool:
         "rho_column": declaration.rho_column,
     }
     connection.execute(_RECORD.insert().values(**row))
-    return True
 
 
 def weighted_label_columns(connection: Connection) -> tuple[Declared, ...]:

@@ -6,7 +6,7 @@ frame. Everything that a stage found out about label k of a frame carries the sa
 """
 
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from sqlalchemy import (
     CheckConstraint,
@@ -15,7 +15,6 @@ from sqlalchemy import (
     ForeignKey,
     ForeignKeyConstraint,
     Index,
-    Integer,
     MetaData,
     Text,
     UniqueConstraint,
@@ -26,19 +25,20 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 RECTANGLE_COLUMNS = ("image_left", "image_top", "image_right", "image_bottom")
 
-Key = Annotated[int, mapped_column(Integer, primary_key=True, autoincrement=False)]
-Metres = Annotated[float, mapped_column(Float(53), comment="metres, LiDAR frame")]
-Radians = Annotated[float, mapped_column(Float(53), comment="radians, (-pi, pi]")]
-Pixels = Annotated[float, mapped_column(Float(53), comment="pixels")]
-Share = Annotated[float, mapped_column(Float(53), comment="0 to 1")]
-Number = Annotated[float, mapped_column(Float(53))]
-Name = Annotated[str, mapped_column(Text)]
-Figure = Annotated[float | None, mapped_column(Float(53))]
-Bound = Annotated[float | None, mapped_column(Float(53), comment="bound of its interval")]
+Key = Annotated[int, mapped_column(primary_key=True, autoincrement=False)]
+Metres = Annotated[float, mapped_column(comment="metres, LiDAR frame")]
+Radians = Annotated[float, mapped_column(comment="radians, (-pi, pi]")]
+Pixels = Annotated[float, mapped_column(comment="pixels")]
+Share = Annotated[float, mapped_column(comment="0 to 1")]
+Bound = Annotated[float | None, mapped_column(comment="bound of its interval")]
 
 
 class Base(DeclarativeBase):
-    """Root of the models."""
+    """Root of the models; their keys say where rows lie, unless a model says otherwise."""
+
+    __table_args__: Any = {"sqlite_with_rowid": False}  # noqa: RUF012 - as SQLAlchemy has it
+
+    type_annotation_map: ClassVar = {str: Text, float: Float(53)}
 
     metadata = MetaData(
         naming_convention={
@@ -87,15 +87,15 @@ class Frame(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    dataset: Mapped[Name]
-    frame: Mapped[str] = mapped_column(Text, comment="frame id within the data set")
-    split: Mapped[str] = mapped_column(Text, comment="labeled | unlabeled | val")
-    points_path: Mapped[str] = mapped_column(Text, comment="relative to the data set's root")
-    image_path: Mapped[str] = mapped_column(Text, comment="relative to the data set's root")
-    calibration_path: Mapped[str] = mapped_column(Text, comment="relative to the data set's root")
+    id: Mapped[int] = mapped_column(primary_key=True)
+    dataset: Mapped[str]
+    frame: Mapped[str] = mapped_column(comment="frame id within the data set")
+    split: Mapped[str] = mapped_column(comment="labeled | unlabeled | val")
+    points_path: Mapped[str] = mapped_column(comment="relative to the data set's root")
+    image_path: Mapped[str] = mapped_column(comment="relative to the data set's root")
+    calibration_path: Mapped[str] = mapped_column(comment="relative to the data set's root")
     label_path: Mapped[str | None] = mapped_column(
-        Text, comment="relative to the data set's root; never for unlabeled frames"
+        comment="relative to the data set's root; never for unlabeled frames"
     )
 
 
@@ -103,18 +103,17 @@ class SplitList(Base):
     """The lists of frames as `curate init` found and chose them; the firewall compares."""
 
     __tablename__ = "split_list"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     source: Mapped[str] = mapped_column(
-        Text, primary_key=True, comment="chosen | dataset (its own) | file (given to init)"
+        primary_key=True, comment="chosen | dataset (its own) | file (given to init)"
     )
     name: Mapped[str] = mapped_column(
-        Text, primary_key=True, comment="labeled | unlabeled | val, or of the data set's list"
+        primary_key=True, comment="labeled | unlabeled | val, or of the data set's list"
     )
-    path: Mapped[str | None] = mapped_column(Text, comment="of the file")
-    frames: Mapped[int] = mapped_column(Integer, comment="how many")
-    sha256: Mapped[str] = mapped_column(Text, comment="of names")
-    names: Mapped[str] = mapped_column(Text, comment="the sorted names, one per line")
+    path: Mapped[str | None] = mapped_column(comment="of the file")
+    frames: Mapped[int] = mapped_column(comment="how many")
+    sha256: Mapped[str] = mapped_column(comment="of names")
+    names: Mapped[str] = mapped_column(comment="the sorted names, one per line")
 
 
 class GroundTruth(Base):
@@ -132,8 +131,8 @@ class GroundTruth(Base):
 
     frame_id: Mapped[Key]
     k: Mapped[Key]
-    split: Mapped[Name]
-    category: Mapped[Name]
+    split: Mapped[str]
+    category: Mapped[str]
     x: Mapped[Metres | None]
     y: Mapped[Metres | None]
     z: Mapped[Metres | None]
@@ -142,7 +141,7 @@ class GroundTruth(Base):
     height: Mapped[Metres | None]
     yaw: Mapped[Radians | None]
     truncated: Mapped[Share]
-    occluded: Mapped[int] = mapped_column(Integer, comment="KITTI's levels 0 to 3")
+    occluded: Mapped[int] = mapped_column(comment="KITTI's levels 0 to 3")
     alpha: Mapped[Radians]
     image_left: Mapped[Pixels]
     image_top: Mapped[Pixels]
@@ -156,16 +155,12 @@ class Checkpoint(Base):
     __tablename__ = "checkpoint"
     __table_args__ = (UniqueConstraint("round", "policy"),)
 
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    round: Mapped[int] = mapped_column(
-        Integer, comment="the round that made it; 0 before the first"
-    )
-    policy: Mapped[str] = mapped_column(
-        Text, comment="whose weights it learned from; '' for round 0"
-    )
-    detector: Mapped[Name]
-    path: Mapped[str] = mapped_column(Text, comment="relative to the workspace, or absolute")
-    sha256: Mapped[Name]
+    id: Mapped[int] = mapped_column(primary_key=True)
+    round: Mapped[int] = mapped_column(comment="the round that made it; 0 before the first")
+    policy: Mapped[str] = mapped_column(comment="whose weights it learned from; '' for round 0")
+    detector: Mapped[str]
+    path: Mapped[str] = mapped_column(comment="relative to the workspace, or absolute")
+    sha256: Mapped[str]
     created_at: Mapped[datetime] = mapped_column(DateTime(timezone=True))
 
 
@@ -173,32 +168,32 @@ class TrainingStatistics(Base):
     """The curves of a training: loss terms, learning rate and gradient norm of every few steps."""
 
     __tablename__ = "training_statistics"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     round: Mapped[int] = mapped_column(
-        Integer, primary_key=True, autoincrement=False, comment="as of the checkpoint"
+        primary_key=True, autoincrement=False, comment="as of the checkpoint"
     )
-    policy: Mapped[str] = mapped_column(Text, primary_key=True, comment="as of the checkpoint")
+    policy: Mapped[str] = mapped_column(primary_key=True, comment="as of the checkpoint")
     step: Mapped[int] = mapped_column(
-        Integer, primary_key=True, autoincrement=False, comment="of the optimiser, from 1"
+        primary_key=True, autoincrement=False, comment="of the optimiser, from 1"
     )
     name: Mapped[str] = mapped_column(
-        Text, primary_key=True, comment="loss, a term of it, learning_rate or gradient_norm"
+        primary_key=True, comment="loss, a term of it, learning_rate or gradient_norm"
     )
-    value: Mapped[Figure] = mapped_column(comment="of this step alone; null = not finite")
+    value: Mapped[float | None] = mapped_column(comment="of this step alone; null = not finite")
 
 
 class Round(Base):
     """One round e of E: the teacher's answers, their evidence, their weights, the student."""
 
     __tablename__ = "round"
+    __table_args__ = ()
 
     number: Mapped[Key]
-    rounds: Mapped[int] = mapped_column(Integer, comment="E: e/E is the age of Eq. 4")
+    rounds: Mapped[int] = mapped_column(comment="E: e/E is the age of Eq. 4")
     teacher_id: Mapped[int | None] = mapped_column(ForeignKey("checkpoint.id"))
-    config: Mapped[str] = mapped_column(Text, comment="the whole configuration, JSON")
-    code_version: Mapped[Name]
-    seed: Mapped[int] = mapped_column(Integer)
+    config: Mapped[str] = mapped_column(comment="the whole configuration, JSON")
+    code_version: Mapped[str]
+    seed: Mapped[int]
 
 
 class Prediction(Box, Base):
@@ -213,10 +208,9 @@ class Prediction(Box, Base):
     round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
     frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
     k: Mapped[Key]
-    category: Mapped[Name]
+    category: Mapped[str]
     score: Mapped[Share]
     iou: Mapped[float | None] = mapped_column(
-        Float(53),
         sort_order=1,
         comment="the detector's estimate of its 3D IoU with the object; null = it makes none",
     )
@@ -226,14 +220,13 @@ class RepredictionView(Base):
     """The similarity A of one augmented view of a frame."""
 
     __tablename__ = "reprediction_view"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
     frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
     view: Mapped[Key]
-    flip_y: Mapped[int] = mapped_column(Integer, comment="1 if y was mirrored, first")
-    rotation_rad: Mapped[float] = mapped_column(Float(53), comment="about z, radians, second")
-    scale: Mapped[float] = mapped_column(Float(53), comment="of all coordinates, third")
+    flip_y: Mapped[int] = mapped_column(comment="1 if y was mirrored, first")
+    rotation_rad: Mapped[float] = mapped_column(comment="about z, radians, second")
+    scale: Mapped[float] = mapped_column(comment="of all coordinates, third")
 
 
 class Reprediction(Box, Base):
@@ -253,14 +246,14 @@ class Reprediction(Box, Base):
     frame_id: Mapped[Key]
     view: Mapped[Key]
     k: Mapped[int] = mapped_column(
-        Integer, primary_key=True, autoincrement=False, comment="number within the view"
+        primary_key=True, autoincrement=False, comment="number within the view"
     )
-    category: Mapped[Name]
+    category: Mapped[str]
     score: Mapped[Share]
-    matched_k: Mapped[int | None] = mapped_column(Integer, comment="prediction.k; null = no match")
-    iou: Mapped[float | None] = mapped_column(Float(53), comment="BEV IoU of the match")
-    score_loss: Mapped[float | None] = mapped_column(Float(53), comment="-ln of this score")
-    box_loss: Mapped[float | None] = mapped_column(Float(53), comment="sum of smooth L1, beta 1/9")
+    matched_k: Mapped[int | None] = mapped_column(comment="prediction.k; null = no match")
+    iou: Mapped[float | None] = mapped_column(comment="BEV IoU of the match")
+    score_loss: Mapped[float | None] = mapped_column(comment="-ln of this score")
+    box_loss: Mapped[float | None] = mapped_column(comment="sum of smooth L1, beta 1/9")
 
 
 class Consistency(Base):
@@ -272,9 +265,9 @@ class Consistency(Base):
     round: Mapped[Key]
     frame_id: Mapped[Key]
     k: Mapped[Key]
-    loss: Mapped[float | None] = mapped_column(Float(53), comment="L; null = no match, no evidence")
-    views: Mapped[int] = mapped_column(Integer)
-    matched_views: Mapped[int] = mapped_column(Integer)
+    loss: Mapped[float | None] = mapped_column(comment="L; null = no match, no evidence")
+    views: Mapped[int]
+    matched_views: Mapped[int]
 
 
 class PointPrior(Base):
@@ -286,8 +279,8 @@ class PointPrior(Base):
     round: Mapped[Key]
     frame_id: Mapped[Key]
     k: Mapped[Key]
-    points: Mapped[int] = mapped_column(Integer, comment="m")
-    points_threshold: Mapped[float] = mapped_column(Float(53), comment="m_th of the category")
+    points: Mapped[int] = mapped_column(comment="m")
+    points_threshold: Mapped[float] = mapped_column(comment="m_th of the category")
     rho_diff: Mapped[Share]
 
 
@@ -300,8 +293,8 @@ class SemanticPrior(Base):
     round: Mapped[Key]
     frame_id: Mapped[Key]
     k: Mapped[Key]
-    mask_pixels: Mapped[int] = mapped_column(Integer, comment="S")
-    box_pixels: Mapped[int] = mapped_column(Integer, comment="A; 0 = outside the image")
+    mask_pixels: Mapped[int] = mapped_column(comment="S")
+    box_pixels: Mapped[int] = mapped_column(comment="A; 0 = outside the image")
     rho_anno: Mapped[Share]
 
 
@@ -309,15 +302,14 @@ class EvidenceSource(Base):
     """What an evidence source has declared that has a table `prior_NAME` of its own."""
 
     __tablename__ = "evidence_source"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
-    name: Mapped[str] = mapped_column(Text, primary_key=True, comment="its table is prior_NAME")
-    source: Mapped[str] = mapped_column(Text, comment="as run.priors names it")
+    name: Mapped[str] = mapped_column(primary_key=True, comment="its table is prior_NAME")
+    source: Mapped[str] = mapped_column(comment="as run.priors names it")
     columns: Mapped[str] = mapped_column(
-        Text, comment="JSON: name, kind, unit, meaning and optional of each"
+        comment="JSON: name, kind, unit, meaning and optional of each"
     )
     rho_column: Mapped[str | None] = mapped_column(
-        Text, comment="the column with its trust in [0, 1]; null = not a prior"
+        comment="the column with its trust in [0, 1]; null = not a prior"
     )
 
 
@@ -335,9 +327,9 @@ class Weight(Base):
     round: Mapped[Key]
     frame_id: Mapped[Key]
     k: Mapped[Key]
-    policy: Mapped[str] = mapped_column(Text, primary_key=True)
-    lambda_u: Mapped[float | None] = mapped_column(Float(53), comment="Eq. 4; null where unused")
-    rho_det: Mapped[float | None] = mapped_column(Float(53), comment="product of the priors")
+    policy: Mapped[str] = mapped_column(primary_key=True)
+    lambda_u: Mapped[float | None] = mapped_column(comment="Eq. 4; null where unused")
+    rho_det: Mapped[float | None] = mapped_column(comment="product of the priors")
     v: Mapped[Share]
 
 
@@ -348,31 +340,31 @@ class LabelCount(Base):
     """
 
     __tablename__ = "label_count"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
-    policy: Mapped[str] = mapped_column(Text, primary_key=True)
-    category: Mapped[str] = mapped_column(Text, primary_key=True)
-    labels: Mapped[int] = mapped_column(Integer, comment="that the policy did not drop")
-    kept: Mapped[int] = mapped_column(Integer, comment="with a weight above 0")
-    trusted: Mapped[int] = mapped_column(Integer, comment="with a weight above 0.5")
-    weight: Mapped[float] = mapped_column(Float(53), comment="sum of the weights")
+    policy: Mapped[str] = mapped_column(primary_key=True)
+    category: Mapped[str] = mapped_column(primary_key=True)
+    labels: Mapped[int] = mapped_column(comment="that the policy did not drop")
+    kept: Mapped[int] = mapped_column(comment="with a weight above 0")
+    trusted: Mapped[int] = mapped_column(comment="with a weight above 0.5")
+    weight: Mapped[float] = mapped_column(comment="sum of the weights")
 
 
 class Review(Base):
     """Labels that were handed to an editor, and when the answer was taken back."""
 
     __tablename__ = "review"
+    __table_args__ = ()
 
-    id: Mapped[str] = mapped_column(Text, primary_key=True, comment="hash of its manifest")
-    round: Mapped[int] = mapped_column(Integer, comment="whose labels")
-    policy: Mapped[str] = mapped_column(Text, comment="whose weights chose them")
-    editor: Mapped[str] = mapped_column(Text, comment="kitti | labelcloud | cvat")
-    frames: Mapped[int] = mapped_column(Integer)
-    boxes: Mapped[int] = mapped_column(Integer, comment="in all, those for context included")
-    asked: Mapped[int] = mapped_column(Integer, comment="of the boxes")
-    exported_at: Mapped[str] = mapped_column(Text, comment="ISO 8601, UTC")
-    imported_at: Mapped[str | None] = mapped_column(Text, comment="ISO 8601, UTC; null = not yet")
+    id: Mapped[str] = mapped_column(primary_key=True, comment="hash of its manifest")
+    round: Mapped[int] = mapped_column(comment="whose labels")
+    policy: Mapped[str] = mapped_column(comment="whose weights chose them")
+    editor: Mapped[str] = mapped_column(comment="kitti | labelcloud | cvat")
+    frames: Mapped[int]
+    boxes: Mapped[int] = mapped_column(comment="in all, those for context included")
+    asked: Mapped[int] = mapped_column(comment="of the boxes")
+    exported_at: Mapped[str] = mapped_column(comment="ISO 8601, UTC")
+    imported_at: Mapped[str | None] = mapped_column(comment="ISO 8601, UTC; null = not yet")
 
 
 class HumanLabel(Box, Base):
@@ -393,16 +385,16 @@ class HumanLabel(Box, Base):
 
     frame_id: Mapped[Key]
     n: Mapped[Key]
-    split: Mapped[Name]
+    split: Mapped[str]
     review: Mapped[str] = mapped_column(ForeignKey("review.id"))
     item: Mapped[int | None] = mapped_column(
-        Integer, comment="number of the box in the review; null = added"
+        comment="number of the box in the review; null = added"
     )
-    decision: Mapped[str] = mapped_column(Text, comment="accepted | rejected | moved | added")
-    category: Mapped[Name]
-    from_round: Mapped[int] = mapped_column(Integer, comment="it counts in this round and later")
+    decision: Mapped[str] = mapped_column(comment="accepted | rejected | moved | added")
+    category: Mapped[str]
+    from_round: Mapped[int] = mapped_column(comment="it counts in this round and later")
     seen_x: Mapped[float | None] = mapped_column(
-        Float(53), sort_order=1, comment="metres, LiDAR frame: the box as it was shown; null = none"
+        sort_order=1, comment="metres, LiDAR frame: the box as it was shown; null = none"
     )
     seen_y: Mapped[Metres | None] = mapped_column(sort_order=1)
     seen_z: Mapped[Metres | None] = mapped_column(sort_order=1)
@@ -410,8 +402,8 @@ class HumanLabel(Box, Base):
     seen_width: Mapped[Metres | None] = mapped_column(sort_order=1)
     seen_height: Mapped[Metres | None] = mapped_column(sort_order=1)
     seen_yaw: Mapped[Radians | None] = mapped_column(sort_order=1)
-    reviewer: Mapped[str] = mapped_column(Text, sort_order=2, comment="who decided")
-    decided_at: Mapped[str] = mapped_column(Text, sort_order=2, comment="ISO 8601, UTC")
+    reviewer: Mapped[str] = mapped_column(sort_order=2, comment="who decided")
+    decided_at: Mapped[str] = mapped_column(sort_order=2, comment="ISO 8601, UTC")
 
 
 class HumanMatch(Base):
@@ -431,59 +423,60 @@ class HumanMatch(Base):
     round: Mapped[Key]
     frame_id: Mapped[Key]
     k: Mapped[Key]
-    n: Mapped[int] = mapped_column(Integer, comment="human_label.n")
-    iou: Mapped[float] = mapped_column(Float(53), comment="BEV IoU with its box, or the one seen")
+    n: Mapped[int] = mapped_column(comment="human_label.n")
+    iou: Mapped[float] = mapped_column(comment="BEV IoU with its box, or the one seen")
     leads: Mapped[int] = mapped_column(
-        Integer, comment="1 if the human label stands in weighted_labels under this k"
+        comment="1 if the human label stands in weighted_labels under this k"
     )
 
 
 class _Audited:
     """The key of a row of an audit."""
 
-    round: Mapped[int] = mapped_column(
-        Integer, primary_key=True, sort_order=-1, comment="of the teacher"
-    )
+    round: Mapped[int] = mapped_column(primary_key=True, sort_order=-1, comment="of the teacher")
     frames: Mapped[str] = mapped_column(
-        Text, primary_key=True, sort_order=-1, comment="which: val, labeled, or e.g. 5 folds"
+        primary_key=True, sort_order=-1, comment="which: val, labeled, or e.g. 5 folds"
     )
-    overlap: Mapped[str] = mapped_column(Text, primary_key=True, sort_order=-1, comment="bev | 3d")
+    overlap: Mapped[str] = mapped_column(primary_key=True, sort_order=-1, comment="bev | 3d")
     policy: Mapped[str] = mapped_column(
-        Text,
         primary_key=True,
         sort_order=-1,
         comment="or score, rho_det, consistency: evidence by itself",
     )
-    category: Mapped[str] = mapped_column(Text, primary_key=True, sort_order=-1, comment="or 'all'")
+    category: Mapped[str] = mapped_column(primary_key=True, sort_order=-1, comment="or 'all'")
 
 
 class _Judgement:
     """What is said of the labels of an audit; every figure is null where it is undefined."""
 
-    labels: Mapped[int] = mapped_column(Integer, comment="that are right or wrong")
-    neutral: Mapped[int] = mapped_column(Integer, comment="further labels that are neither")
-    right_labels: Mapped[int] = mapped_column(Integer, comment="of the labels")
-    objects: Mapped[int | None] = mapped_column(Integer, comment="to be found; null = unknown")
-    share_right: Mapped[Figure]
+    labels: Mapped[int] = mapped_column(comment="that are right or wrong")
+    neutral: Mapped[int] = mapped_column(comment="further labels that are neither")
+    right_labels: Mapped[int] = mapped_column(comment="of the labels")
+    objects: Mapped[int | None] = mapped_column(comment="to be found; null = unknown")
+    share_right: Mapped[float | None]
     share_right_low: Mapped[Bound]
     share_right_high: Mapped[Bound]
-    auroc: Mapped[Figure] = mapped_column(
+    auroc: Mapped[float | None] = mapped_column(
         comment="chance that a right label weighs more than a wrong one"
     )
     auroc_low: Mapped[Bound]
     auroc_high: Mapped[Bound]
-    average_precision: Mapped[Figure] = mapped_column(comment="of the labels ranked by weight")
+    average_precision: Mapped[float | None] = mapped_column(
+        comment="of the labels ranked by weight"
+    )
     average_precision_low: Mapped[Bound]
     average_precision_high: Mapped[Bound]
-    weighted_precision: Mapped[Figure] = mapped_column(
+    weighted_precision: Mapped[float | None] = mapped_column(
         comment="share of the weight that lies on right labels"
     )
     weighted_precision_low: Mapped[Bound]
     weighted_precision_high: Mapped[Bound]
-    weighted_recall: Mapped[Figure] = mapped_column(comment="weight on right labels per object")
+    weighted_recall: Mapped[float | None] = mapped_column(
+        comment="weight on right labels per object"
+    )
     weighted_recall_low: Mapped[Bound]
     weighted_recall_high: Mapped[Bound]
-    calibration_error: Mapped[Figure] = mapped_column(
+    calibration_error: Mapped[float | None] = mapped_column(
         comment="expected distance of weight and share of right labels"
     )
     calibration_error_low: Mapped[Bound]
@@ -497,21 +490,17 @@ class Audit(_Audited, _Judgement, Base):
     """
 
     __tablename__ = "audit"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
 
 class AuditSlice(_Audited, _Judgement, Base):
     """The same for a range of distances from the LiDAR, or of LiDAR points in the label."""
 
     __tablename__ = "audit_slice"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
-    kind: Mapped[str] = mapped_column(Text, primary_key=True, comment="distance | points")
-    low: Mapped[float] = mapped_column(
-        Float(53), primary_key=True, comment="metres or points, included"
-    )
+    kind: Mapped[str] = mapped_column(primary_key=True, comment="distance | points")
+    low: Mapped[float] = mapped_column(primary_key=True, comment="metres or points, included")
     high: Mapped[float | None] = mapped_column(
-        Float(53), comment="metres or points, not included; null = open"
+        comment="metres or points, not included; null = open"
     )
 
 
@@ -519,14 +508,13 @@ class AuditBin(_Audited, Base):
     """The labels of an audit whose weight lies in a bin; the last bin holds its upper edge."""
 
     __tablename__ = "audit_bin"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
-    low: Mapped[float] = mapped_column(Float(53), primary_key=True, comment="weight, included")
-    high: Mapped[float] = mapped_column(Float(53), comment="weight, not included")
-    labels: Mapped[int] = mapped_column(Integer)
-    mean_weight: Mapped[Figure]
-    precision: Mapped[Figure] = mapped_column(comment="share of right labels in the bin")
-    recall: Mapped[Figure] = mapped_column(comment="right labels of the bin per object")
+    low: Mapped[float] = mapped_column(primary_key=True, comment="weight, included")
+    high: Mapped[float] = mapped_column(comment="weight, not included")
+    labels: Mapped[int]
+    mean_weight: Mapped[float | None]
+    precision: Mapped[float | None] = mapped_column(comment="share of right labels in the bin")
+    recall: Mapped[float | None] = mapped_column(comment="right labels of the bin per object")
 
 
 class EvaluationObject(Box, Base):
@@ -545,67 +533,62 @@ class EvaluationObject(Box, Base):
     )
 
     source: Mapped[str] = mapped_column(
-        Text, primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
+        primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
     )
     frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
-    side: Mapped[str] = mapped_column(Text, primary_key=True, comment="object | detection")
+    side: Mapped[str] = mapped_column(primary_key=True, comment="object | detection")
     k: Mapped[int] = mapped_column(
-        Integer, primary_key=True, autoincrement=False, comment="of ground_truth or of prediction"
+        primary_key=True, autoincrement=False, comment="of ground_truth or of prediction"
     )
     category: Mapped[str] = mapped_column(
-        Text, primary_key=True, comment="under evaluation; a Van is an ignored object of Car"
+        primary_key=True, comment="under evaluation; a Van is an ignored object of Car"
     )
-    outcome: Mapped[str] = mapped_column(Text, comment="tp | fp | fn | ignored")
-    matched_k: Mapped[int | None] = mapped_column(Integer, comment="of the other side")
+    outcome: Mapped[str] = mapped_column(comment="tp | fp | fn | ignored")
+    matched_k: Mapped[int | None] = mapped_column(comment="of the other side")
     iou: Mapped[float] = mapped_column(
-        Float(53), comment="with the match, else the greatest with any that took part"
+        comment="with the match, else the greatest with any that took part"
     )
     score: Mapped[float | None] = mapped_column(
-        Float(53), comment="of the detection, for objects of the matched one"
+        comment="of the detection, for objects of the matched one"
     )
-    overlap: Mapped[str] = mapped_column(Text, comment="what iou is: image | bev | 3d")
-    difficulty: Mapped[str] = mapped_column(Text, comment="objects beyond it are ignored")
+    overlap: Mapped[str] = mapped_column(comment="what iou is: image | bev | 3d")
+    difficulty: Mapped[str] = mapped_column(comment="objects beyond it are ignored")
 
 
 class EvaluationAp(Base):
     """KITTI average precision of the detections of val frames."""
 
     __tablename__ = "evaluation_ap"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
     source: Mapped[str] = mapped_column(
-        Text, primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
+        primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
     )
-    category: Mapped[str] = mapped_column(Text, primary_key=True)
-    figure: Mapped[str] = mapped_column(Text, primary_key=True, comment="image | aos | bev | 3d")
-    difficulty: Mapped[str] = mapped_column(
-        Text, primary_key=True, comment="easy | moderate | hard"
-    )
-    objects: Mapped[int] = mapped_column(Integer, comment="that count")
-    ap_r40: Mapped[float | None] = mapped_column(Float(53), comment="percent")
-    ap_r11: Mapped[float | None] = mapped_column(Float(53), comment="percent")
+    category: Mapped[str] = mapped_column(primary_key=True)
+    figure: Mapped[str] = mapped_column(primary_key=True, comment="image | aos | bev | 3d")
+    difficulty: Mapped[str] = mapped_column(primary_key=True, comment="easy | moderate | hard")
+    objects: Mapped[int] = mapped_column(comment="that count")
+    ap_r40: Mapped[float | None] = mapped_column(comment="percent")
+    ap_r11: Mapped[float | None] = mapped_column(comment="percent")
 
 
 class LabelFile(Base):
     """An exported label file as it was written; the firewall notices what changed since."""
 
     __tablename__ = "label_file"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
-    path: Mapped[str] = mapped_column(Text, primary_key=True, comment="relative to the workspace")
-    round: Mapped[int] = mapped_column(Integer, comment="0 = ground truth of X_l alone")
-    policy: Mapped[Name]
-    sha256: Mapped[str] = mapped_column(Text, comment="of the file")
+    path: Mapped[str] = mapped_column(primary_key=True, comment="relative to the workspace")
+    round: Mapped[int] = mapped_column(comment="0 = ground truth of X_l alone")
+    policy: Mapped[str]
+    sha256: Mapped[str] = mapped_column(comment="of the file")
 
 
 class ViewDefinition(Base):
     """The views as they were made last; those with another definition are made anew."""
 
     __tablename__ = "view_definition"
-    __table_args__ = ({"sqlite_with_rowid": False},)
 
-    name: Mapped[str] = mapped_column(Text, primary_key=True, comment="of the view")
-    sha256: Mapped[str] = mapped_column(Text, comment="of its definition")
+    name: Mapped[str] = mapped_column(primary_key=True, comment="of the view")
+    sha256: Mapped[str] = mapped_column(comment="of its definition")
 
 
 class Task(Base):
@@ -635,12 +618,12 @@ class Task(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    round: Mapped[int] = mapped_column(Integer)
-    stage: Mapped[Name]
-    variant: Mapped[str] = mapped_column(Text, comment="policy or format of a round stage, else ''")
+    id: Mapped[int] = mapped_column(primary_key=True)
+    round: Mapped[int]
+    stage: Mapped[str]
+    variant: Mapped[str] = mapped_column(comment="policy or format of a round stage, else ''")
     frame_id: Mapped[int | None] = mapped_column(ForeignKey("frame.id"))
-    fingerprint: Mapped[str] = mapped_column(Text, comment="of all that the result depends on")
-    state: Mapped[str] = mapped_column(Text, comment="done | empty | failed")
+    fingerprint: Mapped[str] = mapped_column(comment="of all that the result depends on")
+    state: Mapped[str] = mapped_column(comment="done | empty | failed")
     error: Mapped[str | None] = mapped_column(Text)
-    seconds: Mapped[Number]
+    seconds: Mapped[float]

@@ -1,6 +1,6 @@
 """Opening a database: pragmas, migrations, and errors in our own words."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,11 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from alembic.util import CommandError
-from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url
+from sqlalchemy import URL, Connection, Engine, Select, create_engine, event, inspect, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError, joined_lines
+from db import bulk
 from db.backups import back_up
 from db.claims import Check, claimed, one_at_a_time, round_resources
 from db.lock_holders import holders
@@ -61,6 +62,11 @@ class Database:
         """A connection for queries."""
         with self._translate_errors(), self.engine.connect() as connection:
             yield connection
+
+    def rows(self, query: Select[Any]) -> Sequence[bulk.Row]:
+        """Return all rows of a query, see `db.bulk.select`."""
+        with self.reading() as connection:
+            return bulk.select(connection, query)
 
     @contextmanager
     def writing(self, *, keys_known: bool = False) -> Iterator[Connection]:

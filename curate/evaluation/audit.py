@@ -18,7 +18,6 @@ from curate.evaluation.reliability import (
     auroc,
     average_precision,
     expected_calibration_error,
-    percentile_interval,
     reliability_bins,
     weighted_precision,
     weighted_recall,
@@ -36,9 +35,15 @@ class Estimate:
 
     @classmethod
     def of(cls, value: float, replicates: np.ndarray, level: float) -> Self:
-        """The figure, and the interval from its (r,) replicates."""
-        interval = percentile_interval(replicates, level)
-        return cls(float(value), interval.low, interval.high)
+        """The figure, and the interval that holds the share `level` of its (r,) replicates.
+
+        Undefined replicates are left out; the interval is NaN where all of them are.
+        """
+        defined = replicates[~np.isnan(replicates)]
+        if not len(defined):
+            return cls(float(value), np.nan, np.nan)
+        low, high = np.quantile(defined, [(1 - level) / 2, (1 + level) / 2])
+        return cls(float(value), float(low), float(high))
 
 
 @dataclass(frozen=True)

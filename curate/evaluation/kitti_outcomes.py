@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 
 from curate.datasets.kitti.labels import KittiObjects
+from curate.detections import Columns
 from curate.errors import ConfigError
 from curate.evaluation.kitti_ap import check_frames
 from curate.evaluation.kitti_matching import (
@@ -31,7 +32,7 @@ TRUE_POSITIVE, FALSE_POSITIVE, FALSE_NEGATIVE, LEFT_OUT = "tp", "fp", "fn", "ign
 
 
 @dataclass(frozen=True)
-class Outcomes:
+class Outcomes(Columns):
     """One row per object of a category under evaluation, in the order of category, frame, object.
 
     A neighbouring category's objects (Van for Car) are rows of that evaluation too, as ignored.
@@ -54,9 +55,6 @@ class Outcomes:
     matches: np.ndarray
     overlaps: np.ndarray
     scores: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.frames)
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:

@@ -9,12 +9,13 @@ from functools import cached_property
 
 import numpy as np
 
+from curate.detections import Columns
 from curate.errors import ConfigError
 from curate.geometry.overlap import overlapping_pairs
 
 
 @dataclass(frozen=True)
-class RoundLabels:
+class RoundLabels(Columns):
     """The n labels of a round with the weights of one policy.
 
     Attributes:
@@ -28,9 +29,6 @@ class RoundLabels:
     categories: np.ndarray
     boxes: np.ndarray
     weights: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.boxes)
 
 
 @dataclass(frozen=True)

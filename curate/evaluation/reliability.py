@@ -4,7 +4,7 @@ Every figure is NaN where it is undefined: without labels, without weight, or wh
 are right (or all wrong) and there is nothing to tell apart.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -192,64 +192,6 @@ def expected_calibration_error(weights: np.ndarray, right: np.ndarray, bins: int
     table = reliability_bins(weights, right, 0, bins)
     gap = np.abs(table.precision - table.mean_weight)
     return _ratio(float(np.nansum(gap * table.labels)), float(table.labels.sum()))
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A bootstrap confidence interval; NaN where the statistic was never defined.
-
-    Attributes:
-        low: lower percentile.
-        high: upper percentile.
-        undefined: share of the replicates in which the statistic was NaN; they are left out.
-    """
-
-    low: float
-    high: float
-    undefined: float
-
-
-def bootstrap(
-    statistic: Callable[[np.ndarray, np.ndarray], float],
-    frame_index: np.ndarray,
-    frames: int,
-    generator: np.random.Generator,
-    *,
-    replicates: int = 1000,
-    level: float = 0.95,
-) -> Interval:
-    """A percentile interval of a statistic over resampled frames, the unit that was sampled.
-
-    Labels of one frame are not independent, so whole frames are drawn, with replacement.
-
-    Args:
-        statistic: from the (m,) drawn labels and the (frames,) drawn frames, both as indices with
-            repetition, to a number or NaN.
-        frame_index: (n,) integer in [0, frames), the frame of each label.
-        frames: number of frames, those without a label included.
-        generator: source of the draws.
-        replicates: number of draws.
-        level: coverage of the interval.
-    """
-    order = np.argsort(frame_index, kind="stable")
-    count = np.bincount(frame_index, minlength=frames)
-    start = np.cumsum(count) - count
-    values = np.full(replicates, np.nan)
-    for replicate in range(replicates if frames else 0):
-        drawn = generator.integers(frames, size=frames)
-        size = count[drawn]
-        within = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
-        values[replicate] = statistic(order[np.repeat(start[drawn], size) + within], drawn)
-    return percentile_interval(values, level)
-
-
-def percentile_interval(replicates: np.ndarray, level: float = 0.95) -> Interval:
-    """The interval that holds the share `level` of the (r,) defined replicates."""
-    defined = replicates[~np.isnan(replicates)]
-    if not len(defined):
-        return Interval(np.nan, np.nan, 1.0)
-    low, high = np.quantile(defined, [(1 - level) / 2, (1 + level) / 2])
-    return Interval(float(low), float(high), 1.0 - len(defined) / len(replicates))
 
 
 def _minimum_iou(settings: JudgeSettings, category: str) -> float:

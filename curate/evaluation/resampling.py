@@ -1,8 +1,7 @@
 """A bootstrap over frames in which the labels are sorted once, not once per draw.
 
 A draw of frames with replacement is kept as how often each frame was drawn. Every figure is then a
-sum over labels with these multiplicities. `curate.evaluation.reliability.bootstrap` does the same
-for any statistic, by copying labels and a hundred times slower.
+sum over labels with these multiplicities.
 """
 
 import numpy as np

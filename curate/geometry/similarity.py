@@ -63,13 +63,6 @@ class Similarity:
         moved[:, :3] = points[:, :3] @ self._matrix().T.astype(points.dtype)
         return moved
 
-    def invert_points(self, points: np.ndarray) -> np.ndarray:
-        """A^-1 of (n, >=3) points; columns after the third are kept. Same dtype."""
-        moved = points.copy()
-        inverse = self._matrix() / self.scale**2
-        moved[:, :3] = points[:, :3] @ inverse.astype(points.dtype)
-        return moved
-
     def apply_to_boxes(self, boxes: np.ndarray) -> np.ndarray:
         """A of (n, 7) boxes."""
         moved = np.array(boxes, dtype=np.float64)

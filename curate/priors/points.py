@@ -51,21 +51,6 @@ class PointSettings:
             raise ConfigError("point prior: fixed and fallback must be at least 1 point")
 
 
-@dataclass(frozen=True)
-class PointThresholds:
-    """What was learned from X_l.
-
-    Attributes:
-        values: m_th per category, in points, at least 1.
-        ground_truths: number of ground-truth boxes per category that it was learned from.
-        fallbacks: the categories that had none and got the fallback.
-    """
-
-    values: Mapping[str, float]
-    ground_truths: Mapping[str, int]
-    fallbacks: tuple[str, ...]
-
-
 _DEFAULT = PointSettings()
 
 
@@ -100,7 +85,7 @@ def learn_thresholds(
     samples: Iterable[tuple[Frame, Annotations]],
     categories: Sequence[str],
     settings: PointSettings = _DEFAULT,
-) -> PointThresholds:
+) -> dict[str, float]:
     """m_th of each category from labeled frames; warns for a category without ground truth.
 
     Args:
@@ -124,11 +109,7 @@ def learn_thresholds(
             category,
             settings.fallback,
         )
-    return PointThresholds(
-        values={c: points_threshold(m, settings) for c, m in merged.items()},
-        ground_truths={c: len(m) for c, m in merged.items()},
-        fallbacks=tuple(missing),
-    )
+    return {c: points_threshold(m, settings) for c, m in merged.items()}
 
 
 @dataclass(frozen=True)
@@ -136,7 +117,7 @@ class PointPrior(EvidenceSource):
     """rho_diff = min(m, m_th(c)) / m_th(c).
 
     Attributes:
-        thresholds: m_th per category, in points; `PointThresholds.values`.
+        thresholds: m_th per category, in points; see `learn_thresholds`.
     """
 
     thresholds: Mapping[str, float]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from curate.detections import Columns
 from curate.geometry.overlap import bev_iou
 
 ACCEPTED, REJECTED, MOVED, ADDED = DECISIONS = ("accepted", "rejected", "moved", "added")
@@ -25,7 +26,7 @@ SAME_DECISION_IOU = 0.5
 
 
 @dataclass(frozen=True)
-class HumanLabels:
+class HumanLabels(Columns):
     """The n human labels of one frame.
 
     Attributes:
@@ -39,9 +40,6 @@ class HumanLabels:
     categories: np.ndarray
     boxes: np.ndarray
     seen: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.boxes)
 
 
 @dataclass(frozen=True)

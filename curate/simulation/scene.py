@@ -16,9 +16,6 @@ from curate.simulation.street import Street
 SEMANTIC_CLASSES = {"Car": 1, "Pedestrian": 2, "Cyclist": 3}
 """Class ids of the semantic maps; 0 is everything else."""
 
-GROUND = 0
-"""The number of the ground among the things of a scene; placements count from 1."""
-
 
 @dataclass(frozen=True)
 class Hits:

@@ -5,15 +5,11 @@ two more packages for this one network.
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-from onnx import ModelProto, TensorProto, checker, helper, numpy_helper
+from onnx import ModelProto, TensorProto, helper
 
-_OPSET = 18
-_IR_VERSION = 10
-# Of torch's BatchNorm2d.
-_EPSILON = 1e-5
+from curate.files.onnx_graph import EPSILON, GraphBuilder
 
 
 def build_graph(weights: Mapping[str, np.ndarray], width: int, height: int) -> ModelProto:
@@ -36,25 +32,8 @@ def build_graph(weights: Mapping[str, np.ndarray], width: int, height: int) -> M
     return graph.model((1, height, width))
 
 
-class _Graph:
-    """Collects nodes and constants; methods take and return names of values."""
-
-    def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
-        self._weights = weights
-        self._nodes: list = []
-        self._constants: list = []
-
-    def node(self, operator: str, *inputs: str, **attributes: Any) -> str:
-        """Adds an operator with one output."""
-        name = f"value{len(self._nodes)}"
-        self._nodes.append(helper.make_node(operator, inputs, [name], **attributes))
-        return name
-
-    def constant(self, array: np.ndarray) -> str:
-        """Adds a constant."""
-        name = f"constant{len(self._constants)}"
-        self._constants.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
-        return name
+class _Graph(GraphBuilder):
+    """The parts of the network."""
 
     def image(self, name: str) -> str:
         """The input as maps (1, 3, height, width) from -1 to 1."""
@@ -66,7 +45,7 @@ class _Graph:
     def convolution(self, maps: str, name: str, *, stride: int = 1, dilation: int = 1) -> str:
         """ReLU of a normalised 3 x 3 convolution."""
         mean, variance = (self._weights[f"{name}.1.running_{part}"] for part in ("mean", "var"))
-        scale = self._weights[f"{name}.1.weight"] / np.sqrt(variance + _EPSILON)
+        scale = self._weights[f"{name}.1.weight"] / np.sqrt(variance + EPSILON)
         kernel = self.constant(self._weights[f"{name}.0.weight"] * scale[:, None, None, None])
         shift = self.constant(self._weights[f"{name}.1.bias"] - mean * scale)
         attributes = {"pads": [dilation] * 4, "strides": [stride] * 2, "dilations": [dilation] * 2}
@@ -100,8 +79,4 @@ class _Graph:
         describe = helper.make_tensor_value_info
         image = describe("image", TensorProto.UINT8, (*shape, 3))
         answer = describe("class_ids", TensorProto.UINT8, shape)
-        graph = helper.make_graph(self._nodes, "segmentation", [image], [answer], self._constants)
-        opsets = [helper.make_opsetid("", _OPSET)]
-        model = helper.make_model(graph, opset_imports=opsets, ir_version=_IR_VERSION)
-        checker.check_model(model, full_check=True)
-        return model
+        return self.finish("segmentation", [image], [answer], full_check=True)

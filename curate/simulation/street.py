@@ -97,11 +97,6 @@ class Street:
         height = np.interp(s, self._knots_s, self._profile) + self.slope[1] * d + kerb
         return np.array([cos * s - sin * d, sin * s + cos * d, height])
 
-    def to_road(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates s and d of places in the LiDAR frame."""
-        cos, sin = np.float32(np.cos(self.heading_rad)), np.float32(np.sin(self.heading_rad))
-        return cos * x + sin * y, cos * y - sin * x
-
     def ground(self) -> Mesh:
         """The ground as a mesh: asphalt, pavements, yards."""
         s, d = np.meshgrid(self._knots_s, self._knots_d, indexing="ij")

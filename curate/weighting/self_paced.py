@@ -32,7 +32,15 @@ class SPSL(Policy):
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a setting without meaning."""
-        _check(self.name, self.scope, self.quantile)
+        if self.scope not in get_args(Scope):
+            known = ", ".join(get_args(Scope))
+            raise ConfigError(
+                f"policy {self.name}: unknown scope {self.scope!r}; choose one of {known}"
+            )
+        if self.quantile is not None and not 0 < self.quantile <= 1:
+            raise ConfigError(
+                f"policy {self.name}: quantile must be in (0, 1], not {self.quantile}"
+            )
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -46,30 +54,17 @@ class SPSL(Policy):
 
 
 @dataclass(frozen=True)
-class PSPSL(Policy):
+class PSPSL(SPSL):
     """v = rho_det * (1 - L / lambda) where L < lambda, else 0 (Eq. 11).
 
     Attributes:
-        scope: as in `SPSL`.
-        quantile: as in `SPSL`.
         self_paced: false leaves the factor 1 - L / lambda out: v = rho_det of every label that
             matched, to see what the schedule is good for; of every label where none of the round
             matched, for a detector without a second pass.
     """
 
-    scope: Scope = "round"
-    quantile: float | None = None
     self_paced: bool = True
     name: ClassVar[str] = "pspsl"
-
-    def __post_init__(self) -> None:
-        """Raises ConfigError for a setting without meaning."""
-        _check(self.name, self.scope, self.quantile)
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """The columns that it looks at."""
-        return ("loss", "category") if self.scope == "category" else ("loss",)
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
         """The weight of every label; 0 where no reprediction matched."""
@@ -110,15 +105,6 @@ def age_parameter(
     # Rounding can lift the mean of equal losses above them all, and would let them pass.
     lambda_u: np.ndarray = np.minimum(parameter, maximum)[group]
     return lambda_u
-
-
-def _check(policy: str, scope: str, quantile: float | None) -> None:
-    """Raises ConfigError for a setting without meaning."""
-    if scope not in get_args(Scope):
-        known = ", ".join(get_args(Scope))
-        raise ConfigError(f"policy {policy}: unknown scope {scope!r}; choose one of {known}")
-    if quantile is not None and not 0 < quantile <= 1:
-        raise ConfigError(f"policy {policy}: quantile must be in (0, 1], not {quantile}")
 
 
 def _group(evidence: Evidence, scope: Scope) -> tuple[np.ndarray, int]:

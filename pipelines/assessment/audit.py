@@ -266,5 +266,4 @@ def _points(workspace: Workspace, round_number: int) -> dict[tuple[int, int], in
     """LiDAR points in each label, by frame and k."""
     table = bulk.table("point_prior")
     query = select(table.c.frame_id, table.c.k, table.c.points).where(table.c.round == round_number)
-    with workspace.database.reading() as connection:
-        return {(frame, k): points for frame, k, points in bulk.select(connection, query)}
+    return {(frame, k): points for frame, k, points in workspace.database.rows(query)}

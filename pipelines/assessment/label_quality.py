@@ -53,5 +53,4 @@ def _weights(workspace: Workspace, round_number: int, policy: str) -> dict[tuple
     query = select(table.c.frame_id, table.c.k, table.c.v).where(
         table.c.round == round_number, table.c.policy == policy
     )
-    with workspace.database.reading() as connection:
-        return {(frame, k): v for frame, k, v in bulk.select(connection, query)}
+    return {(frame, k): v for frame, k, v in workspace.database.rows(query)}

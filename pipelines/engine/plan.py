@@ -153,14 +153,12 @@ class Plan:
         query, holds = self._waiting(of, split)
         query = query.where(holds if measured else not_(holds)).order_by(frame.c.id)
         ends = select(func.min(frame.c.id), func.max(frame.c.id)).where(frame.c.split == split)
-        with self.workspace.database.reading() as connection:
-            [(lowest, highest)] = bulk.select(connection, ends)
+        [(lowest, highest)] = self.workspace.database.rows(ends)
         if lowest is None:
             return
         for first in range(lowest, highest + 1, PAGE):
             page = query.where(frame.c.id.between(first, first + PAGE - 1))
-            with self.workspace.database.reading() as connection:
-                found = bulk.select(connection, page)
+            found = self.workspace.database.rows(page)
             for key, name, empty in found:
                 yield WaitingFrame(key, name, bool(empty))
 
@@ -185,8 +183,7 @@ class Plan:
     def count_waiting(self, of: FramesStage, split: str) -> int:
         """Return how many frames are to be worked on."""
         query, _ = self._waiting(of, split)
-        with self.workspace.database.reading() as connection:
-            found = bulk.select(connection, select(func.count()).select_from(query.subquery()))
+        found = self.workspace.database.rows(select(func.count()).select_from(query.subquery()))
         return int(found[0][0])
 
     def counts(self, of: FramesStage, split: str) -> Counts:
@@ -199,8 +196,7 @@ class Plan:
             .where(frame.c.split == split)
             .group_by(own.c.state)
         )
-        with self.workspace.database.reading() as connection:
-            found: dict[str | None, int] = dict(bulk.select(connection, query))
+        found: dict[str | None, int] = dict(self.workspace.database.rows(query))
         done, empty, failed, waiting = (
             found.get(key, 0) for key in ("done", "empty", "failed", None)
         )
@@ -251,8 +247,7 @@ class Plan:
         """
         what = TaskKey(self.context.number, of.name, policy)
         query = select(bulk.table("task").c.fingerprint).where(*what.conditions())
-        with self.workspace.database.reading() as connection:
-            stored = bulk.select(connection, query)
+        stored = self.workspace.database.rows(query)
         if not stored:
             return "waiting"
         try:
@@ -308,8 +303,7 @@ class Plan:
     def _frames(self, of: FramesStage, split: str, *, undone: bool) -> list[WaitingFrame]:
         """The frames that all earlier stages have finished; with `undone` those that wait."""
         query = self._waiting(of, split)[0] if undone else self._ready(of, split)[0]
-        with self.workspace.database.reading() as connection:
-            found = bulk.select(connection, query)
+        found = self.workspace.database.rows(query)
         return [WaitingFrame(key, name, bool(empty)) for key, name, empty in found]
 
     def _failed_before(self, of: FramesStage, split: str) -> set[str]:
@@ -342,8 +336,7 @@ class Plan:
 def is_current(workspace: Workspace, what: TaskKey, fingerprint: str) -> bool:
     """Return whether it has been done with all that it depends on."""
     query = select(bulk.table("task").c.fingerprint).where(*what.conditions())
-    with workspace.database.reading() as connection:
-        return bulk.select(connection, query) == [(fingerprint,)]
+    return workspace.database.rows(query) == [(fingerprint,)]
 
 
 def _fingerprint(name: str, settings: Any, reads: Sequence[str], known: Mapping[str, str]) -> str:

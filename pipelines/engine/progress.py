@@ -29,15 +29,6 @@ class TotalProgress(Protocol):
         ...
 
 
-class Silent:
-    """Shows nothing."""
-
-    @contextmanager
-    def track(self, what: str, total: int) -> Iterator[Advance]:  # noqa: ARG002
-        """Yields a function that does nothing."""
-        yield lambda _step, _note: None
-
-
 def as_total(advance: Advance) -> TotalProgress:
     """Moves `advance` for work that tells how much is done in all, not how much more."""
     before = 0

@@ -85,8 +85,7 @@ def _record_round(workspace: Workspace, row: dict[str, Any]) -> None:
     """Stores a round; one that another process works on keeps its settings."""
     table, number = bulk.table("round"), row["number"]
     query = select(*(table.c[name] for name in row)).where(table.c.number == number)
-    with workspace.database.reading() as connection:
-        stored = bulk.select(connection, query)
+    stored = workspace.database.rows(query)
     if stored == [tuple(row.values())]:
         return
     with (
@@ -138,8 +137,7 @@ def find_teacher(
     query = select(table.c.id, table.c.path, table.c.sha256, table.c.detector).where(
         table.c.round == number - 1, table.c.policy == policy
     )
-    with workspace.database.reading() as connection:
-        found = bulk.select(connection, query)
+    found = workspace.database.rows(query)
     before = "curate pretrain" if number == 1 else f"curate train-round --round {number - 1}"
     if not found and brought and not is_student_trained(workspace):
         return _external_detector(workspace)
@@ -204,8 +202,7 @@ def _external_detector(workspace: Workspace) -> tuple[int, Teacher]:
     digest = sha256(path)
     table = bulk.table("checkpoint")
     query = select(table.c.id, table.c.sha256).where(table.c.round == 0, table.c.policy == "")
-    with workspace.database.reading() as connection:
-        found = bulk.select(connection, query)
+    found = workspace.database.rows(query)
     if not found or found[0][1] != digest:
         with workspace.database.writing() as connection:
             register_checkpoint(connection, workspace, 0, "", path)
@@ -214,20 +211,17 @@ def _external_detector(workspace: Workspace) -> tuple[int, Teacher]:
 
 
 def _has_frames(workspace: Workspace) -> bool:
-    with workspace.database.reading() as connection:
-        return bool(bulk.select(connection, select(bulk.table("frame").c.id).limit(1)))
+    return bool(workspace.database.rows(select(bulk.table("frame").c.id).limit(1)))
 
 
 def _students(workspace: Workspace) -> set[int]:
     """The rounds that have trained a student with the configured policy."""
     table = bulk.table("checkpoint")
     query = select(table.c.round).where(table.c.policy == workspace.config.run.method)
-    with workspace.database.reading() as connection:
-        return {row[0] for row in bulk.select(connection, query)}
+    return {row[0] for row in workspace.database.rows(query)}
 
 
 def _stored_rounds(workspace: Workspace, number: int) -> int | None:
     table = bulk.table("round")
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, select(table.c.rounds).where(table.c.number == number))
+    rows = workspace.database.rows(select(table.c.rounds).where(table.c.number == number))
     return rows[0][0] if rows else None

@@ -99,93 +99,85 @@ class ReusableMeasurements:
 
 
 @dataclass(frozen=True)
-class FirstStage:
-    """A stage that is done once in a workspace, before the first round.
+class _Stage:
+    """What all stages have.
 
     Attributes:
         name: of the stage and, with underscores, of its file.
         command: that runs it.
-        reads: tables or sources.
+        reads: tables or sources; together with `settings` all that its rows depend on.
         writes: tables or files.
+    """
+
+    name: str
+    command: str
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstStage(_Stage):
+    """A stage that is done once in a workspace, before the first round.
+
+    Attributes:
         settings: all that its result depends on.
         run: does it.
         file: what it leaves on disk.
         guard: what must hold at every start, even where the stage is up to date; raises.
     """
 
-    name: str
-    command: str
-    reads: tuple[str, ...]
-    writes: tuple[str, ...]
     settings: Callable[[Workspace], Any]
     run: Callable[[Workspace, Progress], Product]
     file: Callable[[Workspace], Path]
     guard: Callable[[Workspace], None]
 
 
-@dataclass(frozen=True)
-class FrameStage:
-    """A stage that treats every frame alone.
+@dataclass(frozen=True, kw_only=True)
+class _FramesStage(_Stage):
+    """What the stages have whose rows belong to frames.
 
     Attributes:
-        name: of the stage and, with underscores, of its file.
-        command: that runs it.
-        reads: tables or sources; together with `settings` all that its rows depend on.
-        writes: tables.
         settings: what its rows depend on beside what it reads and recalls.
-        function: what it does with a frame.
-        recall: see `Recall`; None where there is nothing that could be kept.
         check: what can be known before the first frame to be wrong with its settings; raises.
         prepare: makes what it writes to, where that is not there yet.
     """
 
-    name: str
-    command: str
-    reads: tuple[str, ...]
-    writes: tuple[str, ...]
     settings: Callable[[Workspace, RoundContext], Settings]
-    function: Callable[[Workspace, RoundContext], FrameFunction]
-    recall: ReusableMeasurements | None = None
     check: Callable[[Workspace], None] | None = None
     prepare: Callable[[Workspace], None] | None = None
 
 
-@dataclass(frozen=True)
-class SequenceStage:
+@dataclass(frozen=True, kw_only=True)
+class FrameStage(_FramesStage):
+    """A stage that treats every frame alone.
+
+    Attributes:
+        function: what it does with a frame.
+        recall: see `Recall`; None where there is nothing that could be kept.
+    """
+
+    function: Callable[[Workspace, RoundContext], FrameFunction]
+    recall: ReusableMeasurements | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceStage(_FramesStage):
     """A stage that looks at all frames of a sequence together, planned and resumed per sequence.
 
     A frame of no known sequence is a sequence of its own. Frames that failed before are left out.
 
     Attributes:
-        name: of the stage and, with underscores, of its file.
-        command: that runs it.
-        reads: tables or sources; together with `settings` all that its rows depend on.
-        writes: tables.
-        settings: what its rows depend on beside what it reads.
         function: what it does with a sequence.
-        check: what can be known before the first frame to be wrong with its settings; raises.
-        prepare: makes what it writes to, where that is not there yet.
     """
 
-    name: str
-    command: str
-    reads: tuple[str, ...]
-    writes: tuple[str, ...]
-    settings: Callable[[Workspace, RoundContext], Settings]
     function: Callable[[Workspace, RoundContext], SequenceFunction]
-    check: Callable[[Workspace], None] | None = None
-    prepare: Callable[[Workspace], None] | None = None
 
 
-@dataclass(frozen=True)
-class RoundStage:
+@dataclass(frozen=True, kw_only=True)
+class RoundStage(_Stage):
     """A stage that looks at all labels of a round at once, for one policy.
 
     Attributes:
-        name: of the stage and, with underscores, of its file.
-        command: that runs it.
-        reads: tables or sources.
-        writes: tables or files.
         settings: what its result depends on beside what it reads; the last argument is the policy.
         run: does it.
         file: what it leaves on disk, if anything.
@@ -194,10 +186,6 @@ class RoundStage:
         check: what can be known before any work to be wrong with its settings; raises.
     """
 
-    name: str
-    command: str
-    reads: tuple[str, ...]
-    writes: tuple[str, ...]
     settings: Callable[[Workspace, RoundContext, str], Settings]
     run: Callable[[Workspace, RoundJob, Progress], Product]
     file: Callable[[Workspace, RoundContext, str], Path] | None = None

@@ -56,8 +56,7 @@ def _fault(found: LabelFileFrames, own: Mapping[str, str]) -> str:
 def _written(workspace: Workspace) -> dict[str, str]:
     """The hash of each label file as it was exported."""
     table = bulk.table("label_file")
-    with workspace.database.reading() as connection:
-        return dict(bulk.select(connection, select(table.c.path, table.c.sha256)))
+    return dict(workspace.database.rows(select(table.c.path, table.c.sha256)))
 
 
 def object_bank(

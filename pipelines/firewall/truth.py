@@ -83,8 +83,7 @@ def _suspects(workspace: Workspace, number: int, frames: Mapping[str, int]) -> M
     table = bulk.table("prediction")
     query = select(table.c.frame_id).distinct()
     query = query.where(table.c.round == number, table.c.score >= _CERTAIN)
-    with workspace.database.reading() as connection:
-        certain = {row[0] for row in bulk.select(connection, query)}
+    certain = {row[0] for row in workspace.database.rows(query)}
     step = max(1, len(frames) // _SAMPLED_FRAMES)
     return {
         name: key for i, (name, key) in enumerate(frames.items()) if key in certain or i % step == 0

@@ -2,22 +2,20 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, Float, Integer, Select, Text, select, type_coerce
 
-from curate.errors import WorkspaceError
 from curate.evaluation.label_changes import RoundLabels
 from curate.files.batches import batched
 from db import bulk
 from db.evidence import weighted_label_columns
 from db.models import BOX_COLUMNS
 from db.views import weighted_labels
-from pipelines.labels.by_frame import check_weights
+from pipelines.labels.by_frame import check_weights, unweighted
 from pipelines.workspace.workspace import Workspace
 
-_CHUNK = 50_000
 _BLOCK_FRAMES = 1000
 # SQLite looks so few frames up one by one; for more it would walk through the whole round.
 _ASKED_FRAMES = 8
@@ -112,14 +110,6 @@ def read_blocks(
             raise unweighted(each, policy)
 
 
-def unweighted(round_number: int, policy: str) -> WorkspaceError:
-    """What is wrong where a policy has weighted nothing in a round."""
-    return WorkspaceError(
-        f"round {round_number} has no labels weighted by {policy}; "
-        f"run `curate solve --round {round_number} --policy {policy}`"
-    )
-
-
 def _read(
     workspace: Workspace,
     connection: Connection,
@@ -128,72 +118,56 @@ def _read(
     wanted: Sequence[str] | None = None,
 ) -> LabelColumns:
     """The labels of a round, of all frames or of the wanted ones."""
-    view = weighted_labels(connection)
-    labels, numbers = view.c, numeric_columns(connection)
-    values = (*BOX_COLUMNS, *numbers)
+    view = weighted_labels(connection).c
+    kinds: dict[str, Any] = {"frame": Text(), "k": Integer(), "category": Text()}
+    kinds |= dict.fromkeys((*BOX_COLUMNS, *numeric_columns(connection)), Float())
     # Not ordered: the database would write millions of whole rows to its disk to sort them.
-    query = select(
-        labels.frame, labels.k, labels.category, *(labels[name] for name in values)
-    ).where(labels.round == round_number, labels.policy == policy)
+    columns = [type_coerce(view[name], kind).label(name) for name, kind in kinds.items()]
+    query: Select[Any] = select(*columns)
+    query = query.where(view.round == round_number, view.policy == policy)
     queries = [query]
     if wanted is not None:
-        parts = batched(wanted, _ASKED_FRAMES)
-        queries = [query.where(labels.frame.in_(part)) for part in parts]
-    frames: dict[str, int] = {}
-    categories = {name: i for i, name in enumerate(workspace.config.dataset.categories)}
-    keys, tables = [np.zeros((0, 3), np.int64)], [np.zeros((0, len(values)))]
-    streaming = connection.execution_options(stream_results=True)
-    for rows in chain.from_iterable(streaming.execute(each).partitions(_CHUNK) for each in queries):
-        names, places_in_frame, kinds, *columns = zip(*rows, strict=True)
-        places = [frames.setdefault(name, len(frames)) for name in names]
-        own = [categories.setdefault(name, len(categories)) for name in kinds]
-        keys.append(np.array([places, places_in_frame, own], dtype=np.int64).T)
-        tables.append(np.array(columns, dtype=np.float64).T)
-    return ordered(list(frames), tuple(categories), joined(keys), joined(tables), numbers)
+        queries = [query.where(view.frame.in_(part)) for part in batched(wanted, _ASKED_FRAMES)]
+    parts = [bulk.select_columns(connection, each) for each in queries]
+    found = {name: np.concatenate([part[name] for part in parts]) for name in kinds}
+    return ordered(found, workspace.config.dataset.categories)
 
 
-def joined(chunks: list[np.ndarray]) -> np.ndarray:
-    """All chunks below each other; each is let go as soon as it is copied."""
-    end = sum(map(len, chunks))
-    whole = np.empty((end, chunks[0].shape[1]), chunks[0].dtype)
-    while chunks:
-        chunk = chunks.pop()
-        whole[end - len(chunk) : end] = chunk
-        end -= len(chunk)
-    return whole
+def ordered(found: dict[str, np.ndarray], categories: tuple[str, ...]) -> LabelColumns:
+    """Return (n,) columns by frame and k, whatever the order in which the database gave them.
 
-
-def ordered(
-    names: list[str],
-    categories: tuple[str, ...],
-    key: np.ndarray,
-    table: np.ndarray,
-    columns: Sequence[str],
-) -> LabelColumns:
-    """The columns by frame and k, whatever the order in which the database gave them."""
-    rank = np.empty(len(names), np.int64)
-    rank[np.argsort(np.array(names), kind="stable")] = np.arange(len(names))
-    frames = rank[key[:, 0]]
-    order = np.lexsort([key[:, 1], frames])
-    if (order[1:] < order[:-1]).any():
-        frames, key, table = frames[order], key[order], table[order]
-    numbers = {name: table[:, 7 + i] for i, name in enumerate(columns)}
+    Args:
+        found: frame, k, category, the box and further numbers by name.
+        categories: that come first in the numbering.
+    """
+    names, frames = np.unique(found["frame"], return_inverse=True)
+    order = np.lexsort([found["k"], frames])
+    present, own = np.unique(found["category"], return_inverse=True)
+    categories = tuple(dict.fromkeys((*categories, *present.tolist())))
+    number = np.array([categories.index(name) for name in present], dtype=np.int64)
+    keys = ("frame", "k", "category", *BOX_COLUMNS)
     return LabelColumns(
-        sorted(names), frames, key[:, 1], key[:, 2], categories, table[:, :7], numbers
+        names.tolist(),
+        frames[order],
+        found["k"][order],
+        number[own[order]],
+        categories,
+        np.stack([found[name][order] for name in BOX_COLUMNS], axis=1),
+        {name: values[order] for name, values in found.items() if name not in keys},
     )
 
 
 def as_rounds(before: LabelColumns, after: LabelColumns) -> tuple[RoundLabels, RoundLabels]:
     """Both rounds with one numbering of frames and categories."""
-    frames = {name: i for i, name in enumerate(before.frame_names)}
-    categories = {name: i for i, name in enumerate(before.category_names)}
-    frame = np.array(
-        [frames.setdefault(name, len(frames)) for name in after.frame_names], dtype=np.int64
-    )
-    category = [categories.setdefault(name, len(categories)) for name in after.category_names]
-    return (
-        RoundLabels(before.frames, before.categories, before.boxes, before.weights),
+    frames = np.union1d(np.array(before.frame_names, str), np.array(after.frame_names, str))
+    names = tuple(dict.fromkeys((*before.category_names, *after.category_names)))
+    one, other = (
         RoundLabels(
-            frame[after.frames], np.array(category)[after.categories], after.boxes, after.weights
-        ),
+            np.searchsorted(frames, np.array(each.frame_names, str))[each.frames],
+            np.array([names.index(name) for name in each.category_names])[each.categories],
+            each.boxes,
+            each.weights,
+        )
+        for each in (before, after)
     )
+    return one, other

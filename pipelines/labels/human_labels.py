@@ -58,11 +58,11 @@ def read_human_labels(
         query = query.where(table.c.from_round <= until_round)
     if but_of is not None:
         query = query.where(table.c.review != but_of)
-    found: dict[int, list[bulk.Row]] = {}
-    for frame_id, *row in bulk.select(connection, query):
-        if frame_ids is None or frame_id in frame_ids:
-            found.setdefault(frame_id, []).append(tuple(row))
-    return {frame_id: _stored(rows) for frame_id, rows in found.items()}
+    return {
+        frame_id: _stored(rows)
+        for frame_id, rows in bulk.grouped(bulk.select(connection, query)).items()
+        if frame_ids is None or frame_id in frame_ids
+    }
 
 
 def refresh_matches(
@@ -106,8 +106,7 @@ def fingerprint(workspace: Workspace, round_number: int) -> str | None:
     table = bulk.table("human_label")
     names = ("frame_id", "decision", "category", *BOX_COLUMNS, *SEEN_COLUMNS)
     query = select(*(table.c[name] for name in names)).where(table.c.from_round <= round_number)
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, query)
+    rows = workspace.database.rows(query)
     return hashlib.sha256(repr(sorted(map(repr, rows))).encode()).hexdigest()[:32] if rows else None
 
 
@@ -115,8 +114,7 @@ def counts(workspace: Workspace, round_number: int) -> dict[str, int]:
     """How many human labels of each decision count in a round."""
     table = bulk.table("human_label")
     query = select(table.c.decision).where(table.c.from_round <= round_number)
-    with workspace.database.reading() as connection:
-        found = [row[0] for row in bulk.select(connection, query)]
+    found = [row[0] for row in workspace.database.rows(query)]
     return {name: found.count(name) for name in sorted(set(found))}
 
 
@@ -151,10 +149,7 @@ def _predictions(
         .where(table.c.round == round_number, table.c.frame_id.in_(frame_ids))
         .order_by(table.c.frame_id, table.c.k)
     )
-    found: dict[int, list[bulk.Row]] = {}
-    for frame_id, *row in bulk.select(connection, query):
-        found.setdefault(frame_id, []).append(tuple(row))
-    return found
+    return bulk.grouped(bulk.select(connection, query))
 
 
 def _match_rows(

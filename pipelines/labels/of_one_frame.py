@@ -11,7 +11,7 @@ from curate.review.human_labels import REJECTED
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
-from pipelines.labels.by_frame import check_weights
+from pipelines.labels.by_frame import check_weights, unweighted
 from pipelines.labels.human_labels import human_boxes
 from pipelines.workspace.workspace import Workspace
 
@@ -79,13 +79,9 @@ def labeled_by(workspace: Workspace, round_number: int, policy: str, limit: int)
         .order_by(frame.c.frame)
         .limit(limit)
     )
-    with workspace.database.reading() as connection:
-        names = [row[0] for row in bulk.select(connection, query)]
+    names = [row[0] for row in workspace.database.rows(query)]
     if not names:
-        raise WorkspaceError(
-            f"round {round_number} has no labels weighted by {policy}; "
-            f"run `curate solve --round {round_number} --policy {policy}`"
-        )
+        raise unweighted(round_number, policy)
     return names
 
 
@@ -115,8 +111,7 @@ def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) 
 def _find(workspace: Workspace, name: str) -> tuple[str, int]:
     table = bulk.table("frame")
     query = select(table.c.split, table.c.id).where(table.c.frame == name)
-    with workspace.database.reading() as connection:
-        found = bulk.select(connection, query)
+    found = workspace.database.rows(query)
     if not found:
         raise ConfigError(f"no frame is named '{name}' here; the table frame lists all of them")
     return found[0][0], found[0][1]
@@ -148,9 +143,8 @@ def _decided(
         *same, match.c.round == round_number, match.c.frame_id == key
     )
     rejected, replaced = np.zeros((2, count), dtype=bool)
-    with workspace.database.reading() as connection:
-        for k, decision in bulk.select(connection, query):
-            (rejected if decision == REJECTED else replaced)[k] = True
+    for k, decision in workspace.database.rows(query):
+        (rejected if decision == REJECTED else replaced)[k] = True
     return rejected, replaced
 
 
@@ -163,8 +157,7 @@ def _repredictions(
         .where(table.c.round == round_number, table.c.frame_id == key)
         .order_by(table.c.view, table.c.k)
     )
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, query)
+    rows = workspace.database.rows(query)
     boxes = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 7)
     own = [0.0 if row[0] is None else float(weights[row[0]]) for row in rows]
     return ShownRepredictions(boxes, np.array(own, dtype=np.float64))

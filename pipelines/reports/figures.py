@@ -17,8 +17,7 @@ def is_repredicted(workspace: Workspace, number: int) -> bool:
     """Whether the round has a second pass over augmented copies."""
     view = bulk.table("reprediction_view")
     query = select(view.c.round).where(view.c.round == number).limit(1)
-    with workspace.database.reading() as connection:
-        return bool(bulk.select(connection, query))
+    return bool(workspace.database.rows(query))
 
 
 def summary(
@@ -104,11 +103,10 @@ def beside_others(workspace: Workspace, number: int, policy: str) -> Iterator[Se
         .group_by(weight.c.policy)
         .order_by(weight.c.policy)
     )
-    with workspace.database.reading() as connection:
-        rows = [
-            (f"{row[0]} (this page)" if row[0] == policy else row[0], *map(int, row[1:4]), *row[4:])
-            for row in bulk.select(connection, query)
-        ]
+    rows = [
+        (f"{row[0]} (this page)" if row[0] == policy else row[0], *map(int, row[1:4]), *row[4:])
+        for row in workspace.database.rows(query)
+    ]
     if len(rows) > 1:
         columns = ("policy", "labels", "weight > 0", "weight > 0.5", "sum of weights", "mean")
         note = "The same labels under every policy that has weighted them in this round."
@@ -139,6 +137,5 @@ def _age(workspace: Workspace, number: int) -> str:
     """The round and of how many it is, as it was made."""
     table = bulk.table("round")
     query = select(table.c.rounds).where(table.c.number == number)
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, query)
+    rows = workspace.database.rows(query)
     return f"{number}/{rows[0][0]}" if rows else str(number)

@@ -11,8 +11,8 @@ from curate.viewing.canvas import save_png
 from curate.viewing.frame_view import draw_frame
 from curate.viewing.overlay import draw_overlay
 from curate.viewing.tags import ShownLabels
-from pipelines.labels.by_frame import FrameLabels, read_labels
-from pipelines.labels.of_one_frame import chosen_round, read_frame
+from pipelines.labels.columns import LabelColumns, read_columns
+from pipelines.labels.of_one_frame import FrameBoxes, chosen_round, read_frame
 from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
@@ -20,9 +20,31 @@ from pipelines.workspace.workspace import Workspace
 def draw_example_frame(workspace: Workspace, round_number: int) -> list[Path]:
     """A bird's eye view and an image overlay of the frame that shows most of all weights."""
     policy = workspace.config.run.method
-    frames = list(read_labels(workspace, round_number, policy))
-    shown = max(frames, key=_variety)
-    return draw_labels(workspace, round_number, shown)
+    found = read_columns(workspace, round_number, policy)
+    place = _most_varied(found)
+    name, own = found.frame_names[place], found.frames == place
+    frame = workspace.dataset.read(name, image=True)
+    if frame.image is None:
+        raise DataError(f"frame {name}: the data set has no image")
+    points = found.numbers["points"][own]
+    labels = ShownLabels(
+        found.boxes[own],
+        np.array(found.category_names)[found.categories[own]],
+        found.numbers["score"][own],
+        found.weights[own],
+        None if np.isnan(points).any() else points.astype(np.int64),
+        zero_weight_of(workspace.config, policy),
+    )
+    title = f"frame {name}, round {round_number}, weights by {policy}"
+    stem = f"round-{round_number:02d}-{name}"
+    pictures = {
+        f"{stem}-bird-eye.png": draw_bird_eye(frame.points, labels, title=title),
+        f"{stem}-image.png": draw_overlay(frame.image, frame.calibration, labels, title=title),
+    }
+    folder = workspace.root / "pictures"
+    for file, picture in pictures.items():
+        save_png(folder / file, picture)
+    return [folder / file for file in pictures]
 
 
 def draw_view(
@@ -64,14 +86,7 @@ def frame_picture(workspace: Workspace, name: str, round_number: int, policy: st
     found = read_frame(workspace, name, round_number, policy)
     frame = workspace.dataset.read(name, image=True)
     counts = count_points_in_boxes(frame.points, found.labels.boxes)
-    labels = ShownLabels(
-        found.labels.boxes,
-        found.labels.categories,
-        found.labels.scores,
-        found.weights,
-        counts,
-        zero_weight_of(workspace.config, policy),
-    )
+    labels = shown_labels(workspace, policy, found, counts)
     title = f"frame {name} ({found.split}), round {round_number}, weights by {policy}"
     return draw_frame(
         frame,
@@ -83,34 +98,19 @@ def frame_picture(workspace: Workspace, name: str, round_number: int, policy: st
     )
 
 
-def draw_labels(workspace: Workspace, round_number: int, shown: FrameLabels) -> list[Path]:
-    """Both pictures of a frame, in the folder `pictures`."""
-    frame = workspace.dataset.read(shown.frame, image=True)
-    if frame.image is None:
-        raise DataError(f"frame {shown.frame}: the data set has no image")
-    labels = ShownLabels(
-        shown.labels.boxes,
-        shown.labels.categories,
-        shown.labels.scores,
-        shown.weights,
-        shown.points,
-        zero_weight_of(workspace.config, workspace.config.run.method),
+def shown_labels(
+    workspace: Workspace, policy: str, found: FrameBoxes, points: np.ndarray
+) -> ShownLabels:
+    """Return the labels of a frame as pictures show them, with the (n,) points in each."""
+    labels, meaning = found.labels, zero_weight_of(workspace.config, policy)
+    return ShownLabels(
+        labels.boxes, labels.categories, labels.scores, found.weights, points, meaning
     )
-    title = f"frame {shown.frame}, round {round_number}, weights by {workspace.config.run.method}"
-    stem = f"round-{round_number:02d}-{shown.frame}"
-    pictures = {
-        f"{stem}-bird-eye.png": draw_bird_eye(frame.points, labels, title=title),
-        f"{stem}-image.png": draw_overlay(frame.image, frame.calibration, labels, title=title),
-    }
-    folder = workspace.root / "pictures"
-    for name, picture in pictures.items():
-        save_png(folder / name, picture)
-    return [folder / name for name in pictures]
 
 
-def _variety(shown: FrameLabels) -> float:
-    """How much a frame has of both trusted and mistrusted labels, the nearer the better."""
-    near = shown.labels.boxes[:, 0] < 40
-    trusted = (shown.weights[near] > 0.3).sum()
-    mistrusted = (shown.weights[near] < 0.1).sum()
-    return float(min(trusted, mistrusted) + 0.01 * trusted)
+def _most_varied(found: LabelColumns) -> int:
+    """The frame with most of both trusted and mistrusted labels, the nearer the better."""
+    near, count = found.boxes[:, 0] < 40, len(found.frame_names)
+    trusted = np.bincount(found.frames[near & (found.weights > 0.3)], minlength=count)
+    mistrusted = np.bincount(found.frames[near & (found.weights < 0.1)], minlength=count)
+    return int(np.argmax(np.minimum(trusted, mistrusted) + 0.01 * trusted))

@@ -9,12 +9,11 @@ from sqlalchemy import select
 from curate.errors import ConfigError
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.viewing.recording import RecordedFrame, load_rerun, write_recording
-from curate.viewing.tags import ShownLabels
 from db import bulk
 from db.views import weighted_labels
 from pipelines.labels.columns import numeric_columns
 from pipelines.labels.of_one_frame import read_frame
-from pipelines.stages.methods import zero_weight_of
+from pipelines.reports.pictures import shown_labels
 from pipelines.workspace.workspace import Workspace
 
 
@@ -44,19 +43,11 @@ def _recorded(
     workspace: Workspace, names: Sequence[str], round_number: int, policy: str
 ) -> Iterator[RecordedFrame]:
     """The frames, one at a time: their points do not fit into memory together."""
-    meaning = zero_weight_of(workspace.config, policy)
     for name in names:
         found = read_frame(workspace, name, round_number, policy)
         frame = workspace.dataset.read(name, image=True)
         counts = count_points_in_boxes(frame.points, found.labels.boxes)
-        labels = ShownLabels(
-            found.labels.boxes,
-            found.labels.categories,
-            found.labels.scores,
-            found.weights,
-            counts,
-            meaning,
-        )
+        labels = shown_labels(workspace, policy, found, counts)
         evidence = _evidence(workspace, name, round_number, policy, len(labels))
         evidence["points"] = counts.astype(np.float64)
         yield RecordedFrame(
@@ -67,7 +58,7 @@ def _recorded(
             found.truth_boxes,
             None if found.truth is None else found.truth.categories,
             f"frame {name} ({found.split}), round {round_number}, weights by {policy}; "
-            f"weight 0: {meaning}",
+            f"weight 0: {labels.zero_weight}",
         )
 
 

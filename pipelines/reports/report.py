@@ -93,8 +93,7 @@ def _round_before(workspace: Workspace, number: int, policy: str) -> int | None:
     """The round before, where the policy weighted that."""
     weight = bulk.table("weight")
     query = select(weight.c.k).where(weight.c.round == number - 1, weight.c.policy == policy)
-    with workspace.database.reading() as connection:
-        return number - 1 if bulk.select(connection, query.limit(1)) else None
+    return number - 1 if workspace.database.rows(query.limit(1)) else None
 
 
 def _changes(workspace: Workspace, found: Difference) -> Iterator[Section]:
@@ -135,8 +134,7 @@ def _rejected(
         labels.provenance == "human",
         labels.weight == 0,
     )
-    with workspace.database.reading() as connection:
-        return {(frame, k) for frame, k in bulk.select(connection, query)}
+    return {(frame, k) for frame, k in workspace.database.rows(query)}
 
 
 def _shown(
@@ -201,8 +199,7 @@ def _reliability(workspace: Workspace, number: int, policy: str) -> Iterator[Sec
         .where(bins.c.round == number, bins.c.policy == policy, bins.c.category == "all")
         .order_by(bins.c.frames, bins.c.overlap, bins.c.low)
     )
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, query)
+    rows = workspace.database.rows(query)
     figures = [
         Figure(
             _curve([row[2:] for row in rows if row[:2] == kind]),

@@ -19,11 +19,9 @@ COLUMNS = ("round", "stage", "split", "policy", "state", "done", "empty", "faile
 def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]]:
     """Column names, and a row per round and stage; nothing is written."""
     table = bulk.table("round")
-    with workspace.database.reading() as connection:
-        numbers = [
-            row[0]
-            for row in bulk.select(connection, select(table.c.number).order_by(table.c.number))
-        ]
+    numbers = [
+        row[0] for row in workspace.database.rows(select(table.c.number).order_by(table.c.number))
+    ]
     # A detector that the user brings needs no pretraining, and has students only by a command:
     # nothing would ever come of these rows.
     trained = is_student_trained(workspace)
@@ -77,8 +75,7 @@ def _round_rows(plan: Plan, stage: RoundStage) -> Iterator[tuple[Any, ...]]:
     query = select(task.c.variant).where(
         task.c.round == context.number, task.c.stage == stage.name, task.c.frame_id.is_(None)
     )
-    with workspace.database.reading() as connection:
-        policies = {row[0] for row in bulk.select(connection, query)}
+    policies = {row[0] for row in workspace.database.rows(query)}
     for policy in sorted(policies | {workspace.config.run.method}):
         state = plan.round_state(stage, policy)
         done = int(state == "done")

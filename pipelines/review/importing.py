@@ -130,8 +130,7 @@ def apply_review(
 def _keys(workspace: Workspace, folder: Path, sheet: Sheet) -> dict[str, int]:
     """The keys of the frames of a review that this workspace has handed out."""
     table = bulk.table("review")
-    with workspace.database.reading() as connection:
-        known = bulk.select(connection, select(table.c.id).where(table.c.id == sheet.id))
+    known = workspace.database.rows(select(table.c.id).where(table.c.id == sheet.id))
     if not known:
         raise DataError(
             f"{folder / MANIFEST}: review {sheet.id} was not exported from the workspace "

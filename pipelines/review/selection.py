@@ -158,8 +158,7 @@ def _human_labels(workspace: Workspace, number: int, policy: str) -> Asked:
     query = select(labels.frame, labels.k).where(
         labels.round == number, labels.policy == policy, labels.provenance == "human"
     )
-    with workspace.database.reading() as connection:
-        return {(str(frame), int(k)) for frame, k in bulk.select(connection, query)}
+    return {(str(frame), int(k)) for frame, k in workspace.database.rows(query)}
 
 
 def _shown(

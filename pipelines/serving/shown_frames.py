@@ -163,8 +163,7 @@ class FramePages:
         return names, tuple(self._execute(query))
 
     def _execute(self, query: Any) -> list[bulk.Row]:
-        with self._workspace.database.reading() as connection:
-            return list(bulk.select(connection, query))
+        return list(self._workspace.database.rows(query))
 
 
 def _is_evidence(column: Column, tables: list[Table]) -> bool:

@@ -136,7 +136,7 @@ def stage(source: Source) -> FramesStage:
             reads=("frame", "prediction"),
             writes=(source.table,),
             settings=partial(_sequence_settings, source),
-            function=partial(_sequence_function, name),
+            function=lambda workspace, _context: ScoreSequence(workspace.config, name),
             prepare=partial(prepare_table, source=source),
         )
     learns = ("ground_truth",) if PRIORS.takes(name, "thresholds") else ()
@@ -220,20 +220,14 @@ def _function(kind: type[Score], name: str, workspace: Workspace, _context: Roun
     return kind(workspace.config, name, thresholds)
 
 
-def _sequence_function(name: str, workspace: Workspace, _context: RoundContext) -> ScoreSequence:
-    """What score does with a sequence."""
-    return ScoreSequence(workspace.config, name)
-
-
 def _learned(workspace: Workspace) -> Mapping[str, float]:
     """m_th of each category, from X_l."""
     truth = workspace.ground_truth("labeled")
-    learned = learn_thresholds(
+    return learn_thresholds(
         ((workspace.dataset.read(frame), annotations) for frame, annotations in truth.items()),
         workspace.config.dataset.categories,
         point_settings(workspace.config),
     )
-    return learned.values
 
 
 def _read_measured(
@@ -246,13 +240,9 @@ def _read_measured(
         .where(table.c.round == context.number, table.c.frame_id.in_(frame_ids))
         .order_by(table.c.frame_id, table.c.k)
     )
-    found: dict[int, list[bulk.Row]] = {key: [] for key in frame_ids}
-    with workspace.database.reading() as connection:
-        for key, *row in bulk.select(connection, query):
-            found[key].append(tuple(row))
     return {
         key: dict(zip(names, map(_array, zip(*rows, strict=True)), strict=True))
-        for key, rows in found.items()
+        for key, rows in bulk.grouped(workspace.database.rows(query), frame_ids).items()
     }
 
 

@@ -72,8 +72,7 @@ class SplitRecord:
         """Both from the database."""
         table = bulk.table("split_list")
         columns = (table.c[name] for name in ("source", "name", "path", "sha256", "names"))
-        with workspace.database.reading() as connection:
-            rows = bulk.select(connection, select(*columns))
+        rows = workspace.database.rows(select(*columns))
         lists = [
             RecordedList(source, name, path and Path(path), digest, SplitList.from_text(names))
             for source, name, path, digest, names in rows

@@ -46,9 +46,7 @@ class Workspace:
             WorkspaceError: there is none.
             ConfigError: its configuration is wrong.
         """
-        root = folder.resolve() if folder else _find(Path.cwd())
-        if not (root / CONFIG_NAME).is_file():
-            raise WorkspaceError(f"{root}: no workspace here; make one with `curate init {root}`")
+        root = _root(folder)
         config = _anchored(root, read_config(root / CONFIG_NAME))
         return cls(root, config, Database(_url(root, config), root))
 
@@ -95,8 +93,7 @@ class Workspace:
         """Frame names and their keys, in the order of the names."""
         frame = bulk.table("frame")
         query = select(frame.c.frame, frame.c.id).where(frame.c.split.in_(splits))
-        with self.database.reading() as connection:
-            return dict(bulk.select(connection, query.order_by(frame.c.frame)))
+        return dict(self.database.rows(query.order_by(frame.c.frame)))
 
     def ground_truth(self, *splits: str) -> dict[str, Annotations]:
         """The stored ground truth per frame; there is none of unlabeled frames."""
@@ -108,10 +105,7 @@ class Workspace:
             .where(frame.c.split.in_(splits))
             .order_by(frame.c.frame, truth.c.k)
         )
-        found: dict[str, list[bulk.Row]] = {name: [] for name in self.frames(*splits)}
-        with self.database.reading() as connection:
-            for name, *row in bulk.select(connection, query):
-                found[name].append(tuple(row))
+        found = bulk.grouped(self.database.rows(query), self.frames(*splits))
         return {name: _annotations(rows) for name, rows in found.items()}
 
     def predictions(self, round_number: int, frame_ids: Sequence[int]) -> dict[int, Detections]:
@@ -127,10 +121,7 @@ class Workspace:
             .where(table.c.round == round_number, table.c.frame_id.in_(frame_ids))
             .order_by(table.c.frame_id, table.c.k)
         )
-        found: dict[int, list[bulk.Row]] = {key: [] for key in frame_ids}
-        with self.database.reading() as connection:
-            for key, *row in bulk.select(connection, query):
-                found[key].append(tuple(row))
+        found = bulk.grouped(self.database.rows(query), frame_ids)
         return {key: Detections.from_rows(rows) for key, rows in found.items()}
 
 
@@ -189,10 +180,14 @@ def _anchored(root: Path, config: Config) -> Config:
     return config.model_copy(update=changes)
 
 
-def _find(start: Path) -> Path:
-    for folder in (start, *start.parents):
+def _root(chosen: Path | None) -> Path:
+    """The folder of the workspace in `chosen`, else in the current folder or one above it."""
+    start = chosen.resolve() if chosen else Path.cwd()
+    for folder in (start,) if chosen else (start, *start.parents):
         if (folder / CONFIG_NAME).is_file():
             return folder
+    if chosen:
+        raise WorkspaceError(f"{start}: no workspace here; make one with `curate init {start}`")
     raise WorkspaceError(
         f"no {CONFIG_NAME} in {start} or above it; make a workspace with `curate init DIR`, "
         "or name one with --workspace DIR"
@@ -223,7 +218,5 @@ def _annotations(rows: Sequence[Sequence[Any]]) -> Annotations:
 
 def database_url(folder: Path | None) -> URL:
     """The URL of a workspace's database, without opening or migrating it."""
-    root = folder.resolve() if folder else _find(Path.cwd())
-    if not (root / CONFIG_NAME).is_file():
-        raise WorkspaceError(f"{root}: no workspace here; make one with `curate init {root}`")
+    root = _root(folder)
     return _url(root, read_config(root / CONFIG_NAME))

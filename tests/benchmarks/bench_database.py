@@ -8,11 +8,11 @@ import pytest
 from benchmarks.measuring import OURS, measure
 from benchmarks.rows import frame_rows, prediction_rows
 from sqlalchemy import insert, select
+from support.silent import Silent
 from support.stored_tuples import COLUMNS, store
 
 from db import bulk
 from db.session import BUSY_TIMEOUT_MS, Database
-from pipelines.engine.progress import Silent
 from pipelines.engine.stage import RoundContext, RoundJob, Teacher
 from pipelines.stages import solve
 from pipelines.workspace.config import make_config

@@ -5,10 +5,10 @@ import time
 
 import pytest
 from benchmarks.measuring import measure
+from support.silent import Silent
 
 from curate.detections import CATEGORIES
 from curate.simulation import simulate
-from pipelines.engine.progress import Silent
 from pipelines.engine.runner import open_executor, run_frames
 from pipelines.round import open_plan
 from pipelines.workspace.config import make_config

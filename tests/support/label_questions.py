@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from pipelines.engine.progress import Silent
 from pipelines.engine.stage import RoundContext, RoundJob, Teacher
 from pipelines.stages import solve
 from pipelines.workspace.workspace import Workspace
+from support.silent import Silent
 
 COUNTS = "SELECT policy, category, labels, trusted FROM label_count WHERE round = 1"
 TRUSTED = "SELECT * FROM weighted_labels WHERE round = 1 AND weight > 0.5 AND category = 'Car'"

@@ -3,12 +3,12 @@
 from typing import Any
 
 from pipelines.engine.executors.serial import SerialExecutor
-from pipelines.engine.progress import Silent
 from pipelines.engine.runner import Report, run_frames, run_round
 from pipelines.engine.schedule import run_all
 from pipelines.engine.stage import RoundStage
 from pipelines.round import graph_of, open_plan
 from pipelines.workspace.workspace import Workspace
+from support.silent import Silent
 
 
 def run_workspace(workspace: Workspace, rounds: int | None = None, **options: Any) -> list[Report]:

@@ -2,7 +2,6 @@
 
 from sqlalchemy import select
 
-from db import bulk
 from db.models import Base
 from pipelines.workspace.workspace import Workspace
 
@@ -15,11 +14,10 @@ SETTINGS = {"config"}
 def dump(workspace: Workspace) -> list[tuple]:
     """Every row of every table as (table, *values), floats to the last bit."""
     rows = []
-    with workspace.database.reading() as connection:
-        for table in Base.metadata.sorted_tables:
-            columns = [column for column in table.columns if column.name not in CHANCE | SETTINGS]
-            found = bulk.select(connection, select(*columns))
-            rows += sorted(((table.name, *map(_exact, row)) for row in found), key=repr)
+    for table in Base.metadata.sorted_tables:
+        columns = [column for column in table.columns if column.name not in CHANCE | SETTINGS]
+        found = workspace.database.rows(select(*columns))
+        rows += sorted(((table.name, *map(_exact, row)) for row in found), key=repr)
     return rows
 
 

@@ -17,7 +17,7 @@ from typing import Self
 
 import numpy as np
 
-from curate.detections import Annotations, Detections, as_categories
+from curate.detections import Annotations, Columns, Detections, as_categories
 from curate.errors import DataError
 from curate.files.atomic import replace_file
 from curate.frames import Calibration
@@ -36,7 +36,7 @@ _LARGEST = 1e6
 
 
 @dataclass(frozen=True)
-class KittiObjects:
+class KittiObjects(Columns):
     """The lines of one KITTI label or result file, in the frames of reference of that file.
 
     Attributes:
@@ -60,23 +60,6 @@ class KittiObjects:
     locations: np.ndarray
     rotations_y: np.ndarray
     scores: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.categories)
-
-    def select(self, index: np.ndarray) -> Self:
-        """The objects at `index` (integers or a mask), in that order."""
-        return type(self)(
-            self.categories[index],
-            self.truncated[index],
-            self.occluded[index],
-            self.alpha[index],
-            self.boxes_2d[index],
-            self.dimensions[index],
-            self.locations[index],
-            self.rotations_y[index],
-            self.scores[index],
-        )
 
     @classmethod
     def empty(cls) -> Self:

@@ -5,19 +5,13 @@ needs neither, and folds each batch norm into the product or convolution before 
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-from onnx import ModelProto, TensorProto, checker, helper, numpy_helper
+from onnx import ModelProto, TensorProto, helper
 
 from curate.detectors.pillars.encoding import BOX_CODE, POINT_FEATURES
 from curate.detectors.pillars.presets import Preset
-
-# The first version whose ScatterND takes a maximum.
-_OPSET = 18
-_IR_VERSION = 10
-# Of torch's BatchNorm1d and BatchNorm2d.
-_EPSILON = 1e-5
+from curate.files.onnx_graph import EPSILON, GraphBuilder
 
 
 def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: int) -> ModelProto:
@@ -32,40 +26,29 @@ def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: i
     pillars = preset.pillar_channels
     values = graph.product("features", "points.0", "points.1")
     empty = graph.constant(np.zeros((4 * cells_x * cells_y, pillars), np.float32))
-    canvas = graph.node("ScatterND", [empty, "slots", values], reduction="max")
-    rows = graph.node("Reshape", [canvas, graph.constant(np.array([-1, 4 * pillars]))])
+    canvas = graph.node("ScatterND", empty, "slots", values, reduction="max")
+    rows = graph.node("Reshape", canvas, graph.constant(np.array([-1, 4 * pillars])))
     rows = graph.product(rows, "stem.mix", "stem_norm")
-    rows = graph.node("Reshape", [rows, graph.constant(np.array([1, cells_x, cells_y, -1]))])
-    maps = graph.node("Transpose", [rows], perm=[0, 3, 1, 2])
+    rows = graph.node("Reshape", rows, graph.constant(np.array([1, cells_x, cells_y, -1])))
+    maps = graph.node("Transpose", rows, perm=[0, 3, 1, 2])
     fine = graph.scale(maps, "scale1", preset.depths[0], down=False)
     middle = graph.scale(fine, "scale2", 1 + preset.depths[1], down=True)
     coarse = graph.scale(middle, "scale3", 1 + preset.depths[2], down=True)
-    middle = graph.node("Add", [middle, graph.doubled(graph.pointwise(coarse, "up3"))])
+    middle = graph.node("Add", middle, graph.doubled(graph.pointwise(coarse, "up3")))
     fine = graph.node(
-        "Add", [graph.pointwise(fine, "side1"), graph.doubled(graph.pointwise(middle, "up2"))]
+        "Add", graph.pointwise(fine, "side1"), graph.doubled(graph.pointwise(middle, "up2"))
     )
     answers = graph.answers(graph.convolution(fine, "head.0", "head.1"), "answer")
     channels = {"scores": categories, "codes": BOX_CODE, "ious": 1}
     logits, codes, ious = graph.split(answers, list(channels.values()))
-    graph.output(graph.node("Sigmoid", [logits]), "scores")
+    graph.output(graph.node("Sigmoid", logits), "scores")
     graph.output(codes, "codes")
-    graph.output(graph.node("Sigmoid", [ious]), "ious")
+    graph.output(graph.node("Sigmoid", ious), "ious")
     return graph.model({name: (cells_x, cells_y, count) for name, count in channels.items()})
 
 
-class _Graph:
-    """Collects nodes and constants; methods take and return names of values."""
-
-    def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
-        self._weights = weights
-        self._nodes: list = []
-        self._constants: list = []
-
-    def node(self, operator: str, inputs: list[str], **attributes: Any) -> str:
-        """Adds an operator with one output."""
-        name = f"value{len(self._nodes)}"
-        self._nodes.append(helper.make_node(operator, inputs, [name], **attributes))
-        return name
+class _Graph(GraphBuilder):
+    """The parts of the network."""
 
     def split(self, value: str, sizes: list[int]) -> list[str]:
         """The channels of a map in parts of these sizes."""
@@ -74,35 +57,29 @@ class _Graph:
         self._nodes.append(helper.make_node("Split", inputs, names, axis=1))
         return names
 
-    def constant(self, array: np.ndarray) -> str:
-        """Adds a constant."""
-        name = f"constant{len(self._constants)}"
-        self._constants.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
-        return name
-
     def product(self, rows: str, mix: str, norm: str) -> str:
         """ReLU of a normalised matrix product of rows."""
         scale, shift = self._norm(norm)
         matrix = self.constant((self._weights[f"{mix}.weight"] * scale[:, None]).T)
-        return self.node("Relu", [self.node("Gemm", [rows, matrix, self.constant(shift)])])
+        return self.node("Relu", self.node("Gemm", rows, matrix, self.constant(shift)))
 
     def convolution(self, maps: str, name: str, norm: str, stride: int = 1) -> str:
         """ReLU of a normalised 3 x 3 convolution."""
         scale, shift = self._norm(norm)
         kernel = self.constant(self._weights[f"{name}.weight"] * scale[:, None, None, None])
         inputs = [maps, kernel, self.constant(shift)]
-        convolved = self.node("Conv", inputs, pads=[1, 1, 1, 1], strides=[stride, stride])
-        return self.node("Relu", [convolved])
+        convolved = self.node("Conv", *inputs, pads=[1, 1, 1, 1], strides=[stride, stride])
+        return self.node("Relu", convolved)
 
     def pointwise(self, maps: str, name: str) -> str:
         """A 1 x 1 convolution."""
         kernel = self._weights[f"{name}.mix.weight"]
-        return self.node("Conv", [maps, self.constant(kernel[:, :, None, None])])
+        return self.node("Conv", maps, self.constant(kernel[:, :, None, None]))
 
     def answers(self, maps: str, name: str) -> str:
         """A 1 x 1 convolution with bias and nothing after it."""
         kernel = self.constant(self._weights[f"{name}.weight"][:, :, None, None])
-        return self.node("Conv", [maps, kernel, self.constant(self._weights[f"{name}.bias"])])
+        return self.node("Conv", maps, kernel, self.constant(self._weights[f"{name}.bias"]))
 
     def scale(self, maps: str, name: str, convolutions: int, *, down: bool) -> str:
         """All convolutions of one scale; the first may go down to it."""
@@ -115,11 +92,11 @@ class _Graph:
         """Maps at twice the resolution, each cell repeated."""
         scales = self.constant(np.array([1, 1, 2, 2], np.float32))
         modes = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric"}
-        return self.node("Resize", [maps, "", scales], nearest_mode="floor", **modes)
+        return self.node("Resize", maps, "", scales, nearest_mode="floor", **modes)
 
     def output(self, maps: str, name: str) -> None:
         """Names (1, c, x, y) maps, as (x, y, c), an output of the graph."""
-        single = self.node("Squeeze", [maps, self.constant(np.array([0]))])
+        single = self.node("Squeeze", maps, self.constant(np.array([0])))
         self._nodes.append(helper.make_node("Transpose", [single], [name], perm=[1, 2, 0]))
 
     def model(self, outputs: Mapping[str, tuple[int, ...]]) -> ModelProto:
@@ -130,14 +107,10 @@ class _Graph:
             describe("slots", TensorProto.INT64, ["n", 1]),
         ]
         results = [describe(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()]
-        graph = helper.make_graph(self._nodes, "pillars", inputs, results, self._constants)
-        opsets = [helper.make_opsetid("", _OPSET)]
-        model = helper.make_model(graph, opset_imports=opsets, ir_version=_IR_VERSION)
-        checker.check_model(model)
-        return model
+        return self.finish("pillars", inputs, results)
 
     def _norm(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Scale and shift that a batch norm amounts to after training."""
         mean, variance = (self._weights[f"{name}.running_{part}"] for part in ("mean", "var"))
-        scale = self._weights[f"{name}.weight"] / np.sqrt(variance + _EPSILON)
+        scale = self._weights[f"{name}.weight"] / np.sqrt(variance + EPSILON)
         return scale, self._weights[f"{name}.bias"] - mean * scale

@@ -1,7 +1,8 @@
 """The detector's estimate of its IoU with the object."""
 
-import sqlalchemy as sa
 from alembic import op
+
+from db.ddl import real
 
 revision = "0003"
 down_revision = "0002"
@@ -11,15 +12,8 @@ depends_on = None
 
 def upgrade() -> None:
     """Goes forward."""
-    op.add_column(
-        "prediction",
-        sa.Column(
-            "iou",
-            sa.Float(precision=53),
-            nullable=True,
-            comment="the detector's estimate of its 3D IoU with the object; null = it makes none",
-        ),
-    )
+    meaning = "the detector's estimate of its 3D IoU with the object; null = it makes none"
+    op.add_column("prediction", real("iou", meaning, nullable=True))
 
 
 def downgrade() -> None:

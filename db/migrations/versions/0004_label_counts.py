@@ -1,7 +1,8 @@
 """Counts of weighed labels, and frames found by their name alone."""
 
-import sqlalchemy as sa
 from alembic import op
+
+from db.ddl import integer, real, table, text
 
 revision = "0004"
 down_revision = "0003"
@@ -11,18 +12,15 @@ depends_on = None
 
 def upgrade() -> None:
     """Goes forward; what has been weighed before is counted."""
-    op.create_table(
+    table(
         "label_count",
-        sa.Column("round", sa.Integer(), nullable=False),
-        sa.Column("policy", sa.Text(), nullable=False),
-        sa.Column("category", sa.Text(), nullable=False),
-        sa.Column("labels", sa.Integer(), nullable=False, comment="that the policy did not drop"),
-        sa.Column("kept", sa.Integer(), nullable=False, comment="with a weight above 0"),
-        sa.Column("trusted", sa.Integer(), nullable=False, comment="with a weight above 0.5"),
-        sa.Column("weight", sa.Float(precision=53), nullable=False, comment="sum of the weights"),
-        sa.ForeignKeyConstraint(["round"], ["round.number"], name=op.f("fk_label_count_round")),
-        sa.PrimaryKeyConstraint("round", "policy", "category", name=op.f("pk_label_count")),
-        sqlite_with_rowid=False,
+        integer("round", primary_key=True, refers="round.number"),
+        text("policy", primary_key=True),
+        text("category", primary_key=True),
+        integer("labels", "that the policy did not drop"),
+        integer("kept", "with a weight above 0"),
+        integer("trusted", "with a weight above 0.5"),
+        real("weight", "sum of the weights"),
     )
     op.execute("""
         INSERT INTO label_count

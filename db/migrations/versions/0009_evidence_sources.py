@@ -3,6 +3,8 @@
 import sqlalchemy as sa
 from alembic import op
 
+from db.ddl import table, text
+
 revision = "0009"
 down_revision = "0008"
 branch_labels = None
@@ -11,31 +13,19 @@ depends_on = None
 
 def upgrade() -> None:
     """Make both tables; the views are made after the migrations."""
-    op.create_table(
+    table(
         "evidence_source",
-        sa.Column("name", sa.Text(), nullable=False, comment="its table is prior_NAME"),
-        sa.Column("source", sa.Text(), nullable=False, comment="as run.priors names it"),
-        sa.Column(
-            "columns",
-            sa.Text(),
-            nullable=False,
-            comment="JSON: name, kind, unit, meaning and optional of each",
+        text("name", "its table is prior_NAME", primary_key=True),
+        text("source", "as run.priors names it"),
+        text("columns", "JSON: name, kind, unit, meaning and optional of each"),
+        text(
+            "rho_column", "the column with its trust in [0, 1]; null = not a prior", nullable=True
         ),
-        sa.Column(
-            "rho_column",
-            sa.Text(),
-            nullable=True,
-            comment="the column with its trust in [0, 1]; null = not a prior",
-        ),
-        sa.PrimaryKeyConstraint("name", name=op.f("pk_evidence_source")),
-        sqlite_with_rowid=False,
     )
-    op.create_table(
+    table(
         "view_definition",
-        sa.Column("name", sa.Text(), nullable=False, comment="of the view"),
-        sa.Column("sha256", sa.Text(), nullable=False, comment="of its definition"),
-        sa.PrimaryKeyConstraint("name", name=op.f("pk_view_definition")),
-        sqlite_with_rowid=False,
+        text("name", "of the view", primary_key=True),
+        text("sha256", "of its definition"),
     )
 
 

@@ -1,7 +1,8 @@
 """The curves of trainings: loss terms, learning rate and gradient norm of every few steps."""
 
-import sqlalchemy as sa
 from alembic import op
+
+from db.ddl import key, real, table, text
 
 revision = "0010"
 down_revision = "0009"
@@ -11,24 +12,13 @@ depends_on = None
 
 def upgrade() -> None:
     """Adds the table."""
-    op.create_table(
+    table(
         "training_statistics",
-        sa.Column("round", sa.Integer(), nullable=False, comment="as of the checkpoint"),
-        sa.Column("policy", sa.Text(), nullable=False, comment="as of the checkpoint"),
-        sa.Column("step", sa.Integer(), nullable=False, comment="of the optimiser, from 1"),
-        sa.Column(
-            "name",
-            sa.Text(),
-            nullable=False,
-            comment="loss, a term of it, learning_rate or gradient_norm",
-        ),
-        sa.Column(
-            "value", sa.Float(53), nullable=True, comment="of this step alone; null = not finite"
-        ),
-        sa.PrimaryKeyConstraint(
-            "round", "policy", "step", "name", name=op.f("pk_training_statistics")
-        ),
-        sqlite_with_rowid=False,
+        key("round", "as of the checkpoint"),
+        text("policy", "as of the checkpoint", primary_key=True),
+        key("step", "of the optimiser, from 1"),
+        text("name", "loss, a term of it, learning_rate or gradient_norm", primary_key=True),
+        real("value", "of this step alone; null = not finite", nullable=True),
     )
 
 

@@ -1,6 +1,7 @@
 """What every executor offers, and what happens to one frame wherever it is worked on."""
 
 import logging
+import pickle
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -208,6 +209,35 @@ def open_function(function: JobFunction) -> None:
         raise ModelError(
             f"the models cannot be loaded: {type(fault).__name__}: {one_line(fault, 500)}"
         ) from fault
+
+
+class RayWorker:
+    """What a worker on the other side of a pipe holds: the function at hand, with its models."""
+
+    def __init__(self) -> None:
+        self.function: JobFunction | None = None
+
+    def open(self, packed: bytes) -> CurateError | None:
+        """Loads the models; the error where they cannot be loaded."""
+        self.function = None  # the one before, with its models, makes room first
+        function = pickle.loads(packed)  # noqa: S301 - from the runner
+        try:
+            open_function(function)
+        except CurateError as fault:
+            return fault
+        self.function = function
+        return None
+
+    def work(self, job: Job) -> tuple[Sequence[FrameRows], str | None, float]:
+        """Rows, error and seconds of a job.
+
+        Raises:
+            CurateError: it has no models.
+        """
+        if self.function is None:
+            raise CurateError("asked to work before the models were loaded")
+        outcome = attempt(self.function, job)
+        return outcome.rows, outcome.error, outcome.seconds
 
 
 def attempt(function: Any, job: Job) -> Outcome:

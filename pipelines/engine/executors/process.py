@@ -23,8 +23,7 @@ from pipelines.engine.executors.base import (
     JobFunction,
     JobQueue,
     Outcome,
-    attempt,
-    open_function,
+    RayWorker,
 )
 
 # How often a look is taken at workers that say nothing: a process that a dead one has forked may
@@ -148,21 +147,12 @@ def _serve(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends us
     inbox: SimpleQueue[Any] = SimpleQueue()  # the packed function, jobs, None for the end
     Thread(target=_receive, args=(connection, inbox), daemon=True).start()
-    function: JobFunction | None = None
+    holder = RayWorker()
     while (message := inbox.get()) is not None:
         if isinstance(message, bytes):
-            function = None  # the one before, with its models, makes room first
-            try:
-                function = pickle.loads(message)  # noqa: S301 - from the parent process
-                open_function(function)
-            except CurateError as fault:
-                function = None
-                connection.send(fault)
-            else:
-                connection.send(None)
-        elif function is not None:
-            outcome = attempt(function, message)
-            connection.send((outcome.rows, outcome.error, outcome.seconds))
+            connection.send(holder.open(message))
+        elif holder.function is not None:
+            connection.send(holder.work(message))
 
 
 def _receive(connection: Connection, inbox: "SimpleQueue[Any]") -> None:

@@ -19,8 +19,7 @@ from pipelines.engine.executors.base import (
     JobFunction,
     JobQueue,
     Outcome,
-    attempt,
-    open_function,
+    RayWorker,
 )
 
 PULSE_S = 5.0
@@ -62,7 +61,7 @@ class RayExecutor:
             _join(self._ray, address, workers)
         # A dead actor is replaced by another one, so that it is known which frame it had begun.
         options = {**self._needs, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
-        self._holder = self._ray.remote(**options)(RayWorker)
+        self._holder = self._ray.remote(**options)(ActorHolder)
         self._crew: list[_Actor] = []
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
@@ -145,38 +144,16 @@ class RayExecutor:
             )
 
 
-class RayWorker:
-    """What runs in an actor: the function of the stage at hand, with its models."""
+class ActorHolder(RayWorker):
+    """What runs in an actor."""
 
     def __init__(self, search_path: Sequence[str]) -> None:
+        super().__init__()
         # A detector that the driver finds beside itself must be found on another node as well.
         sys.path += [path for path in search_path if path not in sys.path]
-        self._function: JobFunction | None = None
 
     def place(self) -> None:
         """Answers once the actor has found its place."""
-
-    def open(self, packed: bytes) -> CurateError | None:
-        """Loads the models; the error where they cannot be loaded."""
-        self._function = None  # the one before, with its models, makes room first
-        function = pickle.loads(packed)  # noqa: S301 - from the driver
-        try:
-            open_function(function)
-        except CurateError as fault:
-            return fault
-        self._function = function
-        return None
-
-    def work(self, job: Job) -> tuple[Any, str | None, float]:
-        """Rows, error and seconds of a frame.
-
-        Raises:
-            CurateError: it has no models.
-        """
-        if self._function is None:
-            raise CurateError("asked to work before the models were loaded")
-        outcome = attempt(self._function, job)
-        return outcome.rows, outcome.error, outcome.seconds
 
 
 class _Actor:

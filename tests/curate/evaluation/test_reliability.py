@@ -12,7 +12,6 @@ from curate.evaluation.reliability import (
     JudgeSettings,
     auroc,
     average_precision,
-    bootstrap,
     expected_calibration_error,
     judge,
     reliability_bins,
@@ -263,86 +262,3 @@ def test_calibrated_weights_have_a_small_error_and_overconfident_ones_a_large_on
     right = generator.random(20_000) < weights
     assert expected_calibration_error(weights, right) < 0.02
     assert expected_calibration_error(weights**0.25, right) > 0.2
-
-
-def test_bootstrap_interval_of_a_mean_is_the_normal_one():
-    """One label per frame: mean +- 1.96 standard errors, to the accuracy of the draws."""
-    values = np.random.default_rng(3).normal(5.0, 2.0, 400)
-    interval = bootstrap(
-        lambda drawn, _: float(values[drawn].mean()),
-        np.arange(400),
-        400,
-        np.random.default_rng(4),
-        replicates=4000,
-    )
-    half = 1.96 * values.std() / np.sqrt(400)
-    assert interval.low == pytest.approx(values.mean() - half, abs=0.15 * half)
-    assert interval.high == pytest.approx(values.mean() + half, abs=0.15 * half)
-    assert interval.undefined == 0.0
-
-
-def test_bootstrap_draws_whole_frames():
-    """Labels of a frame come and go together, frames without a label take part."""
-    frame_index = np.array([2, 0, 2, 0, 2])
-    seen = []
-
-    def statistic(drawn, frames):
-        assert len(frames) == 4
-        expected = [label for frame in frames for label in np.flatnonzero(frame_index == frame)]
-        assert drawn.tolist() == expected
-        seen.append(len(drawn))
-        return float(len(drawn))
-
-    bootstrap(statistic, frame_index, 4, np.random.default_rng(0), replicates=200)
-    assert 0 in seen
-    assert max(seen) > 5
-
-
-def test_copies_of_a_label_do_not_narrow_the_interval():
-    """Ten copies per frame carry no more evidence than one; labels drawn alone would say so."""
-    right = np.random.default_rng(1).random(60) < 0.5
-
-    def width(copies):
-        column = np.repeat(right, copies)
-        interval = bootstrap(
-            lambda drawn, _: float(column[drawn].mean()),
-            np.repeat(np.arange(60), copies),
-            60,
-            np.random.default_rng(2),
-        )
-        return interval.high - interval.low
-
-    assert width(10) == pytest.approx(width(1))
-
-
-def test_bootstrap_repeats_with_its_generator_and_reports_undefined_draws():
-    """Same generator, same interval; replicates without a right label are left out and counted."""
-    weights, right = np.array([0.9, 0.1, 0.4]), np.array([True, False, False])
-
-    def run(seed):
-        return bootstrap(
-            lambda drawn, _: auroc(weights[drawn], right[drawn]),
-            np.arange(3),
-            3,
-            np.random.default_rng(seed),
-            replicates=300,
-        )
-
-    assert run(7) == run(7)
-    assert 0 < run(7).undefined < 1
-    assert run(7).low == run(7).high == 1.0
-
-
-@pytest.mark.parametrize("frames", [0, 3])
-def test_bootstrap_without_labels_is_undefined(frames):
-    """No frames, or no labels in them: NaN, all draws undefined."""
-    nothing = np.zeros(0, dtype=np.int64)
-    interval = bootstrap(
-        lambda drawn, _: weighted_precision(np.zeros(len(drawn)), np.zeros(len(drawn), bool)),
-        nothing,
-        frames,
-        np.random.default_rng(0),
-        replicates=10,
-    )
-    assert np.isnan([interval.low, interval.high]).all()
-    assert interval.undefined == 1.0

@@ -53,7 +53,7 @@ def judged(request, kitti_root):
     thresholds = learn_thresholds(
         ((dataset.read(name), dataset.annotations(name)) for name in labeled), ("Car",)
     )
-    priors = [PointPrior(thresholds.values), SemanticPrior(segmenter)]
+    priors = [PointPrior(thresholds), SemanticPrior(segmenter)]
     rows = []
     for index, frame_id in enumerate(sorted(VAL) if split == "val" else dataset.frame_ids()):
         frame = dataset.read(frame_id, image=True)

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from curate.evaluation.reliability import auroc, average_precision, bootstrap, percentile_interval
+from curate.evaluation.audit import Estimate
+from curate.evaluation.reliability import auroc, average_precision
 from curate.evaluation.resampling import draw_frames, ranked_replicates
 
 
@@ -63,15 +64,13 @@ def test_its_interval_is_that_of_the_general_bootstrap():
     right, frame = generator.random(300) < 0.5, generator.integers(40, size=300)
     weights = np.clip(0.5 * right + generator.normal(0.3, 0.3, 300), 0, 1)
     fast, _ = ranked_replicates(weights, right, frame, draw_frames(generator, 40, 2000))
-    slow = bootstrap(
-        lambda labels, _: auroc(weights[labels], right[labels]),
-        frame,
-        40,
-        generator,
-        replicates=2000,
-    )
-    ours = percentile_interval(fast)
-    assert (ours.low, ours.high) == pytest.approx((slow.low, slow.high), abs=0.01)
+    slow = np.empty(2000)
+    for replicate in range(2000):
+        drawn = generator.integers(40, size=40)
+        labels = np.concatenate([np.flatnonzero(frame == each) for each in drawn])
+        slow[replicate] = auroc(weights[labels], right[labels])
+    ours, theirs = (Estimate.of(0.0, replicates, 0.95) for replicates in (fast, slow))
+    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), abs=0.01)
 
 
 def test_no_frames_have_no_figures():
@@ -81,4 +80,5 @@ def test_no_frames_have_no_figures():
     found, area = ranked_replicates(nothing, nothing.astype(bool), nothing.astype(int), draws)
     assert np.isnan(found).all()
     assert np.isnan(area).all()
-    assert percentile_interval(found).undefined == 1
+    nowhere = Estimate.of(np.nan, found, 0.95)
+    assert np.isnan([nowhere.low, nowhere.high]).all()

@@ -72,9 +72,7 @@ def test_thresholds_are_learned_per_category_over_all_frames():
         (frame_with(5), annotations_at([], [])),
     ]
     learned = learn_thresholds(samples, ("Car", "Cyclist"))
-    assert learned.values == {"Car": 20.0, "Cyclist": 3.0}
-    assert learned.ground_truths == {"Car": 3, "Cyclist": 1}
-    assert learned.fallbacks == ()
+    assert learned == {"Car": 20.0, "Cyclist": 3.0}
 
 
 def test_dont_care_and_foreign_categories_teach_nothing():
@@ -82,8 +80,7 @@ def test_dont_care_and_foreign_categories_teach_nothing():
     truth = annotations_at([0, 1, 0], ["Car", "Van", "DontCare"])
     truth.boxes[2] = np.nan
     learned = learn_thresholds([(frame_with(8, 100), truth)], ("Car",))
-    assert learned.values == {"Car": 8.0}
-    assert learned.ground_truths == {"Car": 1}
+    assert learned == {"Car": 8.0}
 
 
 def test_a_category_without_ground_truth_warns_and_falls_back(caplog):
@@ -94,8 +91,7 @@ def test_a_category_without_ground_truth_warns_and_falls_back(caplog):
             ("Car", "Pedestrian"),
             PointSettings(fallback=7.0),
         )
-    assert learned.values == {"Car": 8.0, "Pedestrian": 7.0}
-    assert learned.fallbacks == ("Pedestrian",)
+    assert learned == {"Car": 8.0, "Pedestrian": 7.0}
     (record,) = caplog.records
     assert "Pedestrian" in record.getMessage()
     assert "7 points" in record.getMessage()
@@ -104,8 +100,7 @@ def test_a_category_without_ground_truth_warns_and_falls_back(caplog):
 def test_a_fixed_threshold_needs_no_ground_truth(caplog):
     """It is not a fallback, so nobody is warned."""
     learned = learn_thresholds([], ("Car",), PointSettings("fixed", fixed=9.0))
-    assert learned.values == {"Car": 9.0}
-    assert learned.fallbacks == ()
+    assert learned == {"Car": 9.0}
     assert not caplog.records
 
 

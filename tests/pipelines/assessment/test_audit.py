@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.pipelines_cli import Curate
+from support.silent import Silent
 from support.toys import write_toy_kitti
 
 from curate.errors import ConfigError, FramesFailed, LeakageError, WorkspaceError
 from curate.geometry.overlap import bev_iou
 from pipelines.assessment.audit import EVIDENCE, POLICIES, AuditRequest, run_audit
 from pipelines.assessment.audit_folds import open_folds
-from pipelines.engine.progress import Silent
 from pipelines.engine.rounds import open_round
 from pipelines.labels.evidence import read_evidence
 from pipelines.workspace.workspace import Workspace

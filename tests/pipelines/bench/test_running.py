@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from support.bench_results import ToyJobs, made_up, make_bench
+from support.silent import Silent
 
 from curate.errors import CellsFailed, WorkspaceError
 from pipelines.bench.grid import Job
@@ -13,7 +14,6 @@ from pipelines.bench.processes import JobProcesses
 from pipelines.bench.results import write_result
 from pipelines.bench.running import alone, run_grid
 from pipelines.bench.settings import Bench
-from pipelines.engine.progress import Silent
 
 GRID = {"ratios": (0.25, 0.5), "seeds": (0, 1)}
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import text
 from support.rounds import run_stage
+from support.silent import Silent
 from support.toys import ToySequences
 
 from curate.errors import ModelError
@@ -15,7 +16,6 @@ from pipelines.engine.executors.process import ProcessExecutor
 from pipelines.engine.executors.serial import SerialExecutor
 from pipelines.engine.graph import Graph
 from pipelines.engine.plan import Plan
-from pipelines.engine.progress import Silent
 from pipelines.engine.runner import Report, run_frames
 from pipelines.engine.stage import SequenceStage
 from pipelines.round import open_plan

@@ -4,7 +4,8 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.labels.columns import joined, ordered
+from db.models import BOX_COLUMNS
+from pipelines.labels.columns import ordered
 
 NUMBERS = ("score", "loss", "weight")
 # How long an example takes says nothing on a busy machine.
@@ -15,10 +16,14 @@ _PATIENT = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.permutations(range(12)))
 def test_any_order_of_rows_gives_the_same_columns(order: list[int]) -> None:
     """By name of the frame, then by k; each row stays whole."""
-    names = ["b", "c", "a"]
-    key = np.array([(i % 3, i // 3, i % 2) for i in range(12)])[order]
-    table = np.repeat(np.array(order, dtype=float)[:, None], 7 + len(NUMBERS), axis=1)
-    found = ordered(names, ("Car", "Cyclist"), key, table, NUMBERS)
+    names, kinds = ["b", "c", "a"], ["Car", "Cyclist"]
+    numbers = dict.fromkeys((*BOX_COLUMNS, *NUMBERS), np.array(order, dtype=float))
+    columns = {
+        "frame": np.array([names[i % 3] for i in order]),
+        "k": np.array(order) // 3,
+        "category": np.array([kinds[i % 2] for i in order]),
+    }
+    found = ordered(columns | numbers, ("Car", "Cyclist"))
     assert found.frame_names == ["a", "b", "c"]
     shown = [found.frame_names[i] for i in found.frames]
     assert list(zip(shown, found.k.tolist(), strict=True)) == [
@@ -28,13 +33,3 @@ def test_any_order_of_rows_gives_the_same_columns(order: list[int]) -> None:
     assert [names[i % 3] for i in was] == shown
     assert (found.categories == was % 2).all()
     assert (found.boxes[:, 0] == was).all()
-
-
-@_PATIENT
-@given(st.lists(st.integers(0, 5), min_size=1, max_size=6))
-def test_chunks_are_joined_in_their_order(sizes: list[int]) -> None:
-    """Empty ones too, and the list is used up."""
-    rows = np.arange(2 * sum(sizes)).reshape(-1, 2)
-    chunks = [rows[sum(sizes[:i]) : sum(sizes[: i + 1])] for i in range(len(sizes))]
-    assert (joined(chunks) == rows).all()
-    assert chunks == []

@@ -9,6 +9,7 @@ from support.pipelines_cli import Curate
 
 from curate.errors import ConfigError, WorkspaceError
 from pipelines.labels.of_one_frame import read_frame
+from pipelines.reports.pictures import draw_example_frame
 from pipelines.workspace.workspace import Workspace
 
 
@@ -160,3 +161,12 @@ def test_without_predictions_the_remedy_is_named(curate: Curate, workspace: Work
     code, _, err = curate("view", "000000", "-w", workspace.root)
     assert code == WorkspaceError.exit_code
     assert "curate predict" in err
+
+
+def test_the_telling_frame_is_drawn_twice(weighted: Workspace) -> None:
+    """From above and over its image, with the labels and weights of that frame alone."""
+    paths = draw_example_frame(weighted, 1)
+    names = {path.name for path in paths}
+    frame = next(name for name in weighted.frames("unlabeled") if any(name in n for n in names))
+    assert names == {f"round-01-{frame}-bird-eye.png", f"round-01-{frame}-image.png"}
+    assert all(drawn(path).size for path in paths)
