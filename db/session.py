@@ -5,10 +5,11 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url, text
-from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
+from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, text
+from sqlalchemy.exc import DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError, joined_lines
+from db.addresses import parse_url
 from db.backups import back_up
 from db.claims import Check, claimed, one_at_a_time, round_resources
 from db.lock_holders import holders
@@ -196,29 +197,6 @@ class Database:
                     "writing: wait for it or end it, then run the command again"
                 )
         return next((each for sign, each in _REMEDIES[backend].items() if sign in message), "")
-
-
-def parse_url(address: str) -> URL:
-    """An SQLAlchemy URL; a password in its query is moved to where it is not shown.
-
-    Raises:
-        ConfigError: it is none.
-    """
-    try:
-        # No driver takes a zero byte, and each says so with an error of its own.
-        url = make_url("" if "\0" in address else address)
-    except ArgumentError as error:
-        # The text is not repeated: it may hold a password.
-        raise ConfigError(
-            "run.database: no URL of a database; write postgresql://USER@HOST/NAME, or leave it "
-            "out for curate.db in the workspace"
-        ) from error
-    if url.drivername in {"postgres", "postgresql"}:
-        url = url.set(drivername="postgresql+psycopg")
-    secret = url.query.get("password")
-    if isinstance(secret, str):  # where it stands otherwise, messages leave it out
-        url = url.difference_update_query(["password"]).set(password=url.password or secret)
-    return url
 
 
 def _upgrade(connection: Connection) -> None:

@@ -25,8 +25,9 @@ from pipelines.engine.schedule import run_all
 from pipelines.round import graph_of, open_plan
 from pipelines.stages.methods import METHODS
 from pipelines.workspace.config import write_config
+from pipelines.workspace.location import CONFIG_NAME
 from pipelines.workspace.setup import initialise
-from pipelines.workspace.workspace import CONFIG_NAME, SPLITS, Workspace
+from pipelines.workspace.workspace import SPLITS, Workspace
 
 DATABASE = "curate.db"
 

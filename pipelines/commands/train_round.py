@@ -53,7 +53,8 @@ def train_round(
 def _remember(folder: Path | None, policy: str | None, told: Mapping[str, str]) -> None:
     """Writes how the next teacher was trained into curate.toml, where later rounds look."""
     from pipelines.workspace.config_file import change_settings
-    from pipelines.workspace.workspace import CONFIG_NAME, Workspace
+    from pipelines.workspace.location import CONFIG_NAME
+    from pipelines.workspace.workspace import Workspace
 
     if not told:
         return
