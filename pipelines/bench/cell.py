@@ -27,7 +27,8 @@ from pipelines.stages.methods import METHODS
 from pipelines.workspace.config import write_config
 from pipelines.workspace.location import CONFIG_NAME
 from pipelines.workspace.setup import initialise
-from pipelines.workspace.workspace import SPLITS, Workspace
+from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.workspace import Workspace
 
 DATABASE = "curate.db"
 

@@ -26,7 +26,7 @@ def run_frame_command(
     from pipelines.engine.progress import Bar
     from pipelines.engine.runner import open_executor, run_frames
     from pipelines.round import open_plan
-    from pipelines.workspace.workspace import SPLITS
+    from pipelines.workspace.splits import SPLITS
 
     workspace = open_workspace(folder, executor, workers)
     priors = workspace.config.run.priors

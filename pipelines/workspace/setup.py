@@ -22,7 +22,8 @@ from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
 from pipelines.workspace.config import Config
 from pipelines.workspace.split_record import split_rows
-from pipelines.workspace.workspace import SPLITS, Workspace, open_dataset
+from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.workspace import Workspace, open_dataset
 
 _log = logging.getLogger(__name__)
 

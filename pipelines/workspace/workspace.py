@@ -20,8 +20,6 @@ from pipelines import registry
 from pipelines.workspace.config import Config, make_config, read_config, write_config
 from pipelines.workspace.location import CONFIG_NAME, find_workspace, url_of
 
-SPLITS = ("labeled", "unlabeled", "val")
-
 
 @dataclass(frozen=True)
 class Workspace:
