@@ -5,8 +5,17 @@ from typing import Annotated, Optional
 
 import typer
 
-from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption, open_workspace
+from pipelines.commands.options import (
+    JsonOption,
+    LastRoundOption,
+    PolicyOption,
+    WorkspaceOption,
+    complete,
+    open_workspace,
+    registered,
+)
 from pipelines.commands.stages import run_round_command
+from pipelines.registry import EXPORTERS
 
 
 def export(
@@ -14,29 +23,27 @@ def export(
         str,
         typer.Option(
             "--format",
-            help="sqlite, parquet, csv, coco, kitti, openpcdet, st3d, mmdet3d, nuscenes or "
-            "module:Class.",
+            help=f"File format: {registered(EXPORTERS)}.",
+            autocompletion=complete(EXPORTERS.classes),
         ),
     ] = "sqlite",
     output: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="File or folder to write; default: in exports/ of the workspace."),
+        typer.Option(
+            help="File or folder to write; default: in the folder exports of the workspace."
+        ),
     ] = None,
     policy: PolicyOption = None,
-    round_number: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option("--round", min=1, help="Round; default: the last that the policy weighted."),
-    ] = None,
+    round_number: LastRoundOption = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the weighted labels in the format of a trainer; docs/training.md tells them apart.
+    """Write the weighted labels as files in the format of a trainer, see docs/training.md.
 
     Example: curate export --format sqlite
     """
     from pipelines.engine.rounds import open_round
     from pipelines.labels.by_frame import weighted_round
-    from pipelines.registry import EXPORTERS
     from pipelines.stages.export import export_as
 
     opened = open_workspace(workspace)

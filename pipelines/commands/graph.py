@@ -6,9 +6,11 @@ import typer
 
 
 def graph(
-    mermaid: Annotated[bool, typer.Option(help="Print Mermaid source.")] = False,
+    mermaid: Annotated[
+        bool, typer.Option("--mermaid", help="Print it as a Mermaid flowchart.")
+    ] = False,
 ) -> None:
-    """Show the stages of a round: what each reads and writes.
+    """Show the stages of a round, and what each reads and writes.
 
     Example: curate graph
     """

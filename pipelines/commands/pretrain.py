@@ -17,7 +17,7 @@ def pretrain(
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Train the first teacher on the labeled frames alone.
+    """Train the first teacher, on the labeled frames only.
 
     Example: curate pretrain
     """

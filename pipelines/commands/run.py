@@ -9,32 +9,37 @@ from pipelines.commands.options import (
     JsonOption,
     WorkersOption,
     WorkspaceOption,
+    complete,
     end,
     open_workspace,
+    registered,
 )
+from pipelines.registry import POLICIES
 from pipelines.reports.terminal import print_report
 
 
 def run(
     rounds: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=1, help="E; default: run.rounds of curate.toml."),
+        typer.Option(min=1, help="Number of rounds; default: run.rounds of curate.toml."),
     ] = None,
     method: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="See docs/methods.md; default: run.method of curate.toml."),
+        typer.Option(
+            help=f"Method, see docs/methods.md: {registered(POLICIES)}; default: run.method of "
+            "curate.toml.",
+            autocompletion=complete(POLICIES.classes),
+        ),
     ] = None,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Bring every stage of every round up to date; what is up to date is not done again.
+    """Run every stage of every round that is not up to date.
 
-    With a detector that you bring, there is one round and it ends with the export.
-
-    Methods: pspsl, spsl, uda, uda-cl, sess, 3dioumatch, st3d, hssda, threshold, baseline, or a
-    policy module:Class.
+    With an external detector and without train.command there is one round, which ends with the
+    export.
 
     Example: curate run --rounds 3 --method pspsl
     """
