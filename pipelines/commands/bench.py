@@ -231,6 +231,8 @@ def _announce(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
 
     if not report.results:
         typer.echo("no cell is finished yet", err=True)
+        if as_json:
+            print_json({})
         return
     written = report.write()
     if as_json:

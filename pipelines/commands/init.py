@@ -6,8 +6,9 @@ from typing import Annotated, Any, Optional
 import typer
 
 from curate.segmenters.classes import CLASS_MAPS
-from pipelines.commands.options import complete, one_of, registered
+from pipelines.commands.options import JsonOption, complete, one_of, registered
 from pipelines.registry import DATASETS, DETECTORS, SEGMENTERS
+from pipelines.reports.terminal import print_json
 
 
 def init(
@@ -83,6 +84,7 @@ def init(
         Optional[list[str]],  # noqa: UP045
         typer.Option("--set", help="Any setting of curate.toml, as section.key=value; repeatable."),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Create a workspace: its settings, its database, and which frames are labeled.
 
@@ -122,6 +124,9 @@ def init(
         trainable_detector(config)
     workspace = initialise(directory, config, labeled, val)
     counts = {split: len(workspace.frames(split)) for split in ("labeled", "unlabeled", "val")}
+    if as_json:
+        print_json({"workspace": str(workspace.root), "frames": counts})
+        return
     typer.echo(
         f"{workspace.root}: {counts['labeled']} labeled, {counts['unlabeled']} unlabeled and "
         f"{counts['val']} val frames; settings in curate.toml"

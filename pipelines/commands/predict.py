@@ -3,6 +3,7 @@
 import typer
 
 from pipelines.commands.options import (
+    DryRunOption,
     ExecutorOption,
     JsonOption,
     RoundOption,
@@ -19,6 +20,7 @@ def predict(
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run the teacher on frames and store its boxes, low scores included.
@@ -26,8 +28,9 @@ def predict(
     Example: curate predict --split unlabeled
     """
     run_frame_command(
-        ("predict",), workspace, round_number, split, executor, workers, as_json=as_json
-    )
+        ("predict",), workspace, round_number, split, executor, workers,
+        as_json=as_json, dry_run=dry_run,
+    )  # fmt: skip
 
 
 def register(app: typer.Typer) -> None:

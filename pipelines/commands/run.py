@@ -4,7 +4,9 @@ from typing import Annotated, Optional
 
 import typer
 
+from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import (
+    DryRunOption,
     ExecutorOption,
     JsonOption,
     WorkersOption,
@@ -34,6 +36,7 @@ def run(
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run every stage of every round that is not up to date.
@@ -45,14 +48,20 @@ def run(
     """
     from dataclasses import replace
 
+    from pipelines.engine.preview import preview_all
     from pipelines.engine.progress import Bar
-    from pipelines.engine.schedule import run_all
+    from pipelines.engine.schedule import check_stages, run_all
     from pipelines.round import graph_of
     from pipelines.stages.methods import with_method
 
     opened = open_workspace(workspace, executor, workers)
     if method is not None:
         opened = replace(opened, config=with_method(opened.config, method))
+    if dry_run:
+        graph = graph_of(opened)
+        check_stages(opened, graph, opened.config.run.method)
+        print_preview(preview_all(opened, graph, rounds), as_json=as_json)
+        return
     reports = []
     for report in run_all(opened, graph_of(opened), rounds, Bar()):
         reports.append(report)

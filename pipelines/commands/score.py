@@ -5,6 +5,7 @@ from typing import Annotated, Optional
 import typer
 
 from pipelines.commands.options import (
+    DryRunOption,
     ExecutorOption,
     JsonOption,
     RoundOption,
@@ -31,6 +32,7 @@ def score(
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compute the priors of each box, such as its LiDAR points and its segmentation pixels.
@@ -40,7 +42,10 @@ def score(
     Example: curate score --prior points
     """
     stages = None if prior is None else (prior,)
-    run_frame_command(stages, workspace, round_number, split, executor, workers, as_json=as_json)
+    run_frame_command(
+        stages, workspace, round_number, split, executor, workers,
+        as_json=as_json, dry_run=dry_run,
+    )  # fmt: skip
 
 
 def register(app: typer.Typer) -> None:

@@ -5,6 +5,9 @@ from typing import Annotated, Optional
 
 import typer
 
+from pipelines.commands.options import JsonOption
+from pipelines.reports.terminal import print_json
+
 
 def simulate(
     directory: Annotated[Path, typer.Argument(help="Folder to write the data set to.")],
@@ -22,6 +25,7 @@ def simulate(
         Optional[int],  # noqa: UP045
         typer.Option(min=1, help="Number of processes; default: one per core."),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Simulate a LiDAR-camera data set in KITTI format: ray-cast sweeps, images, labels.
 
@@ -35,6 +39,9 @@ def simulate(
     with Bar().track("simulate", frames) as advance:
         shown = as_total(advance)
         run(directory, frames, seed, val_frames=val, workers=workers, progress=shown)
+    if as_json:
+        print_json({"folder": str(directory), "frames": frames, "val": val, "seed": seed})
+        return
     typer.echo(
         f"{frames} frames in {directory}, as KITTI lays them out; labels in training/label_2"
     )

@@ -5,6 +5,7 @@ from typing import Annotated, Optional
 import typer
 
 from pipelines.commands.options import (
+    DryRunOption,
     JsonOption,
     RoundOption,
     WorkspaceOption,
@@ -26,6 +27,7 @@ def solve(
     ] = None,
     round_number: RoundOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compute the weight of every label of a round under a policy.
@@ -34,7 +36,9 @@ def solve(
 
     Example: curate solve --policy spsl
     """
-    run_round_command("solve", open_workspace(workspace), round_number, policy, as_json=as_json)
+    run_round_command(
+        "solve", open_workspace(workspace), round_number, policy, as_json=as_json, dry_run=dry_run
+    )
 
 
 def register(app: typer.Typer) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import end, open_workspace
 from pipelines.reports.terminal import print_report
 
@@ -20,12 +21,15 @@ def run_frame_command(
     workers: int | None,
     *,
     as_json: bool,
+    dry_run: bool = False,
 ) -> None:
-    """Runs frame stages for a split; None stands for the configured priors."""
+    """Run frame stages for a split; None stands for the configured priors."""
     from curate.errors import ConfigError
+    from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
+    from pipelines.engine.rounds import preview_round
     from pipelines.engine.runner import open_executor, run_frames
-    from pipelines.round import open_plan
+    from pipelines.round import graph_of, open_plan
     from pipelines.workspace.splits import SPLITS
 
     workspace = open_workspace(folder, executor, workers)
@@ -36,11 +40,18 @@ def run_frame_command(
     unknown = [name for name in names if name not in (*priors, "predict", "repredict")]
     if unknown:
         raise ConfigError(f"--prior {unknown[0]}: not among run.priors {list(priors)}")
-    plan = open_plan(workspace, round_number)
-    wanted = [plan.graph.of_frames(name) for name in names]
+    graph = graph_of(workspace)
+    wanted = [graph.of_frames(name) for name in names]
     for stage in wanted:
         if stage.check:
             stage.check(workspace)
+    if dry_run:
+        context = preview_round(workspace, round_number)
+        preview = Preview(workspace, graph, context.number, context)
+        planned = (preview.of_frames(stage, split, alone=True) for stage in wanted)
+        print_preview(planned, as_json=as_json)
+        return
+    plan = open_plan(workspace, round_number)
     reports = []
     with open_executor(workspace) as work:
         for stage in wanted:
@@ -57,14 +68,27 @@ def run_round_command(
     policy: str | None,
     *,
     as_json: bool,
+    dry_run: bool = False,
 ) -> None:
-    """Runs a round stage for a policy."""
+    """Run a round stage for a policy."""
+    from pipelines.engine.plan import Plan
+    from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
+    from pipelines.engine.rounds import preview_round
     from pipelines.engine.runner import run_round
-    from pipelines.round import open_plan
+    from pipelines.round import graph_of, open_plan
 
+    chosen = policy or workspace.config.run.method
+    if dry_run:
+        context, graph = preview_round(workspace, round_number), graph_of(workspace)
+        plan, stage = Plan(workspace, context, graph), graph.of_rounds(name)
+        plan.require(stage, chosen)
+        plan.frames_to_weigh(stage, chosen)
+        preview = Preview(workspace, graph, context.number, context)
+        print_preview([preview.of_round(stage, chosen)], as_json=as_json)
+        return
     plan = open_plan(workspace, round_number)
-    report = run_round(plan, name, policy or workspace.config.run.method, Bar())
+    report = run_round(plan, name, chosen, Bar())
     if not as_json:
         print_report(report)
     end([report], as_json=as_json)

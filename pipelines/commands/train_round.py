@@ -7,6 +7,7 @@ from typing import Annotated, Optional
 import typer
 
 from pipelines.commands.options import (
+    DryRunOption,
     JsonOption,
     PolicyOption,
     RoundOption,
@@ -39,6 +40,7 @@ def train_round(
     ] = None,
     threads: ThreadsOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train the student of a round, which is the teacher of the next round.
@@ -56,7 +58,9 @@ def train_round(
     given = {"command": command, "labels_format": labels_format}
     told = {name: value for name, value in given.items() if value is not None}
     opened = open_workspace(workspace, threads=threads).with_settings("train", **told)
-    run_round_command("train-round", opened, round_number, policy, as_json=as_json)
+    run_round_command("train-round", opened, round_number, policy, as_json=as_json, dry_run=dry_run)
+    if dry_run:
+        return
     _remember(workspace, policy, told)
 
 
