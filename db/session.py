@@ -5,16 +5,12 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from alembic import command
-from alembic.config import Config
-from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
-from alembic.util import CommandError
-from sqlalchemy import URL, Connection, Engine, Select, create_engine, event, inspect, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
+from sqlalchemy import URL, Connection, Engine, Select, create_engine, event, inspect
+from sqlalchemy.exc import DBAPIError, NoSuchModuleError
 
 from curate.errors import ConfigError, DatabaseError, LeakageError, joined_lines
 from db import bulk
+from db.addresses import parse_url
 from db.backups import back_up
 from db.claims import Check, claimed, one_at_a_time, round_resources
 from db.lock_holders import holders
@@ -23,6 +19,10 @@ from db.views import create_views, drop_views, refresh_views, views_are_current
 
 # A writer that finds another one waits this long before it gives up.
 BUSY_TIMEOUT_MS = 30_000
+_MIGRATIONS = Path(__file__).parent / "migrations"
+# By the names of their files: to open a database of this schema does not need alembic, which takes
+# as long to import as SQLAlchemy.
+REVISIONS = sorted(path.stem.partition("_")[0] for path in _MIGRATIONS.glob("versions/*.py"))
 # On a server two processes may find an old schema at once; this number of theirs is one lock.
 _MIGRATION_LOCK = 0x637572617465  # "curate" in ASCII
 
@@ -108,12 +108,9 @@ class Database:
         self.engine.dispose()
 
     def _migrate(self, backups: Path | None) -> None:
-        config = Config()
-        config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
-        script = ScriptDirectory.from_config(config)
-        head = script.get_current_head()
+        head = REVISIONS[-1]
         with self.engine.connect() as connection:
-            current = self._revision(connection, script)
+            current = self._revision(connection)
             if current is None:
                 self._check_tables(connection)
             elif current == head:
@@ -126,15 +123,14 @@ class Database:
             one_at_a_time(connection, _MIGRATION_LOCK)
             # Whoever had the lock before may have migrated it: its copy is of the older schema,
             # and one that is made now would take its place.
-            current = self._revision(connection, script)
+            current = self._revision(connection)
             if current == head:
                 refresh_views(connection)
                 return
             if current is not None:
                 back_up(self.url, current, backups)
-            config.attributes["connection"] = connection
             drop_views(connection)
-            command.upgrade(config, "head")
+            _upgrade(connection)
             create_views(connection)
 
     def _write_ahead(self) -> None:
@@ -165,19 +161,20 @@ class Database:
                 "alembic_version: move it away if it is another program's, restore a backup if not"
             )
 
-    def _revision(self, connection: Connection, script: ScriptDirectory) -> str | None:
+    def _revision(self, connection: Connection) -> str | None:
         """Of the schema; None for an empty database, DatabaseError where it is unknown here."""
-        try:
-            current = MigrationContext.configure(connection).get_current_revision()
-        except CommandError as error:  # more than one row, which no curate writes
+        if not inspect(connection).has_table("alembic_version"):
+            return None
+        found = connection.execute(text("SELECT version_num FROM alembic_version")).scalars().all()
+        if len(found) > 1:  # which no curate writes
             raise DatabaseError(
                 f"{self.name}: table alembic_version names several schemas; restore a backup"
-            ) from error
-        if current is not None and current not in {r.revision for r in script.walk_revisions()}:
-            raise DatabaseError(
-                f"{self.name}: written by a newer curate (schema {current}); update curate"
             )
-        return current
+        if found and found[0] not in REVISIONS:
+            raise DatabaseError(
+                f"{self.name}: written by a newer curate (schema {found[0]}); update curate"
+            )
+        return str(found[0]) if found else None
 
     @contextmanager
     def _translate_errors(self) -> Iterator[None]:
@@ -208,27 +205,15 @@ class Database:
         return next((each for sign, each in _REMEDIES[backend].items() if sign in message), "")
 
 
-def parse_url(address: str) -> URL:
-    """An SQLAlchemy URL; a password in its query is moved to where it is not shown.
+def _upgrade(connection: Connection) -> None:
+    """Run the migrations that the connection's database has not seen yet."""
+    from alembic import command
+    from alembic.config import Config
 
-    Raises:
-        ConfigError: it is none.
-    """
-    try:
-        # No driver takes a zero byte, and each says so with an error of its own.
-        url = make_url("" if "\0" in address else address)
-    except ArgumentError as error:
-        # The text is not repeated: it may hold a password.
-        raise ConfigError(
-            "run.database: no URL of a database; write postgresql://USER@HOST/NAME, or leave it "
-            "out for curate.db in the workspace"
-        ) from error
-    if url.drivername in {"postgres", "postgresql"}:
-        url = url.set(drivername="postgresql+psycopg")
-    secret = url.query.get("password")
-    if isinstance(secret, str):  # where it stands otherwise, messages leave it out
-        url = url.difference_update_query(["password"]).set(password=url.password or secret)
-    return url
+    config = Config()
+    config.set_main_option("script_location", str(_MIGRATIONS))
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")
 
 
 def _engine(url: URL) -> Engine:

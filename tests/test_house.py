@@ -22,7 +22,7 @@ LAYERS = {
     "curate": (
         "errors", "files", "frames", "geometry", "detections", "consistency", "datasets",
         "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters", "detectors",
-        "firewall", "viewing", "review", "training",
+        "firewall", "viewing", "review", "training", "__main__",
     ),
     "pipelines": (
         "user_modules", "registry", "workspace", "assembly", "engine", "labels", "firewall",

@@ -3,7 +3,6 @@
 import numpy as np
 
 from curate.geometry.boxes import as_boxes
-from curate.geometry.kernels import greedy_nms, rectangle_table
 
 
 def nms_bev(boxes: np.ndarray, scores: np.ndarray, iou_threshold: float) -> np.ndarray:
@@ -17,5 +16,7 @@ def nms_bev(boxes: np.ndarray, scores: np.ndarray, iou_threshold: float) -> np.n
     Returns:
         (k,) int64 indices of the kept boxes, by descending score.
     """
+    from curate.geometry.kernels import greedy_nms, rectangle_table
+
     order = np.argsort(-np.asarray(scores, dtype=np.float64), kind="stable")
     return greedy_nms(rectangle_table(as_boxes(boxes)), order, float(iou_threshold))

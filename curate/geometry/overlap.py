@@ -8,7 +8,6 @@ overlaps nothing, itself included.
 import numpy as np
 
 from curate.geometry.boxes import as_boxes
-from curate.geometry.kernels import grouped_iou, iou_matrix, paired_iou, rectangle_table
 
 
 def bev_iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
@@ -23,6 +22,8 @@ def iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
 
 def paired_iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     """(n,) volume IoU in [0, 1] of each of (n, 7) boxes with the other's box in the same row."""
+    from curate.geometry.kernels import paired_iou
+
     return paired_iou(_table(boxes_a), _table(boxes_b))
 
 
@@ -40,16 +41,22 @@ def overlapping_pairs(
     Returns:
         Row in a, row in b, BEV IoU and 3D IoU of each pair, ascending by (row in a, row in b).
     """
+    from curate.geometry.kernels import grouped_iou
+
     groups_a = np.ascontiguousarray(starts_a, dtype=np.int64)
     groups_b = np.ascontiguousarray(starts_b, dtype=np.int64)
     return grouped_iou(_table(boxes_a), groups_a, _table(boxes_b), groups_b)
 
 
 def _iou(boxes_a: np.ndarray, boxes_b: np.ndarray, *, with_height: bool) -> np.ndarray:
+    from curate.geometry.kernels import iou_matrix
+
     table_b = _table(boxes_b)
     order = np.argsort(table_b[:, 0])
     return iou_matrix(_table(boxes_a), table_b[order], order, with_height)
 
 
 def _table(boxes: np.ndarray) -> np.ndarray:
+    from curate.geometry.kernels import rectangle_table
+
     return rectangle_table(as_boxes(boxes))

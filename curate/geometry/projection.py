@@ -1,7 +1,6 @@
 """Projection from the LiDAR frame into the image (KITTI: Geiger et al., IJRR 2013, eq. 8)."""
 
 import numpy as np
-from numba import njit
 
 from curate.frames import Calibration
 from curate.geometry.boxes import box_corners
@@ -47,6 +46,8 @@ def in_view(
         calibration: of the frame.
         image_size: (width, height) in pixels.
     """
+    from curate.geometry.view_kernel import points_in_view
+
     width, height = image_size
     columns = np.asarray(points)
     matrix = calibration.lidar_to_image
@@ -54,53 +55,13 @@ def in_view(
     reach = max(1.0, -columns.min(initial=0), columns.max(initial=0))
     margin = np.abs(matrix).sum() * _UNDECIDED * reach * max(width, height)
     x, y, z = np.ascontiguousarray(columns[:, :3].T)  # each by itself: the kernel is vectorised
-    seen, undecided = _in_view(x, y, z, matrix, float(width), float(height), margin)
+    seen, undecided = points_in_view(x, y, z, matrix, float(width), float(height), margin)
     doubtful = np.flatnonzero(undecided)
     if len(doubtful):
         pixels, depth = project_points(columns[doubtful], calibration)
         inside = (pixels >= 0) & (pixels < np.asarray(image_size))
         seen[doubtful] = inside.all(axis=1) & (depth > 0)
     return seen
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _in_view(
-    x: np.ndarray,
-    y: np.ndarray,
-    z: np.ndarray,
-    matrix: np.ndarray,
-    width: float,
-    height: float,
-    margin: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The kernel of `in_view`: (n,) bool, and (n,) whether it leaves a point undecided.
-
-    It has no branches: which points are seen is too irregular to be foretold.
-    """
-    seen = np.empty(len(x), np.bool_)
-    doubtful = np.empty(len(x), np.bool_)
-    m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
-    m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
-    m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
-    for i in range(len(x)):
-        px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-        u = m00 * px + m01 * py + m02 * pz + m03
-        v = m10 * px + m11 * py + m12 * pz + m13
-        depth = m20 * px + m21 * py + m22 * pz + m23
-        right, below = width * depth - u, height * depth - v
-        inside = (
-            (depth > margin) & (u > margin) & (v > margin) & (right > margin) & (below > margin)
-        )
-        outside = (
-            (depth < -margin)
-            | (u < -margin)
-            | (v < -margin)
-            | (right < -margin)
-            | (below < -margin)
-        )
-        seen[i] = inside
-        doubtful[i] = not (inside | outside)  # NaN too
-    return seen, doubtful
 
 
 def image_rectangles(

@@ -8,11 +8,13 @@ counted from 0.
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from curate.errors import ConfigError
 from curate.spelling import did_you_mean
+
+if TYPE_CHECKING:
+    import numpy as np
 
 ClassMap = Mapping[str, tuple[int, ...]]
 
@@ -69,8 +71,10 @@ def free_id(classes: ClassMap) -> int:
     return next((one for one in range(256) if one not in wanted), 0)
 
 
-def foreign_ids(class_ids: np.ndarray, classes: ClassMap) -> str | None:
+def foreign_ids(class_ids: "np.ndarray", classes: ClassMap) -> str | None:
     """What is wrong with (h, w) class ids that the declared class set does not have, else None."""
+    import numpy as np
+
     for name, known in _KNOWN_IDS.items():
         if CLASS_MAPS[name] != classes:
             continue

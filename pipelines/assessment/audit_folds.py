@@ -15,8 +15,9 @@ from curate.errors import ConfigError
 from curate.firewall.sequences import group_by_sequence
 from pipelines.workspace.config import Config, read_config
 from pipelines.workspace.config_file import write_config
+from pipelines.workspace.location import CONFIG_NAME
 from pipelines.workspace.setup import initialise
-from pipelines.workspace.workspace import CONFIG_NAME, Workspace
+from pipelines.workspace.workspace import Workspace
 
 
 def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:

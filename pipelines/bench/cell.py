@@ -25,8 +25,10 @@ from pipelines.engine.schedule import run_all
 from pipelines.round import graph_of, open_plan
 from pipelines.stages.methods import METHODS
 from pipelines.workspace.config_file import write_config
+from pipelines.workspace.location import CONFIG_NAME
 from pipelines.workspace.setup import initialise
-from pipelines.workspace.workspace import CONFIG_NAME, SPLITS, Workspace
+from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.workspace import Workspace
 
 DATABASE = "curate.db"
 

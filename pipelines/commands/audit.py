@@ -25,21 +25,29 @@ if TYPE_CHECKING:
 
 def audit(
     split: Annotated[
-        str, typer.Option(help="val; labeled for a detector that never saw these frames.")
+        str,
+        typer.Option(
+            help="Frames to audit: val, or labeled for a detector that was not trained on them."
+        ),
     ] = "val",
     folds: Annotated[
-        int, typer.Option(min=0, help="Held-out folds of the labeled frames instead.")
+        int,
+        typer.Option(
+            min=0, help="Audit this many held-out folds of the labeled frames instead; 0: none."
+        ),
     ] = 0,
     policy: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(
-            help="Policy, or score, rho_det, consistency; repeat it for several. Default: "
-            "pspsl, spsl, threshold, uniform and the three."
+            help="Policy, or a single piece of evidence: score, rho_det or consistency; "
+            "repeatable. Default: pspsl, spsl, threshold, uniform, and all three."
         ),
     ] = None,
-    overlap: Annotated[str, typer.Option(help="A right label overlaps in bev or 3d.")] = "bev",
+    overlap: Annotated[
+        str, typer.Option(help="IoU that makes a label correct: bev or 3d.")
+    ] = "bev",
     replicates: Annotated[
-        int, typer.Option(min=10, help="Draws of the bootstrap for the intervals.")
+        int, typer.Option(min=10, help="Bootstrap samples for the confidence intervals.")
     ] = 1000,
     round_number: RoundOption = None,
     executor: ExecutorOption = None,
@@ -48,13 +56,14 @@ def audit(
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say how many pseudo-labels are right and which policy's weights judge them best.
+    """Measure how many pseudo-labels are correct and how well each policy's weights rank them.
 
-    Treats frames with ground truth that the teacher has not seen as if they were unlabeled, and
-    then asks the truth: a label is right with an IoU above 0.7 (Car) or 0.5 (others). With --folds
-    K, K teachers each learn from the other folds. Draws reports/audit-*.png and fills the tables
-    audit, audit_slice (by distance and points) and audit_bin (by weight):
-    curate query "SELECT policy, category, auroc, auroc_low, auroc_high FROM audit"
+    Frames with ground truth that the teacher was not trained on are treated as unlabeled, and their
+    labels are then compared with the ground truth. A label is correct with an IoU above 0.7 (Car)
+    or 0.5 (others). With --folds K, K teachers are each trained without one fold. The plot is
+    reports/audit-*.png. The tables audit, audit_slice (by distance and points) and audit_bin (by
+    weight) hold the numbers: curate query "SELECT policy, category, auroc, auroc_low, auroc_high
+    FROM audit"
 
     Example: curate audit --policy pspsl --policy threshold --policy score
     """

@@ -22,34 +22,40 @@ FRAMES, VAL = 600, 300
 
 
 def bench(
-    directory: Annotated[Path, typer.Argument(help="Folder of the bench.")],
+    directory: Annotated[Path, typer.Argument(help="Folder of the benchmark.")],
     data: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="synthetic, or a folder in KITTI's layout. Default: synthetic."),
+        typer.Option(
+            help="synthetic, or the folder of a data set in KITTI's layout. Default: synthetic."
+        ),
     ] = None,
     methods: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Methods, with commas. Default: the paper's seven."),
+        typer.Option(help=f"Comma-separated methods. Default: {METHODS}."),
     ] = None,
     ratios: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help=f"Labeled shares of the training frames. Default: {RATIOS}."),
+        typer.Option(
+            help=f"Comma-separated labeled shares of the training frames. Default: {RATIOS}."
+        ),
     ] = None,
     seeds: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help=f"Of labeled draw, training and views. Default: {SEEDS}."),
+        typer.Option(
+            help=f"Comma-separated seeds of split, training and augmentation. Default: {SEEDS}."
+        ),
     ] = None,
     frames: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=2, help=f"Training frames to simulate. Default: {FRAMES}."),
+        typer.Option(min=2, help=f"Number of training frames to simulate. Default: {FRAMES}."),
     ] = None,
     val: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=1, help=f"Validation frames to simulate. Default: {VAL}."),
+        typer.Option(min=1, help=f"Number of validation frames to simulate. Default: {VAL}."),
     ] = None,
     data_seed: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=0, help="Of the simulation. Default: 0."),
+        typer.Option(min=0, help="Random seed of the simulation. Default: 0."),
     ] = None,
     steps: Annotated[
         Optional[int],  # noqa: UP045
@@ -57,38 +63,39 @@ def bench(
     ] = None,
     teacher_steps: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=1, help="Optimiser steps of the teacher. Default: those of a round."),
+        typer.Option(min=1, help="Optimiser steps of the teacher. Default: those of --steps."),
     ] = None,
     rounds: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=1, help="Rounds of every method. Default: 2."),
+        typer.Option(min=1, help="Number of rounds of every method. Default: 2."),
     ] = None,
     override: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option(
-            "--set", help="Any setting of curate.toml, section.key=value; repeat it for several."
-        ),
+        typer.Option("--set", help="Any setting of curate.toml, as section.key=value; repeatable."),
     ] = None,
     workers: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=1, help="Cells at once, a thread each; default: all cores."),
+        typer.Option(min=1, help="Number of jobs at once, one thread each; default: one per core."),
     ] = None,
     report: Annotated[
-        bool, typer.Option("--report", help="Run nothing; print what is finished.")
+        bool, typer.Option("--report", help="Run nothing; print the results of the finished cells.")
     ] = False,
     overlaps: Annotated[
-        str, typer.Option(help="The tables to print: kitti, loose or all.")
+        str,
+        typer.Option(help="IoU thresholds of the tables to print: kitti, loose (relaxed) or all."),
     ] = "kitti",
     as_json: JsonOption = False,
 ) -> None:
-    """Compare methods: methods x labeled ratios x seeds, on simulated data or on yours.
+    """Compare methods over labeled shares and seeds, on simulated data or on yours.
 
-    Every cell of the grid is a workspace in DIR/cells. All methods start from the same teacher and
-    take equally many optimiser steps. Finished cells are never redone, a killed bench continues;
-    options that you leave out are those of the bench in DIR. The grid may grow, what its cells
-    share may not change. Ablations: --set train.zero_weight=background, --set solve.scope=frame.
+    Every cell of the grid (method, share, seed) is a workspace in the folder cells of DIRECTORY.
+    All methods start from the same teacher and take the same number of optimiser steps. Finished
+    cells are kept, and the same command resumes after an interruption. Options that you leave out
+    keep their value from the previous run. More methods, shares and seeds can be added later; all
+    other options are fixed by the first run. Ablations: --set train.zero_weight=background, --set
+    solve.scope=frame.
 
-    Prints tables (AP R40, recall, labels) and leaves results.md, results.json, curve.png in DIR.
+    Prints tables (AP R40, recall, labels) and writes results.md, results.json and curve.png.
     On KITTI: --data KITTI --set segmenter.name=onnx --set segmenter.path=deeplab.onnx --set
     segmenter.classes=voc.
 
@@ -224,6 +231,8 @@ def _announce(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
 
     if not report.results:
         typer.echo("no cell is finished yet", err=True)
+        if as_json:
+            print_json({})
         return
     written = report.write()
     if as_json:

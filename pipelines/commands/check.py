@@ -6,10 +6,10 @@ from pipelines.commands.options import JsonOption, WorkspaceOption
 
 
 def check(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> None:
-    """Look whether any ground truth could reach what it must not; nothing is changed.
+    """Check that no ground truth leaks into pseudo-labels or training; nothing is changed.
 
-    The same rules are looked at before every export and training, there on a sample of frames.
-    A broken rule ends in exit code 5.
+    Every export and every training checks the same rules first, on a sample of frames. The exit
+    code is 5 if a rule is broken.
 
     Example: curate check
     """

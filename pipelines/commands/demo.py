@@ -7,26 +7,31 @@ import typer
 
 
 def demo(
-    directory: Annotated[Path, typer.Argument(help="Folder for data and workspace.")] = Path(
-        "demo"
-    ),
-    frames: Annotated[int, typer.Option(min=8, help="Training frames to simulate.")] = 200,
-    val: Annotated[int, typer.Option(min=4, help="Validation frames to simulate.")] = 120,
+    directory: Annotated[
+        Path, typer.Argument(help="Folder for the data set and the workspace.")
+    ] = Path("demo"),
+    frames: Annotated[
+        int, typer.Option(min=8, help="Number of training frames to simulate.")
+    ] = 200,
+    val: Annotated[int, typer.Option(min=4, help="Number of validation frames to simulate.")] = 120,
     labeled: Annotated[
-        float, typer.Option(help="Share of the training frames with labels.")
+        float, typer.Option(help="Share of the training frames that are labeled.")
     ] = 0.08,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds.")] = 1,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of rounds.")] = 1,
     steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 400,
-    seed: Annotated[int, typer.Option(min=0, help="Of simulation, split and training.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Random seed of simulation, split and training.")
+    ] = 0,
     workers: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=1, help="Processes; default: all cores."),
+        typer.Option(min=1, help="Number of processes; default: one per core."),
     ] = None,
 ) -> None:
-    """Do the whole job on simulated LiDAR-camera data, offline, in minutes on two cores.
+    """Run the whole pipeline on simulated LiDAR-camera data, offline, in minutes on two cores.
 
-    Simulates a data set, trains a teacher on the few labeled frames, weighs its guesses on the
-    others, trains students, and says how good labels and detectors are. A killed demo continues.
+    Simulates a data set, trains a teacher on the few labeled frames, weights its predictions on the
+    others, trains students, and evaluates labels and detectors. After an interruption the same
+    command resumes.
 
     Example: curate demo --rounds 1
     """

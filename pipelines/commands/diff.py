@@ -9,17 +9,17 @@ from pipelines.reports.terminal import print_json, print_table
 
 
 def diff(
-    before: Annotated[int, typer.Argument(min=1, help="The earlier round.")],
-    after: Annotated[int, typer.Argument(min=1, help="The later round.")],
+    before: Annotated[int, typer.Argument(min=1, help="Number of the earlier round.")],
+    after: Annotated[int, typer.Argument(min=1, help="Number of the later round.")],
     policy: PolicyOption = None,
-    limit: Annotated[int, typer.Option(min=0, help="How many changed labels to list.")] = 10,
+    limit: Annotated[int, typer.Option(min=0, help="Number of changed labels to list.")] = 10,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the labels of two rounds: gained, lost, moved, and how their weights changed.
+    """Compare the labels of two rounds: gained, lost and moved ones, and changed weights.
 
-    Labels are matched one to one by BEV IoU within a frame and category. Moved: the boxes overlap
-    by less than 0.7; heavier and lighter: the weight changed by 0.05 or more.
+    Labels are matched one to one by BEV IoU within a frame and category. A label moved if its boxes
+    have an IoU below 0.7, and got heavier or lighter if its weight changed by 0.05 or more.
 
     Example: curate diff 1 2 --policy pspsl
     """

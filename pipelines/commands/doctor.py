@@ -11,14 +11,15 @@ from pipelines.reports.terminal import print_json
 def doctor(
     frame: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Argument(help="Frame id; default: the first unlabeled frame."),
+        typer.Argument(help="Frame id, e.g. 000008; default: the first unlabeled frame."),
     ] = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check one frame through the whole chain: data, calibration, boxes and their convention.
+    """Check one frame from file to box: data, calibration, segmentation, and how boxes are defined.
 
-    The exit code is 1 where something is wrong. Nothing is stored. Take a frame with near objects.
+    Choose a frame with objects near the vehicle. Nothing is stored. The exit code is 1 if a check
+    fails.
 
     Example: curate doctor 000008
     """

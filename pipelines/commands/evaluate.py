@@ -27,7 +27,9 @@ OUTCOMES = {"tp": "found", "fn": "missed", "ignored": "ignored"}
 def evaluate(
     labels: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Folder of KITTI label files, with --results; needs no workspace."),
+        typer.Option(
+            help="Folder of KITTI label files to compare with --results; needs no workspace."
+        ),
     ] = None,
     results: Annotated[
         Optional[Path],  # noqa: UP045
@@ -35,33 +37,37 @@ def evaluate(
     ] = None,
     frames: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="File of the frame ids to compare; default: all of --labels."),
+        typer.Option(
+            help="File that lists the frame ids to compare; default: all files of --labels."
+        ),
     ] = None,
     round_number: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option("--round", min=1, help="The round's stored val predictions."),
+        typer.Option("--round", min=1, help="Evaluate the stored val predictions of this round."),
     ] = None,
     checkpoint: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Run this checkpoint on the val frames; default: the newest."),
+        typer.Option(help="Checkpoint to run on the val frames; default: the newest."),
     ] = None,
     store: Annotated[
-        bool, typer.Option("--store", help="Keep AP and every object's outcome in the database.")
+        bool,
+        typer.Option("--store", help="Store AP and the outcome of every object in the database."),
     ] = False,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Evaluate as the KITTI benchmark does: image, aos, bev and 3d AP, R40 and R11, and recall.
+    """Compute KITTI's average precision (image, aos, bev, 3d; R40 and R11) and recall.
 
-    Every frame needs both files, an empty one where it has nothing; --frames takes a list such as
-    ImageSets/val.txt. Equal scores enter together.
-    Without objects, or without detections, AP is 0.
+    Without options the newest checkpoint is run on the val frames. With --labels and --results,
+    every frame needs a file in both folders, an empty one if it has no objects; --frames takes a
+    list such as ImageSets/val.txt. Detections with equal scores share one threshold. Without
+    objects, or without detections, AP is 0.
 
-    With --store, ask which objects were missed: curate query "SELECT frame, category, x, y,
-    occluded, iou FROM evaluation WHERE outcome = 'fn'" (tp, fp, fn, ignored; 3D overlap, hard,
-    detections of every score).
+    After --store, list the missed objects with: curate query "SELECT frame, category, x, y,
+    occluded, iou FROM evaluation WHERE outcome = 'fn'". Outcomes are tp, fp, fn and ignored, by 3D
+    IoU at the level hard, for detections of every score.
 
     Example: curate evaluate --labels data/label_2 --results out/results --json
     """

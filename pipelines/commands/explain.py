@@ -6,8 +6,8 @@ import typer
 
 from pipelines.commands.options import (
     JsonOption,
+    LastRoundOption,
     PolicyOption,
-    RoundOption,
     WorkspaceOption,
     open_workspace,
 )
@@ -16,13 +16,13 @@ from pipelines.reports.terminal import print_json
 
 def explain(
     frame: Annotated[str, typer.Argument(help="Frame id, e.g. 000008.")],
-    k: Annotated[int, typer.Argument(min=0, help="Number of the label within the frame.")],
+    k: Annotated[int, typer.Argument(min=0, help="Number of the label in the frame, from 0.")],
     policy: PolicyOption = None,
-    round_number: RoundOption = None,
+    round_number: LastRoundOption = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show every number behind a label's weight, the equation it enters, and the weight from them.
+    """Show every number behind a label's weight and the equation that it enters.
 
     Example: curate explain 000008 0
     """

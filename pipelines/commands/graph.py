@@ -4,17 +4,27 @@ from typing import Annotated
 
 import typer
 
+from pipelines.commands.options import JsonOption
+from pipelines.reports.terminal import print_json
+
 
 def graph(
-    mermaid: Annotated[bool, typer.Option(help="Print Mermaid source.")] = False,
+    mermaid: Annotated[
+        bool, typer.Option("--mermaid", help="Print it as a Mermaid flowchart.")
+    ] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Show the stages of a round: what each reads and writes.
+    """Show the stages of a round, and what each reads and writes.
 
     Example: curate graph
     """
     from pipelines.round import round_graph
 
     found = round_graph()
+    if as_json:
+        shown = ("name", "command", "reads", "writes")
+        print_json([{name: getattr(stage, name) for name in shown} for stage in found.stages])
+        return
     typer.echo(found.as_mermaid() if mermaid else found.as_text())
 
 

@@ -5,60 +5,91 @@ from typing import Annotated, Any, Optional
 
 import typer
 
+from curate.segmenters.classes import CLASS_MAPS
+from pipelines.commands.options import JsonOption, complete, one_of, registered
+from pipelines.registry import DATASETS, DETECTORS, SEGMENTERS
+from pipelines.reports.terminal import print_json
+
 
 def init(
-    directory: Annotated[Path, typer.Argument(help="Folder for the workspace.")],
+    directory: Annotated[Path, typer.Argument(help="Folder of the new workspace.")],
     root: Annotated[Path, typer.Option(help="Folder of the data set.")],
     dataset: Annotated[
-        str, typer.Option(help="kitti, kitti-raw, folder, nuscenes or module:Class.")
+        str,
+        typer.Option(
+            help=f"Kind of data set: {registered(DATASETS)}.",
+            autocompletion=complete(DATASETS.classes),
+        ),
     ] = "kitti",
     dataset_option: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option(help="NAME=VALUE of the data set, such as camera=CAM_BACK; repeatable."),
+        typer.Option(
+            help="Option of the data set, as NAME=VALUE, e.g. camera=CAM_BACK; repeatable."
+        ),
     ] = None,
     labeled: Annotated[
-        str, typer.Option(help="Share of the training frames that is labeled, or a file of ids.")
+        str,
+        typer.Option(
+            help="Share of the training frames that is labeled, or a file with their ids."
+        ),
     ] = "0.04",
     val: Annotated[
-        str, typer.Option(help="Likewise for validation; default: the data set's own val list.")
+        str, typer.Option(help="The same for validation; default: the data set's own val list.")
     ] = "",
     split_by: Annotated[
-        str, typer.Option(help="sequence, where the data set knows them; or frame, see check.")
+        str,
+        typer.Option(
+            help="What the split keeps together: sequence (if the data set has them) or frame."
+        ),
     ] = "sequence",
     follow_links: Annotated[
-        bool, typer.Option("--follow-links", help="Links may lead out of the root.")
+        bool,
+        typer.Option("--follow-links", help="Follow symbolic links that lead out of the root."),
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the split and of every later draw.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Random seed of the split and of all later stages.")
+    ] = 0,
     detector: Annotated[
-        str, typer.Option(help="pillars, onnx, recorded or module:Class.")
+        str,
+        typer.Option(
+            help=f"Detector: {registered(DETECTORS)}.",
+            autocompletion=complete(DETECTORS.classes),
+        ),
     ] = "pillars",
     detector_path: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="File or folder of a detector that you bring."),
+        typer.Option(help="Checkpoint, model file or results of an external detector."),
     ] = None,
     segmenter: Annotated[
-        str, typer.Option(help="onnx, saved, instances, simulated, none or module:Class.")
+        str,
+        typer.Option(
+            help=f"Segmenter: {registered(SEGMENTERS, 'simulated', 'none')}.",
+            autocompletion=complete((*SEGMENTERS.classes, "simulated", "none")),
+        ),
     ] = "none",
     segmenter_path: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Model, folder of saved maps, or file of masks."),
+        typer.Option(
+            help="Model file, folder of saved maps, or file of masks, as the segmenter needs it."
+        ),
     ] = None,
     segmenter_classes: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
-            help="Whose class numbers: voc, coco, coco-from-0, cityscapes, cityscapes-label-ids."
+            help=f"Data set that defines the segmenter's class ids: {one_of(CLASS_MAPS)}.",
+            autocompletion=complete(CLASS_MAPS),
         ),
     ] = None,
     settings: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option(
-            "--set", help="Any setting of curate.toml, section.key=value; repeat it for several."
-        ),
+        typer.Option("--set", help="Any setting of curate.toml, as section.key=value; repeatable."),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Make a workspace: curate.toml, curate.db, which frames are labeled, their ground truth.
+    """Create a workspace: its settings, its database, and which frames are labeled.
 
-    Ground truth of unlabeled frames is not read. Without a segmenter only the point prior is asked.
+    Ground truth of unlabeled frames is never read. Without a segmenter only the point prior is
+    used.
 
     Example: curate init work --root data/simulated --labeled 0.06 --segmenter simulated
     """
@@ -93,6 +124,9 @@ def init(
         trainable_detector(config)
     workspace = initialise(directory, config, labeled, val)
     counts = {split: len(workspace.frames(split)) for split in ("labeled", "unlabeled", "val")}
+    if as_json:
+        print_json({"workspace": str(workspace.root), "frames": counts})
+        return
     typer.echo(
         f"{workspace.root}: {counts['labeled']} labeled, {counts['unlabeled']} unlabeled and "
         f"{counts['val']} val frames; settings in curate.toml"

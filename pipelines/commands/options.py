@@ -1,31 +1,78 @@
 """Options that several commands share."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from pipelines.registry import EXECUTORS, POLICIES, Registry
+from pipelines.workspace.splits import SPLITS
+
 if TYPE_CHECKING:
     from pipelines.engine.runner import Report
     from pipelines.workspace.workspace import Workspace
 
+
+def one_of(names: Iterable[str]) -> str:
+    """Return names as a help text lists them: "a, b or c"."""
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def registered(registry: Registry, *others: str) -> str:
+    """Return the names that a configuration may use, and that a class of the user's is one, too."""
+    return one_of((*registry.classes, *others, "module:Class"))
+
+
+def complete(names: Iterable[str]) -> Callable[[str], list[str]]:
+    """Return a function that completes a half-typed name in the shell."""
+    known = list(names)
+    return lambda incomplete: [name for name in known if name.startswith(incomplete)]
+
+
 WorkspaceOption = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads this form on every Python
-    typer.Option("--workspace", "-w", help="Folder; default: the current one or one above it."),
+    typer.Option(
+        "--workspace",
+        "-w",
+        help="Folder of the workspace; default: the current folder or the nearest one above it.",
+    ),
 ]
 RoundOption = Annotated[
     Optional[int],  # noqa: UP045
-    typer.Option("--round", min=1, help="Round; default: the first without a student."),
+    typer.Option(
+        "--round", min=1, help="Number of the round; default: the first without a student."
+    ),
 ]
 PolicyOption = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option("--policy", help="Policy; default: run.method of curate.toml."),
+    typer.Option(
+        "--policy",
+        help="Policy that gives the weights, see `curate solve -h`; default: run.method of "
+        "curate.toml.",
+        autocompletion=complete(POLICIES.classes),
+    ),
+]
+LastRoundOption = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(
+        "--round", min=1, help="Number of the round; default: the last that the policy weighted."
+    ),
+]
+SplitOption = Annotated[
+    str,
+    typer.Option(
+        "--split", help=f"Frames to work on: {one_of(SPLITS)}.", autocompletion=complete(SPLITS)
+    ),
 ]
 ExecutorOption = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
-        "--executor", help="serial, process or ray; default: run.executor of curate.toml."
+        "--executor",
+        help=f"How frames are worked on: {registered(EXECUTORS)}; default: run.executor of "
+        "curate.toml.",
+        autocompletion=complete(EXECUTORS.classes),
     ),
 ]
 WorkersOption = Annotated[
@@ -33,14 +80,26 @@ WorkersOption = Annotated[
     typer.Option(
         "--workers",
         min=1,
-        help="Workers, each with its own model; more than one need process or ray.",
+        help="Number of workers, each with its own copy of the model; more than one need the "
+        "executor process or ray. Default: run.workers of curate.toml.",
     ),
 ]
 ThreadsOption = Annotated[
     Optional[int],  # noqa: UP045
-    typer.Option("--threads", min=1, help="Threads; default: train.threads of curate.toml."),
+    typer.Option(
+        "--threads", min=1, help="Threads of a training; default: train.threads of curate.toml."
+    ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON document instead of text.")
+]
+DryRunOption = Annotated[
+    bool,
+    typer.Option(
+        "--dry-run",
+        help="Print what would be done, why, and how long it takes; do nothing and write nothing.",
+    ),
+]
 
 
 def open_workspace(
@@ -49,7 +108,7 @@ def open_workspace(
     workers: int | None = None,
     threads: int | None = None,
 ) -> "Workspace":
-    """The workspace, with what the command line changes for this run."""
+    """Return the workspace with the settings that the command line changes for this run."""
     from pipelines.workspace.workspace import Workspace
 
     workspace = Workspace.open(folder)
@@ -65,10 +124,10 @@ def open_workspace(
 
 
 def end(reports: Sequence["Report"], *, as_json: bool) -> None:
-    """Ends a command that ran stages.
+    """End a command that ran stages.
 
     Raises:
-        FramesFailed: some frames failed.
+        FramesFailed: if frames failed.
     """
     from curate.errors import FramesFailed
     from pipelines.reports.terminal import print_json
@@ -79,5 +138,5 @@ def end(reports: Sequence["Report"], *, as_json: bool) -> None:
     if failed:
         raise FramesFailed(
             f"{failed} frame results failed and are recorded; see `curate status --failed`, "
-            "mend the files and run the command again"
+            "fix the files and rerun"
         )

@@ -1,13 +1,13 @@
 """curate predict: the teacher's boxes."""
 
-from typing import Annotated
-
 import typer
 
 from pipelines.commands.options import (
+    DryRunOption,
     ExecutorOption,
     JsonOption,
     RoundOption,
+    SplitOption,
     WorkersOption,
     WorkspaceOption,
 )
@@ -15,20 +15,22 @@ from pipelines.commands.stages import run_frame_command
 
 
 def predict(
-    split: Annotated[str, typer.Option(help="unlabeled, val or labeled.")] = "unlabeled",
+    split: SplitOption = "unlabeled",
     round_number: RoundOption = None,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the teacher over frames and keep its boxes, low scores too.
+    """Run the teacher on frames and store its boxes, low scores included.
 
     Example: curate predict --split unlabeled
     """
     run_frame_command(
-        ("predict",), workspace, round_number, split, executor, workers, as_json=as_json
-    )
+        ("predict",), workspace, round_number, split, executor, workers,
+        as_json=as_json, dry_run=dry_run,
+    )  # fmt: skip
 
 
 def register(app: typer.Typer) -> None:

@@ -2,7 +2,9 @@
 
 import typer
 
+from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import (
+    DryRunOption,
     JsonOption,
     ThreadsOption,
     WorkspaceOption,
@@ -15,13 +17,15 @@ from pipelines.reports.terminal import print_report
 def pretrain(
     threads: ThreadsOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train the first teacher on the labeled frames alone.
+    """Train the first teacher, on the labeled frames only.
 
     Example: curate pretrain
     """
     from curate.errors import ConfigError
+    from pipelines.engine.preview import preview_first
     from pipelines.engine.progress import Bar
     from pipelines.engine.runner import run_first
     from pipelines.round import graph_of
@@ -32,6 +36,9 @@ def pretrain(
         raise ConfigError(
             f"detector '{opened.config.detector.name}' needs no pretraining; run `curate predict`"
         )
+    if dry_run:
+        print_preview((preview_first(opened, first) for first in firsts), as_json=as_json)
+        return
     reports = [run_first(opened, first, Bar()) for first in firsts]
     if not as_json:
         print_report(reports[0])

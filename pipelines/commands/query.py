@@ -72,7 +72,7 @@ def _database(file: Path | None, workspace: Path | None) -> "URL":
     from sqlalchemy import URL
 
     from curate.errors import ConfigError
-    from pipelines.workspace.workspace import database_url
+    from pipelines.workspace.location import database_url
 
     if file is None:
         return database_url(workspace)

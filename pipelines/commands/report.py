@@ -1,27 +1,28 @@
 """curate report: a round on one page."""
 
-from typing import Annotated, Optional
-
 import typer
 
-from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption, open_workspace
+from pipelines.commands.options import (
+    JsonOption,
+    LastRoundOption,
+    PolicyOption,
+    WorkspaceOption,
+    open_workspace,
+)
 from pipelines.reports.terminal import print_json
 
 
 def report(
-    round_number: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option("--round", min=1, help="Round; default: the last that the policy weighted."),
-    ] = None,
+    round_number: LastRoundOption = None,
     policy: PolicyOption = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a round's report: one HTML file in reports/ that needs no network.
+    """Write a report of a round: one HTML file in the folder reports that works offline.
 
-    Losses with lambda, priors, weights, labels by category and distance, other policies, what
-    changed since the round before, doubted, kept and changed labels as pictures, and the
-    reliability curve where `curate audit` has left one.
+    It shows losses and lambda, priors, weights, labels by category and distance, other policies,
+    changes since the previous round, images of uncertain, kept and changed labels, and the
+    reliability curve if `curate audit` was run.
 
     Example: curate report --round 2
     """

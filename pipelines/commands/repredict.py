@@ -1,13 +1,13 @@
 """curate repredict: the teacher's answers for augmented copies."""
 
-from typing import Annotated
-
 import typer
 
 from pipelines.commands.options import (
+    DryRunOption,
     ExecutorOption,
     JsonOption,
     RoundOption,
+    SplitOption,
     WorkersOption,
     WorkspaceOption,
 )
@@ -15,20 +15,22 @@ from pipelines.commands.stages import run_frame_command
 
 
 def repredict(
-    split: Annotated[str, typer.Option(help="unlabeled, val or labeled.")] = "unlabeled",
+    split: SplitOption = "unlabeled",
     round_number: RoundOption = None,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the teacher over augmented copies, map its boxes back, measure the consistency loss.
+    """Run the teacher on augmented copies of frames and compute the consistency loss.
 
     Example: curate repredict
     """
     run_frame_command(
-        ("repredict",), workspace, round_number, split, executor, workers, as_json=as_json
-    )
+        ("repredict",), workspace, round_number, split, executor, workers,
+        as_json=as_json, dry_run=dry_run,
+    )  # fmt: skip
 
 
 def register(app: typer.Typer) -> None:

@@ -5,7 +5,16 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption, open_workspace
+from pipelines.commands.options import (
+    JsonOption,
+    LastRoundOption,
+    PolicyOption,
+    WorkspaceOption,
+    complete,
+    one_of,
+    open_workspace,
+)
+from pipelines.registry import EDITORS
 from pipelines.reports.terminal import print_json, print_table
 
 if TYPE_CHECKING:
@@ -13,7 +22,7 @@ if TYPE_CHECKING:
 
 group = typer.Typer(
     name="review",
-    help="Have people correct labels: what they decide wins over any policy.",
+    help="Have people correct labels; their decisions override every policy.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -25,35 +34,38 @@ _COLUMNS = (
 
 @group.command("export")
 def export_review(
-    directory: Annotated[Path, typer.Argument(help="Folder to write; it must not be there yet.")],
-    round_number: Annotated[
-        Optional[int],  # noqa: UP045 - typer reads this form on every Python
-        typer.Option("--round", min=1, help="Round; default: the last that was weighted."),
-    ] = None,
+    directory: Annotated[Path, typer.Argument(help="Folder to create; it must not exist yet.")],
+    round_number: LastRoundOption = None,
     policy: PolicyOption = None,
-    count: Annotated[int, typer.Option(min=1, help="On how many labels to ask.")] = 100,
+    count: Annotated[int, typer.Option(min=1, help="Number of labels to review.")] = 100,
     order: Annotated[
-        str, typer.Option("--by", help="Which first: uncertain, lowest or changed.")
+        str, typer.Option("--by", help="Labels to review first: uncertain, lowest or changed.")
     ] = "uncertain",
     frames: Annotated[
-        str, typer.Option(help="Only these, comma-separated; shown even without labels.")
+        str, typer.Option(help="Only these frames, comma-separated; exported even without labels.")
     ] = "",
-    category: Annotated[str, typer.Option(help="Only these, comma-separated.")] = "",
-    form: Annotated[str, typer.Option("--format", help="kitti, labelcloud or cvat.")] = "kitti",
+    category: Annotated[str, typer.Option(help="Only these categories, comma-separated.")] = "",
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            help=f"Editor: {one_of((*EDITORS.classes, 'module:Class'))}.",
+            autocompletion=complete(EDITORS.classes),
+        ),
+    ] = "kitti",
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Hand the least certain labels to an editor, with pictures of their whole frames.
+    """Export the least certain labels for an editor, with images of their frames.
 
-    Uncertain: weight nearest to 0.5; lowest: lowest weight, of equal ones the highest score;
-    changed: largest change since the round before. The other labels of these frames
-    from a weight of 0.1 on are shown as context, and may be corrected as well; docs/review.md goes
-    through an example.
+    --by chooses which labels come first. uncertain: weight nearest to 0.5. lowest: lowest weight,
+    ties by highest score. changed: largest change since the previous round. The other labels of
+    these frames with a weight of at least 0.1 are exported as context and can be corrected, too.
+    docs/review.md has an example.
 
     Example: curate review export to-review --count 50 --category Pedestrian,Cyclist
     """
     from pipelines.engine.progress import Bar
-    from pipelines.registry import EDITORS
     from pipelines.review.exporting import write_review
     from pipelines.review.selection import ReviewRequest, make_sheet
 
@@ -84,32 +96,37 @@ def export_review(
 
 @group.command("import")
 def import_review(
-    directory: Annotated[Path, typer.Argument(help="The folder as it was exported and edited.")],
+    directory: Annotated[Path, typer.Argument(help="The exported folder, after editing.")],
     answer: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="File or folder that the editor wrote, where it lies elsewhere."),
+        typer.Option(help="File or folder that the editor wrote, if it is elsewhere."),
     ] = None,
     accept: Annotated[
         str,
-        typer.Option(help="Frames whose unchanged boxes are accepted, comma-separated, or all."),
+        typer.Option(
+            help="Frames with unchanged boxes that count as accepted, comma-separated, or all."
+        ),
     ] = "",
     reviewer: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Who decided; default: you."),
+        typer.Option(help="Name of the reviewer; default: your user name."),
     ] = None,
     from_round: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=1, help="First round in which it counts; default: the reviewed one."),
+        typer.Option(
+            min=1, help="First round in which the decisions count; default: the reviewed one."
+        ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would happen.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print what would be imported; store nothing.")
+    ] = False,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Take back what was accepted, rejected, moved and added; it wins over any policy from then on.
+    """Import accepted, rejected, moved and added labels; they override every policy.
 
-    A box that came back unchanged counts as not looked at, unless review.csv or --accept says that
-    it is accepted. The same import again changes nothing, one of corrected files takes the place of
-    the former.
+    An unchanged box counts as not reviewed, unless review.csv or --accept accepts it. Importing the
+    same files again changes nothing; importing corrected files replaces the earlier decisions.
 
     Example: curate review import to-review --dry-run
     """
@@ -132,7 +149,7 @@ def import_review(
 
 @group.command("list")
 def list_reviews(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> None:
-    """List the reviews with what was decided in them.
+    """List the reviews and the decisions made in them.
 
     Example: curate review list
     """
@@ -152,14 +169,16 @@ def list_reviews(workspace: WorkspaceOption = None, as_json: JsonOption = False)
 def clear_reviews(
     reviews: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Argument(help="Reviews, as `curate review list` names them."),
+        typer.Argument(help="Ids of reviews, see `curate review list`."),
     ] = None,
     frames: Annotated[str, typer.Option(help="Only in these frames, comma-separated.")] = "",
-    everything: Annotated[bool, typer.Option("--all", help="Of all reviews.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Delete the decisions of all reviews.")
+    ] = False,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Forget human labels; the weights of the policies, which were kept, count again.
+    """Delete human labels; the stored weights of the policies count again.
 
     Example: curate review clear --frames 000012,000017
     """

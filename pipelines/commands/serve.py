@@ -14,26 +14,29 @@ if TYPE_CHECKING:
 def serve(
     folder: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Argument(metavar="[WORKSPACE]", help="As --workspace.", show_default=False),
+        typer.Argument(metavar="[WORKSPACE]", help="The same as --workspace.", show_default=False),
     ] = None,
     file: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Serve this exported label file only."),
+        typer.Option(help="Serve only this exported label file."),
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes any free one.")] = 8001,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="TCP port; 0 takes any free one.")
+    ] = 8001,
     host: Annotated[
-        str, typer.Option(help="Where to listen; the default is for this machine only.")
+        str,
+        typer.Option(help="Address to listen on; the default is reachable from this machine only."),
     ] = "127.0.0.1",
     time_limit: Annotated[
-        float, typer.Option(min=0.1, max=600, help="Seconds that a question may take.")
+        float, typer.Option(min=0.1, max=600, help="Seconds after which a query is stopped.")
     ] = 10.0,
-    browse: Annotated[bool, typer.Option("--open", help="Show it in a browser.")] = False,
+    browse: Annotated[bool, typer.Option("--open", help="Open it in a browser.")] = False,
     workspace: WorkspaceOption = None,
 ) -> None:
-    """Serve the labels to a browser: tables, SQL, the named queries, a picture per frame.
+    """Serve the labels to a browser: tables, SQL, the named queries, an image per frame.
 
-    The workspace's database and the exported labels.sqlite are opened for reading only; questions
-    have a time limit. Nothing is loaded from the network. Ctrl-C ends it.
+    The workspace's database and the exported labels.sqlite are opened read-only. Nothing is loaded
+    from the network. Ctrl-C stops the server.
 
     Example: curate serve --port 8001 --open
     """

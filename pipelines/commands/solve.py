@@ -1,31 +1,44 @@
 """curate solve: weigh the labels."""
 
+from typing import Annotated, Optional
+
 import typer
 
 from pipelines.commands.options import (
+    DryRunOption,
     JsonOption,
-    PolicyOption,
     RoundOption,
     WorkspaceOption,
+    complete,
     open_workspace,
+    registered,
 )
 from pipelines.commands.stages import run_round_command
+from pipelines.registry import POLICIES
 
 
 def solve(
-    policy: PolicyOption = None,
+    policy: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help=f"Policy: {registered(POLICIES)}; default: run.method of curate.toml.",
+            autocompletion=complete(POLICIES.classes),
+        ),
+    ] = None,
     round_number: RoundOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Weigh every label of a round under a policy; policies stand side by side.
+    """Compute the weight of every label of a round under a policy.
 
-    Policies: pspsl, spsl, uda, uda-cl, sess, 3dioumatch, st3d, hssda, threshold, baseline, or
-    module:Class.
+    The weights of several policies are stored side by side. docs/methods.md describes the policies.
 
     Example: curate solve --policy spsl
     """
-    run_round_command("solve", open_workspace(workspace), round_number, policy, as_json=as_json)
+    run_round_command(
+        "solve", open_workspace(workspace), round_number, policy, as_json=as_json, dry_run=dry_run
+    )
 
 
 def register(app: typer.Typer) -> None:

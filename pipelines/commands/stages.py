@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import end, open_workspace
 from pipelines.reports.terminal import print_report
 
@@ -20,16 +21,18 @@ def run_frame_command(
     workers: int | None,
     *,
     as_json: bool,
+    dry_run: bool = False,
 ) -> None:
-    """Runs frame stages for a split; None stands for the configured priors."""
+    """Run frame stages for a split; None stands for the configured priors."""
     from curate.errors import ConfigError
     from pipelines.assembly import check_executor
     from pipelines.engine.plan import Plan
+    from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
-    from pipelines.engine.rounds import open_round
+    from pipelines.engine.rounds import open_round, preview_round
     from pipelines.engine.runner import open_executor, run_frames
     from pipelines.round import graph_of
-    from pipelines.workspace.workspace import SPLITS
+    from pipelines.workspace.splits import SPLITS
 
     workspace = open_workspace(folder, executor, workers)
     priors = workspace.config.run.priors
@@ -45,6 +48,12 @@ def run_frame_command(
     for stage in wanted:
         if stage.check:
             stage.check(workspace)
+    if dry_run:
+        context = preview_round(workspace, round_number)
+        preview = Preview(workspace, graph, context.number, context)
+        planned = (preview.of_frames(stage, split, alone=True) for stage in wanted)
+        print_preview(planned, as_json=as_json)
+        return
     plan = Plan(workspace, open_round(workspace, round_number), graph)
     reports = []
     with open_executor(workspace) as work:
@@ -62,21 +71,31 @@ def run_round_command(
     policy: str | None,
     *,
     as_json: bool,
+    dry_run: bool = False,
 ) -> None:
-    """Runs a round stage for a policy."""
+    """Run a round stage for a policy."""
     from pipelines.engine.plan import Plan
+    from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
-    from pipelines.engine.rounds import open_round
+    from pipelines.engine.rounds import open_round, preview_round
     from pipelines.engine.runner import run_round
     from pipelines.round import graph_of
 
-    policy = policy or workspace.config.run.method
+    chosen = policy or workspace.config.run.method
     graph = graph_of(workspace)
-    check = graph.of_rounds(name).check
-    if check:
-        check(workspace, policy)
+    stage = graph.of_rounds(name)
+    if stage.check:
+        stage.check(workspace, chosen)
+    if dry_run:
+        context = preview_round(workspace, round_number)
+        plan = Plan(workspace, context, graph)
+        plan.require(stage, chosen)
+        plan.frames_to_weigh(stage, chosen)
+        preview = Preview(workspace, graph, context.number, context)
+        print_preview([preview.of_round(stage, chosen)], as_json=as_json)
+        return
     plan = Plan(workspace, open_round(workspace, round_number), graph)
-    report = run_round(plan, name, policy, Bar())
+    report = run_round(plan, name, chosen, Bar())
     if not as_json:
         print_report(report)
     end([report], as_json=as_json)

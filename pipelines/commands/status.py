@@ -9,11 +9,13 @@ from pipelines.reports.terminal import print_json, print_table
 
 
 def status(
-    failed: Annotated[bool, typer.Option(help="List every failed frame with its error.")] = False,
+    failed: Annotated[
+        bool, typer.Option("--failed", help="List every failed frame with its error.")
+    ] = False,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show per round and stage what is done, empty, failed, waiting or stale.
+    """Show which stages of each round are done, stale or waiting, and how many frames failed.
 
     Example: curate status --failed
     """

@@ -7,14 +7,18 @@ from typing import Annotated, Optional
 import typer
 
 from pipelines.commands.options import (
+    DryRunOption,
     JsonOption,
     PolicyOption,
     RoundOption,
     ThreadsOption,
     WorkspaceOption,
+    complete,
     open_workspace,
+    registered,
 )
 from pipelines.commands.stages import run_round_command
+from pipelines.registry import EXPORTERS
 
 
 def train_round(
@@ -22,38 +26,49 @@ def train_round(
     round_number: RoundOption = None,
     command: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Your own trainer; default: train.command of curate.toml."),
+        typer.Option(
+            help="Command line of your own trainer; default: train.command of curate.toml."
+        ),
     ] = None,
     labels_format: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Of its labels: sqlite, openpcdet, ...; default: train.labels_format."),
+        typer.Option(
+            help=f"Format of the labels that your trainer reads: {registered(EXPORTERS)}; default: "
+            "train.labels_format of curate.toml.",
+            autocompletion=complete(EXPORTERS.classes),
+        ),
     ] = None,
     threads: ThreadsOption = None,
     workspace: WorkspaceOption = None,
+    dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train the student of a round on X_l and the weighted labels; it teaches the next round.
+    """Train the student of a round, which is the teacher of the next round.
 
-    A killed training continues from its last snapshot. With --command any trainer does it: in the
-    command {labels}, {output}, {teacher}, {round} and {policy} are replaced, and CURATE_LABELS,
-    CURATE_OUTPUT and so on are in its environment; no shell runs it. It writes {output}, a
-    file or a folder. docs/training.md shows how v is made to count. Once it has trained the student
-    that teaches the next round, it is written into curate.toml, so that later rounds are trained
-    with it too.
+    After an interruption the same command resumes from the last snapshot.
+
+    --command runs your own trainer instead. {labels}, {output}, {teacher}, {round} and {policy} in
+    it are replaced, and are in its environment as CURATE_LABELS, CURATE_OUTPUT and so on. No shell
+    is involved. The trainer writes the file or folder {output}. After a student of the configured
+    policy, the command is stored in curate.toml and trains later rounds, too. docs/training.md
+    shows how a trainer uses the weights.
 
     Example: curate train-round --command "python train.py {labels} {output}"
     """
     given = {"command": command, "labels_format": labels_format}
     told = {name: value for name, value in given.items() if value is not None}
     opened = open_workspace(workspace, threads=threads).with_settings("train", **told)
-    run_round_command("train-round", opened, round_number, policy, as_json=as_json)
+    run_round_command("train-round", opened, round_number, policy, as_json=as_json, dry_run=dry_run)
+    if dry_run:
+        return
     _remember(workspace, policy, told)
 
 
 def _remember(folder: Path | None, policy: str | None, told: Mapping[str, str]) -> None:
     """Writes how the next teacher was trained into curate.toml, where later rounds look."""
     from pipelines.workspace.config_file import change_settings
-    from pipelines.workspace.workspace import CONFIG_NAME, Workspace
+    from pipelines.workspace.location import CONFIG_NAME
+    from pipelines.workspace.workspace import Workspace
 
     if not told:
         return

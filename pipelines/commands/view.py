@@ -15,31 +15,38 @@ def view(
         typer.Argument(metavar="FRAME...", help="Frame ids, e.g. 000008.", show_default=False),
     ] = None,
     every: Annotated[
-        bool, typer.Option("--all", help="The unlabeled frames that have labels, by name.")
+        bool,
+        typer.Option(
+            "--all", help="Draw the unlabeled frames that have labels, in the order of their ids."
+        ),
     ] = False,
-    limit: Annotated[int, typer.Option(min=1, help="With --all: no more frames than this.")] = 50,
+    limit: Annotated[int, typer.Option(min=1, help="With --all: at most this many frames.")] = 50,
     round_number: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option("--round", min=1, help="Round; default: the last with predictions."),
+        typer.Option(
+            "--round", min=1, help="Number of the round; default: the last with predictions."
+        ),
     ] = None,
     policy: PolicyOption = None,
     output: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="PNG file of one frame; default: in the workspace's folder pictures."),
+        typer.Option(
+            help="PNG file for one frame; default: in the folder pictures of the workspace."
+        ),
     ] = None,
     recording: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option("--rerun", help="Write an .rrd recording of all frames, not pictures."),
+        typer.Option("--rerun", help="Write one .rrd recording of all frames instead of images."),
     ] = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw frames: image and bird's eye view with all boxes, coloured by weight.
+    """Draw frames: camera image and bird's eye view with all boxes, coloured by weight.
 
-    Predictions are solid, repredictions dashed, ground truth dotted; ground truth of labeled and
-    val frames only. Each label tells its weight, score and LiDAR points where there is room. A
-    recording holds points, image, boxes and the evidence of each label, with a time line over the
-    frames; look at it with `rerun FILE` (pip install 'curate-pseudo-labels[rerun]').
+    Predictions are solid, repredictions dashed, ground truth dotted. Ground truth is drawn for
+    labeled and val frames only. Labels show their weight, score and LiDAR points where there is
+    room. A recording holds points, image, boxes and the evidence of each label, frame by frame;
+    open it with `rerun FILE` (pip install 'curate-pseudo-labels[rerun]').
 
     Example: curate view 000008 --round 1 --policy pspsl --output 000008.png
     """

@@ -51,16 +51,58 @@ class Bar:
             yield advance
 
 
+class Pace:
+    """How fast work is done, and when it will be finished.
+
+    The first step is not counted: it loads models and compiles kernels, or counts what an earlier
+    run had done, so it says nothing about those that follow. Until the second step ends, rate and
+    time left are unknown.
+    """
+
+    def __init__(self, total: int) -> None:
+        self.done = 0
+        self._total = total
+        self._warm_up = 0
+        self._start = 0.0
+
+    def advance(self, step: int) -> None:
+        """Count finished work."""
+        if step > 0 and self._warm_up == 0:
+            self._warm_up, self._start = step, time.monotonic()
+        self.done += step
+
+    @property
+    def rate(self) -> float | None:
+        """How much is done in a second; None as long as nothing can be said."""
+        measured, seconds = self.done - self._warm_up, time.monotonic() - self._start
+        return measured / seconds if measured > 0 and seconds > 0 else None
+
+    @property
+    def seconds_left(self) -> float | None:
+        """How long the rest takes; None as long as nothing can be said."""
+        rate = self.rate
+        return None if rate is None else (self._total - self.done) / rate
+
+    def __str__(self) -> str:
+        rate, left = self.rate, self.seconds_left
+        return "" if rate is None or left is None else f"{rate:.3g}/s, {duration(left)} left"
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in words: "0.2 s", "42 s", "3 min 20 s", "2 h 5 min"."""
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if not minutes:
+        return f"{rest} s"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
+
+
 @contextmanager
 def _bar(what: str, total: int) -> Iterator[Advance]:
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as RichProgress
 
     with RichProgress(
@@ -68,41 +110,32 @@ def _bar(what: str, total: int) -> Iterator[Advance]:
         BarColumn(bar_width=32),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
         console=Console(stderr=True),
         transient=True,
     ) as bar:
-        task = bar.add_task(what, total=total, note="")
-        start, done = time.monotonic(), 0
+        task, pace = bar.add_task(what, total=total, note=""), Pace(total)
 
         def advance(step: int, note: str) -> None:
-            nonlocal done
-            done += step
-            bar.update(task, advance=step, note=f"{_rate(done, start)} {note}")
+            pace.advance(step)
+            bar.update(task, advance=step, note=" ".join(filter(None, (str(pace), note))))
 
         yield advance
-
-
-def _rate(done: int, start: float) -> str:
-    """How many are done in a second."""
-    return f"{done / max(time.monotonic() - start, 1e-9):.3g}/s"
 
 
 @contextmanager
 def _lines(what: str, total: int) -> Iterator[Advance]:
     start = last = time.monotonic()
-    done = 0
+    pace = Pace(total)
 
     def advance(step: int, note: str) -> None:
-        nonlocal last, done
-        done += step
+        nonlocal last
+        pace.advance(step)
         now = time.monotonic()
         if now - start > QUIET_S and now - last > LINE_EVERY_S:
             last = now
-            left = (now - start) * (total - done) / max(done, 1)
-            rate = _rate(done, start)
-            sys.stderr.write(f"  {what} {done}/{total}, {rate}, {left:.0f} s left {note}\n")
+            words = ", ".join(filter(None, (f"{what} {pace.done}/{total}", str(pace), note)))
+            sys.stderr.write(f"  {words}\n")
             sys.stderr.flush()
 
     yield advance

@@ -53,13 +53,8 @@ def open_round(
             f"{workspace.root}: holds no frames, its init was interrupted; "
             "run `curate init` again with the same arguments"
         )
-    students = _students(workspace)
-    wanted = rounds or workspace.config.run.rounds
-    if number is None:
-        number = next(e for e in range(1, wanted + 1) if e not in students or e == wanted)
+    number, rounds = choose_round(workspace, number, rounds)
     teacher_id, teacher = find_teacher(workspace, number, to_work=True)
-    stored = _stored_rounds(workspace, number)
-    rounds = stored if stored and number in students else max(wanted, number)
     row = {
         "number": number,
         "rounds": rounds,
@@ -70,6 +65,37 @@ def open_round(
     }
     _record_round(workspace, row)
     return RoundContext(number, rounds, workspace.config.run.seed, teacher)
+
+
+def choose_round(workspace: Workspace, number: int | None, rounds: int | None) -> tuple[int, int]:
+    """Return the number e of the round to work on and the count E of rounds, see `open_round`."""
+    students = _students(workspace)
+    wanted = rounds or workspace.config.run.rounds
+    if number is None:
+        number = next(e for e in range(1, wanted + 1) if e not in students or e == wanted)
+    stored = _stored_rounds(workspace, number)
+    return number, stored if stored and number in students else max(wanted, number)
+
+
+def preview_round(
+    workspace: Workspace, number: int | None = None, rounds: int | None = None
+) -> RoundContext:
+    """Return a round as `open_round` would make it, without writing anything.
+
+    Raises:
+        WorkspaceError: if the detector of the round does not exist yet.
+    """
+    number, rounds = choose_round(workspace, number, rounds)
+    _, teacher = find_teacher(workspace, number)
+    return RoundContext(number, rounds, workspace.config.run.seed, teacher)
+
+
+def recorded_config(workspace: Workspace, number: int) -> dict[str, Any] | None:
+    """Return the configuration that a round was last worked on with; None for a new round."""
+    table = bulk.table("round")
+    with workspace.database.reading() as connection:
+        rows = bulk.select(connection, select(table.c.config).where(table.c.number == number))
+    return json.loads(rows[0][0]) if rows else None
 
 
 def _recorded_config(workspace: Workspace) -> str:
@@ -109,7 +135,7 @@ def peek_round(workspace: Workspace, number: int) -> RoundContext | None:
 
 def find_teacher(
     workspace: Workspace, number: int, *, to_work: bool = False
-) -> tuple[int, Teacher]:
+) -> tuple[int | None, Teacher]:
     """The key and the file of the detector that answers in a round.
 
     A detector or checkpoint that the user brings answers in the first round, and in later ones as
@@ -119,6 +145,7 @@ def find_teacher(
         workspace: see `Workspace`.
         number: e.
         to_work: whether it is about to answer, so that its file must be the one that was stored.
+            Otherwise nothing is written, and an external detector that was never used has no key.
 
     Raises:
         WorkspaceError: it does not exist yet, or is another.
@@ -128,7 +155,7 @@ def find_teacher(
     trainable = trainable_detector(workspace.config)
     brought = not is_pretrained(workspace)
     if brought and number == 1:
-        key, teacher = _external_detector(workspace)
+        key, teacher = _external_detector(workspace, record=to_work)
         if to_work and trainable:
             trainable.detector.check_checkpoint(teacher.path)
         return key, teacher
@@ -140,7 +167,7 @@ def find_teacher(
     found = workspace.database.rows(query)
     before = "curate pretrain" if number == 1 else f"curate train-round --round {number - 1}"
     if not found and brought and not is_student_trained(workspace):
-        return _external_detector(workspace)
+        return _external_detector(workspace, record=to_work)
     if not found:
         raise WorkspaceError(f"round {number} has no teacher yet; run `{before}`")
     key, path, digest, detector = found[0]
@@ -190,7 +217,7 @@ def register_checkpoint(
         connection.execute(table.insert().values(round=round_number, policy=policy, **row))
 
 
-def _external_detector(workspace: Workspace) -> tuple[int, Teacher]:
+def _external_detector(workspace: Workspace, *, record: bool) -> tuple[int | None, Teacher]:
     """The detector that the user brought, which answers in every round."""
     path = workspace.config.detector.path
     if path is None:
@@ -204,6 +231,8 @@ def _external_detector(workspace: Workspace) -> tuple[int, Teacher]:
     query = select(table.c.id, table.c.sha256).where(table.c.round == 0, table.c.policy == "")
     found = workspace.database.rows(query)
     if not found or found[0][1] != digest:
+        if not record:
+            return None, Teacher(path, digest)
         with workspace.database.writing() as connection:
             register_checkpoint(connection, workspace, 0, "", path)
             found = bulk.select(connection, query)

@@ -29,7 +29,8 @@ from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.labels.human_labels import SEEN_COLUMNS, read_human_labels, refresh_all_matches
 from pipelines.registry import EDITORS
-from pipelines.workspace.workspace import SPLITS, Workspace
+from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.workspace import Workspace
 
 ALL_FRAMES = "all"
 # How many faults an error names.

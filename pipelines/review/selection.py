@@ -14,7 +14,8 @@ from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
 from pipelines.labels.by_frame import weighted_round
 from pipelines.labels.columns import as_rounds, read_columns
-from pipelines.workspace.workspace import SPLITS, Workspace
+from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.workspace import Workspace
 
 ORDERS = ("uncertain", "lowest", "changed")
 EVEN_ODDS = 0.5

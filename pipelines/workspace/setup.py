@@ -29,7 +29,8 @@ from pipelines.assembly import (
 )
 from pipelines.workspace.config import Config
 from pipelines.workspace.split_record import split_rows
-from pipelines.workspace.workspace import SPLITS, Workspace, open_dataset
+from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.workspace import Workspace, open_dataset
 
 _log = logging.getLogger(__name__)
 

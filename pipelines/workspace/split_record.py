@@ -10,7 +10,8 @@ from sqlalchemy import select
 from curate.errors import ConfigError
 from curate.firewall.split_lists import SplitList, changes
 from db import bulk
-from pipelines.workspace.workspace import SPLITS, Workspace
+from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.workspace import Workspace
 
 # Of a data set's own lists, those that decide who may learn from what.
 _OWN_LISTS = ("train", "val")

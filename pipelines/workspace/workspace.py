@@ -8,20 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sqlalchemy import URL, select
+from sqlalchemy import select
 
 from curate.datasets.base import Dataset
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError, WorkspaceError
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
-from db.session import Database, parse_url
+from db.session import Database
 from pipelines import registry
 from pipelines.workspace.config import Config, make_config, read_config
 from pipelines.workspace.config_file import write_config, write_schema
-
-CONFIG_NAME = "curate.toml"
-SPLITS = ("labeled", "unlabeled", "val")
+from pipelines.workspace.location import CONFIG_NAME, find_workspace, url_of
 
 
 @dataclass(frozen=True)
@@ -46,9 +44,9 @@ class Workspace:
             WorkspaceError: there is none.
             ConfigError: its configuration is wrong.
         """
-        root = _root(folder)
+        root = find_workspace(folder)
         config = _anchored(root, read_config(root / CONFIG_NAME))
-        return cls(root, config, Database(_url(root, config), root))
+        return cls(root, config, Database(url_of(root, config), root))
 
     @classmethod
     def create(cls, root: Path, config: Config) -> "Workspace":
@@ -67,7 +65,7 @@ class Workspace:
             write_schema(root)
         else:
             write_config(path, config)
-        return cls(root, config, Database(_url(root, config), root))
+        return cls(root, config, Database(url_of(root, config), root))
 
     def with_settings(self, section: str, **changes: Any) -> "Workspace":
         """The same workspace with other settings in a section, for this command only.
@@ -180,27 +178,6 @@ def _anchored(root: Path, config: Config) -> Config:
     return config.model_copy(update=changes)
 
 
-def _root(chosen: Path | None) -> Path:
-    """The folder of the workspace in `chosen`, else in the current folder or one above it."""
-    start = chosen.resolve() if chosen else Path.cwd()
-    for folder in (start,) if chosen else (start, *start.parents):
-        if (folder / CONFIG_NAME).is_file():
-            return folder
-    if chosen:
-        raise WorkspaceError(f"{start}: no workspace here; make one with `curate init {start}`")
-    raise WorkspaceError(
-        f"no {CONFIG_NAME} in {start} or above it; make a workspace with `curate init DIR`, "
-        "or name one with --workspace DIR"
-    )
-
-
-def _url(root: Path, config: Config) -> URL:
-    if config.run.database is not None:
-        return parse_url(config.run.database)
-    # Made from its parts: in a string, a ? or % of the folder's name would mean something else.
-    return URL.create("sqlite", database=str(root / "curate.db"))
-
-
 def _annotations(rows: Sequence[Sequence[Any]]) -> Annotations:
     if not rows:
         return Annotations.empty()
@@ -214,9 +191,3 @@ def _annotations(rows: Sequence[Sequence[Any]]) -> Annotations:
         alpha=table[:, 9],
         boxes_2d=table[:, 10:],
     )
-
-
-def database_url(folder: Path | None) -> URL:
-    """The URL of a workspace's database, without opening or migrating it."""
-    root = _root(folder)
-    return _url(root, read_config(root / CONFIG_NAME))

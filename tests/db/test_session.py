@@ -18,8 +18,9 @@ from support.stored_tuples import COLUMNS, store
 from curate.errors import DatabaseError, LeakageError
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db import bulk
+from db.addresses import parse_url
 from db.models import Base
-from db.session import Database, parse_url
+from db.session import Database
 from db.views import drop_views
 
 ENGINES = ("sqlite", "postgresql")

@@ -3,7 +3,6 @@
 import struct
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from curate.errors import DataError
@@ -27,6 +26,8 @@ def read_image(path: Path) -> np.ndarray:
     Raises:
         DataError: the file is missing, truncated or no image.
     """
+    import cv2
+
     return cv2.cvtColor(decode_image(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
@@ -61,6 +62,8 @@ def decode_image(path: Path, mode: int) -> np.ndarray:
     Raises:
         DataError: the file is missing, truncated, no PNG or JPEG, or larger than `MOST_PIXELS`.
     """
+    import cv2
+
     content = _read_bytes(path)
     _claimed_size(content, path)
     if content.startswith(PNG_SIGNATURE) and not _has_end(content):

@@ -1,5 +1,7 @@
 """What a long sweep shows of itself where no terminal is, and how totals become steps."""
 
+from collections.abc import Callable
+
 import pytest
 
 from pipelines.engine import progress
@@ -16,15 +18,65 @@ def test_totals_become_steps() -> None:
     assert moves == [(3, ""), (0, "waits"), (7, "done")]
 
 
-def test_a_line_shows_throughput_time_left_and_failures(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """40 of 100 after 20 s: 2 a second, 30 s left."""
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """A function that sets the time."""
     now = 0.0
+
+    def at(seconds: float) -> None:
+        nonlocal now
+        now = seconds
+
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    return at
+
+
+def test_a_line_shows_throughput_time_left_and_failures(
+    capsys: pytest.CaptureFixture, clock: Callable[[float], None]
+) -> None:
+    """One frame after 0 s, 41 after 20 s: 2 a second, 29.5 s left for the other 59."""
     with progress.Bar().track("predict", 100) as advance:
         advance(1, "")
-        now = 20.0
-        advance(39, "3 failed")
+        clock(20.0)
+        advance(40, "3 failed")
         advance(1, "3 failed")
-    assert capsys.readouterr().err == "  predict 40/100, 2/s, 30 s left 3 failed\n"
+    assert capsys.readouterr().err == "  predict 41/100, 2/s, 30 s left, 3 failed\n"
+
+
+def test_the_warm_up_of_the_first_frame_does_not_count(clock: Callable[[float], None]) -> None:
+    """A first frame of 30 s and then 2 a second: the time left is right from the second frame."""
+    pace = progress.Pace(101)
+    assert pace.rate is None
+    clock(30.0)
+    pace.advance(1)
+    assert pace.seconds_left is None
+    for done in range(2, 101):
+        clock(30.0 + (done - 1) / 2)
+        pace.advance(1)
+        assert pace.rate == pytest.approx(2.0)
+        assert pace.seconds_left == pytest.approx((101 - done) / 2)
+
+
+def test_what_an_earlier_run_had_done_does_not_count(clock: Callable[[float], None]) -> None:
+    """A training that resumes at step 500 of 1000 and then takes 10 s for 100 steps."""
+    pace = progress.Pace(1000)
+    pace.advance(500)
+    clock(10.0)
+    pace.advance(100)
+    assert pace.seconds_left == pytest.approx(40.0)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (0.0, "0.0 s"),
+        (0.23, "0.2 s"),
+        (42.4, "42 s"),
+        (59.7, "1 min 0 s"),
+        (200.0, "3 min 20 s"),
+        (7500, "2 h 5 min"),
+    ],
+)
+def test_a_duration_in_words(seconds: float, words: str) -> None:
+    """Rounded to what matters."""
+    assert progress.duration(seconds) == words

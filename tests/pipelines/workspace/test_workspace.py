@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from curate.errors import ConfigError, WorkspaceError
-from db.session import parse_url
+from db.addresses import parse_url
 from pipelines.engine.rounds import (
     find_teacher,
     newest_checkpoint,

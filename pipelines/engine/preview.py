@@ -1,0 +1,342 @@
+"""What a run would do, why, and how long it takes, without doing or writing anything.
+
+A frame is to be worked on where its task is missing, has failed, or carries another fingerprint
+than the current one. A changed setting changes the fingerprints of all stages that follow, so
+these tasks alone say what is to be done. Why a fingerprint differs follows from the configuration
+that the round was last worked on with: either a setting of the stage itself has another value
+there, or its input changes.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from statistics import median
+from typing import Any
+
+from sqlalchemy import func, select
+
+from curate.datasets.base import sequences_of
+from curate.errors import CurateError
+from curate.firewall.sequences import group_by_sequence
+from db import bulk
+from pipelines.engine.graph import Graph
+from pipelines.engine.plan import FINISHED, Plan, TaskKey, digest, is_current
+from pipelines.engine.rounds import is_student_trained, preview_round, recorded_config
+from pipelines.engine.stage import (
+    FirstStage,
+    FramesStage,
+    FrameStage,
+    RoundContext,
+    RoundStage,
+    SequenceStage,
+    Stage,
+)
+from pipelines.workspace.config import make_config
+from pipelines.workspace.workspace import Workspace
+
+SHOWN_FRAMES = 5
+MEASURED_TASKS = 1000
+"""The rate of a stage follows from this many of its latest tasks."""
+NEVER = "never ran"
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """What a stage would do.
+
+    Attributes:
+        round: e; 0 for what comes before the first.
+        stage: its name.
+        frames: how many frames it would work on; None for a stage that is not done per frame.
+        first_frames: the first of them, by name.
+        reasons: why it would run; none where it is up to date.
+        seconds: how long it would take by what it took before; None if it never ran.
+    """
+
+    round: int
+    stage: str
+    frames: int | None
+    first_frames: tuple[str, ...]
+    reasons: tuple[str, ...]
+    seconds: float | None
+
+
+@dataclass(frozen=True)
+class _Reason:
+    """Why a stage would work on a frame, and whether its stored measurements still hold."""
+
+    words: str
+    measured: bool = False
+
+
+def preview_all(workspace: Workspace, graph: Graph, rounds: int | None) -> Iterator[PlannedStage]:
+    """Yield what `run_all` would do with the same arguments, stage by stage."""
+    trained = is_student_trained(workspace)
+    changing = []
+    for first in graph.first_stages:
+        planned = preview_first(workspace, first)
+        if planned.reasons:
+            changing.append(first.name)
+        yield planned
+    for number in range(1, ((rounds or workspace.config.run.rounds) if trained else 1) + 1):
+        context = None if changing else preview_round(workspace, number, rounds)
+        preview = Preview(workspace, graph, number, context)
+        for stage in graph.stages:
+            if isinstance(stage, FramesStage):
+                yield preview.of_frames(stage)
+            elif isinstance(stage, RoundStage) and (trained or "student" not in stage.writes):
+                planned = preview.of_round(stage, workspace.config.run.method)
+                if planned.reasons and "student" in stage.writes:
+                    changing.append(stage.name)
+                yield planned
+
+
+def preview_first(workspace: Workspace, stage: FirstStage) -> PlannedStage:
+    """Return what a stage would do that is done once, before the first round."""
+    key, file = TaskKey(0, stage.name, ""), stage.file(workspace)
+    reasons: tuple[str, ...] = ()
+    if not _has_task(workspace, key):
+        reasons = (NEVER,)
+    elif not is_current(workspace, key, digest(stage.settings(workspace))):
+        reasons = ("its settings or its input changed",)
+    elif not file.exists():
+        reasons = (f"{workspace.relative(file)} is missing",)
+    return PlannedStage(0, stage.name, None, (), reasons, _seconds(workspace, stage, 1, reasons))
+
+
+class Preview:
+    """What the stages of a round would do; in their order, as each sees what came before.
+
+    Args:
+        workspace: see `Workspace`.
+        graph: the stages.
+        number: e.
+        context: the round; None as long as its teacher is still to be trained.
+    """
+
+    def __init__(
+        self, workspace: Workspace, graph: Graph, number: int, context: RoundContext | None
+    ) -> None:
+        self._workspace = workspace
+        self._graph = graph
+        self._number = number
+        self._plan = None if context is None else Plan(workspace, context, graph)
+        self._changing: list[Stage] = []
+
+    def of_frames(
+        self, stage: FramesStage, split: str = "unlabeled", *, alone: bool = False
+    ) -> PlannedStage:
+        """Return what a stage would do with the frames of a split.
+
+        Args:
+            stage: of frames.
+            split: of the frames.
+            alone: whether no earlier stage runs before, so that frames may wait for one.
+        """
+        names = self._workspace.frames(split)
+        if self._plan is None:
+            found = dict.fromkeys(names, _Reason("its teacher is still to be trained"))
+        else:
+            found = self._to_do(self._plan, stage, names)
+        if found and isinstance(stage, SequenceStage):
+            found = self._whole_sequences(names, found)
+        if alone:
+            waiting = self._waiting_for_others(stage, names)
+            found = {name: why for name, why in found.items() if name not in waiting}
+        if found:
+            self._changing.append(stage)
+        counts = Counter(why.words for why in found.values())
+        words = tuple(
+            reason if len(counts) == 1 else f"{count} frames: {reason}"
+            for reason, count in counts.items()
+        )
+        costly = sum(not why.measured for why in found.values())
+        return PlannedStage(
+            self._number,
+            stage.name,
+            len(found),
+            tuple(sorted(found)[:SHOWN_FRAMES]),
+            words,
+            _seconds(self._workspace, stage, costly, words),
+        )
+
+    def of_round(self, stage: RoundStage, policy: str) -> PlannedStage:
+        """Return what a stage would do that looks at all labels of a round."""
+        inputs = self._changing_inputs(stage)
+        reasons: tuple[str, ...] = ()
+        if self._plan is None:
+            reasons = ("its teacher is still to be trained",)
+        elif (state := self._plan.round_state(stage, policy)) == "waiting":
+            reasons = (NEVER,)
+        elif state == "stale":
+            file = stage.file and stage.file(self._workspace, self._plan.context, policy)
+            if file is not None and not file.exists():
+                reasons = (f"{self._workspace.relative(file)} is missing",)
+            else:
+                reasons = (self._why(stage, policy),)
+        elif inputs:
+            reasons = (f"its input changes: {', '.join(inputs)}",)
+        if reasons:
+            self._changing.append(stage)
+        seconds = _seconds(self._workspace, stage, 1, reasons)
+        return PlannedStage(self._number, stage.name, None, (), reasons, seconds)
+
+    def _to_do(
+        self, plan: Plan, stage: FramesStage, names: Mapping[str, int]
+    ) -> dict[str, _Reason]:
+        """The frames that a stage would work on."""
+        current, tasks = plan.fingerprint(stage), self._tasks(stage)
+        recalls = isinstance(stage, FrameStage) and stage.recall is not None
+        measured = current.partition(".")[0]
+        stale = self._why(stage, "") if any(tasks[key][1] != current for key in tasks) else ""
+        found = {}
+        for name, key in names.items():
+            state, fingerprint = tasks.get(key, (None, ""))
+            if state is None:
+                found[name] = _Reason(NEVER)
+            elif fingerprint != current:
+                same = fingerprint.partition(".")[0] == measured
+                found[name] = _Reason(stale, measured=recalls and state == "done" and same)
+            elif state not in FINISHED:
+                found[name] = _Reason("failed before")
+        return found
+
+    def _tasks(self, stage: FramesStage) -> Mapping[int, tuple[str, str]]:
+        """State and fingerprint of the task of each frame that has one."""
+        task = bulk.table("task")
+        query = select(task.c.frame_id, task.c.state, task.c.fingerprint).where(
+            task.c.round == self._number,
+            task.c.stage == stage.name,
+            task.c.frame_id.is_not(None),
+        )
+        with self._workspace.database.reading() as connection:
+            return {
+                key: (state, fingerprint)
+                for key, state, fingerprint in bulk.select(connection, query)
+            }
+
+    def _whole_sequences(
+        self, names: Mapping[str, int], found: Mapping[str, _Reason]
+    ) -> dict[str, _Reason]:
+        """All frames of the sequences in which a frame is to be worked on."""
+        sequences = sequences_of(self._workspace.dataset, list(names))
+        other = _Reason("another frame of its sequence changes")
+        return {
+            name: found.get(name, other)
+            for members in group_by_sequence(sequences, list(names)).values()
+            if any(name in found for name in members)
+            for name in members
+        }
+
+    def _waiting_for_others(self, stage: FramesStage, names: Mapping[str, int]) -> set[str]:
+        """The frames that an earlier stage has not finished."""
+        waiting: set[str] = set()
+        for other in self._graph.before(stage):
+            current = self._plan.fingerprint(other) if self._plan else ""
+            done = {(state, current) for state in FINISHED}
+            finished = {key for key, task in self._tasks(other).items() if task in done}
+            waiting |= {name for name, key in names.items() if key not in finished}
+        return waiting
+
+    def _changing_inputs(self, stage: Stage) -> list[str]:
+        """The stages that would change what a stage reads."""
+        reads = set(stage.reads)
+        return [other.name for other in self._changing if reads & set(other.writes)]
+
+    def _why(self, stage: FramesStage | RoundStage, policy: str) -> str:
+        """Why the fingerprint of a stage differs from that of its last run."""
+        changed = self._changed_settings(stage, policy)
+        if changed:
+            return f"changed settings: {', '.join(changed)}"
+        if self._plan and "teacher" in stage.reads:
+            teacher = self._plan.context.teacher.sha256
+            if self._recorded_teacher not in (teacher, None):
+                return "its teacher changed"
+        if inputs := self._changing_inputs(stage):
+            return f"its input changes: {', '.join(inputs)}"
+        return "its settings or its input changed"
+
+    def _changed_settings(self, stage: FramesStage | RoundStage, policy: str) -> list[str]:
+        """The settings of a stage that differ from those of the round's last run."""
+        if self._recorded is None or self._plan is None:
+            return []
+        try:
+            former = _settings(stage, self._recorded, self._plan.context, policy)
+        except CurateError:  # what they name may be gone
+            return []
+        now = _settings(stage, self._workspace, self._plan.context, policy)
+        return sorted(key for key in {*now, *former} if now.get(key) != former.get(key))
+
+    @cached_property
+    def _recorded(self) -> Workspace | None:
+        """The workspace with the settings that the round was last worked on with."""
+        document = recorded_config(self._workspace, self._number)
+        try:
+            config = make_config(document, "the round's configuration") if document else None
+        except CurateError:  # an older curate may have known other settings
+            return None
+        return None if config is None else replace(self._workspace, config=config)
+
+    @cached_property
+    def _recorded_teacher(self) -> str | None:
+        """The hash of the teacher that the round was last worked on with."""
+        table, checkpoint = bulk.table("round"), bulk.table("checkpoint")
+        query = (
+            select(checkpoint.c.sha256)
+            .join(table, table.c.teacher_id == checkpoint.c.id)
+            .where(table.c.number == self._number)
+        )
+        with self._workspace.database.reading() as connection:
+            found = bulk.select(connection, query)
+        return found[0][0] if found else None
+
+
+def _settings(
+    stage: FramesStage | RoundStage, workspace: Workspace, context: RoundContext, policy: str
+) -> dict[str, Any]:
+    """The settings of a stage, as text by dotted name."""
+    if isinstance(stage, RoundStage):
+        return _flat(stage.settings(workspace, context, policy))
+    return _flat(stage.settings(workspace, context))
+
+
+def _flat(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        inner = isinstance(value, Mapping) and value
+        found |= _flat(value, f"{before}{name}.") if inner else {f"{before}{name}": repr(value)}
+    return found
+
+
+def _has_task(workspace: Workspace, key: TaskKey) -> bool:
+    query = select(func.count()).select_from(bulk.table("task")).where(*key.conditions())
+    with workspace.database.reading() as connection:
+        return bool(connection.execute(query).scalar_one())
+
+
+def _seconds(
+    workspace: Workspace, stage: Stage, count: int, reasons: tuple[str, ...]
+) -> float | None:
+    """How long a stage takes for so many frames, or once; None where it never ran."""
+    if not reasons:
+        return 0.0
+    task = bulk.table("task")
+    query = (
+        select(task.c.variant, task.c.seconds)
+        .where(task.c.stage == stage.name, task.c.state == "done")
+        .order_by(task.c.id.desc())
+        .limit(MEASURED_TASKS)
+    )
+    with workspace.database.reading() as connection:
+        rows = bulk.select(connection, query)
+    if not rows:
+        return None
+    if isinstance(stage, FirstStage | RoundStage):
+        return float(rows[0][1])
+    workers = workspace.config.run.workers
+    if isinstance(stage, SequenceStage):  # each of its frames carries the seconds of all
+        whole: dict[str, float] = dict(rows)
+        return count * sum(whole.values()) / len(rows) / workers
+    # The median, as the first frame of a run is slower than the others.
+    return count * float(median(seconds for _, seconds in rows)) / workers

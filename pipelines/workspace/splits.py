@@ -1,0 +1,3 @@
+"""The splits of a workspace's frames."""
+
+SPLITS = ("labeled", "unlabeled", "val")
