@@ -31,6 +31,7 @@ def demo(
     Example: curate demo --rounds 1
     """
     from pipelines.demo import Demo, run_demo
+    from pipelines.reports.terminal import print_line
 
     run_demo(
         Demo(
@@ -43,7 +44,7 @@ def demo(
             seed=seed,
             workers=workers,
         ),
-        typer.echo,
+        print_line,
     )
 
 

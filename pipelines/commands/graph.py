@@ -4,6 +4,8 @@ from typing import Annotated
 
 import typer
 
+from pipelines.reports.terminal import print_table
+
 
 def graph(
     mermaid: Annotated[bool, typer.Option(help="Print Mermaid source.")] = False,
@@ -15,7 +17,11 @@ def graph(
     from pipelines.round import round_graph
 
     found = round_graph()
-    typer.echo(found.as_mermaid() if mermaid else found.as_text())
+    if mermaid:
+        typer.echo(found.as_mermaid())
+    else:
+        rows = ((", ".join(each.reads), each.name, ", ".join(each.writes)) for each in found.stages)
+        print_table(("reads", "stage", "writes"), rows)
 
 
 def register(app: typer.Typer) -> None:
