@@ -26,11 +26,17 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 RECTANGLE_COLUMNS = ("image_left", "image_top", "image_right", "image_bottom")
 
+# `comment` is stored in the database, `doc` is not and replaces it in the descriptions that
+# `pipelines.queries.schema` makes; `info["unit"]` is the unit.
 Key = Annotated[int, mapped_column(Integer, primary_key=True, autoincrement=False)]
-Metres = Annotated[float, mapped_column(Float(53), comment="metres, LiDAR frame")]
-Radians = Annotated[float, mapped_column(Float(53), comment="radians, (-pi, pi]")]
-Pixels = Annotated[float, mapped_column(Float(53), comment="pixels")]
-Share = Annotated[float, mapped_column(Float(53), comment="0 to 1")]
+Metres = Annotated[
+    float, mapped_column(Float(53), comment="metres, LiDAR frame", info={"unit": "m"})
+]
+Radians = Annotated[
+    float, mapped_column(Float(53), comment="radians, (-pi, pi]", info={"unit": "rad"})
+]
+Pixels = Annotated[float, mapped_column(Float(53), comment="pixels", info={"unit": "px"})]
+Share = Annotated[float, mapped_column(Float(53), comment="0 to 1", info={"unit": "1"})]
 Number = Annotated[float, mapped_column(Float(53))]
 Name = Annotated[str, mapped_column(Text)]
 Figure = Annotated[float | None, mapped_column(Float(53))]
@@ -54,13 +60,13 @@ class Base(DeclarativeBase):
 class Box:
     """The seven numbers of a box."""
 
-    x: Mapped[Metres]
-    y: Mapped[Metres]
-    z: Mapped[Metres]
-    length: Mapped[Metres]
-    width: Mapped[Metres]
-    height: Mapped[Metres]
-    yaw: Mapped[Radians]
+    x: Mapped[Metres] = mapped_column(doc="box centre, forward of the LiDAR")
+    y: Mapped[Metres] = mapped_column(doc="box centre, to the left of the LiDAR")
+    z: Mapped[Metres] = mapped_column(doc="box centre, above the LiDAR")
+    length: Mapped[Metres] = mapped_column(doc="along the heading")
+    width: Mapped[Metres] = mapped_column(doc="across the heading")
+    height: Mapped[Metres] = mapped_column(doc="upward")
+    yaw: Mapped[Radians] = mapped_column(doc="counter-clockwise from x, in (-pi, pi]")
 
 
 def _evidence(*more: Any) -> tuple[Any, ...]:
@@ -87,8 +93,10 @@ class Frame(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    dataset: Mapped[Name]
+    id: Mapped[int] = mapped_column(
+        Integer, primary_key=True, doc="key of the row in this database"
+    )
+    dataset: Mapped[Name] = mapped_column(doc="kind of the data set, as in curate.toml")
     frame: Mapped[str] = mapped_column(Text, comment="frame id within the data set")
     split: Mapped[str] = mapped_column(Text, comment="labeled | unlabeled | val")
     points_path: Mapped[str] = mapped_column(Text, comment="relative to the data set's root")
@@ -130,24 +138,24 @@ class GroundTruth(Base):
         {"sqlite_with_rowid": False},
     )
 
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
-    split: Mapped[Name]
-    category: Mapped[Name]
-    x: Mapped[Metres | None]
-    y: Mapped[Metres | None]
-    z: Mapped[Metres | None]
-    length: Mapped[Metres | None]
-    width: Mapped[Metres | None]
-    height: Mapped[Metres | None]
-    yaw: Mapped[Radians | None]
-    truncated: Mapped[Share]
+    frame_id: Mapped[Key] = mapped_column(doc="frame.id")
+    k: Mapped[Key] = mapped_column(doc="number of the object within its frame")
+    split: Mapped[Name] = mapped_column(doc="labeled | val")
+    category: Mapped[Name] = mapped_column(doc="of the object")
+    x: Mapped[Metres | None] = mapped_column(doc="box centre, forward of the LiDAR")
+    y: Mapped[Metres | None] = mapped_column(doc="box centre, to the left of the LiDAR")
+    z: Mapped[Metres | None] = mapped_column(doc="box centre, above the LiDAR")
+    length: Mapped[Metres | None] = mapped_column(doc="along the heading")
+    width: Mapped[Metres | None] = mapped_column(doc="across the heading")
+    height: Mapped[Metres | None] = mapped_column(doc="upward")
+    yaw: Mapped[Radians | None] = mapped_column(doc="counter-clockwise from x, in (-pi, pi]")
+    truncated: Mapped[Share] = mapped_column(doc="share of the object outside the image, 0 to 1")
     occluded: Mapped[int] = mapped_column(Integer, comment="KITTI's levels 0 to 3")
-    alpha: Mapped[Radians]
-    image_left: Mapped[Pixels]
-    image_top: Mapped[Pixels]
-    image_right: Mapped[Pixels]
-    image_bottom: Mapped[Pixels]
+    alpha: Mapped[Radians] = mapped_column(doc="KITTI's observation angle, in (-pi, pi]")
+    image_left: Mapped[Pixels] = mapped_column(doc="left edge of the rectangle in the image")
+    image_top: Mapped[Pixels] = mapped_column(doc="top edge of the rectangle in the image")
+    image_right: Mapped[Pixels] = mapped_column(doc="right edge of the rectangle in the image")
+    image_bottom: Mapped[Pixels] = mapped_column(doc="bottom edge of the rectangle in the image")
 
 
 class Checkpoint(Base):
@@ -156,17 +164,17 @@ class Checkpoint(Base):
     __tablename__ = "checkpoint"
     __table_args__ = (UniqueConstraint("round", "policy"),)
 
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    id: Mapped[int] = mapped_column(Integer, primary_key=True, doc="key of the row")
     round: Mapped[int] = mapped_column(
         Integer, comment="the round that made it; 0 before the first"
     )
     policy: Mapped[str] = mapped_column(
         Text, comment="whose weights it learned from; '' for round 0"
     )
-    detector: Mapped[Name]
+    detector: Mapped[Name] = mapped_column(doc="as in curate.toml")
     path: Mapped[str] = mapped_column(Text, comment="relative to the workspace, or absolute")
-    sha256: Mapped[Name]
-    created_at: Mapped[datetime] = mapped_column(DateTime(timezone=True))
+    sha256: Mapped[Name] = mapped_column(doc="of the file")
+    created_at: Mapped[datetime] = mapped_column(DateTime(timezone=True), doc="time in UTC")
 
 
 class TrainingStatistics(Base):
@@ -193,12 +201,14 @@ class Round(Base):
 
     __tablename__ = "round"
 
-    number: Mapped[Key]
+    number: Mapped[Key] = mapped_column(doc="e, from 1")
     rounds: Mapped[int] = mapped_column(Integer, comment="E: e/E is the age of Eq. 4")
-    teacher_id: Mapped[int | None] = mapped_column(ForeignKey("checkpoint.id"))
+    teacher_id: Mapped[int | None] = mapped_column(
+        ForeignKey("checkpoint.id"), doc="checkpoint.id of the detector that predicts"
+    )
     config: Mapped[str] = mapped_column(Text, comment="the whole configuration, JSON")
-    code_version: Mapped[Name]
-    seed: Mapped[int] = mapped_column(Integer)
+    code_version: Mapped[Name] = mapped_column(doc="of curate")
+    seed: Mapped[int] = mapped_column(Integer, doc="of all random draws of the round")
 
 
 class Prediction(Box, Base):
@@ -210,11 +220,13 @@ class Prediction(Box, Base):
         {"sqlite_with_rowid": False},
     )
 
-    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
-    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
-    k: Mapped[Key]
-    category: Mapped[Name]
-    score: Mapped[Share]
+    round: Mapped[int] = mapped_column(
+        ForeignKey("round.number"), primary_key=True, doc="round.number"
+    )
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
+    k: Mapped[Key] = mapped_column(doc="number of the label within its frame, by falling score")
+    category: Mapped[Name] = mapped_column(doc="of the object")
+    score: Mapped[Share] = mapped_column(doc="s of the detector, 0 to 1")
     iou: Mapped[float | None] = mapped_column(
         Float(53),
         sort_order=1,
@@ -228,11 +240,15 @@ class RepredictionView(Base):
     __tablename__ = "reprediction_view"
     __table_args__ = ({"sqlite_with_rowid": False},)
 
-    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
-    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
-    view: Mapped[Key]
+    round: Mapped[int] = mapped_column(
+        ForeignKey("round.number"), primary_key=True, doc="round.number"
+    )
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
+    view: Mapped[Key] = mapped_column(doc="number of the view, from 0")
     flip_y: Mapped[int] = mapped_column(Integer, comment="1 if y was mirrored, first")
-    rotation_rad: Mapped[float] = mapped_column(Float(53), comment="about z, radians, second")
+    rotation_rad: Mapped[float] = mapped_column(
+        Float(53), comment="about z, radians, second", info={"unit": "rad"}
+    )
     scale: Mapped[float] = mapped_column(Float(53), comment="of all coordinates, third")
 
 
@@ -249,14 +265,14 @@ class Reprediction(Box, Base):
         {"sqlite_with_rowid": False},
     )
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    view: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="round.number")
+    frame_id: Mapped[Key] = mapped_column(doc="frame.id")
+    view: Mapped[Key] = mapped_column(doc="reprediction_view.view")
     k: Mapped[int] = mapped_column(
         Integer, primary_key=True, autoincrement=False, comment="number within the view"
     )
-    category: Mapped[Name]
-    score: Mapped[Share]
+    category: Mapped[Name] = mapped_column(doc="of the object")
+    score: Mapped[Share] = mapped_column(doc="s' of the detector, 0 to 1")
     matched_k: Mapped[int | None] = mapped_column(Integer, comment="prediction.k; null = no match")
     iou: Mapped[float | None] = mapped_column(Float(53), comment="BEV IoU of the match")
     score_loss: Mapped[float | None] = mapped_column(Float(53), comment="-ln of this score")
@@ -269,12 +285,12 @@ class Consistency(Base):
     __tablename__ = "consistency"
     __table_args__ = _evidence()
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
     loss: Mapped[float | None] = mapped_column(Float(53), comment="L; null = no match, no evidence")
-    views: Mapped[int] = mapped_column(Integer)
-    matched_views: Mapped[int] = mapped_column(Integer)
+    views: Mapped[int] = mapped_column(Integer, doc="augmented views of the frame")
+    matched_views: Mapped[int] = mapped_column(Integer, doc="views with a matched reprediction")
 
 
 class PointPrior(Base):
@@ -283,12 +299,12 @@ class PointPrior(Base):
     __tablename__ = "point_prior"
     __table_args__ = _evidence()
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
     points: Mapped[int] = mapped_column(Integer, comment="m")
     points_threshold: Mapped[float] = mapped_column(Float(53), comment="m_th of the category")
-    rho_diff: Mapped[Share]
+    rho_diff: Mapped[Share] = mapped_column(doc="trust in [0, 1], Eq. 8")
 
 
 class SemanticPrior(Base):
@@ -297,12 +313,12 @@ class SemanticPrior(Base):
     __tablename__ = "semantic_prior"
     __table_args__ = _evidence()
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
     mask_pixels: Mapped[int] = mapped_column(Integer, comment="S")
     box_pixels: Mapped[int] = mapped_column(Integer, comment="A; 0 = outside the image")
-    rho_anno: Mapped[Share]
+    rho_anno: Mapped[Share] = mapped_column(doc="trust in [0, 1], Eq. 9")
 
 
 class EvidenceSource(Base):
@@ -332,13 +348,13 @@ class Weight(Base):
     __tablename__ = "weight"
     __table_args__ = _evidence()
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
-    policy: Mapped[str] = mapped_column(Text, primary_key=True)
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
+    policy: Mapped[str] = mapped_column(Text, primary_key=True, doc="that gave the weight")
     lambda_u: Mapped[float | None] = mapped_column(Float(53), comment="Eq. 4; null where unused")
     rho_det: Mapped[float | None] = mapped_column(Float(53), comment="product of the priors")
-    v: Mapped[Share]
+    v: Mapped[Share] = mapped_column(doc="weight in [0, 1]; what 0 means, the policy says")
 
 
 class LabelCount(Base):
@@ -350,9 +366,11 @@ class LabelCount(Base):
     __tablename__ = "label_count"
     __table_args__ = ({"sqlite_with_rowid": False},)
 
-    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
-    policy: Mapped[str] = mapped_column(Text, primary_key=True)
-    category: Mapped[str] = mapped_column(Text, primary_key=True)
+    round: Mapped[int] = mapped_column(
+        ForeignKey("round.number"), primary_key=True, doc="round.number"
+    )
+    policy: Mapped[str] = mapped_column(Text, primary_key=True, doc="that weighted the labels")
+    category: Mapped[str] = mapped_column(Text, primary_key=True, doc="of the labels")
     labels: Mapped[int] = mapped_column(Integer, comment="that the policy did not drop")
     kept: Mapped[int] = mapped_column(Integer, comment="with a weight above 0")
     trusted: Mapped[int] = mapped_column(Integer, comment="with a weight above 0.5")
@@ -368,7 +386,7 @@ class Review(Base):
     round: Mapped[int] = mapped_column(Integer, comment="whose labels")
     policy: Mapped[str] = mapped_column(Text, comment="whose weights chose them")
     editor: Mapped[str] = mapped_column(Text, comment="kitti | labelcloud | cvat")
-    frames: Mapped[int] = mapped_column(Integer)
+    frames: Mapped[int] = mapped_column(Integer, doc="frames that were exported")
     boxes: Mapped[int] = mapped_column(Integer, comment="in all, those for context included")
     asked: Mapped[int] = mapped_column(Integer, comment="of the boxes")
     exported_at: Mapped[str] = mapped_column(Text, comment="ISO 8601, UTC")
@@ -391,25 +409,35 @@ class HumanLabel(Box, Base):
         {"sqlite_with_rowid": False},
     )
 
-    frame_id: Mapped[Key]
-    n: Mapped[Key]
-    split: Mapped[Name]
-    review: Mapped[str] = mapped_column(ForeignKey("review.id"))
+    frame_id: Mapped[Key] = mapped_column(doc="frame.id")
+    n: Mapped[Key] = mapped_column(doc="number of the decision within its frame")
+    split: Mapped[Name] = mapped_column(doc="always unlabeled")
+    review: Mapped[str] = mapped_column(ForeignKey("review.id"), doc="review.id")
     item: Mapped[int | None] = mapped_column(
         Integer, comment="number of the box in the review; null = added"
     )
     decision: Mapped[str] = mapped_column(Text, comment="accepted | rejected | moved | added")
-    category: Mapped[Name]
+    category: Mapped[Name] = mapped_column(doc="of the object")
     from_round: Mapped[int] = mapped_column(Integer, comment="it counts in this round and later")
     seen_x: Mapped[float | None] = mapped_column(
-        Float(53), sort_order=1, comment="metres, LiDAR frame: the box as it was shown; null = none"
+        Float(53),
+        sort_order=1,
+        comment="metres, LiDAR frame: the box as it was shown; null = none",
+        doc="of the box as it was shown; null = none",
+        info={"unit": "m"},
     )
-    seen_y: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_z: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_length: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_width: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_height: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_yaw: Mapped[Radians | None] = mapped_column(sort_order=1)
+    seen_y: Mapped[Metres | None] = mapped_column(sort_order=1, doc="of the box as it was shown")
+    seen_z: Mapped[Metres | None] = mapped_column(sort_order=1, doc="of the box as it was shown")
+    seen_length: Mapped[Metres | None] = mapped_column(
+        sort_order=1, doc="of the box as it was shown"
+    )
+    seen_width: Mapped[Metres | None] = mapped_column(
+        sort_order=1, doc="of the box as it was shown"
+    )
+    seen_height: Mapped[Metres | None] = mapped_column(
+        sort_order=1, doc="of the box as it was shown"
+    )
+    seen_yaw: Mapped[Radians | None] = mapped_column(sort_order=1, doc="of the box as it was shown")
     reviewer: Mapped[str] = mapped_column(Text, sort_order=2, comment="who decided")
     decided_at: Mapped[str] = mapped_column(Text, sort_order=2, comment="ISO 8601, UTC")
 
@@ -428,9 +456,9 @@ class HumanMatch(Base):
         Index("ix_human_match_label", "frame_id", "n"),
     )
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
     n: Mapped[int] = mapped_column(Integer, comment="human_label.n")
     iou: Mapped[float] = mapped_column(Float(53), comment="BEV IoU with its box, or the one seen")
     leads: Mapped[int] = mapped_column(
@@ -464,7 +492,7 @@ class _Judgement:
     neutral: Mapped[int] = mapped_column(Integer, comment="further labels that are neither")
     right_labels: Mapped[int] = mapped_column(Integer, comment="of the labels")
     objects: Mapped[int | None] = mapped_column(Integer, comment="to be found; null = unknown")
-    share_right: Mapped[Figure]
+    share_right: Mapped[Figure] = mapped_column(doc="right_labels / labels")
     share_right_low: Mapped[Bound]
     share_right_high: Mapped[Bound]
     auroc: Mapped[Figure] = mapped_column(
@@ -523,8 +551,8 @@ class AuditBin(_Audited, Base):
 
     low: Mapped[float] = mapped_column(Float(53), primary_key=True, comment="weight, included")
     high: Mapped[float] = mapped_column(Float(53), comment="weight, not included")
-    labels: Mapped[int] = mapped_column(Integer)
-    mean_weight: Mapped[Figure]
+    labels: Mapped[int] = mapped_column(Integer, doc="that are right or wrong, in the bin")
+    mean_weight: Mapped[Figure] = mapped_column(doc="of the labels in the bin")
     precision: Mapped[Figure] = mapped_column(comment="share of right labels in the bin")
     recall: Mapped[Figure] = mapped_column(comment="right labels of the bin per object")
 
@@ -547,7 +575,7 @@ class EvaluationObject(Box, Base):
     source: Mapped[str] = mapped_column(
         Text, primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
     )
-    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
     side: Mapped[str] = mapped_column(Text, primary_key=True, comment="object | detection")
     k: Mapped[int] = mapped_column(
         Integer, primary_key=True, autoincrement=False, comment="of ground_truth or of prediction"
@@ -576,14 +604,18 @@ class EvaluationAp(Base):
     source: Mapped[str] = mapped_column(
         Text, primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
     )
-    category: Mapped[str] = mapped_column(Text, primary_key=True)
+    category: Mapped[str] = mapped_column(Text, primary_key=True, doc="under evaluation")
     figure: Mapped[str] = mapped_column(Text, primary_key=True, comment="image | aos | bev | 3d")
     difficulty: Mapped[str] = mapped_column(
         Text, primary_key=True, comment="easy | moderate | hard"
     )
     objects: Mapped[int] = mapped_column(Integer, comment="that count")
-    ap_r40: Mapped[float | None] = mapped_column(Float(53), comment="percent")
-    ap_r11: Mapped[float | None] = mapped_column(Float(53), comment="percent")
+    ap_r40: Mapped[float | None] = mapped_column(
+        Float(53), comment="percent", doc="at 40 recall positions", info={"unit": "%"}
+    )
+    ap_r11: Mapped[float | None] = mapped_column(
+        Float(53), comment="percent", doc="at 11 recall positions", info={"unit": "%"}
+    )
 
 
 class LabelFile(Base):
@@ -594,7 +626,7 @@ class LabelFile(Base):
 
     path: Mapped[str] = mapped_column(Text, primary_key=True, comment="relative to the workspace")
     round: Mapped[int] = mapped_column(Integer, comment="0 = ground truth of X_l alone")
-    policy: Mapped[Name]
+    policy: Mapped[Name] = mapped_column(doc="whose weights it holds; '' for ground truth alone")
     sha256: Mapped[str] = mapped_column(Text, comment="of the file")
 
 
@@ -635,12 +667,14 @@ class Task(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    round: Mapped[int] = mapped_column(Integer)
-    stage: Mapped[Name]
+    id: Mapped[int] = mapped_column(Integer, primary_key=True, doc="key of the row")
+    round: Mapped[int] = mapped_column(Integer, doc="round.number; 0 before the first")
+    stage: Mapped[Name] = mapped_column(doc="name of the stage")
     variant: Mapped[str] = mapped_column(Text, comment="policy or format of a round stage, else ''")
-    frame_id: Mapped[int | None] = mapped_column(ForeignKey("frame.id"))
+    frame_id: Mapped[int | None] = mapped_column(
+        ForeignKey("frame.id"), doc="frame.id; null for a stage of the whole round"
+    )
     fingerprint: Mapped[str] = mapped_column(Text, comment="of all that the result depends on")
     state: Mapped[str] = mapped_column(Text, comment="done | empty | failed")
-    error: Mapped[str | None] = mapped_column(Text)
-    seconds: Mapped[Number]
+    error: Mapped[str | None] = mapped_column(Text, doc="message; null unless failed")
+    seconds: Mapped[Number] = mapped_column(doc="time that the work took", info={"unit": "s"})
