@@ -30,14 +30,10 @@ class Terminal:
 
 
 @contextmanager
-def terminal(
-    monkeypatch: pytest.MonkeyPatch, columns: int, lines: int = TALL
-) -> Iterator[Terminal]:
-    """Make sys.stdin and sys.stdout a pseudo-terminal of this size until the end of the block."""
+def open_terminal(columns: int, lines: int) -> Iterator[tuple[Terminal, int]]:
+    """Open a terminal of this size: what is printed in it, and its end for a program."""
     master, slave = pty.openpty()
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
-    for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR"):
-        monkeypatch.delenv(name, raising=False)
     found, parts = Terminal(), []
 
     def drain() -> None:
@@ -52,18 +48,27 @@ def terminal(
 
     reader = threading.Thread(target=drain)
     reader.start()
-    with (
-        open(slave, "w", encoding="utf-8", closefd=False) as output,
-        open(slave, encoding="utf-8", closefd=False) as given,
-        monkeypatch.context() as patched,
-    ):
-        patched.setattr(sys, "stdout", output)
-        patched.setattr(sys, "stdin", given)
-        try:
+    try:
+        yield found, slave
+    finally:
+        os.close(slave)
+        reader.join()
+        os.close(master)
+        found.text = b"".join(parts).decode()
+
+
+@contextmanager
+def terminal(
+    monkeypatch: pytest.MonkeyPatch, columns: int, lines: int = TALL
+) -> Iterator[Terminal]:
+    """Make sys.stdin and sys.stdout a pseudo-terminal of this size until the end of the block."""
+    with open_terminal(columns, lines) as (found, slave), monkeypatch.context() as patched:
+        for name in ("COLUMNS", "LINES", "FORCE_COLOR"):
+            patched.delenv(name, raising=False)
+        with (
+            open(slave, "w", encoding="utf-8", closefd=False) as output,
+            open(slave, encoding="utf-8", closefd=False) as given,
+        ):
+            patched.setattr(sys, "stdout", output)
+            patched.setattr(sys, "stdin", given)
             yield found
-        finally:
-            output.flush()
-            os.close(slave)
-            reader.join()
-            os.close(master)
-            found.text = b"".join(parts).decode()
