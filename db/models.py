@@ -25,18 +25,18 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 RECTANGLE_COLUMNS = ("image_left", "image_top", "image_right", "image_bottom")
 
+# `comment` is stored in the database, `doc` is not and replaces it in the descriptions that
+# `pipelines.queries.schema` makes; `info["unit"]` is the unit.
 Key = Annotated[int, mapped_column(primary_key=True, autoincrement=False)]
-Metres = Annotated[float, mapped_column(comment="metres, LiDAR frame")]
-Radians = Annotated[float, mapped_column(comment="radians, (-pi, pi]")]
-Pixels = Annotated[float, mapped_column(comment="pixels")]
-Share = Annotated[float, mapped_column(comment="0 to 1")]
+Metres = Annotated[float, mapped_column(comment="metres, LiDAR frame", info={"unit": "m"})]
+Radians = Annotated[float, mapped_column(comment="radians, (-pi, pi]", info={"unit": "rad"})]
+Pixels = Annotated[float, mapped_column(comment="pixels", info={"unit": "px"})]
+Share = Annotated[float, mapped_column(comment="0 to 1", info={"unit": "1"})]
 Bound = Annotated[float | None, mapped_column(comment="bound of its interval")]
 
 
 class Base(DeclarativeBase):
-    """Root of the models; their keys say where rows lie, unless a model says otherwise."""
-
-    __table_args__: Any = {"sqlite_with_rowid": False}  # noqa: RUF012 - as SQLAlchemy has it
+    """Root of the models."""
 
     type_annotation_map: ClassVar = {str: Text, float: Float(53)}
 
@@ -54,13 +54,13 @@ class Base(DeclarativeBase):
 class Box:
     """The seven numbers of a box."""
 
-    x: Mapped[Metres]
-    y: Mapped[Metres]
-    z: Mapped[Metres]
-    length: Mapped[Metres]
-    width: Mapped[Metres]
-    height: Mapped[Metres]
-    yaw: Mapped[Radians]
+    x: Mapped[Metres] = mapped_column(doc="box centre, forward of the LiDAR")
+    y: Mapped[Metres] = mapped_column(doc="box centre, to the left of the LiDAR")
+    z: Mapped[Metres] = mapped_column(doc="box centre, above the LiDAR")
+    length: Mapped[Metres] = mapped_column(doc="along the heading")
+    width: Mapped[Metres] = mapped_column(doc="across the heading")
+    height: Mapped[Metres] = mapped_column(doc="upward")
+    yaw: Mapped[Radians] = mapped_column(doc="counter-clockwise from x, in (-pi, pi]")
 
 
 def _evidence(*more: Any) -> tuple[Any, ...]:
@@ -87,8 +87,8 @@ class Frame(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    dataset: Mapped[str]
+    id: Mapped[int] = mapped_column(primary_key=True, doc="key of the row in this database")
+    dataset: Mapped[str] = mapped_column(doc="kind of the data set, as in curate.toml")
     frame: Mapped[str] = mapped_column(comment="frame id within the data set")
     split: Mapped[str] = mapped_column(comment="labeled | unlabeled | val")
     points_path: Mapped[str] = mapped_column(comment="relative to the data set's root")
@@ -103,6 +103,7 @@ class SplitList(Base):
     """The lists of frames as `curate init` found and chose them; the firewall compares."""
 
     __tablename__ = "split_list"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
     source: Mapped[str] = mapped_column(
         primary_key=True, comment="chosen | dataset (its own) | file (given to init)"
@@ -129,24 +130,24 @@ class GroundTruth(Base):
         {"sqlite_with_rowid": False},
     )
 
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
-    split: Mapped[str]
-    category: Mapped[str]
-    x: Mapped[Metres | None]
-    y: Mapped[Metres | None]
-    z: Mapped[Metres | None]
-    length: Mapped[Metres | None]
-    width: Mapped[Metres | None]
-    height: Mapped[Metres | None]
-    yaw: Mapped[Radians | None]
-    truncated: Mapped[Share]
+    frame_id: Mapped[Key] = mapped_column(doc="frame.id")
+    k: Mapped[Key] = mapped_column(doc="number of the object within its frame")
+    split: Mapped[str] = mapped_column(doc="labeled | val")
+    category: Mapped[str] = mapped_column(doc="of the object")
+    x: Mapped[Metres | None] = mapped_column(doc="box centre, forward of the LiDAR")
+    y: Mapped[Metres | None] = mapped_column(doc="box centre, to the left of the LiDAR")
+    z: Mapped[Metres | None] = mapped_column(doc="box centre, above the LiDAR")
+    length: Mapped[Metres | None] = mapped_column(doc="along the heading")
+    width: Mapped[Metres | None] = mapped_column(doc="across the heading")
+    height: Mapped[Metres | None] = mapped_column(doc="upward")
+    yaw: Mapped[Radians | None] = mapped_column(doc="counter-clockwise from x, in (-pi, pi]")
+    truncated: Mapped[Share] = mapped_column(doc="share of the object outside the image, 0 to 1")
     occluded: Mapped[int] = mapped_column(comment="KITTI's levels 0 to 3")
-    alpha: Mapped[Radians]
-    image_left: Mapped[Pixels]
-    image_top: Mapped[Pixels]
-    image_right: Mapped[Pixels]
-    image_bottom: Mapped[Pixels]
+    alpha: Mapped[Radians] = mapped_column(doc="KITTI's observation angle, in (-pi, pi]")
+    image_left: Mapped[Pixels] = mapped_column(doc="left edge of the rectangle in the image")
+    image_top: Mapped[Pixels] = mapped_column(doc="top edge of the rectangle in the image")
+    image_right: Mapped[Pixels] = mapped_column(doc="right edge of the rectangle in the image")
+    image_bottom: Mapped[Pixels] = mapped_column(doc="bottom edge of the rectangle in the image")
 
 
 class Checkpoint(Base):
@@ -155,19 +156,20 @@ class Checkpoint(Base):
     __tablename__ = "checkpoint"
     __table_args__ = (UniqueConstraint("round", "policy"),)
 
-    id: Mapped[int] = mapped_column(primary_key=True)
+    id: Mapped[int] = mapped_column(primary_key=True, doc="key of the row")
     round: Mapped[int] = mapped_column(comment="the round that made it; 0 before the first")
     policy: Mapped[str] = mapped_column(comment="whose weights it learned from; '' for round 0")
-    detector: Mapped[str]
+    detector: Mapped[str] = mapped_column(doc="as in curate.toml")
     path: Mapped[str] = mapped_column(comment="relative to the workspace, or absolute")
-    sha256: Mapped[str]
-    created_at: Mapped[datetime] = mapped_column(DateTime(timezone=True))
+    sha256: Mapped[str] = mapped_column(doc="of the file")
+    created_at: Mapped[datetime] = mapped_column(DateTime(timezone=True), doc="time in UTC")
 
 
 class TrainingStatistics(Base):
     """The curves of a training: loss terms, learning rate and gradient norm of every few steps."""
 
     __tablename__ = "training_statistics"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
     round: Mapped[int] = mapped_column(
         primary_key=True, autoincrement=False, comment="as of the checkpoint"
@@ -186,14 +188,15 @@ class Round(Base):
     """One round e of E: the teacher's answers, their evidence, their weights, the student."""
 
     __tablename__ = "round"
-    __table_args__ = ()
 
-    number: Mapped[Key]
+    number: Mapped[Key] = mapped_column(doc="e, from 1")
     rounds: Mapped[int] = mapped_column(comment="E: e/E is the age of Eq. 4")
-    teacher_id: Mapped[int | None] = mapped_column(ForeignKey("checkpoint.id"))
+    teacher_id: Mapped[int | None] = mapped_column(
+        ForeignKey("checkpoint.id"), doc="checkpoint.id of the detector that predicts"
+    )
     config: Mapped[str] = mapped_column(comment="the whole configuration, JSON")
-    code_version: Mapped[str]
-    seed: Mapped[int]
+    code_version: Mapped[str] = mapped_column(doc="of curate")
+    seed: Mapped[int] = mapped_column(doc="of all random draws of the round")
 
 
 class Prediction(Box, Base):
@@ -205,11 +208,13 @@ class Prediction(Box, Base):
         {"sqlite_with_rowid": False},
     )
 
-    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
-    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
-    k: Mapped[Key]
-    category: Mapped[str]
-    score: Mapped[Share]
+    round: Mapped[int] = mapped_column(
+        ForeignKey("round.number"), primary_key=True, doc="round.number"
+    )
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
+    k: Mapped[Key] = mapped_column(doc="number of the label within its frame, by falling score")
+    category: Mapped[str] = mapped_column(doc="of the object")
+    score: Mapped[Share] = mapped_column(doc="s of the detector, 0 to 1")
     iou: Mapped[float | None] = mapped_column(
         sort_order=1,
         comment="the detector's estimate of its 3D IoU with the object; null = it makes none",
@@ -220,12 +225,17 @@ class RepredictionView(Base):
     """The similarity A of one augmented view of a frame."""
 
     __tablename__ = "reprediction_view"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
-    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
-    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
-    view: Mapped[Key]
+    round: Mapped[int] = mapped_column(
+        ForeignKey("round.number"), primary_key=True, doc="round.number"
+    )
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
+    view: Mapped[Key] = mapped_column(doc="number of the view, from 0")
     flip_y: Mapped[int] = mapped_column(comment="1 if y was mirrored, first")
-    rotation_rad: Mapped[float] = mapped_column(comment="about z, radians, second")
+    rotation_rad: Mapped[float] = mapped_column(
+        comment="about z, radians, second", info={"unit": "rad"}
+    )
     scale: Mapped[float] = mapped_column(comment="of all coordinates, third")
 
 
@@ -242,14 +252,14 @@ class Reprediction(Box, Base):
         {"sqlite_with_rowid": False},
     )
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    view: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="round.number")
+    frame_id: Mapped[Key] = mapped_column(doc="frame.id")
+    view: Mapped[Key] = mapped_column(doc="reprediction_view.view")
     k: Mapped[int] = mapped_column(
         primary_key=True, autoincrement=False, comment="number within the view"
     )
-    category: Mapped[str]
-    score: Mapped[Share]
+    category: Mapped[str] = mapped_column(doc="of the object")
+    score: Mapped[Share] = mapped_column(doc="s' of the detector, 0 to 1")
     matched_k: Mapped[int | None] = mapped_column(comment="prediction.k; null = no match")
     iou: Mapped[float | None] = mapped_column(comment="BEV IoU of the match")
     score_loss: Mapped[float | None] = mapped_column(comment="-ln of this score")
@@ -262,12 +272,12 @@ class Consistency(Base):
     __tablename__ = "consistency"
     __table_args__ = _evidence()
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
     loss: Mapped[float | None] = mapped_column(comment="L; null = no match, no evidence")
-    views: Mapped[int]
-    matched_views: Mapped[int]
+    views: Mapped[int] = mapped_column(doc="augmented views of the frame")
+    matched_views: Mapped[int] = mapped_column(doc="views with a matched reprediction")
 
 
 class PointPrior(Base):
@@ -276,12 +286,12 @@ class PointPrior(Base):
     __tablename__ = "point_prior"
     __table_args__ = _evidence()
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
     points: Mapped[int] = mapped_column(comment="m")
     points_threshold: Mapped[float] = mapped_column(comment="m_th of the category")
-    rho_diff: Mapped[Share]
+    rho_diff: Mapped[Share] = mapped_column(doc="trust in [0, 1], Eq. 8")
 
 
 class SemanticPrior(Base):
@@ -290,18 +300,19 @@ class SemanticPrior(Base):
     __tablename__ = "semantic_prior"
     __table_args__ = _evidence()
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
     mask_pixels: Mapped[int] = mapped_column(comment="S")
     box_pixels: Mapped[int] = mapped_column(comment="A; 0 = outside the image")
-    rho_anno: Mapped[Share]
+    rho_anno: Mapped[Share] = mapped_column(doc="trust in [0, 1], Eq. 9")
 
 
 class EvidenceSource(Base):
     """What an evidence source has declared that has a table `prior_NAME` of its own."""
 
     __tablename__ = "evidence_source"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
     name: Mapped[str] = mapped_column(primary_key=True, comment="its table is prior_NAME")
     source: Mapped[str] = mapped_column(comment="as run.priors names it")
@@ -324,13 +335,13 @@ class Weight(Base):
     __tablename__ = "weight"
     __table_args__ = _evidence()
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
-    policy: Mapped[str] = mapped_column(primary_key=True)
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
+    policy: Mapped[str] = mapped_column(primary_key=True, doc="that gave the weight")
     lambda_u: Mapped[float | None] = mapped_column(comment="Eq. 4; null where unused")
     rho_det: Mapped[float | None] = mapped_column(comment="product of the priors")
-    v: Mapped[Share]
+    v: Mapped[Share] = mapped_column(doc="weight in [0, 1]; what 0 means, the policy says")
 
 
 class LabelCount(Base):
@@ -340,10 +351,13 @@ class LabelCount(Base):
     """
 
     __tablename__ = "label_count"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
-    round: Mapped[int] = mapped_column(ForeignKey("round.number"), primary_key=True)
-    policy: Mapped[str] = mapped_column(primary_key=True)
-    category: Mapped[str] = mapped_column(primary_key=True)
+    round: Mapped[int] = mapped_column(
+        ForeignKey("round.number"), primary_key=True, doc="round.number"
+    )
+    policy: Mapped[str] = mapped_column(primary_key=True, doc="that weighted the labels")
+    category: Mapped[str] = mapped_column(primary_key=True, doc="of the labels")
     labels: Mapped[int] = mapped_column(comment="that the policy did not drop")
     kept: Mapped[int] = mapped_column(comment="with a weight above 0")
     trusted: Mapped[int] = mapped_column(comment="with a weight above 0.5")
@@ -354,13 +368,12 @@ class Review(Base):
     """Labels that were handed to an editor, and when the answer was taken back."""
 
     __tablename__ = "review"
-    __table_args__ = ()
 
     id: Mapped[str] = mapped_column(primary_key=True, comment="hash of its manifest")
     round: Mapped[int] = mapped_column(comment="whose labels")
     policy: Mapped[str] = mapped_column(comment="whose weights chose them")
     editor: Mapped[str] = mapped_column(comment="kitti | labelcloud | cvat")
-    frames: Mapped[int]
+    frames: Mapped[int] = mapped_column(doc="frames that were exported")
     boxes: Mapped[int] = mapped_column(comment="in all, those for context included")
     asked: Mapped[int] = mapped_column(comment="of the boxes")
     exported_at: Mapped[str] = mapped_column(comment="ISO 8601, UTC")
@@ -383,25 +396,34 @@ class HumanLabel(Box, Base):
         {"sqlite_with_rowid": False},
     )
 
-    frame_id: Mapped[Key]
-    n: Mapped[Key]
-    split: Mapped[str]
-    review: Mapped[str] = mapped_column(ForeignKey("review.id"))
+    frame_id: Mapped[Key] = mapped_column(doc="frame.id")
+    n: Mapped[Key] = mapped_column(doc="number of the decision within its frame")
+    split: Mapped[str] = mapped_column(doc="always unlabeled")
+    review: Mapped[str] = mapped_column(ForeignKey("review.id"), doc="review.id")
     item: Mapped[int | None] = mapped_column(
         comment="number of the box in the review; null = added"
     )
     decision: Mapped[str] = mapped_column(comment="accepted | rejected | moved | added")
-    category: Mapped[str]
+    category: Mapped[str] = mapped_column(doc="of the object")
     from_round: Mapped[int] = mapped_column(comment="it counts in this round and later")
     seen_x: Mapped[float | None] = mapped_column(
-        sort_order=1, comment="metres, LiDAR frame: the box as it was shown; null = none"
+        sort_order=1,
+        comment="metres, LiDAR frame: the box as it was shown; null = none",
+        doc="of the box as it was shown; null = none",
+        info={"unit": "m"},
     )
-    seen_y: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_z: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_length: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_width: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_height: Mapped[Metres | None] = mapped_column(sort_order=1)
-    seen_yaw: Mapped[Radians | None] = mapped_column(sort_order=1)
+    seen_y: Mapped[Metres | None] = mapped_column(sort_order=1, doc="of the box as it was shown")
+    seen_z: Mapped[Metres | None] = mapped_column(sort_order=1, doc="of the box as it was shown")
+    seen_length: Mapped[Metres | None] = mapped_column(
+        sort_order=1, doc="of the box as it was shown"
+    )
+    seen_width: Mapped[Metres | None] = mapped_column(
+        sort_order=1, doc="of the box as it was shown"
+    )
+    seen_height: Mapped[Metres | None] = mapped_column(
+        sort_order=1, doc="of the box as it was shown"
+    )
+    seen_yaw: Mapped[Radians | None] = mapped_column(sort_order=1, doc="of the box as it was shown")
     reviewer: Mapped[str] = mapped_column(sort_order=2, comment="who decided")
     decided_at: Mapped[str] = mapped_column(sort_order=2, comment="ISO 8601, UTC")
 
@@ -420,9 +442,9 @@ class HumanMatch(Base):
         Index("ix_human_match_label", "frame_id", "n"),
     )
 
-    round: Mapped[Key]
-    frame_id: Mapped[Key]
-    k: Mapped[Key]
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
     n: Mapped[int] = mapped_column(comment="human_label.n")
     iou: Mapped[float] = mapped_column(comment="BEV IoU with its box, or the one seen")
     leads: Mapped[int] = mapped_column(
@@ -453,7 +475,7 @@ class _Judgement:
     neutral: Mapped[int] = mapped_column(comment="further labels that are neither")
     right_labels: Mapped[int] = mapped_column(comment="of the labels")
     objects: Mapped[int | None] = mapped_column(comment="to be found; null = unknown")
-    share_right: Mapped[float | None]
+    share_right: Mapped[float | None] = mapped_column(doc="right_labels / labels")
     share_right_low: Mapped[Bound]
     share_right_high: Mapped[Bound]
     auroc: Mapped[float | None] = mapped_column(
@@ -490,12 +512,14 @@ class Audit(_Audited, _Judgement, Base):
     """
 
     __tablename__ = "audit"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
 
 class AuditSlice(_Audited, _Judgement, Base):
     """The same for a range of distances from the LiDAR, or of LiDAR points in the label."""
 
     __tablename__ = "audit_slice"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
     kind: Mapped[str] = mapped_column(primary_key=True, comment="distance | points")
     low: Mapped[float] = mapped_column(primary_key=True, comment="metres or points, included")
@@ -508,11 +532,12 @@ class AuditBin(_Audited, Base):
     """The labels of an audit whose weight lies in a bin; the last bin holds its upper edge."""
 
     __tablename__ = "audit_bin"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
     low: Mapped[float] = mapped_column(primary_key=True, comment="weight, included")
     high: Mapped[float] = mapped_column(comment="weight, not included")
-    labels: Mapped[int]
-    mean_weight: Mapped[float | None]
+    labels: Mapped[int] = mapped_column(doc="that are right or wrong, in the bin")
+    mean_weight: Mapped[float | None] = mapped_column(doc="of the labels in the bin")
     precision: Mapped[float | None] = mapped_column(comment="share of right labels in the bin")
     recall: Mapped[float | None] = mapped_column(comment="right labels of the bin per object")
 
@@ -535,7 +560,7 @@ class EvaluationObject(Box, Base):
     source: Mapped[str] = mapped_column(
         primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
     )
-    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True)
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
     side: Mapped[str] = mapped_column(primary_key=True, comment="object | detection")
     k: Mapped[int] = mapped_column(
         primary_key=True, autoincrement=False, comment="of ground_truth or of prediction"
@@ -559,26 +584,32 @@ class EvaluationAp(Base):
     """KITTI average precision of the detections of val frames."""
 
     __tablename__ = "evaluation_ap"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
     source: Mapped[str] = mapped_column(
         primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
     )
-    category: Mapped[str] = mapped_column(primary_key=True)
+    category: Mapped[str] = mapped_column(primary_key=True, doc="under evaluation")
     figure: Mapped[str] = mapped_column(primary_key=True, comment="image | aos | bev | 3d")
     difficulty: Mapped[str] = mapped_column(primary_key=True, comment="easy | moderate | hard")
     objects: Mapped[int] = mapped_column(comment="that count")
-    ap_r40: Mapped[float | None] = mapped_column(comment="percent")
-    ap_r11: Mapped[float | None] = mapped_column(comment="percent")
+    ap_r40: Mapped[float | None] = mapped_column(
+        comment="percent", doc="at 40 recall positions", info={"unit": "%"}
+    )
+    ap_r11: Mapped[float | None] = mapped_column(
+        comment="percent", doc="at 11 recall positions", info={"unit": "%"}
+    )
 
 
 class LabelFile(Base):
     """An exported label file as it was written; the firewall notices what changed since."""
 
     __tablename__ = "label_file"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
     path: Mapped[str] = mapped_column(primary_key=True, comment="relative to the workspace")
     round: Mapped[int] = mapped_column(comment="0 = ground truth of X_l alone")
-    policy: Mapped[str]
+    policy: Mapped[str] = mapped_column(doc="whose weights it holds; '' for ground truth alone")
     sha256: Mapped[str] = mapped_column(comment="of the file")
 
 
@@ -586,6 +617,7 @@ class ViewDefinition(Base):
     """The views as they were made last; those with another definition are made anew."""
 
     __tablename__ = "view_definition"
+    __table_args__ = ({"sqlite_with_rowid": False},)
 
     name: Mapped[str] = mapped_column(primary_key=True, comment="of the view")
     sha256: Mapped[str] = mapped_column(comment="of its definition")
@@ -618,12 +650,14 @@ class Task(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    round: Mapped[int]
-    stage: Mapped[str]
+    id: Mapped[int] = mapped_column(primary_key=True, doc="key of the row")
+    round: Mapped[int] = mapped_column(doc="round.number; 0 before the first")
+    stage: Mapped[str] = mapped_column(doc="name of the stage")
     variant: Mapped[str] = mapped_column(comment="policy or format of a round stage, else ''")
-    frame_id: Mapped[int | None] = mapped_column(ForeignKey("frame.id"))
+    frame_id: Mapped[int | None] = mapped_column(
+        ForeignKey("frame.id"), doc="frame.id; null for a stage of the whole round"
+    )
     fingerprint: Mapped[str] = mapped_column(comment="of all that the result depends on")
     state: Mapped[str] = mapped_column(comment="done | empty | failed")
-    error: Mapped[str | None] = mapped_column(Text)
-    seconds: Mapped[float]
+    error: Mapped[str | None] = mapped_column(doc="message; null unless failed")
+    seconds: Mapped[float] = mapped_column(doc="time that the work took", info={"unit": "s"})

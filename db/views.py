@@ -10,7 +10,7 @@ from sqlalchemy import Connection, TableClause, column, inspect, select, table, 
 
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db.evidence import Declaration, label_columns, read_declarations
-from db.models import Base, ViewDefinition
+from db.models import BOX_COLUMNS, Base, ViewDefinition
 
 # The view with its core columns, to select from.
 WEIGHTED_LABELS = table("weighted_labels", *map(column, WEIGHTED_LABEL_COLUMNS))
@@ -109,6 +109,19 @@ _VIEWS = {
         WHERE t.state = 'failed'
     """,
 }
+
+VIEW_COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "evaluation": (
+        "evaluation_object.source", "frame.frame",
+        *(f"evaluation_object.{name}" for name in (
+            "side", "k", "category", "outcome", "matched_k", "iou", "score", *BOX_COLUMNS,
+        )),
+        "ground_truth.truncated", "ground_truth.occluded",
+        "evaluation_object.overlap", "evaluation_object.difficulty",
+    ),
+    "failed_frames": ("task.round", "task.stage", "frame.frame", "frame.split", "task.error"),
+}  # fmt: skip
+"""The column of a table behind each column of a view, in the order of the view."""
 
 
 def weighted_labels(connection: Connection) -> TableClause:

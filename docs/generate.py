@@ -14,9 +14,9 @@ from pydantic import BaseModel
 
 import db.models
 from curate.errors import CurateError
-from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
-from db.models import Base
+from pipelines.queries.functions import FUNCTIONS
 from pipelines.queries.named_queries import named_queries
+from pipelines.queries.schema import working_schema
 from pipelines.registry import DETECTORS, trainable
 from pipelines.round import round_graph
 from pipelines.workspace.config import Config
@@ -78,39 +78,19 @@ def _exit_codes() -> list[str]:
 
 
 def schema_page() -> str:
-    """Every table with its columns, units and what they mean."""
+    """Return every view and table with its columns, their units and what they mean."""
     parts = ["# The database", _NOTE, inspect.getdoc(db.models) or "", ""]
-    for model in Base.__subclasses__():
-        table = Base.metadata.tables[model.__tablename__]
-        doc = " ".join((inspect.getdoc(model) or "").split())
-        parts += [f"## {table.name}", "", doc, "", "| column | type | null | meaning |"]
-        parts.append("|---|---|---|---|")
-        for column in table.columns:
-            null = "yes" if column.nullable else ""
-            meaning = "; ".join(filter(None, ["key" * column.primary_key, column.comment]))
+    parts += ["`curate query --schema` prints the same, with further evidence of a workspace.", ""]
+    for relation in working_schema():
+        kind = " (view)" if relation.kind == "view" else ""
+        parts += [f"## {relation.name}{kind}", "", relation.meaning, ""]
+        parts += ["| column | type | unit | null | meaning |", "|---|---|---|---|---|"]
+        for column in relation.columns:
+            null = "yes" if column.optional else ""
+            meaning = "; ".join(filter(None, ["key" * column.key, column.meaning]))
             escaped = meaning.replace("|", "\\|")
-            parts.append(f"| {column.name} | {column.type} | {null} | {escaped} |")
+            parts.append(f"| {column.name} | {column.type} | {column.unit} | {null} | {escaped} |")
         parts.append("")
-    names = ", ".join(WEIGHTED_LABEL_COLUMNS)
-    parts += [
-        "## weighted_labels (view)",
-        "",
-        "Every label of an unlabeled frame with its evidence, a row per policy, in the working",
-        "database and in every exported file; where provenance is human, people decided:",
-        "",
-        f"```text\n{_wrapped(names)}\n```",
-        "",
-        "## evaluation (view)",
-        "",
-        "What became of every object and detection of val frames, as `curate evaluate --store`",
-        "left it: source, frame, side, k, category, outcome, matched_k, iou, score, the box,",
-        "truncated and occluded (of objects), overlap, difficulty.",
-        "",
-        "## failed_frames (view)",
-        "",
-        "round, stage, frame, split, error.",
-        "",
-    ]
     return "\n".join(parts)
 
 
@@ -199,14 +179,36 @@ def queries_page() -> str:
     )
     parts.append(
         "exported label file where that holds the answer; `curate query --list` lists them, and\n"
-        "[`curate serve`](serve.md) shows their answers in a browser.\n"
+        "[`curate serve`](serve.md) shows their answers in a browser. `--policy` and `--round`\n"
+        "select the rows of one policy and round. `curate query --schema` lists tables, views and\n"
+        "columns with their meaning, as the page [on the database](schema.md) does.\n"
     )
+    parts.append(_sql_functions())
     for query in named_queries().values():
         where = "" if query.exported else " Working database only."
+        options = " and ".join(f"`--{name}`" for name in query.filters)
+        taken = f" Takes {options}." if options else ""
         parts.append(
-            f"## {query.name}\n\n{query.description}.{where}\n\n```sql\n{query.sql}\n```\n"
+            f"## {query.name}\n\n{query.description}.{where}{taken}\n\n```sql\n{query.sql}\n```\n"
         )
     return "\n".join(parts)
+
+
+def _sql_functions() -> str:
+    """Return the section on functions that curate adds to SQL."""
+    rows = "\n".join(
+        f"| `{each.name}({each.arguments})` | {each.meaning} | {each.postgresql} |"
+        for each in FUNCTIONS
+    )
+    return (
+        "## SQL functions\n\n"
+        "`curate query` and `curate serve` add these to SQLite. Nulls do not count; without\n"
+        "enough values the result is null. A PostgreSQL server has only its own functions: the\n"
+        "last column says what to write there.\n\n"
+        f"| function | result | on PostgreSQL |\n|---|---|---|\n{rows}\n\n"
+        "```sql\nSELECT category, median(points) AS points, corr(score, weight) AS agreement\n"
+        "FROM weighted_labels WHERE policy = 'pspsl' GROUP BY category\n```\n"
+    )
 
 
 def main() -> None:
@@ -217,12 +219,6 @@ def main() -> None:
 
 def _trimmed(text: str) -> str:
     return "\n".join(line.rstrip() for line in text.strip().splitlines())
-
-
-def _wrapped(text: str) -> str:
-    import textwrap
-
-    return "\n".join(textwrap.wrap(text, 96))
 
 
 if __name__ == "__main__":

@@ -171,9 +171,9 @@ def _train_student(workspace: Workspace, policy: str) -> None:
 
 
 def _print_query(workspace: Workspace) -> None:
-    from pipelines.queries.run_query import ask
+    from pipelines.queries.run_query import run_query
 
-    columns, rows = ask(workspace.database.url, QUERY)
+    columns, rows = run_query(workspace.database.url, QUERY)
     print_table(columns, rows)
 
 

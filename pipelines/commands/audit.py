@@ -16,7 +16,7 @@ from pipelines.commands.options import (
     end,
     open_workspace,
 )
-from pipelines.reports.terminal import print_json, print_report, print_table
+from pipelines.reports.terminal import print_json, print_line, print_report, print_table
 
 if TYPE_CHECKING:
     from curate.evaluation.audit import Audit, Estimate, Figures
@@ -107,8 +107,8 @@ def audit(
         print_json({**about, **as_numbers(found.figures)})
     else:
         _print(found.figures, _title(found))
-        typer.echo("\n".join(words))
-        typer.echo(f"picture: {picture}")
+        print_line("\n".join(words), indent=2)
+        print_line(f"picture: {picture}")
     end(found.reports, as_json=False)
 
 
@@ -124,7 +124,7 @@ def _title(found: "AuditedRound") -> str:
 def _print(figures: "Audit", title: str) -> None:
     """All policies, their AUROC by category, the first one's weight bins, and the slices."""
     by_policy = figures.whole()
-    typer.echo(f"{title}; {100 * figures.level:.0f} % intervals over {figures.frames} frames\n")
+    print_line(f"{title}; {100 * figures.level:.0f} % intervals over {figures.frames} frames\n")
     print_table(
         ("weight of", "AUROC", "interval", "AP", "precision", "interval", "recall", "calib. error"),
         [

@@ -241,8 +241,7 @@ def _announce(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
     for table in report.tables:
         if overlaps == "all" or table.overlaps in {None, overlaps}:
             rows = [[shown(value) for value in row] for row in table.rows]
-            typer.echo(table.title)  # by itself, so that a narrow table does not break it
-            print_table(table.columns, rows, dense=True)
+            print_table(table.columns, rows, title=table.title)
     typer.echo("\n".join(str(path) for path in written))
 
 

@@ -16,13 +16,15 @@ def check(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> Non
     from curate.errors import LeakageError
     from pipelines.commands.options import open_workspace
     from pipelines.firewall.rules import check as check_all
-    from pipelines.reports.terminal import print_json
+    from pipelines.reports.terminal import print_json, print_line
 
     findings = []
     for finding in check_all(open_workspace(workspace)):
         findings.append(finding)
         if not as_json:
-            typer.echo(f"{'pass' if finding.held else 'FAIL'}  {finding.rule:<36} {finding.told}")
+            print_line(
+                f"{'pass' if finding.held else 'FAIL'}  {finding.rule:<36} {finding.told}", 6
+            )
     if as_json:
         print_json(findings)
     broken = [finding for finding in findings if not finding.held]

@@ -36,6 +36,7 @@ def demo(
     Example: curate demo --rounds 1
     """
     from pipelines.demo import Demo, run_demo
+    from pipelines.reports.terminal import print_line
 
     run_demo(
         Demo(
@@ -48,7 +49,7 @@ def demo(
             seed=seed,
             workers=workers,
         ),
-        typer.echo,
+        print_line,
     )
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, Optional
 import typer
 
 from pipelines.commands.options import JsonOption, WorkspaceOption, open_workspace
-from pipelines.reports.terminal import print_json
+from pipelines.reports.terminal import print_json, print_line
 
 
 def doctor(
@@ -31,7 +31,7 @@ def doctor(
     else:
         typer.echo(f"frame {name}")
         for one in findings:
-            typer.echo(f"{one.state:<8} {one.check:<12} {one.message}")
+            print_line(f"{one.state:<8} {one.check:<12} {one.message}", indent=22)
     if any(one.state == "wrong" for one in findings):
         raise typer.Exit(1)
 

@@ -12,7 +12,7 @@ from pipelines.commands.options import (
     WorkspaceOption,
     open_workspace,
 )
-from pipelines.reports.terminal import print_json, print_table
+from pipelines.reports.terminal import print_json, print_line, print_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -90,7 +90,7 @@ def evaluate(
         opened = open_workspace(workspace, executor, workers)
         found, notes = _evaluate_val(opened, round_number, checkpoint, store=store)
         if not as_json:
-            typer.echo(notes)
+            print_line(notes)
     if as_json:
         print_json(found.as_dict())
     else:

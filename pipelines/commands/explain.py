@@ -11,7 +11,7 @@ from pipelines.commands.options import (
     WorkspaceOption,
     open_workspace,
 )
-from pipelines.reports.terminal import print_json
+from pipelines.reports.terminal import print_json, print_line
 
 
 def explain(
@@ -33,7 +33,8 @@ def explain(
     if as_json:
         print_json(found)
     else:
-        typer.echo(found.as_text())
+        for line in found.lines:
+            print_line(line, indent=17)
 
 
 def register(app: typer.Typer) -> None:

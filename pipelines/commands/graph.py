@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from pipelines.commands.options import JsonOption
-from pipelines.reports.terminal import print_json
+from pipelines.reports.terminal import print_json, print_table
 
 
 def graph(
@@ -24,8 +24,11 @@ def graph(
     if as_json:
         shown = ("name", "command", "reads", "writes")
         print_json([{name: getattr(stage, name) for name in shown} for stage in found.stages])
-        return
-    typer.echo(found.as_mermaid() if mermaid else found.as_text())
+    elif mermaid:
+        typer.echo(found.as_mermaid())
+    else:
+        rows = ((", ".join(each.reads), each.name, ", ".join(each.writes)) for each in found.stages)
+        print_table(("reads", "stage", "writes"), rows)
 
 
 def register(app: typer.Typer) -> None:

@@ -7,24 +7,44 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from pipelines.commands.options import JsonOption, WorkspaceOption
-from pipelines.reports.terminal import print_json_rows, print_table
+from pipelines.reports.terminal import print_json_rows, print_line, print_table, print_tables
 
 if TYPE_CHECKING:
     from sqlalchemy import URL
 
+    from pipelines.queries.schema import Relation
+
 FORMATS = ("table", "csv", "json")
+AUDITED = ("score", "rho_det", "consistency")
+"""Evidence that `curate audit` stores beside the policies."""
+_SCHEMA = ("table", "kind", "column", "type", "unit", "key", "null", "meaning")
 
 
 def query(
-    sql: Annotated[Optional[str], typer.Argument(help="A SELECT.")] = None,  # noqa: UP045
+    sql: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Argument(help="A SELECT; with --schema the table or view to describe."),
+    ] = None,
     named: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Ask a question that ships with curate, see --list."),
+        typer.Option(help="Run a query that ships with curate, see --list."),
     ] = None,
-    show_list: Annotated[bool, typer.Option("--list", help="List these questions.")] = False,
+    show_list: Annotated[bool, typer.Option("--list", help="List these queries.")] = False,
+    schema: Annotated[
+        bool,
+        typer.Option("--schema", help="List tables and views: columns, types, units, meaning."),
+    ] = False,
+    policy: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="With --named: only this policy's rows; default: all policies."),
+    ] = None,
+    round_number: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option("--round", min=0, help="With --named: only this round; default: all rounds."),
+    ] = None,
     file: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Ask an exported label file, not the workspace's database."),
+        typer.Option(help="Query an exported label file, not the workspace's database."),
     ] = None,
     form: Annotated[str, typer.Option("--format", help="table, csv or json.")] = "table",
     as_csv: Annotated[bool, typer.Option("--csv", help="Short for --format csv.")] = False,
@@ -32,42 +52,47 @@ def query(
         int, typer.Option(min=1, help="Rows of the table; csv and json print all.")
     ] = 50,
     seconds: Annotated[
-        float, typer.Option(min=0.1, help="After which the question is given up.")
+        float, typer.Option(min=0.1, help="Time after which the query is stopped.")
     ] = 60.0,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Ask the database; the connection is read-only.
+    """Query the database with SQL; the connection is read-only.
+
+    The view weighted_labels has a row per label and policy, with all evidence. SQLite gets the
+    functions median(x), quantile(x, q), corr(x, y), stddev(x) and iou_bev(x1, y1, length1, width1,
+    yaw1, x2, ...). In a terminal a table that does not fit becomes a block per row, and a long
+    one goes through the pager (PAGER=cat switches it off); a table rounds fractions to four digits.
 
     Example: curate query "SELECT frame, k, weight FROM weighted_labels WHERE weight > 0.5"
     """
     from curate.errors import ConfigError
-    from pipelines.queries.named_queries import find_query, named_queries
-    from pipelines.queries.run_query import ask
 
     form = "json" if as_json else "csv" if as_csv else form
     if form not in FORMATS:
         raise ConfigError(f"--format {form}: use one of {', '.join(FORMATS)}")
-    if (sql is not None) + (named is not None) + show_list != 1:
-        raise ConfigError("query: give one of a SELECT, --named NAME or --list")
-    if show_list:
-        columns: Sequence[str] = ("name", "exported file", "answers")
-        rows: Iterator[tuple[Any, ...]] = (
-            (each.name, "yes" if each.exported else "no", each.description)
-            for each in named_queries().values()
-        )
-        limit = len(named_queries())
+    if (sql is not None and not schema) + (named is not None) + show_list + schema != 1:
+        raise ConfigError("query: give one of a SELECT, --named NAME, --list or --schema")
+    if named is None and (policy is not None or round_number is not None):
+        raise ConfigError("query: --policy and --round go with --named; write WHERE in a SELECT")
+    if schema:
+        _print_schema(_schema(sql, file, workspace), form)
+    elif show_list:
+        _print(*_list(), form, None)
     else:
-        sql = find_query(named).sql if named is not None else sql or ""
-        columns, rows = ask(_database(file, workspace), sql, seconds)
-    _print(columns, rows, form, limit)
+        from pipelines.queries.run_query import run_query
+
+        url = _database(file, workspace)
+        if named is not None:
+            sql = _named(named, policy, round_number, url)
+        _print(*run_query(url, sql or "", seconds), form, limit)
 
 
 def _database(file: Path | None, workspace: Path | None) -> "URL":
-    """The database that is asked.
+    """Return the database to query.
 
     Raises:
-        ConfigError: there is no such file.
+        ConfigError: if there is no such file.
     """
     from sqlalchemy import URL
 
@@ -81,9 +106,87 @@ def _database(file: Path | None, workspace: Path | None) -> "URL":
     return URL.create("sqlite", database=str(file))
 
 
-def _print(columns: Sequence[str], rows: Iterator[tuple[Any, ...]], form: str, limit: int) -> None:
+def _named(name: str, policy: str | None, round_number: int | None, url: "URL") -> str:
+    """Return the SQL of a named query, for a policy and a round.
+
+    Raises:
+        ConfigError: if a name is unknown, or the query does not depend on what is selected.
+    """
+    from curate.errors import ConfigError
+    from curate.spelling import did_you_mean
+    from pipelines.queries.named_queries import find_query
+    from pipelines.registry import POLICIES
+
+    found = find_query(name)
+    known = (*POLICIES.classes, *AUDITED)
+    if policy is not None and policy not in known and ":" not in policy:
+        raise ConfigError(
+            f"--policy {policy}: unknown policy{did_you_mean(policy, known)}; "
+            f"use one of {', '.join(known)}, or module:Class"
+        )
+    postgresql = url.get_backend_name() == "postgresql"
+    return found.selecting(policy, round_number, postgresql=postgresql)
+
+
+def _list() -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
+    from pipelines.queries.named_queries import named_queries
+
+    return ("name", "exported file", "options", "result"), (
+        (
+            each.name,
+            "yes" if each.exported else "no",
+            " ".join(f"--{name}" for name in each.filters),
+            each.description,
+        )
+        for each in named_queries().values()
+    )
+
+
+def _schema(name: str | None, file: Path | None, workspace: Path | None) -> "tuple[Relation, ...]":
+    """Return all tables and views, or the named one; outside a workspace those of any."""
+    from curate.errors import WorkspaceError
+    from pipelines.queries.schema import find_relation, read_schema, working_schema
+
+    try:
+        found = read_schema(_database(file, workspace), exported=file is not None)
+    except WorkspaceError:
+        if workspace is not None:
+            raise
+        found = working_schema()
+    return found if name is None else (find_relation(found, name),)
+
+
+def _print_schema(schema: "tuple[Relation, ...]", form: str) -> None:
+    rows = {
+        each: [
+            (
+                *(column.name, column.type, column.unit),
+                *("yes" if said else "" for said in (column.key, column.optional)),
+                column.meaning,
+            )
+            for column in each.columns
+        ]
+        for each in schema
+    }
+    if form == "table":
+        print_tables(
+            (
+                (f"{each.name} ({each.kind}): {each.meaning}", _SCHEMA[2:], of_it)
+                for each, of_it in rows.items()
+            ),
+            page=True,
+        )
+    else:
+        flat = ((each.name, each.kind, *row) for each, of_it in rows.items() for row in of_it)
+        _print(_SCHEMA, flat, form, None)
+
+
+def _print(
+    columns: Sequence[str], rows: Iterator[tuple[Any, ...]], form: str, limit: int | None
+) -> None:
     import csv
     import sys
+    from itertools import islice
 
     if form == "json":
         print_json_rows(dict(zip(columns, row, strict=True)) for row in rows)
@@ -92,12 +195,12 @@ def _print(columns: Sequence[str], rows: Iterator[tuple[Any, ...]], form: str, l
         writer.writerow(columns)
         writer.writerows(rows)
     else:
-        shown = [row for row, _ in zip(rows, range(limit), strict=False)]
-        print_table(columns, shown)
+        shown = list(islice(rows, limit))
+        print_table(columns, shown, page=True)
         if len(shown) == limit and next(rows, None) is not None:
-            typer.echo(f"the first {limit} rows; more with --limit, all with --format csv or json")
+            print_line(f"the first {limit} rows; more with --limit, all with --format csv or json")
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(query)

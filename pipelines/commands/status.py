@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from pipelines.commands.options import JsonOption, WorkspaceOption, open_workspace
-from pipelines.reports.terminal import print_json, print_table
+from pipelines.reports.terminal import print_json, print_line, print_table
 
 
 def status(
@@ -30,8 +30,8 @@ def status(
         print_json([dict(zip(columns, row, strict=True)) for row in rows])
     elif failed:
         for number, stage, frame, split, error in rows:
-            typer.echo(f"round {number}  {stage}  {frame} ({split}): {error}")
-        typer.echo(f"{len(rows)} failed")
+            print_line(f"round {number}  {stage}  {frame} ({split}): {error}", indent=4)
+        print_line(f"{len(rows)} failed")
     else:
         splits = {split: len(opened.frames(split)) for split in ("labeled", "unlabeled", "val")}
         counts = ", ".join(f"{count} {split}" for split, count in splits.items())

@@ -1,8 +1,9 @@
-"""Read-only questions in SQL."""
+"""Read-only SQL on a workspace's database or an exported label file."""
 
+import re
 import sqlite3
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,13 @@ from sqlalchemy import URL, Connection, CursorResult, NullPool, create_engine
 from sqlalchemy.exc import DBAPIError
 
 from curate.errors import ConfigError, DatabaseError, joined_lines, one_line
+from curate.spelling import did_you_mean
+from pipelines.queries.functions import FUNCTIONS, register_functions
 
-# What SQLite may do for a question: read tables and call functions, nothing else. ATTACH would read
+Names = Mapping[str, Sequence[str]]
+"""The columns of each table and view."""
+
+# What SQLite may do for a query: read tables and call functions, nothing else. ATTACH would read
 # other files, PRAGMA could switch the protection off.
 ALLOWED = frozenset(
     {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
@@ -38,28 +44,37 @@ _FIRST_ROWS = (
 )
 # SQLSTATE query_canceled, in every language of the server.
 _TIMED_OUT = "57014"
+# How SQLite and PostgreSQL name what does not exist: its kind and its name.
+_UNKNOWN = re.compile(
+    r"no such (?P<kind>column|table|function): \"?(?P<name>[\w.]+)"
+    r"|(?P<kind_>column|relation|function) \"?(?P<name_>[\w.]+).* does not exist"
+)
+_FUNCTION_NAMES = (
+    *(each.name for each in FUNCTIONS),
+    *("abs", "avg", "coalesce", "count", "group_concat", "max", "min", "round", "sqrt", "sum"),
+)
 
 
-def ask(
+def run_query(
     url: URL, sql: str, seconds: float = 60.0
 ) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
-    """The columns and the rows of a question.
+    """Return the columns and the rows of a query.
 
     Args:
         url: of the database.
         sql: one SELECT.
-        seconds: after which the question is given up, also while its rows are taken.
+        seconds: after which the query is stopped, also while its rows are read.
 
     Raises:
-        ConfigError: the SQL is wrong, does more than read, or takes too long or too much.
-        DatabaseError: the database cannot be opened.
+        ConfigError: if the SQL is invalid, does more than read, or takes too long or too much.
+        DatabaseError: if the database cannot be opened.
     """
     if url.get_backend_name() == "sqlite":
-        return _query_sqlite(Path(str(url.database)), sql, seconds)
-    return _query_server(url, sql, seconds)
+        return _run_on_sqlite(Path(str(url.database)), sql, seconds)
+    return _run_on_server(url, sql, seconds)
 
 
-def _query_sqlite(
+def _run_on_sqlite(
     path: Path, sql: str, seconds: float
 ) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
     try:
@@ -76,56 +91,125 @@ def _query_sqlite(
         connection.setlimit(category, limit)
     connection.execute("PRAGMA query_only = ON")
     connection.execute("PRAGMA trusted_schema = OFF")
+    faults = register_functions(connection)
     connection.set_authorizer(may_read)
     end = time.monotonic() + seconds
     connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS)
     try:
         cursor = connection.execute(sql)
     except (sqlite3.Error, sqlite3.Warning, UnicodeEncodeError, ValueError) as error:
+        own = _sqlite_error_message(path, error, seconds, connection)
         connection.close()
-        raise _sqlite_error_message(path, error, seconds) from error
+        raise own from error
     if cursor.description is None:
         connection.close()
-        raise ConfigError("query: not a question; write a SELECT")
-    return [column[0] for column in cursor.description], _rows(connection, cursor, path, seconds)
+        raise ConfigError("query: this returns no rows; write a SELECT")
+    rows = _rows(connection, cursor, path, seconds, faults)
+    return [column[0] for column in cursor.description], rows
 
 
 def _rows(
-    connection: sqlite3.Connection, cursor: sqlite3.Cursor, path: Path, seconds: float
+    connection: sqlite3.Connection,
+    cursor: sqlite3.Cursor,
+    path: Path,
+    seconds: float,
+    faults: Sequence[str],
 ) -> Iterator[tuple[Any, ...]]:
-    """The rows as they are found; what goes wrong in the middle is said in our own words."""
+    """Yield the rows as they are found; an error among them is reported as one of ours."""
     with closing(connection):
         try:
-            yield from cursor
+            for row in cursor:
+                _check_faults(faults)
+                yield row
+            _check_faults(faults)
         except sqlite3.Error as error:
-            raise _sqlite_error_message(path, error, seconds) from error
+            raise _sqlite_error_message(path, error, seconds, connection) from error
+
+
+def _check_faults(faults: Sequence[str]) -> None:
+    """Raise ConfigError where a function reports an argument that it cannot work with."""
+    if faults:
+        raise ConfigError(f"query: {faults[-1]}")
 
 
 def _sqlite_error_message(
-    path: Path, error: Exception, seconds: float
+    path: Path, error: Exception, seconds: float, connection: sqlite3.Connection
 ) -> ConfigError | DatabaseError:
     message = one_line(error)
     if "file is not a database" in message or "malformed" in message:
         return DatabaseError(f"{path}: {message}; restore a backup of the file")
     if "interrupted" in message:
         return _given_up(seconds)
-    return ConfigError(_explain(message))
+    return ConfigError(_explain(message) + _suggestion(message, lambda: _sqlite_names(connection)))
+
+
+def _sqlite_names(connection: sqlite3.Connection) -> Names:
+    """Return the columns of each table and view."""
+    connection.set_authorizer(None)
+    query = (
+        "SELECT m.name, c.name FROM sqlite_master AS m, pragma_table_info(m.name) AS c "
+        "WHERE m.type IN ('table', 'view')"
+    )
+    try:
+        return _grouped(connection.execute(query))
+    except sqlite3.Error:  # a view of a file that anyone may have made
+        return {}
+
+
+def _server_names(connection: Connection) -> Names:
+    """Return the columns of each table and view of a server."""
+    connection.rollback()
+    rows = connection.exec_driver_sql(
+        "SELECT table_name, column_name FROM information_schema.columns "
+        "WHERE table_schema = current_schema()"
+    )
+    return _grouped(tuple(row) for row in rows)
+
+
+def _grouped(rows: Iterable[tuple[str, str]]) -> Names:
+    names: dict[str, list[str]] = {}
+    for table, column in rows:
+        names.setdefault(table, []).append(column)
+    return names
+
+
+def _suggestion(message: str, read_names: Callable[[], Names]) -> str:
+    """Return what to write in place of an unknown name, and where the known ones are listed."""
+    found = _UNKNOWN.search(message)
+    if found is None:
+        return ""
+    kind, name = found["kind"] or found["kind_"], (found["name"] or found["name_"]).split(".")[-1]
+    if kind == "function":
+        for each in FUNCTIONS:
+            if each.name == name and "does not exist" in message:
+                return f"; on PostgreSQL: {each.postgresql.replace('`', '')}"
+        suggestion = did_you_mean(name, _FUNCTION_NAMES)
+        return _hint(suggestion, "docs/queries.md lists the functions of curate")
+    names = read_names()
+    known = names if kind in {"table", "relation"} else {c for each in names.values() for c in each}
+    return _hint(
+        did_you_mean(name, sorted(known)), "`curate query --schema` lists tables and columns"
+    )
+
+
+def _hint(suggestion: str, hint: str) -> str:
+    return f"{suggestion} {hint}" if suggestion else f"; {hint}"
 
 
 def may_read(action: int, _first: str | None, second: str | None, *_: str | None) -> int:
-    """SQLite asks this before each thing that a statement would do; only reading is allowed."""
+    """Return whether SQLite may take a step of a statement; only reading is allowed."""
     if action == sqlite3.SQLITE_FUNCTION and second in FORBIDDEN_FUNCTIONS:
         return sqlite3.SQLITE_DENY
     return sqlite3.SQLITE_OK if action in ALLOWED else sqlite3.SQLITE_DENY
 
 
-def _query_server(
+def _run_on_server(
     url: URL, sql: str, seconds: float
 ) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
-    """The answer of a PostgreSQL server, a part at a time.
+    """Return columns and rows of a PostgreSQL server, which sends a part of them at a time.
 
-    The question becomes DECLARE ... CURSOR FOR, in the protocol that takes one statement only, in a
-    read-only transaction: whatever is not a question is no valid SQL there.
+    The query becomes DECLARE ... CURSOR FOR, in the protocol that takes one statement only, in a
+    read-only transaction: whatever is not a query is invalid SQL there.
     """
     engine = create_engine(url, poolclass=NullPool)
     try:
@@ -141,15 +225,19 @@ def _query_server(
         reading = reading.execution_options(stream_results=True, max_row_buffer=SERVER_ROWS)
         result = reading.exec_driver_sql(sql)
     except DBAPIError as error:
+        own = _server_error_message(error, seconds, connection)
         connection.close()
-        raise _server_error_message(error, seconds) from error
+        raise own from error
     return list(result.keys()), _server_rows(reading, result, end, seconds)
 
 
 def _server_rows(
     connection: Connection, result: CursorResult[Any], end: float, seconds: float
 ) -> Iterator[tuple[Any, ...]]:
-    """The rows as they come; the server's clock starts anew with each part, so ours runs, too."""
+    """Yield the rows as they come.
+
+    The server's clock starts anew with each part, hence the one here.
+    """
     with connection, closing(result):
         try:
             for row in result:
@@ -159,18 +247,19 @@ def _server_rows(
                     raise ConfigError("query: string or blob too big")
                 yield tuple(row)
         except DBAPIError as error:
-            raise _server_error_message(error, seconds) from error
+            raise _server_error_message(error, seconds, connection) from error
 
 
-def _server_error_message(error: DBAPIError, seconds: float) -> ConfigError:
+def _server_error_message(error: DBAPIError, seconds: float, connection: Connection) -> ConfigError:
     if getattr(error.orig, "sqlstate", None) == _TIMED_OUT:
         return _given_up(seconds)
-    return ConfigError(_explain(joined_lines(error.orig)))
+    message = joined_lines(error.orig)
+    return ConfigError(_explain(message) + _suggestion(message, lambda: _server_names(connection)))
 
 
 def _given_up(seconds: float) -> ConfigError:
     return ConfigError(
-        f"query: given up after {seconds:g} seconds; ask for less, or allow more with --seconds"
+        f"query: given up after {seconds:g} seconds; select less, or allow more with --seconds"
     )
 
 

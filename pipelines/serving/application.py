@@ -93,8 +93,8 @@ def _metadata(served: Served) -> dict[str, Any]:
             name: (
                 descriptions.working_database(declared)
                 if name == served.working
-                else descriptions.exported_file()
+                else descriptions.exported_file(path)
             )
-            for name in served.files
+            for name, path in served.files.items()
         },
     }

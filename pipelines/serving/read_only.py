@@ -11,6 +11,7 @@ from typing import Any
 from datasette.database import Database
 
 from curate.errors import DatabaseError
+from pipelines.queries.functions import register_functions
 from pipelines.queries.run_query import may_read
 
 # What Datasette asks of a file to describe it; none of them changes anything without a value.
@@ -105,6 +106,7 @@ def connect_read_only(path: Path) -> sqlite3.Connection:
         raise DatabaseError(f"{path}: {error}; name a SQLite file of curate") from error
     for limit, value in _LIMITS.items():
         connection.setlimit(limit, value)
+    register_functions(connection)
     connection.set_authorizer(_authorize)
     return connection
 

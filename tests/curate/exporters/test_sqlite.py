@@ -16,7 +16,7 @@ from curate.exporters.columns import WEIGHTED_LABELS, Column
 from curate.exporters.label_file import read_frames
 from curate.exporters.sqlite import SqliteExporter
 from curate.training.labels import WeightedLabels
-from pipelines.queries.run_query import ask
+from pipelines.queries.run_query import run_query
 
 DESCRIPTION = LabelFileDescription(
     "kitti", Path("/data/kitti"), ("Car", "Cyclist"), 2, "pspsl", "1"
@@ -319,7 +319,9 @@ def test_a_file_of_version_1_is_still_read(tmp_path):
     assert labels.zero_weight == "ignore"
     assert labels[1].weights.tolist() == [0.5, 0.0]
     assert labels[1].ignored.tolist() == [False, True]
-    names, rows = ask(URL.create("sqlite", database=str(path)), "SELECT * FROM weighted_labels")
+    names, rows = run_query(
+        URL.create("sqlite", database=str(path)), "SELECT * FROM weighted_labels"
+    )
     assert dict(zip(names, next(rows), strict=True)) == label("b")
     write(path, labels=[label("b")])
     assert select(path, "SELECT count(*) FROM label") == [(1,)]

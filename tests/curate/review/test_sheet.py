@@ -87,7 +87,13 @@ def test_what_spreadsheets_do_to_a_table_does_no_harm(tmp_path: Path) -> None:
         ("f000001_all", "reject", "", "", "2: a whole frame cannot be rejected"),
         ("f000001_2", "accept", "000001,2", "000001,7", "frame 000001 has boxes 1 to 3, not '7'"),
         ("f000001_2", "accept", "000001,2", "000009,2", "frame '000009' is not in this review"),
-        ("f000001_2", "accept", "decision", "opinion", "1: the columns frame, box and decision are required"),
+        (
+            "f000001_2",
+            "accept",
+            "decision",
+            "opinion",
+            "1: the columns frame, box and decision are req",
+        ),
     ],
 )
 def test_rows_without_meaning_are_refused(

@@ -8,6 +8,7 @@ from support.label_questions import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRU
 from support.labels_at_scale import filled_workspace
 
 from db import weight_index
+from pipelines.queries.named_queries import find_query
 from pipelines.workspace.workspace import Workspace
 
 
@@ -43,6 +44,13 @@ def test_the_heaviest_labels_come_by_their_index(workspace: Workspace, columns: 
     index = "ix_weight_v_pspsl (round=? AND v>?)"
     (part,) = [part for part, step in plan if step.startswith("SEARCH w") and index in step]
     assert [step for of, step in plan if of == part and "TEMP B-TREE" in step] == [], plan
+
+
+def test_a_named_query_of_one_policy_seeks_its_labels(workspace: Workspace) -> None:
+    """The selection of the policy and round reaches the index of the policy's weights."""
+    sql = find_query("trusted-frames").selecting("pspsl", 1)
+    steps = [step for _, step in _plan(workspace, sql)]
+    assert any("ix_weight_v_pspsl (round=? AND v>?)" in step for step in steps), steps
 
 
 def test_counts_are_those_of_the_labels(workspace: Workspace) -> None:

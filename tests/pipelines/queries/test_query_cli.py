@@ -1,4 +1,4 @@
-"""curate query: the questions that ship with the project, the forms of an answer, other files."""
+"""curate query: the queries that ship with curate, the forms of a result, other files."""
 
 import csv
 import io
@@ -9,6 +9,8 @@ import pytest
 from support.pipelines_cli import Curate
 
 from curate.errors import ConfigError
+from pipelines.assessment.audit import EVIDENCE
+from pipelines.commands.query import AUDITED
 from pipelines.queries.named_queries import named_queries
 from pipelines.workspace.workspace import Workspace
 
@@ -81,6 +83,43 @@ def test_missed_objects_are_listed_after_an_evaluation(curate: Curate, weighted:
     assert json.loads(curate("query", "--named", "precision", "--json", "-w", weighted)[1])
 
 
+def test_named_queries_take_a_policy_and_a_round(
+    curate: Curate, weighted: Path, engine: str
+) -> None:
+    """The rows are those of the whole result; each query says what it takes."""
+    assert curate("solve", "--policy", "spsl", "--round", "1", "-w", weighted)[0] == 0
+    assert curate("audit", "--replicates", "10", "-w", weighted)[0] == 0
+
+    def rows(name: str, *options: str) -> list[dict]:
+        code, out, err = curate("query", "--named", name, "--json", *options, "-w", weighted)
+        assert (code, err) == (0, ""), name
+        return json.loads(out)
+
+    selected = set()
+    for name, query in QUERIES.items():
+        whole = rows(name)
+        for column, value in (("policy", "spsl"), ("round", 1)):
+            if column not in query.filters:
+                continue
+            found = rows(name, f"--{column}", str(value))
+            if whole and column in whole[0]:
+                expected = [row for row in whole if row[column] == value]
+                assert _rounded(found) == _rounded(expected), name
+                selected |= {(name, column)} if len(expected) < len(whole) else set()
+        if "round" in query.filters:
+            assert rows(name, "--round", "999") == []
+    assert {("kept", "policy"), ("counts", "policy"), ("reliability", "policy")} <= selected
+    both = rows("kept", "--policy", "spsl", "--round", "1")
+    assert {(row["policy"], row["round"]) for row in both} == {("spsl", 1)}
+
+
+def test_what_the_audit_stores_can_be_selected() -> None:
+    """Evidence stands there beside the policies."""
+    assert tuple(EVIDENCE) == AUDITED
+    sql = QUERIES["kept"].selecting("it's", None)
+    assert "policy = 'it''s'" in sql
+
+
 def test_the_list_names_every_query(curate: Curate) -> None:
     """Without a workspace, in every form."""
     code, out, _ = curate("query", "--list")
@@ -97,6 +136,12 @@ def test_the_list_names_every_query(curate: Curate) -> None:
         (["--named", "nothing"], "use one of age,"),
         (["--format", "xml", "SELECT 1"], "table, csv, json"),
         ([], "give one of"),
+        (["--named", "kepd"], "did you mean 'kept'?"),
+        (["--named", "kept", "--policy", "pspls"], "did you mean 'pspsl'?"),
+        (["--named", "splits", "--policy", "pspsl"], "the query 'splits' has no policy"),
+        (["--named", "false", "--round", "1"], "the query 'false' has no round"),
+        (["SELECT 1", "--policy", "pspsl"], "go with --named"),
+        (["--schema", "--named", "kept"], "give one of"),
         (["SELECT 1", "--named", "age"], "give one of"),
         (["SELECT 1", "--file", "gone.sqlite"], "curate export"),
     ],

@@ -11,7 +11,7 @@ from support.serving import Pages
 from db.models import Base
 from pipelines.labels.of_one_frame import chosen_round
 from pipelines.queries.named_queries import named_queries
-from pipelines.queries.run_query import ask
+from pipelines.queries.run_query import run_query
 from pipelines.reports.pictures import frame_picture
 
 pytest.importorskip("datasette", reason="the extra [serve] is not installed")
@@ -39,7 +39,7 @@ def test_a_table_says_what_it_is(pages: Pages, name: str) -> None:
 def test_a_named_query_answers_as_curate_query_does(pages: Pages, name: str) -> None:
     """As many rows, the same columns; those of the working database only there."""
     query = named_queries()[name]
-    columns, rows = ask(pages.workspace.database.url, query.sql)
+    columns, rows = run_query(pages.workspace.database.url, query.sql)
     answer = json.loads(pages.get(f"/workspace/{name}.json", _shape="array").text)
     assert len(answer) == len(list(rows))
     assert all(list(row) == list(columns) for row in answer)
