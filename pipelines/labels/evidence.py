@@ -48,8 +48,8 @@ def read_evidence(
         boxes: whether to read the boxes, which few policies look at.
         columns: of "category", "score", "iou" and "loss", those that the evidence holds; None for
             all. The others are NaN and not read. The category is read in any case, for the keys
-            hold it and solve counts labels by it: to count in SQL takes twice as long as to read
-            it. The evidence has "" in its place.
+            hold it and solve counts labels by it: to count in SQL takes nearly twice as long as
+            to read it. The evidence has "" in its place.
     """
     wanted = {"category", "score", "iou", "loss"} if columns is None else set(columns)
     for source in sources_of(workspace.config.run.priors):
