@@ -138,7 +138,7 @@ def _section(name: str, section: type[BaseModel]) -> list[str]:
     doc = " ".join((inspect.getdoc(section) or "").split())
     rows = (_setting_cells(setting) for setting in settings_of(section))
     return [
-        f"## [{name}]",
+        f"## `[{name}]`",
         "",
         doc,
         "",

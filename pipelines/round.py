@@ -61,6 +61,7 @@ _DECIDE = (
         settings=export.settings,
         run=export.run,
         file=export.file,
+        check=solve.check,
         guard=export.guard,
     ),
     RoundStage(

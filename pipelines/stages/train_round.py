@@ -14,6 +14,7 @@ from curate.spelling import did_you_mean
 from db import bulk
 from pipelines.assembly import (
     check_labels_format,
+    check_policy,
     device,
     trainable_detector,
     trained_detector,
@@ -76,12 +77,14 @@ def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
 
 
 def check(workspace: Workspace, policy: str) -> None:
-    """Check the settings of the trainer, curate's or the user's.
+    """Check the policy, and the settings of the trainer, curate's or the user's.
 
     Raises:
-        ConfigError: if there is no such label format, or the trainer does not know a setting.
+        ConfigError: if the policy or the label format cannot be used, or the trainer does not know
+            a setting.
     """
     config = workspace.config
+    check_policy(config, policy)
     if config.train.command is not None:
         check_labels_format(config)
     elif trainable_detector(config):

@@ -43,3 +43,51 @@ def test_a_class_without_what_the_pipeline_asks_for_is_refused(
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ConfigError, match=r"^prior '.*' has no columns, rho_column; see curate"):
         PRIORS.load("priors_of_a_user:Mine")
+
+
+SOURCE = """
+class Mine:
+    def __init__(self, path, *, minimum_score, device="cpu"):
+        self.device = device
+    def predict(self, frame): ...
+
+class Anything(Mine):
+    def __init__(self, path, **options):
+        self.options = options
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("pilars", {}, "unknown detector 'pilars': use one of .*; did you mean 'pillars'\\?$"),
+        ("{}:Mien", {}, "cannot be imported: {} has no 'Mien'; did you mean 'Mine'\\?$"),
+        (
+            "{}:Mine",
+            {"devise": "cuda"},
+            "has no option 'devise'; did you mean 'device'\\?; it has minimum_score, device$",
+        ),
+        ("{}:Mine", {}, "missing a required .*argument: 'minimum_score'$"),
+    ],
+)
+def test_a_wrong_name_or_option_is_explained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, options: dict, words: str
+) -> None:
+    """Without an instance being made."""
+    module = "detectors_of_a_user"
+    (tmp_path / f"{module}.py").write_text(SOURCE)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match=words.format(module)):
+        DETECTORS.check(name.format(module), None, offered=(), options=options)
+
+
+def test_a_class_that_takes_any_option_gets_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it does with them is its own affair."""
+    (tmp_path / "open_detectors_of_a_user.py").write_text(SOURCE)
+    monkeypatch.syspath_prepend(tmp_path)
+    made = DETECTORS.build(
+        "open_detectors_of_a_user:Anything", None, offered={}, options={"anything": 1}
+    )
+    assert made.options == {"anything": 1}

@@ -1,5 +1,6 @@
 """Wrong names in the configuration are found before any work, by every command that needs them."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -67,12 +68,12 @@ UNUSABLE = [
         "run.executor: executor 'no_such_package:Executor' cannot be imported: No module named",
     ),
     (
-        ("solve", "run"),
+        ("solve", "export", "train-round", "run"),
         ('method = "pspsl"', 'method = "support.toys:NoPolicy"'),
         "run.method: policy 'support.toys:NoPolicy' cannot be imported",
     ),
     (
-        ("solve", "run"),
+        ("solve", "export", "train-round", "run"),
         ("options = {}\n\n[train]", "options = {pspsl = {self_pased = false}}\n\n[train]"),
         "run.method: policy 'pspsl' has no option 'self_pased'; did you mean 'self_paced'?",
     ),
@@ -145,9 +146,10 @@ def test_an_option_of_the_command_line_is_checked_like_the_file(
     err = fails_before_any_work(curate, workspace, "predict", "--executor", "proces")
     assert "command line: run.executor: unknown executor 'proces'" in err
     assert "did you mean 'process'?" in err
-    err = fails_before_any_work(curate, workspace, "solve", "--policy", "threshhold")
-    assert "--policy: unknown policy 'threshhold'" in err
-    assert "did you mean 'threshold'?" in err
+    for command in ("solve", "export", "train-round"):
+        err = fails_before_any_work(curate, workspace, command, "--policy", "threshhold")
+        assert "--policy: unknown policy 'threshhold'" in err
+        assert "did you mean 'threshold'?" in err
 
 
 @pytest.mark.parametrize(
@@ -189,3 +191,27 @@ def test_a_query_does_not_import_what_it_does_not_need(
     assert (code, err) == (0, "")
     assert "12" in out
     assert "slow_module" not in sys.modules
+
+
+def test_status_does_not_import_what_runs_models(
+    curate: Curate, workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither torch for a detector that curate trains, nor an executor or exporter of the user."""
+    (tmp_path / "heavy_module.py").write_text("raise SystemExit('was imported')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    edit(
+        workspace,
+        ("support.toys:ToyDetector", "pillars"),
+        ('executor = "serial"', 'executor = "heavy_module:Executor"'),
+        ('labels_format = "sqlite"', 'labels_format = "heavy_module:Exporter"'),
+    )
+    code = (
+        "import sys\n"
+        f"sys.argv = ['curate', 'status', '-w', {str(workspace.root)!r}]\n"
+        "from pipelines.cli import main\n"
+        "try: main()\n"
+        "except SystemExit as end: assert not end.code, end.code\n"
+        "print(sorted({'torch', 'onnxruntime', 'open3d', 'heavy_module'} & set(sys.modules)))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout.splitlines()[-1] == "[]"

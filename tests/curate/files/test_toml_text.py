@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 
-from curate.files.toml_text import MOST_CHARACTERS, MOST_PARTS, parse_toml
+from curate.files.toml_text import MOST_CHARACTERS, MOST_PARTS, parse_toml, toml, toml_key
 
 
 @pytest.mark.parametrize(
@@ -46,3 +46,27 @@ def test_the_look_itself_takes_no_time(text: str) -> None:
 def test_a_mark_in_front_of_the_text_is_no_part_of_it() -> None:
     """Some editors write one."""
     assert parse_toml("\ufeffa = 1\n") == {"a": 1}
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        True,
+        3,
+        -0.5,
+        1e-9,
+        'quotes " and \\ and a line\nbreak, \x7f and \x01',
+        ["a", ["b"], {"c d": {"e:f": 1.0}}],
+        {},
+    ],
+)
+def test_what_is_written_is_read_again(value: object) -> None:
+    """Whatever the configuration can hold."""
+    assert parse_toml(f"x = {toml(value)}") == {"x": value}
+
+
+@pytest.mark.parametrize(("key", "written"), [("a-b_1", "a-b_1"), ("a.b", '"a.b"'), ("", '""')])
+def test_a_key_is_in_quotes_where_it_must_be(key: str, written: str) -> None:
+    """So that it stays one key."""
+    assert toml_key(key) == written
+    assert parse_toml(f"{toml_key(key)} = 1") == {key: 1}
