@@ -25,11 +25,12 @@ def run_frame_command(
 ) -> None:
     """Run frame stages for a split; None stands for the configured priors."""
     from curate.errors import ConfigError
+    from pipelines.engine.plan import Plan
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
-    from pipelines.engine.rounds import preview_round
+    from pipelines.engine.rounds import open_round, preview_round
     from pipelines.engine.runner import open_executor, run_frames
-    from pipelines.round import graph_of, open_plan
+    from pipelines.round import graph_of
     from pipelines.workspace.splits import SPLITS
 
     workspace = open_workspace(folder, executor, workers)
@@ -51,7 +52,7 @@ def run_frame_command(
         planned = (preview.of_frames(stage, split, alone=True) for stage in wanted)
         print_preview(planned, as_json=as_json)
         return
-    plan = open_plan(workspace, round_number)
+    plan = Plan(workspace, open_round(workspace, round_number), graph)
     reports = []
     with open_executor(workspace) as work:
         for stage in wanted:
