@@ -72,15 +72,6 @@ class Graph:
                     found.insert(0, other)
         return tuple(found)
 
-    def as_text(self) -> str:
-        """Return a line per stage: inputs -> stage -> outputs."""
-        reads = [", ".join(stage.reads) for stage in self.stages]
-        width = max(map(len, reads))
-        return "\n".join(
-            f"{read:>{width}} -> {stage.name:<11} -> {', '.join(stage.writes)}"
-            for read, stage in zip(reads, self.stages, strict=True)
-        )
-
     def as_mermaid(self) -> str:
         """Return a flowchart of tables (rounded) and stages (boxes)."""
         lines = ["flowchart LR"]

@@ -258,7 +258,11 @@ class Preview:
         return "its settings or its input changed"
 
     def _changed_settings(self, stage: FramesStage | RoundStage, policy: str) -> list[str]:
-        """The settings of a stage that differ from those of the round's last run."""
+        """The settings of a stage that differ from those of the round's last run.
+
+        A stage has names of its own for some of them; they are called as in curate.toml where a
+        setting of the same name has changed there.
+        """
         if self._recorded is None or self._plan is None:
             return []
         try:
@@ -266,7 +270,10 @@ class Preview:
         except CurateError:  # what they name may be gone
             return []
         now = _settings(stage, self._workspace, self._plan.context, policy)
-        return sorted(key for key in {*now, *former} if now.get(key) != former.get(key))
+        changed = {key.rpartition(".")[2] for key in _changes(former, now)}
+        sections = (_flat(each.config.model_dump()) for each in (self._recorded, self._workspace))
+        known = [key for key in _changes(*sections) if key.rpartition(".")[2] in changed]
+        return known or sorted(changed)
 
     @cached_property
     def _recorded(self) -> Workspace | None:
@@ -307,6 +314,10 @@ def _flat(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
         inner = isinstance(value, Mapping) and value
         found |= _flat(value, f"{before}{name}.") if inner else {f"{before}{name}": repr(value)}
     return found
+
+
+def _changes(former: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    return sorted(key for key in {*now, *former} if now.get(key) != former.get(key))
 
 
 def _has_task(workspace: Workspace, key: TaskKey) -> bool:

@@ -4,8 +4,6 @@ import csv
 import io
 import json
 import sqlite3
-import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -33,21 +31,6 @@ def made(curate: Curate, tmp_path: Path, toy_kitti: Path, monkeypatch: pytest.Mo
     assert "2 labeled, 6 unlabeled and 4 val frames" in out
     monkeypatch.chdir(folder)
     return folder
-
-
-def test_help_answers_without_heavy_imports() -> None:
-    """`curate --help` imports neither numpy nor torch nor a database."""
-    code = (
-        "import sys; sys.argv = ['curate', '--help']\n"
-        "from pipelines.cli import main\n"
-        "try: main()\n"
-        "except SystemExit: pass\n"
-        "heavy = {'numpy', 'torch', 'open3d', 'cv2', 'sqlalchemy', 'numba', 'onnxruntime',\n"
-        "         'pydantic', 'scipy'}\n"
-        "print('heavy:', sorted(heavy & set(sys.modules)))"
-    )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "heavy: []" in ended.stdout
 
 
 def test_the_stages_run_one_by_one_and_the_weights_are_in_sql(curate: Curate, made: Path) -> None:

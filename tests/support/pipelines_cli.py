@@ -2,10 +2,12 @@
 
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import pytest
+from typer.main import get_command
 
-from pipelines.cli import main
+from pipelines.cli import COMMANDS, app, main
 
 Curate = Callable[..., tuple[int, str, str]]
 
@@ -26,3 +28,16 @@ def in_process(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -
         return code, output.out, output.err
 
     return run
+
+
+def with_option(option: str) -> set[str]:
+    """The commands that have an option."""
+    root = get_command(app)
+    found = set()
+    for name in COMMANDS:
+        command: Any = root
+        for word in name.split():
+            command = command.commands[word]
+        if any(option in parameter.opts for parameter in command.params):
+            found.add(name)
+    return found

@@ -1,0 +1,206 @@
+"""`--dry-run`: what would be done, why, at what cost, and that nothing is."""
+
+import json
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from support.pipelines_cli import Curate, with_option
+
+from curate.errors import WorkspaceError
+from pipelines.engine.rounds import find_teacher
+from pipelines.workspace.workspace import Workspace
+
+STAGES = ("predict", "repredict", "points", "semantic", "solve", "export")
+
+
+@pytest.fixture
+def made(workspace: Workspace, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a toy workspace, which is the current folder."""
+    monkeypatch.chdir(workspace.root)
+    return workspace.root
+
+
+@pytest.fixture
+def dry(curate: Curate) -> Callable[..., dict[str, dict]]:
+    """A function that returns what would be done, by stage."""
+
+    def run(*arguments: object) -> dict[str, dict]:
+        code, out, err = curate(*arguments, "--dry-run", "--json")
+        assert (code, err) == (0, "")
+        return {each["stage"]: each for each in json.loads(out)["stages"]}
+
+    return run
+
+
+def change(root: Path, former: str, later: str) -> None:
+    """Change a setting."""
+    path = root / "curate.toml"
+    assert former in path.read_text()
+    path.write_text(path.read_text().replace(former, later))
+
+
+def contents(root: Path) -> tuple[list[str], dict[Path, bytes]]:
+    """All rows of the database, and all other files."""
+    with closing(sqlite3.connect(root / "curate.db")) as connection:
+        rows = list(connection.iterdump())
+    files = (path for path in root.rglob("*") if path.is_file() and "curate.db" not in path.name)
+    return rows, {path: path.read_bytes() for path in files}
+
+
+def test_every_stage_command_has_it() -> None:
+    """And no stage is left out."""
+    stages = {"pretrain", "predict", "repredict", "score", "solve", "export", "train-round", "run"}
+    assert with_option("--dry-run") == stages | {"review import"}
+
+
+def test_a_new_workspace_would_run_everything(made: Path, dry: Callable) -> None:
+    """On all unlabeled frames, with the first of them by name, at an unknown cost."""
+    found = dry("run")
+    assert tuple(found) == STAGES
+    for stage in STAGES[:4]:
+        assert found[stage]["frames"] == 6
+        assert len(found[stage]["first_frames"]) == 5
+        assert found[stage]["first_frames"] == sorted(found[stage]["first_frames"])
+    assert {tuple(each["reasons"]) for each in found.values()} == {("never ran",)}
+    assert {each["seconds"] for each in found.values()} == {None}
+
+
+@pytest.mark.parametrize("command", ["run", "predict", "pretrain", "repredict", "score"])
+def test_nothing_is_written(curate: Curate, made: Path, command: str) -> None:
+    """Neither rows, such as the round or the detector, nor files; whatever the command answers."""
+    before = contents(made)
+    curate(command, "--dry-run")
+    assert contents(made) == before
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("run",),
+        ("solve", "--policy", "spsl"),
+        ("export",),
+        ("export", "--format", "kitti"),
+        ("train-round", "--command", "true"),
+    ],
+)
+def test_nothing_is_written_after_a_run(
+    curate: Curate, made: Path, command: tuple[str, ...]
+) -> None:
+    """Though there is something to do."""
+    assert curate("run")[0] == 0
+    change(made, 'scope = "round"', 'scope = "frame"')
+    curate("solve")
+    curate("export")
+    before = contents(made)
+    code, out, err = curate(*command, "--dry-run")
+    assert (code, err) == (0, "")
+    assert out
+    assert contents(made) == before
+
+
+def test_a_changed_setting_is_named_and_what_follows_is_due(
+    curate: Curate, made: Path, dry: Callable
+) -> None:
+    """The stage itself by its setting, later ones by their input; the others are up to date."""
+    assert curate("run")[0] == 0
+    assert all(not each["reasons"] for each in dry("run").values())
+    assert "Everything is up to date" in curate("run", "--dry-run")[1]
+    change(made, "minimum_iou = 0.1", "minimum_iou = 0.2")
+    found = dry("run")
+    assert {stage: each["reasons"] for stage, each in found.items()} == {
+        "predict": [],
+        "repredict": ["changed settings: repredict.minimum_iou"],
+        "points": [],
+        "semantic": [],
+        "solve": ["its input changes: repredict"],
+        "export": ["its input changes: solve"],
+    }
+    assert found["repredict"]["frames"] == 6
+    reports = json.loads(curate("run", "--json")[1])
+    done = {each["stage"]: each["done"] for each in reports}
+    assert {stage for stage, count in done.items() if count} == {"repredict", "solve", "export"}
+
+
+def test_another_teacher_is_named(
+    curate: Curate, made: Path, dry: Callable, weights_file: Path
+) -> None:
+    """An external detector with another file; the new file is not recorded."""
+    assert curate("run")[0] == 0
+    weights_file.write_text("other")
+    assert dry("run")["predict"]["reasons"] == ["its teacher changed"]
+    assert find_teacher(Workspace.open(made), 1)[0] is None
+
+
+def test_a_failed_frame_is_due_again(
+    curate: Curate, made: Path, toy_kitti: Path, workspace: Workspace, dry: Callable
+) -> None:
+    """It alone."""
+    name = min(workspace.frames("unlabeled"))
+    path = toy_kitti / "training" / "calib" / f"{name}.txt"
+    content = path.read_bytes()
+    path.unlink()
+    curate("run")
+    path.write_bytes(content)
+    found = dry("predict")["predict"]
+    assert (found["frames"], found["first_frames"]) == (1, [name])
+    assert found["reasons"] == ["failed before"]
+    assert dry("repredict")["repredict"]["frames"] == 0
+    assert dry("run")["repredict"]["frames"] == 1
+
+
+def test_a_changed_formula_costs_no_measurement(curate: Curate, made: Path, dry: Callable) -> None:
+    """Frames with stored measurements are due, at no cost."""
+    assert curate("run")[0] == 0
+    change(made, "[semantic]", "[semantic]\n# a changed formula")
+    change(made, 'mean = "geometric"', 'mean = "arithmetic"')
+    found = dry("score", "--prior", "semantic")["semantic"]
+    assert (found["frames"], found["seconds"]) == (6, 0.0)
+    assert found["reasons"] == ["changed settings: semantic.mean"]
+
+
+def test_the_cost_follows_from_earlier_frames(curate: Curate, made: Path, dry: Callable) -> None:
+    """By the median, which a slow first frame does not move; several workers share it."""
+    assert curate("run")[0] == 0
+    with closing(sqlite3.connect(made / "curate.db")) as connection, connection:
+        connection.execute("UPDATE task SET seconds = 2.0 WHERE stage = 'predict'")
+        first = "SELECT min(id) FROM task WHERE stage = 'predict'"
+        connection.execute(f"UPDATE task SET seconds = 60.0 WHERE id = ({first})")
+        connection.execute("UPDATE task SET seconds = 7.0 WHERE stage = 'solve'")
+    change(made, "minimum_score = 0.1", "minimum_score = 0.2")
+    assert dry("run")["predict"]["seconds"] == pytest.approx(12.0)
+    assert dry("run")["solve"]["seconds"] == pytest.approx(7.0)
+    assert dry("run", "--workers", 2)["predict"]["seconds"] == pytest.approx(6.0)
+    out = curate("predict", "--dry-run")[1]
+    assert "would work on 6 frames (" in out
+    assert "changed settings: detector.minimum_score; about 12 s" in out
+
+
+def test_a_stage_that_could_not_run_says_so(curate: Curate, made: Path) -> None:
+    """As the command itself would."""
+    code, out, err = curate("solve", "--dry-run")
+    assert (code, out) == (WorkspaceError.exit_code, "")
+    assert "run `curate predict`" in err
+
+
+def test_a_teacher_that_is_still_to_be_trained_makes_every_round_due(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, dry: Callable
+) -> None:
+    """All frames of all rounds."""
+    detector = "support.trainable_toy:GridDetector"
+    curate(
+        "init", tmp_path / "w", "--root", toy_kitti, "--labeled", 0.25, "--detector", detector,
+        "--set", "run.rounds=2",
+    )  # fmt: skip
+    code, out, _ = curate("run", "--dry-run", "--json", "-w", tmp_path / "w")
+    assert code == 0
+    stages = json.loads(out)["stages"]
+    assert [each["round"] for each in stages if each["stage"] == "predict"] == [1, 2]
+    assert stages[0]["stage"] == "pretrain"
+    assert stages[0]["reasons"] == ["never ran"]
+    assert {each["frames"] for each in stages} == {None, 6}
+    assert {tuple(each["reasons"]) for each in stages[1:]} == {
+        ("its teacher is still to be trained",)
+    }
