@@ -25,7 +25,7 @@ prove-bare:
 	$(PYTHON) .ci/prove_bare.py $(SUITES)
 
 wheel: $(READY)
-	$(BIN)/pip wheel -q --no-deps --wheel-dir dist .
+	$(BIN)/pip wheel -q --no-deps --no-build-isolation --wheel-dir dist .
 
 # `make test` tries the same examples every time; this tries new ones with every run.
 fuzz-random: $(READY)
