@@ -1,4 +1,5 @@
-# curate on the CPU. Build: docker build -t curate .   Run: docker run --rm -v "$PWD:/data" curate demo
+# curate on the CPU. Build it with `docker build -t curate .`, then run it in a folder with your data:
+#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" curate demo
 FROM python:3.12-slim-bookworm AS build
 WORKDIR /source
 COPY pyproject.toml README.md LICENSE curate_command.py ./
@@ -8,16 +9,20 @@ COPY pipelines pipelines
 RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
 
 FROM python:3.12-slim-bookworm
-COPY .ci/check_system.py constraints.txt /tmp/
-RUN python /tmp/check_system.py && rm -rf /var/lib/apt/lists/*
+COPY .ci/check_system.py /setup/.ci/
+COPY curate/simulation/system_libraries.py /setup/curate/simulation/
+RUN python /setup/.ci/check_system.py && rm -rf /var/lib/apt/lists/*
 # The CPU build of torch is a tenth of the size of the general one.
 ARG PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
-COPY --from=build /wheels /wheels
-RUN pip install --no-cache-dir -c /tmp/constraints.txt torch==2.13.0+cpu \
-    && pip install --no-cache-dir -c /tmp/constraints.txt "$(echo /wheels/*.whl)[postgres,serve,nuscenes,parquet]" \
-    && rm -rf /wheels /tmp/check_system.py /tmp/constraints.txt
-RUN useradd --create-home curate && mkdir /data && chown curate /data
-USER curate
+COPY constraints.txt /setup/
+COPY --from=build /wheels /setup/wheels
+RUN pip install --no-cache-dir -c /setup/constraints.txt torch==2.13.0+cpu \
+    && pip install --no-cache-dir -c /setup/constraints.txt \
+        "$(echo /setup/wheels/*.whl)[postgres,serve,nuscenes,parquet]" \
+    && rm -rf /setup
+# Any user id may run it: compiled kernels are kept in a folder that everyone can write.
+ENV HOME=/tmp NUMBA_CACHE_DIR=/tmp/numba
 WORKDIR /data
+USER nobody
 ENTRYPOINT ["curate"]
 CMD ["--help"]

@@ -15,7 +15,10 @@ DEBIAN_PACKAGES = {
     "libstdc++.so.6": "libstdc++6",
     "libudev.so.1": "libudev1",
 }
-"""The package of Debian and Ubuntu with each library; libusb-1.0 comes from PyPI instead."""
+"""The package with each library in Debian 12 and 13; Ubuntu 22.04 and 24.04 have the same names.
+
+libusb-1.0 is not in the table, since the package `libusb-package` from PyPI contains it.
+"""
 
 
 def missing_libraries() -> list[str]:
