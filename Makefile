@@ -3,8 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# "no" goes on where the libraries of open3d are missing; only `simulate` and `demo` need them.
+SIMULATION ?= yes
 
-.PHONY: venv demo test prove fuzz fuzz-random bench lint docs clean
+.PHONY: venv demo test prove prove-bare fuzz fuzz-random bench lint docs wheel clean
 
 venv: $(READY)
 
@@ -16,6 +18,14 @@ test: $(READY)
 
 prove: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# Installation, demo and a part of the tests in minimal systems that debootstrap makes; as root.
+SUITES ?= bookworm trixie
+prove-bare:
+	$(PYTHON) .ci/prove_bare.py $(SUITES)
+
+wheel: $(READY)
+	$(BIN)/pip wheel -q --no-deps --no-build-isolation --wheel-dir dist .
 
 # `make test` tries the same examples every time; this tries new ones with every run.
 fuzz-random: $(READY)
@@ -50,12 +60,13 @@ clean:
 # The CPU build of torch is taken where the index offers one and no GPU is in sight; the constraint
 # accepts either build of the same version.
 $(READY): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
-		|| { echo "curate needs Python 3.11 or newer; name one: make PYTHON=python3.12 ..." >&2; exit 1; }
+	@$(PYTHON) .ci/check_system.py $(if $(filter no,$(SIMULATION)),--without-simulation)
 	$(PYTHON) -m venv $(VENV)
 	@command -v nvidia-smi >/dev/null 2>&1 \
 		|| $(BIN)/pip install -q -c constraints.txt torch==2.13.0+cpu 2>/dev/null \
 		|| echo "The index offers no CPU build of torch; installing the general one."
 	$(BIN)/pip install -q -c constraints.txt -e '.[test,lint,postgres,serve,browser,nuscenes]'
+ifneq ($(SIMULATION),no)
 	@$(BIN)/python -c 'from curate.simulation.open3d_loader import load; load()'
+endif
 	@touch $@

@@ -8,7 +8,7 @@ import pytest
 from support.paths import ROOT
 
 from curate.errors import ConfigError
-from curate.simulation import open3d_loader
+from curate.simulation import open3d_loader, system_libraries
 
 
 def test_the_loaded_module_casts_rays():
@@ -26,37 +26,50 @@ def test_a_fresh_process_can_load_it():
     assert ended.stdout.strip() == "open3d"
 
 
-@pytest.mark.parametrize(
-    ("reason", "remedy"),
-    [
-        (
-            "libusb-1.0.so.0: cannot open shared object file: No such file or directory",
-            "apt-get install libusb-1.0-0",
-        ),
-        ("libEGL.so.1: cannot open shared object file: No such file", "apt-get install libegl1"),
-        ("libodd++.so.3: cannot open shared object file", "libodd++.so.3"),
-        ("No module named 'open3d'", "pip install open3d"),
-        ("something\nover two lines", "something over two lines"),
-    ],
-)
-def test_a_failure_names_the_remedy(monkeypatch, reason, remedy):
-    """An import that fails becomes one line that says which library is missing."""
+def fail_to_load(monkeypatch: pytest.MonkeyPatch, error: ImportError) -> str:
+    """Return the message of the loader where the import of open3d raises an error."""
 
-    class Refusal:
+    class Failing:
         def find_spec(self, name, path=None, target=None):
             if name == "open3d":
-                raise ImportError(reason)
+                raise error
 
     monkeypatch.delitem(sys.modules, "open3d", raising=False)
-    monkeypatch.setattr(sys, "meta_path", [Refusal(), *sys.meta_path])
+    monkeypatch.setattr(sys, "meta_path", [Failing(), *sys.meta_path])
     with pytest.raises(ConfigError) as caught:
         open3d_loader.load()
-    assert remedy in str(caught.value)
     assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+NO_EGL = "libEGL.so.1: cannot open shared object file: No such file or directory"
+
+
+def test_a_failure_lists_all_missing_libraries(monkeypatch):
+    """The linker names the first; the message has all of them and one command."""
+    lacking = {"libEGL.so.1", "libidn2.so.0"}
+    monkeypatch.setattr(system_libraries, "loads", lambda library: library not in lacking)
+    message = fail_to_load(monkeypatch, ImportError(NO_EGL))
+    assert "libEGL.so.1, libidn2.so.0" in message
+    assert "`apt-get install libegl1 libidn2-0` as root" in message
+
+
+def test_a_failure_for_another_reason_is_quoted(monkeypatch):
+    """Nothing is missing in the table, so the linker's own words are all there is."""
+    monkeypatch.setattr(system_libraries, "loads", lambda _: True)
+    assert "something over two lines" in fail_to_load(
+        monkeypatch, ImportError("something\nover two lines")
+    )
+
+
+def test_a_missing_package_is_reported(monkeypatch):
+    """With the command that installs it."""
+    error = ModuleNotFoundError("No module named 'open3d'", name="open3d")
+    assert "pip install open3d-cpu" in fail_to_load(monkeypatch, error)
 
 
 def test_only_the_loader_imports_open3d():
-    """Everything else asks the loader, which brings the missing library."""
+    """Everything else uses the loader, which provides the missing library."""
     pattern = re.compile(r"^\s*(import|from) open3d\b", re.MULTILINE)
     folders = (ROOT / name for name in ("curate", "db", "pipelines"))
     sources = [path for folder in folders for path in folder.rglob("*.py")]

@@ -1,0 +1,35 @@
+"""The system libraries that open3d links against, and which of them this machine lacks.
+
+Standard library only: `.ci/check_system.py` runs this file before anything is installed.
+"""
+
+import ctypes
+import sys
+
+DEBIAN_PACKAGES = {
+    "libEGL.so.1": "libegl1",
+    "libGL.so.1": "libgl1",
+    "libX11.so.6": "libx11-6",
+    "libgomp.so.1": "libgomp1",
+    "libidn2.so.0": "libidn2-0",
+    "libstdc++.so.6": "libstdc++6",
+    "libudev.so.1": "libudev1",
+}
+"""The package with each library in Debian 12 and 13; Ubuntu 22.04 and 24.04 have the same names.
+
+libusb-1.0 is not in the table, since the package `libusb-package` from PyPI contains it.
+"""
+
+
+def missing_libraries() -> list[str]:
+    """Return the libraries that cannot be loaded here; none on systems other than Linux."""
+    return [name for name in DEBIAN_PACKAGES if sys.platform == "linux" and not loads(name)]
+
+
+def loads(library: str) -> bool:
+    """Return whether the dynamic linker finds a library."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,42 @@
+"""What works where open3d cannot be loaded: everything but simulation."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from support.pipelines_cli import Curate
+
+from pipelines.workspace.workspace import Workspace
+
+
+@pytest.fixture(autouse=True)
+def _without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every import of open3d fail."""
+    monkeypatch.setitem(sys.modules, "open3d", None)
+
+
+def test_own_data_is_curated(curate: Curate, workspace: Workspace) -> None:
+    """A round, its labels, and what shows them."""
+    for arguments in (
+        ("run", "--rounds", 1),
+        ("status",),
+        ("query", "SELECT count(*) FROM weighted_labels"),
+        ("view", "--all", "--limit", 1),
+        ("report",),
+        ("doctor",),
+        ("check",),
+    ):
+        code, _, error = curate(*arguments, "-w", workspace.root)
+        assert code == 0, f"{arguments}: {error}"
+    assert (workspace.root / "exports" / "labels.sqlite").exists()
+
+
+@pytest.mark.parametrize("command", ["simulate", "demo"])
+def test_simulation_reports_what_it_needs(curate: Curate, tmp_path: Path, command: str) -> None:
+    """In one line, with the exit code of a wrong configuration."""
+    arguments = ("--frames", 8, "--val", 4, "--workers", 1)
+    code, _, error = curate(command, tmp_path / "made", *arguments)
+    assert code == 2
+    assert error.splitlines()[-1].startswith("error: simulation needs open3d, which cannot be")
+    assert "pip install open3d-cpu" in error
+    assert "Traceback" not in error
