@@ -63,9 +63,7 @@ class NamedQuery:
         wanted = {name: value for name, value in wanted.items() if value is not None}
         for name in wanted:
             if name not in self.filters:
-                raise ConfigError(
-                    f"--{name}: the query '{self.name}' does not depend on the {name}"
-                )
+                raise ConfigError(f"--{name}: the query '{self.name}' has no {name} to select")
         selections = []
         for source, columns in self._sources().items():
             conditions = [f"{name} = {wanted[name]}" for name in wanted if name in columns]
