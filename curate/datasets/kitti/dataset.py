@@ -22,6 +22,7 @@ from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.atomic import replace_file
+from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles
 
 _log = logging.getLogger(__name__)
@@ -51,7 +52,7 @@ class KittiDataset:
 
     name = "kitti"
 
-    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
+    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         homes = [self.root / "training", self.root]

@@ -20,6 +20,7 @@ import numpy as np
 from curate.detections import Annotations, Detections, as_categories
 from curate.errors import DataError
 from curate.files.atomic import replace_file
+from curate.files.paths import StrPath
 from curate.frames import Calibration
 from curate.geometry.projection import image_rectangles
 from curate.geometry.similarity import wrap_angle
@@ -85,7 +86,7 @@ class KittiObjects:
 
 
 def read_objects(
-    path: Path, *, scored: bool = False, known: Collection[str] | None = KITTI_CATEGORIES
+    path: StrPath, *, scored: bool = False, known: Collection[str] | None = KITTI_CATEGORIES
 ) -> KittiObjects:
     """The objects of a KITTI label file (15 fields per line) or, if `scored`, result file (16).
 
@@ -102,6 +103,7 @@ def read_objects(
             object that is not DontCare.
     """
     fields = RESULT_FIELDS if scored else LABEL_FIELDS
+    path = Path(path)
     lines = _read_lines(path)
     rows = [row for row in map(str.split, lines) if row]
     categories = [row[0] for row in rows]
@@ -120,7 +122,7 @@ def read_objects(
     return KittiObjects(as_categories(categories), *_columns(values))
 
 
-def write_objects(path: Path, objects: KittiObjects) -> None:
+def write_objects(path: StrPath, objects: KittiObjects) -> None:
     """Writes, whole or not at all, a label file, or a result file where the objects have scores.
 
     KITTI's own files have two decimals. Here alpha, dimensions, location and rotation_y have four,
@@ -130,6 +132,7 @@ def write_objects(path: Path, objects: KittiObjects) -> None:
     Raises:
         DataError: a number is not finite, or only some objects have scores.
     """
+    path = Path(path)
     scored = ~np.isnan(objects.scores)
     if scored.any() and not scored.all():
         raise DataError(f"{path}: {np.sum(~scored)} of {len(scored)} objects have no score")
