@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: venv demo test prove fuzz fuzz-random bench lint docs clean
+.PHONY: venv demo test shapes prove fuzz fuzz-random bench lint docs clean
 
 venv: $(READY)
 
@@ -13,6 +13,11 @@ demo: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+# The same tests, with the shape of every array checked wherever a function of curate is called.
+shapes: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist worksteal \
+		--jaxtyping-packages=curate,support.shapes.check
 
 prove: $(READY)
 	$(BIN)/python -m pytest -m slow

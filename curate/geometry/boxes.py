@@ -1,12 +1,13 @@
 """Corners of boxes: the eight of the cuboid, and the four of its footprint in bird's eye view."""
 
 import numpy as np
+from jaxtyping import Float, Num
 
 # Front left, rear left, rear right, front right: counter-clockwise seen from above.
 _FOOTPRINT_SIGNS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
 
 
-def as_boxes(boxes: np.ndarray) -> np.ndarray:
+def as_boxes(boxes: Num[np.ndarray, " ..."]) -> Float[np.ndarray, "n 7"]:
     """(n, 7) boxes as C-contiguous float64, the one layout that the kernels are compiled for.
 
     Raises:
@@ -18,7 +19,7 @@ def as_boxes(boxes: np.ndarray) -> np.ndarray:
     return boxes
 
 
-def bev_corners(boxes: np.ndarray) -> np.ndarray:
+def bev_corners(boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 4 2"]:
     """Footprints of (n, 7) boxes.
 
     Returns:
@@ -33,7 +34,7 @@ def bev_corners(boxes: np.ndarray) -> np.ndarray:
     return corners
 
 
-def box_corners(boxes: np.ndarray) -> np.ndarray:
+def box_corners(boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 8 3"]:
     """Corners of (n, 7) boxes.
 
     Returns:

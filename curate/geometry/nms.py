@@ -1,12 +1,15 @@
 """Non-maximum suppression of rotated boxes in bird's eye view."""
 
 import numpy as np
+from jaxtyping import Int, Num
 
 from curate.geometry.boxes import as_boxes
 from curate.geometry.kernels import greedy_nms, rectangle_table
 
 
-def nms_bev(boxes: np.ndarray, scores: np.ndarray, iou_threshold: float) -> np.ndarray:
+def nms_bev(
+    boxes: Num[np.ndarray, "n 7"], scores: Num[np.ndarray, " n"], iou_threshold: float
+) -> Int[np.ndarray, " k"]:
     """Keeps each box unless a better kept box overlaps it with a BEV IoU above the threshold.
 
     Args:

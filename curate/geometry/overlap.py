@@ -6,29 +6,44 @@ overlaps nothing, itself included.
 """
 
 import numpy as np
+from jaxtyping import Float, Int, Num
 
 from curate.geometry.boxes import as_boxes
 from curate.geometry.kernels import grouped_iou, iou_matrix, paired_iou, rectangle_table
 
 
-def bev_iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+def bev_iou(
+    boxes_a: Num[np.ndarray, "n 7"], boxes_b: Num[np.ndarray, "m 7"]
+) -> Float[np.ndarray, "n m"]:
     """(n, m) bird's eye view IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
     return _iou(boxes_a, boxes_b, with_height=False)
 
 
-def iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+def iou_3d(
+    boxes_a: Num[np.ndarray, "n 7"], boxes_b: Num[np.ndarray, "m 7"]
+) -> Float[np.ndarray, "n m"]:
     """(n, m) volume IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
     return _iou(boxes_a, boxes_b, with_height=True)
 
 
-def paired_iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+def paired_iou_3d(
+    boxes_a: Num[np.ndarray, "n 7"], boxes_b: Num[np.ndarray, "n 7"]
+) -> Float[np.ndarray, " n"]:
     """(n,) volume IoU in [0, 1] of each of (n, 7) boxes with the other's box in the same row."""
     return paired_iou(_table(boxes_a), _table(boxes_b))
 
 
 def overlapping_pairs(
-    boxes_a: np.ndarray, starts_a: np.ndarray, boxes_b: np.ndarray, starts_b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    boxes_a: Num[np.ndarray, "n 7"],
+    starts_a: Int[np.ndarray, " groups_plus_1"],
+    boxes_b: Num[np.ndarray, "m 7"],
+    starts_b: Int[np.ndarray, " groups_plus_1"],
+) -> tuple[
+    Int[np.ndarray, " pairs"],
+    Int[np.ndarray, " pairs"],
+    Float[np.ndarray, " pairs"],
+    Float[np.ndarray, " pairs"],
+]:
     """All pairs with a BEV IoU above 0 within groups of boxes, such as the frames of a split.
 
     Args:

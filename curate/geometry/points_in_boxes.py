@@ -7,6 +7,7 @@ its cell: one pass over the points, whatever the number of boxes.
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Int, Num
 from numba import njit
 
 from curate.geometry.boxes import as_boxes
@@ -17,7 +18,9 @@ _MOST_CELLS = 256
 _MARGIN_METRES = 1e-3
 
 
-def count_points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+def count_points_in_boxes(
+    points: Num[np.ndarray, "p _"], boxes: Num[np.ndarray, "n 7"]
+) -> Int[np.ndarray, " n"]:
     """(n,) int64 number of points in each of (n, 7) boxes.
 
     Args:
@@ -28,13 +31,17 @@ def count_points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return _count(_as_points(points), placed, *_grid(placed))
 
 
-def box_of_points(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+def box_of_points(
+    points: Num[np.ndarray, "p _"], boxes: Num[np.ndarray, "n 7"]
+) -> Int[np.ndarray, " p"]:
     """(p,) int64 index of the first of (n, 7) boxes that contains each point, -1 where none."""
     placed = _placed(as_boxes(boxes))
     return _first_box(_as_points(points), placed, *_grid(placed))
 
 
-def points_in_box_mask(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+def points_in_box_mask(
+    points: Num[np.ndarray, "p _"], box: Num[np.ndarray, " 7"]
+) -> Bool[np.ndarray, " p"]:
     """(p,) bool, whether each point lies in the (7,) box."""
     inside: np.ndarray = box_of_points(points, np.reshape(box, (1, 7))) == 0
     return inside

@@ -1,6 +1,7 @@
 """Projection from the LiDAR frame into the image (KITTI: Geiger et al., IJRR 2013, eq. 8)."""
 
 import numpy as np
+from jaxtyping import Bool, Float, Num
 from numba import njit
 
 from curate.frames import Calibration
@@ -19,8 +20,8 @@ _EDGE_ENDS = np.array([1, 2, 3, 0, 5, 6, 7, 4, 4, 5, 6, 7])
 
 
 def project_points(
-    points_lidar: np.ndarray, calibration: Calibration
-) -> tuple[np.ndarray, np.ndarray]:
+    points_lidar: Num[np.ndarray, "n _"], calibration: Calibration
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Where points appear in the image.
 
     Args:
@@ -38,8 +39,8 @@ def project_points(
 
 
 def in_view(
-    points: np.ndarray, calibration: Calibration, image_size: tuple[int, int]
-) -> np.ndarray:
+    points: Num[np.ndarray, "n _"], calibration: Calibration, image_size: tuple[int, int]
+) -> Bool[np.ndarray, " n"]:
     """(n,) bool, whether (n, >=3) LiDAR points lie before the camera and inside its image.
 
     Args:
@@ -104,8 +105,8 @@ def _in_view(
 
 
 def image_rectangles(
-    boxes: np.ndarray, calibration: Calibration, image_size: tuple[int, int]
-) -> np.ndarray:
+    boxes: Num[np.ndarray, "n 7"], calibration: Calibration, image_size: tuple[int, int]
+) -> Float[np.ndarray, "n 4"]:
     """The 2D boxes of 3D boxes: the rectangle around each projected box, clipped to the image.
 
     Of a box that reaches behind the camera, the part before the near plane counts.

@@ -15,6 +15,7 @@ from typing import Final, Self
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from torch.utils.data import Dataset
 
 from curate.detections import as_categories
@@ -56,13 +57,13 @@ class LabelBatch:
     """
 
     frame_ids: tuple[str, ...]
-    labeled: torch.Tensor
-    points: torch.Tensor
-    point_frames: torch.Tensor
-    boxes: torch.Tensor
-    box_frames: torch.Tensor
-    categories: torch.Tensor
-    weights: torch.Tensor
+    labeled: Bool[torch.Tensor, " b"]
+    points: Float[torch.Tensor, "p 4"]
+    point_frames: Int[torch.Tensor, " p"]
+    boxes: Float[torch.Tensor, "n 7"]
+    box_frames: Int[torch.Tensor, " n"]
+    categories: Int[torch.Tensor, " n"]
+    weights: Float[torch.Tensor, " n"]
 
     def to(self, device: torch.device | str) -> Self:
         """Return the batch with its tensors on a device."""

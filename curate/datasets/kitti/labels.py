@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 
 from curate.detections import Annotations, Detections, as_categories
 from curate.errors import DataError
@@ -52,20 +53,20 @@ class KittiObjects:
         scores: (n,) float64, NaN where the file has none.
     """
 
-    categories: np.ndarray
-    truncated: np.ndarray
-    occluded: np.ndarray
-    alpha: np.ndarray
-    boxes_2d: np.ndarray
-    dimensions: np.ndarray
-    locations: np.ndarray
-    rotations_y: np.ndarray
-    scores: np.ndarray
+    categories: Shaped[np.ndarray, " n"]
+    truncated: Float[np.ndarray, " n"]
+    occluded: Int[np.ndarray, " n"]
+    alpha: Float[np.ndarray, " n"]
+    boxes_2d: Float[np.ndarray, "n 4"]
+    dimensions: Float[np.ndarray, "n 3"]
+    locations: Float[np.ndarray, "n 3"]
+    rotations_y: Float[np.ndarray, " n"]
+    scores: Float[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.categories)
 
-    def select(self, index: np.ndarray) -> Self:
+    def select(self, index: Int[np.ndarray, " m"] | Bool[np.ndarray, " m"]) -> Self:
         """The objects at `index` (integers or a mask), in that order."""
         return type(self)(
             self.categories[index],
