@@ -27,7 +27,7 @@ def pose_matrix(
 ) -> Float[np.ndarray, "4 4"]:
     """(4, 4) from the frame of reference that stands at `translation`, turned by `quaternion`."""
     pose = np.eye(4)
-    pose[:3, :3] = rotation_matrices(quaternion)[0]
+    pose[:3, :3] = rotation_matrices(np.reshape(quaternion, (1, 4)))[0]
     pose[:3, 3] = translation
     return pose
 

@@ -12,7 +12,6 @@ import ast
 from collections.abc import Callable
 from typing import Any, get_args
 
-import numpy as np
 from beartype import beartype
 from jaxtyping import AbstractArray, _import_hook
 
@@ -37,6 +36,6 @@ def check(function: Callable) -> Callable:
 
 def _has_shape(hint: Any) -> bool:
     """Whether a type is an array with a shape, or made of such."""
-    if isinstance(hint, type) and issubclass(hint, np.ndarray | AbstractArray):
+    if isinstance(hint, type) and issubclass(hint, AbstractArray):
         return True
     return any(map(_has_shape, get_args(hint)))
