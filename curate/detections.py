@@ -26,7 +26,7 @@ def as_categories(names: Sequence[str] | np.ndarray) -> Shaped[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class Detections:
-    """What a detector answers for one frame.
+    """The boxes that a detector finds in one frame, with scores and categories.
 
     Attributes:
         boxes: (n, 7) in the LiDAR frame.

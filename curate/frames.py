@@ -16,7 +16,7 @@ from curate.errors import ConfigError
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where the LiDAR and the camera stand to each other.
+    """The transforms between LiDAR, camera and image.
 
     Attributes:
         projection: (3, 4) rectified camera frame to image pixels (KITTI's P2).
@@ -50,7 +50,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Frame:
-    """One LiDAR-camera frame.
+    """One LiDAR sweep with its image and calibration.
 
     Attributes:
         frame_id: name of the frame within its data set, e.g. "000008".

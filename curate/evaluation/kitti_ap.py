@@ -112,7 +112,10 @@ def evaluate(
     recall_overlaps: Sequence[float] = (0.3, 0.5, 0.7),
     kit_sampling: bool = False,
 ) -> KittiEvaluation:
-    """Compares the detections of all frames with the labels of the same frames.
+    """Return KITTI's average precision of detections: image, aos, BEV and 3D, R11 and R40.
+
+    Sources: Geiger et al., CVPR 2012, and its development kit; Simonelli et al., ICCV 2019, for
+    R40. `evaluate_folders` does the same for folders of text files.
 
     Args:
         labels: the objects of each frame.

@@ -32,7 +32,7 @@ def evaluate_folders(
 def read_folders(
     labels: StrPath, results: StrPath, frame_ids: Sequence[str] | None = None
 ) -> tuple[tuple[str, ...], list[KittiObjects], list[KittiObjects]]:
-    """Reads the label files and the result files of the same frames.
+    """Return the frame ids of two folders, and the labels and results of each frame.
 
     A frame without a result file is an error, never silently left out: a partial run must not be
     scored as a whole one. A frame without detections has an empty result file.

@@ -20,7 +20,7 @@ def as_boxes(boxes: Num[np.ndarray, " ..."]) -> Float[np.ndarray, "n 7"]:
 
 
 def bev_corners(boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 4 2"]:
-    """Footprints of (n, 7) boxes.
+    """Return the corners of the boxes' footprints, in the frame of the boxes.
 
     Returns:
         (n, 4, 2) x and y in metres, counter-clockwise from the front left corner.
@@ -35,7 +35,7 @@ def bev_corners(boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 4 2"]:
 
 
 def box_corners(boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 8 3"]:
-    """Corners of (n, 7) boxes.
+    """Return the eight corners of each box, in the frame of the boxes.
 
     Returns:
         (n, 8, 3) in metres: the footprint of `bev_corners` at the bottom, then the same at the top.

@@ -10,10 +10,13 @@ from curate.geometry.kernels import greedy_nms, rectangle_table
 def nms_bev(
     boxes: Num[np.ndarray, "n 7"], scores: Num[np.ndarray, " n"], iou_threshold: float
 ) -> Int[np.ndarray, " k"]:
-    """Keeps each box unless a better kept box overlaps it with a BEV IoU above the threshold.
+    """Return the boxes that non-maximum suppression in bird's eye view keeps.
+
+    A box is dropped where a kept box with a higher score has a BEV IoU above the threshold with it.
 
     Args:
-        boxes: (n, 7); one category, or all where categories shall suppress each other.
+        boxes: (n, 7) in metres and radians; of one category, or of all where categories shall
+            suppress each other.
         scores: (n,) higher is better; equal scores are ranked by index.
         iou_threshold: in [0, 1].
 

@@ -15,14 +15,30 @@ from curate.geometry.kernels import grouped_iou, iou_matrix, paired_iou, rectang
 def bev_iou(
     boxes_a: Num[np.ndarray, "n 7"], boxes_b: Num[np.ndarray, "m 7"]
 ) -> Float[np.ndarray, "n m"]:
-    """(n, m) bird's eye view IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
+    """Return the bird's eye view IoU of every pair of boxes, in [0, 1].
+
+    Args:
+        boxes_a: (n, 7) in metres and radians; both in the same frame of reference.
+        boxes_b: (m, 7).
+
+    Raises:
+        ValueError: if boxes are not rows of seven numbers.
+    """
     return _iou(boxes_a, boxes_b, with_height=False)
 
 
 def iou_3d(
     boxes_a: Num[np.ndarray, "n 7"], boxes_b: Num[np.ndarray, "m 7"]
 ) -> Float[np.ndarray, "n m"]:
-    """(n, m) volume IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
+    """Return the volume IoU of every pair of boxes, in [0, 1].
+
+    Args:
+        boxes_a: (n, 7) in metres and radians; both in the same frame of reference.
+        boxes_b: (m, 7).
+
+    Raises:
+        ValueError: if boxes are not rows of seven numbers.
+    """
     return _iou(boxes_a, boxes_b, with_height=True)
 
 

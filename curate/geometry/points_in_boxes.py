@@ -21,11 +21,12 @@ _MARGIN_METRES = 1e-3
 def count_points_in_boxes(
     points: Num[np.ndarray, "p _"], boxes: Num[np.ndarray, "n 7"]
 ) -> Int[np.ndarray, " n"]:
-    """(n,) int64 number of points in each of (n, 7) boxes.
+    """Return the number of points in each box.
 
     Args:
         points: (p, >=3) x, y, z in metres in the frame of the boxes; NaN is in no box.
-        boxes: (n, 7); a point in several boxes counts in each; NaN contains nothing.
+        boxes: (n, 7) in metres and radians; a point in several boxes counts in each; NaN contains
+            nothing.
     """
     placed = _placed(as_boxes(boxes))
     return _count(_as_points(points), placed, *_grid(placed))
@@ -34,7 +35,12 @@ def count_points_in_boxes(
 def box_of_points(
     points: Num[np.ndarray, "p _"], boxes: Num[np.ndarray, "n 7"]
 ) -> Int[np.ndarray, " p"]:
-    """(p,) int64 index of the first of (n, 7) boxes that contains each point, -1 where none."""
+    """Return the index of the first box that contains each point, -1 where none does.
+
+    Args:
+        points: (p, >=3) x, y, z in metres in the frame of the boxes; NaN is in no box.
+        boxes: (n, 7) in metres and radians.
+    """
     placed = _placed(as_boxes(boxes))
     return _first_box(_as_points(points), placed, *_grid(placed))
 
@@ -42,7 +48,12 @@ def box_of_points(
 def points_in_box_mask(
     points: Num[np.ndarray, "p _"], box: Num[np.ndarray, " 7"]
 ) -> Bool[np.ndarray, " p"]:
-    """(p,) bool, whether each point lies in the (7,) box."""
+    """Return whether each point lies in one box.
+
+    Args:
+        points: (p, >=3) x, y, z in metres in the frame of the box.
+        box: (7,) in metres and radians.
+    """
     inside: np.ndarray = box_of_points(points, np.reshape(box, (1, 7))) == 0
     return inside
 

@@ -41,10 +41,10 @@ def project_points(
 def in_view(
     points: Num[np.ndarray, "n _"], calibration: Calibration, image_size: tuple[int, int]
 ) -> Bool[np.ndarray, " n"]:
-    """(n,) bool, whether (n, >=3) LiDAR points lie before the camera and inside its image.
+    """Return whether each LiDAR point lies before the camera and inside its image.
 
     Args:
-        points: x, y, z in metres in the LiDAR frame, first of the columns.
+        points: (n, >=3) x, y, z in metres in the LiDAR frame, first of the columns.
         calibration: of the frame.
         image_size: (width, height) in pixels.
     """
@@ -107,7 +107,7 @@ def _in_view(
 def image_rectangles(
     boxes: Num[np.ndarray, "n 7"], calibration: Calibration, image_size: tuple[int, int]
 ) -> Float[np.ndarray, "n 4"]:
-    """The 2D boxes of 3D boxes: the rectangle around each projected box, clipped to the image.
+    """Return the 2D boxes of 3D boxes: the rectangle around each projected box, within the image.
 
     Of a box that reaches behind the camera, the part before the near plane counts.
 

@@ -65,7 +65,7 @@ def simulate(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Writes a simulated data set; frames that are already there are not made again.
+    """Write a simulated data set in KITTI's layout; frames that are already there are kept.
 
     Args:
         directory: the root; gets training/{velodyne,image_2,semantic_2,calib,label_2} and

@@ -89,8 +89,9 @@ class KittiObjects:
 def read_objects(
     path: StrPath, *, scored: bool = False, known: Collection[str] | None = KITTI_CATEGORIES
 ) -> KittiObjects:
-    """The objects of a KITTI label file (15 fields per line) or, if `scored`, result file (16).
+    """Return the objects of a KITTI label file, or of a result file if `scored`.
 
+    Label files have 15 fields per line, result files 16.
     Empty lines are skipped; an empty file holds no objects.
 
     Args:
@@ -124,7 +125,7 @@ def read_objects(
 
 
 def write_objects(path: StrPath, objects: KittiObjects) -> None:
-    """Writes, whole or not at all, a label file, or a result file where the objects have scores.
+    """Write a label file, or a result file where the objects have scores, whole or not at all.
 
     KITTI's own files have two decimals. Here alpha, dimensions, location and rotation_y have four,
     so that a box comes back within 0.1 mm per coordinate, and the score has six; truncation and
