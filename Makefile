@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # "no" goes on where the libraries of open3d are missing; only `simulate` and `demo` need them.
 SIMULATION ?= yes
 
-.PHONY: venv demo test prove prove-bare fuzz fuzz-random bench lint docs wheel clean
+.PHONY: venv demo test shapes prove prove-bare fuzz fuzz-random bench lint docs wheel clean
 
 venv: $(READY)
 
@@ -15,6 +15,11 @@ demo: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+# The same tests, with the shape of every array checked wherever a function of curate is called.
+shapes: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist worksteal \
+		--jaxtyping-packages=curate,support.shapes.check
 
 prove: $(READY)
 	$(BIN)/python -m pytest -m slow

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from curate.detections import Detections
 from curate.errors import ConfigError, ModelError
@@ -56,11 +57,11 @@ class Consistency:
         loss: (n,) score_weight * score_loss + box_weight * box_loss.
     """
 
-    matched: np.ndarray
-    iou: np.ndarray
-    score_loss: np.ndarray
-    box_loss: np.ndarray
-    loss: np.ndarray
+    matched: Int[np.ndarray, " n"]
+    iou: Float[np.ndarray, " n"]
+    score_loss: Float[np.ndarray, " n"]
+    box_loss: Float[np.ndarray, " n"]
+    loss: Float[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,8 @@ class MeanConsistency:
         views_matched: (n,) int64 number of those views.
     """
 
-    loss: np.ndarray
-    views_matched: np.ndarray
+    loss: Float[np.ndarray, " n"]
+    views_matched: Int[np.ndarray, " n"]
 
 
 _DEFAULT = ConsistencySettings()
@@ -121,7 +122,7 @@ def mean_over_views(views: Sequence[Consistency]) -> MeanConsistency:
 
 def match(
     predictions: Detections, repredictions: Detections, minimum_iou: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """One-to-one pairs within each category that maximise the total BEV IoU.
 
     Of several best assignments the choice depends on the detections alone, not on their order.
@@ -147,7 +148,9 @@ def match(
     return matched, iou
 
 
-def residual(anchors: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def residual(
+    anchors: Float[np.ndarray, "n 7"], targets: Float[np.ndarray, "n 7"]
+) -> Float[np.ndarray, "n 7"]:
     """(n, 7) dx/d, dy/d, dz/h, ln l'/l, ln w'/w, ln h'/h, sin(yaw' - yaw); d, h of the anchor.
 
     Args:
@@ -166,7 +169,9 @@ def residual(anchors: np.ndarray, targets: np.ndarray) -> np.ndarray:
     return np.concatenate([offset, stretch, turn], axis=1)
 
 
-def smooth_l1(difference: np.ndarray, beta: float) -> np.ndarray:
+def smooth_l1(
+    difference: Float[np.ndarray, " *shape"], beta: float
+) -> Float[np.ndarray, " *shape"]:
     """0.5 x^2 / beta where |x| < beta, |x| - 0.5 beta elsewhere."""
     size = np.abs(difference)
     loss: np.ndarray = np.where(size < beta, 0.5 * size**2 / beta, size - 0.5 * beta)

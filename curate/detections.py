@@ -9,16 +9,17 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 
 CATEGORIES = ("Car", "Pedestrian", "Cyclist")
 
 
-def empty_boxes() -> np.ndarray:
+def empty_boxes() -> Float[np.ndarray, "0 7"]:
     """(0, 7) float64."""
     return np.zeros((0, 7))
 
 
-def as_categories(names: Sequence[str] | np.ndarray) -> np.ndarray:
+def as_categories(names: Sequence[str] | np.ndarray) -> Shaped[np.ndarray, " n"]:
     """Category names as an (n,) array of str that also holds for n = 0."""
     return np.asarray(names, dtype=np.str_).reshape(-1)
 
@@ -30,14 +31,14 @@ class Columns:
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
-    def select(self, index: np.ndarray) -> Self:
+    def select(self, index: Int[np.ndarray, " m"] | Bool[np.ndarray, " m"]) -> Self:
         """The rows at `index` (integers or a mask), in that order."""
         return type(self)(*(getattr(self, column.name)[index] for column in fields(self)))
 
 
 @dataclass(frozen=True)
 class Detections(Columns):
-    """What a detector answers for one frame.
+    """The boxes that a detector finds in one frame, with scores and categories.
 
     Attributes:
         boxes: (n, 7) in the LiDAR frame.
@@ -47,10 +48,10 @@ class Detections(Columns):
             object; NaN where it makes none, and everywhere if left out.
     """
 
-    boxes: np.ndarray
-    scores: np.ndarray
-    categories: np.ndarray
-    iou: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    boxes: Float[np.ndarray, "n 7"]
+    scores: Float[np.ndarray, " n"]
+    categories: Shaped[np.ndarray, " n"]
+    iou: Float[np.ndarray, " n_or_0"] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         """Fills in estimates that were left out."""
@@ -91,12 +92,12 @@ class Annotations(Columns):
         boxes_2d: (n, 4) float64 left, top, right, bottom in pixels.
     """
 
-    boxes: np.ndarray
-    categories: np.ndarray
-    truncated: np.ndarray
-    occluded: np.ndarray
-    alpha: np.ndarray
-    boxes_2d: np.ndarray
+    boxes: Float[np.ndarray, "n 7"]
+    categories: Shaped[np.ndarray, " n"]
+    truncated: Float[np.ndarray, " n"]
+    occluded: Int[np.ndarray, " n"]
+    alpha: Float[np.ndarray, " n"]
+    boxes_2d: Float[np.ndarray, "n 4"]
 
     @classmethod
     def empty(cls) -> Self:

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from jaxtyping import Float, Float32, UInt8
 
 from curate.errors import ConfigError
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where the LiDAR and the camera stand to each other.
+    """The transforms between LiDAR, camera and image.
 
     Attributes:
         projection: (3, 4) rectified camera frame to image pixels (KITTI's P2).
@@ -24,16 +25,16 @@ class Calibration:
             the data set knows it.
     """
 
-    projection: np.ndarray
-    lidar_to_camera: np.ndarray
-    lidar_to_map: np.ndarray | None = None
+    projection: Float[np.ndarray, "3 4"]
+    lidar_to_camera: Float[np.ndarray, "4 4"]
+    lidar_to_map: Float[np.ndarray, "4 4"] | None = None
 
     @property
-    def lidar_to_image(self) -> np.ndarray:
+    def lidar_to_image(self) -> Float[np.ndarray, "3 4"]:
         """(3, 4) LiDAR frame to homogeneous image pixels."""
         return np.asarray(self.projection @ self.lidar_to_camera)
 
-    def pose_in_map(self) -> np.ndarray:
+    def pose_in_map(self) -> Float[np.ndarray, "4 4"]:
         """(4, 4) LiDAR frame to the frame of the map.
 
         Raises:
@@ -49,7 +50,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Frame:
-    """One LiDAR-camera frame.
+    """One LiDAR sweep with its image and calibration.
 
     Attributes:
         frame_id: name of the frame within its data set, e.g. "000008".
@@ -60,12 +61,12 @@ class Frame:
     """
 
     frame_id: str
-    points: np.ndarray
+    points: Float32[np.ndarray, "n 4"]
     calibration: Calibration
     image_size: tuple[int, int]
-    image: np.ndarray | None = None
+    image: UInt8[np.ndarray, "height width 3"] | None = None
 
-    def with_points(self, points: np.ndarray) -> Self:
+    def with_points(self, points: Float32[np.ndarray, "n 4"]) -> Self:
         """The same frame with other points."""
         return replace(self, points=points)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 from sqlalchemy import Connection, Engine, event
-from support import postgres_server
+from support import postgres_server, shapes  # noqa: F401 - before curate is imported
 from support.exported import block, label, truth, truth_block
 from support.paths import ROOT
 from support.toys import write_toy_kitti
@@ -73,6 +73,15 @@ def postgres() -> Iterator[postgres_server.PostgresServer]:
         server.execute(f"CREATE DATABASE {postgres_server.TEMPLATE}")
         Database(server.url(postgres_server.TEMPLATE)).close()
         yield server
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip tests of wrong shapes where jaxtyping rejects those before our own checks do."""
+    if config.getoption("--jaxtyping-packages"):
+        reason = "gives arrays of wrong shapes on purpose"
+        for item in items:
+            if item.get_closest_marker("wrong_shapes"):
+                item.add_marker(pytest.mark.skip(reason=reason))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -35,6 +35,7 @@ from curate.datasets.kitti.dataset import (
 from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
+from curate.files.paths import StrPath
 from curate.files.toml_text import parse_toml
 from curate.frames import Calibration, Frame, FrameFiles
 
@@ -58,7 +59,7 @@ class FolderDataset:
 
     name = "folder"
 
-    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
+    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._path = self.root / DESCRIPTION

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Shaped
 
 from curate.detections import Detections
 from curate.errors import ConfigError
@@ -58,14 +59,14 @@ class Sample:
 
     frame_id: str
     labeled: bool
-    points: np.ndarray
-    boxes: np.ndarray
-    categories: np.ndarray
-    weights: np.ndarray
+    points: Float32[np.ndarray, "n 4"]
+    boxes: Float[np.ndarray, "m 7"]
+    categories: Shaped[np.ndarray, " m"]
+    weights: Float[np.ndarray, " m"]
     zero_weight: ZeroWeight = "ignore"
 
     @property
-    def ignored(self) -> np.ndarray:
+    def ignored(self) -> Bool[np.ndarray, " m"]:
         """(m,) bool, which boxes are ignore regions: neither object nor background."""
         nothing = self.weights == 0
         return nothing if self.labeled or self.zero_weight == "ignore" else np.zeros_like(nothing)

@@ -17,6 +17,7 @@ from curate.detections import Detections, as_categories
 from curate.detectors.conventions import BoxConvention
 from curate.errors import ConfigError, ModelError, first_line
 from curate.files.onnx_session import are_numbers, open_session, runtime_errors
+from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
 
@@ -50,7 +51,7 @@ class OnnxDetector:
 
     def __init__(
         self,
-        model: Path,
+        model: StrPath,
         *,
         classes: Sequence[str] | None = None,
         categories: Sequence[str] = (),

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from jaxtyping import Float
 
 from curate.evaluation.judged_labels import ALL, WHOLE, JudgedLabels, Slice, slices
 from curate.evaluation.reliability import (
@@ -34,7 +35,7 @@ class Estimate:
     high: float
 
     @classmethod
-    def of(cls, value: float, replicates: np.ndarray, level: float) -> Self:
+    def of(cls, value: float, replicates: Float[np.ndarray, " r"], level: float) -> Self:
         """The figure, and the interval that holds the share `level` of its (r,) replicates.
 
         Undefined replicates are left out; the interval is NaN where all of them are.
@@ -134,7 +135,7 @@ class Audit:
 
 def audit(
     labels: JudgedLabels,
-    weights: Mapping[str, np.ndarray],
+    weights: Mapping[str, Float[np.ndarray, " n"]],
     categories: Sequence[str],
     generator: np.random.Generator,
     *,

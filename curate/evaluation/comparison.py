@@ -7,6 +7,7 @@ Error of a Mean", Biometrika 1908): the pairs share a seed, so what the seed doe
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class PairedDifference:
     count: int
 
 
-def spread(values: np.ndarray) -> Spread:
+def spread(values: Float[np.ndarray, " n"]) -> Spread:
     """Mean and standard deviation of (n,) values; NaN values are left out."""
     values = values[~np.isnan(values)]
     count = len(values)
@@ -51,7 +52,7 @@ def spread(values: np.ndarray) -> Spread:
 
 
 def paired_difference(
-    values: np.ndarray, others: np.ndarray, level: float = 0.95
+    values: Float[np.ndarray, " n"], others: Float[np.ndarray, " n"], level: float = 0.95
 ) -> PairedDifference:
     """The mean of values - others with its t interval.
 

@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Self
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 
 from curate.detections import Annotations, Detections, as_categories
 from curate.evaluation.reliability import JudgeSettings, judge
@@ -32,8 +33,8 @@ class AuditedFrame:
 
     labels: Detections
     truth: Annotations
-    rectangles: np.ndarray
-    points: np.ndarray
+    rectangles: Float[np.ndarray, "n 4"]
+    points: Float[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
@@ -54,15 +55,15 @@ class JudgedLabels:
     """
 
     frames: int
-    frame_index: np.ndarray
-    category: np.ndarray
-    distance: np.ndarray
-    points: np.ndarray
-    right: np.ndarray
-    counted: np.ndarray
-    object_frame: np.ndarray
-    object_category: np.ndarray
-    object_distance: np.ndarray
+    frame_index: Int[np.ndarray, " n"]
+    category: Shaped[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]
+    points: Float[np.ndarray, " n"]
+    right: Bool[np.ndarray, " n"]
+    counted: Bool[np.ndarray, " n"]
+    object_frame: Int[np.ndarray, " m"]
+    object_category: Shaped[np.ndarray, " m"]
+    object_distance: Float[np.ndarray, " m"]
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -108,7 +109,7 @@ class Slice:
     low: float = 0.0
     high: float = np.inf
 
-    def holds(self, values: np.ndarray) -> np.ndarray:
+    def holds(self, values: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """(n,) bool, which of the values it holds."""
         return np.asarray((values >= self.low) & (values < self.high))
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from curate.datasets.kitti.labels import KittiObjects
 from curate.errors import DataError
@@ -59,19 +60,19 @@ class KittiEvaluation:
     """
 
     min_overlaps: Mapping[str, float]
-    curves: np.ndarray
-    objects: np.ndarray
+    curves: Float[np.ndarray, "c 4 3 41"]
+    objects: Int[np.ndarray, "c 3"]
     recall_overlaps: tuple[float, ...]
-    recall_3d: np.ndarray
+    recall_3d: Float[np.ndarray, "c r 3"]
     has_orientation: bool
 
     @property
-    def ap_r11(self) -> np.ndarray:
+    def ap_r11(self) -> Float[np.ndarray, "c 4 3"]:
         """(c, 4, 3) mean over recall 0, 0.1, ..., 1, in percent."""
         return _percent(self.curves[..., ::4])
 
     @property
-    def ap_r40(self) -> np.ndarray:
+    def ap_r40(self) -> Float[np.ndarray, "c 4 3"]:
         """(c, 4, 3) mean over recall 1/40, 2/40, ..., 1, in percent."""
         return _percent(self.curves[..., 1:])
 
@@ -111,7 +112,10 @@ def evaluate(
     recall_overlaps: Sequence[float] = (0.3, 0.5, 0.7),
     kit_sampling: bool = False,
 ) -> KittiEvaluation:
-    """Compares the detections of all frames with the labels of the same frames.
+    """Return KITTI's average precision of detections: image, aos, BEV and 3D, R11 and R40.
+
+    Sources: Geiger et al., CVPR 2012, and its development kit; Simonelli et al., ICCV 2019, for
+    R40. `evaluate_folders` does the same for folders of text files.
 
     Args:
         labels: the objects of each frame.
@@ -216,7 +220,7 @@ class _Match:
         return gains
 
 
-def score_thresholds(scores: np.ndarray, count: int) -> np.ndarray:
+def score_thresholds(scores: Float[np.ndarray, " n"], count: int) -> Float[np.ndarray, " t"]:
     """The kit's score thresholds: at most 41, each the nearest to the next 1/40 of recall.
 
     Args:

@@ -5,12 +5,34 @@ from pathlib import Path
 
 from curate.datasets.kitti.labels import KittiObjects, read_objects
 from curate.errors import DataError
+from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
+from curate.files.paths import StrPath
+
+
+def evaluate_folders(
+    labels: StrPath, results: StrPath, frame_ids: Sequence[str] | None = None
+) -> KittiEvaluation:
+    """Return KITTI's average precision of a folder of result files: image, aos, BEV and 3D.
+
+    At KITTI's overlaps (Car 0.7, Pedestrian and Cyclist 0.5), for R11 and R40, on the CPU.
+    Source: see `evaluate`, which takes other overlaps.
+
+    Args:
+        labels: folder with one `FRAME.txt` of 15 fields per line for each frame.
+        results: folder with one `FRAME.txt` of 16 fields per line, the last a score.
+        frame_ids: the frames to compare; by default all frames of the label folder.
+
+    Raises:
+        DataError: if a folder or file is missing, damaged or malformed.
+    """
+    _, truth, detections = read_folders(labels, results, frame_ids)
+    return evaluate(truth, detections)
 
 
 def read_folders(
-    labels: Path, results: Path, frame_ids: Sequence[str] | None = None
+    labels: StrPath, results: StrPath, frame_ids: Sequence[str] | None = None
 ) -> tuple[tuple[str, ...], list[KittiObjects], list[KittiObjects]]:
-    """Reads the label files and the result files of the same frames.
+    """Return the frame ids of two folders, and the labels and results of each frame.
 
     A frame without a result file is an error, never silently left out: a partial run must not be
     scored as a whole one. A frame without detections has an empty result file.
@@ -27,6 +49,7 @@ def read_folders(
     Raises:
         DataError: a folder or file is missing, damaged or malformed.
     """
+    labels, results = Path(labels), Path(results)
     labelled, answered = _frame_ids(labels), _frame_ids(results)
     wanted = labelled if frame_ids is None else set(frame_ids)
     _require_files(wanted - labelled, labels, "label")

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple, Self
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numba import njit
 
 from curate.datasets.kitti.labels import DONT_CARE, KittiObjects
@@ -27,7 +28,7 @@ class PooledFrames:
     """
 
     objects: KittiObjects
-    starts: np.ndarray
+    starts: Int[np.ndarray, " frames_plus_1"]
 
     @classmethod
     def of(cls, frames: Sequence[KittiObjects]) -> Self:
@@ -41,7 +42,7 @@ class PooledFrames:
         )
         return cls(KittiObjects(*columns), starts)
 
-    def select(self, keep: np.ndarray) -> Self:
+    def select(self, keep: Bool[np.ndarray, " n"]) -> Self:
         """The frames with only the objects in the mask `keep`."""
         kept_before = np.concatenate([[0], np.cumsum(keep)])
         return type(self)(self.objects.select(keep), kept_before[self.starts])
@@ -93,7 +94,7 @@ def candidates_by_metric(labels: PooledFrames, results: PooledFrames) -> dict[st
     }
 
 
-def dont_care_shares(labels: PooledFrames, results: PooledFrames) -> np.ndarray:
+def dont_care_shares(labels: PooledFrames, results: PooledFrames) -> Float[np.ndarray, " results"]:
     """(results,) largest share of each detection's 2D box that lies in one DontCare region."""
     regions = labels.select(labels.objects.categories == DONT_CARE)
     return _covered_shares(
@@ -101,7 +102,7 @@ def dont_care_shares(labels: PooledFrames, results: PooledFrames) -> np.ndarray:
     )
 
 
-def camera_boxes(objects: KittiObjects) -> np.ndarray:
+def camera_boxes(objects: KittiObjects) -> Float[np.ndarray, "n 7"]:
     """(n, 7) centre boxes in a frame with x to the right, y forward and z up, in metres.
 
     The camera's frame turned by 90 degrees, not the LiDAR frame: overlaps need no calibration.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
+from jaxtyping import Float, Int, Shaped
 
 from curate.datasets.kitti.labels import KittiObjects
 from curate.detections import Columns
@@ -48,13 +49,13 @@ class Outcomes(Columns):
         scores: (n,) float64 of the detection, of the matched one for labels; NaN where none.
     """
 
-    categories: np.ndarray
-    frames: np.ndarray
-    indices: np.ndarray
-    outcomes: np.ndarray
-    matches: np.ndarray
-    overlaps: np.ndarray
-    scores: np.ndarray
+    categories: Shaped[np.ndarray, " n"]
+    frames: Int[np.ndarray, " n"]
+    indices: Int[np.ndarray, " n"]
+    outcomes: Shaped[np.ndarray, " n"]
+    matches: Int[np.ndarray, " n"]
+    overlaps: Float[np.ndarray, " n"]
+    scores: Float[np.ndarray, " n"]
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:

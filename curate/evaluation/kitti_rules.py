@@ -8,6 +8,7 @@ penalty.
 from types import MappingProxyType
 
 import numpy as np
+from jaxtyping import Int
 
 from curate.datasets.kitti.labels import KittiObjects
 
@@ -30,7 +31,7 @@ COUNTED, IGNORED, ABSENT = 0, 1, -1
 """States of an object in the evaluation of one category at one difficulty."""
 
 
-def label_states(labels: KittiObjects, category: str, difficulty: int) -> np.ndarray:
+def label_states(labels: KittiObjects, category: str, difficulty: int) -> Int[np.ndarray, " n"]:
     """(n,) int8 state of each labelled object.
 
     Args:
@@ -51,7 +52,7 @@ def label_states(labels: KittiObjects, category: str, difficulty: int) -> np.nda
     return states
 
 
-def result_states(results: KittiObjects, category: str, difficulty: int) -> np.ndarray:
+def result_states(results: KittiObjects, category: str, difficulty: int) -> Int[np.ndarray, " n"]:
     """(n,) int8 state of each detection.
 
     A detection that is too low in the image is ignored whatever its category, so that a low

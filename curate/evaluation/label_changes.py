@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from curate.detections import Columns
 from curate.errors import ConfigError
@@ -25,10 +26,10 @@ class RoundLabels(Columns):
         weights: (n,) in [0, 1].
     """
 
-    frames: np.ndarray
-    categories: np.ndarray
-    boxes: np.ndarray
-    weights: np.ndarray
+    frames: Int[np.ndarray, " n"]
+    categories: Int[np.ndarray, " n"]
+    boxes: Float[np.ndarray, "n 7"]
+    weights: Float[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
@@ -44,28 +45,28 @@ class LabelChanges:
 
     before: RoundLabels
     after: RoundLabels
-    pairs: np.ndarray
-    iou: np.ndarray
+    pairs: Int[np.ndarray, "p 2"]
+    iou: Float[np.ndarray, " p"]
 
     @cached_property
-    def lost(self) -> np.ndarray:
+    def lost(self) -> Int[np.ndarray, " lost"]:
         """Rows before without a match, ascending."""
         return np.setdiff1d(np.arange(len(self.before)), self.pairs[:, 0])
 
     @cached_property
-    def gained(self) -> np.ndarray:
+    def gained(self) -> Int[np.ndarray, " gained"]:
         """Rows after without a match, ascending."""
         return np.setdiff1d(np.arange(len(self.after)), self.pairs[:, 1])
 
     @cached_property
-    def weight_change(self) -> np.ndarray:
+    def weight_change(self) -> Float[np.ndarray, " p"]:
         """(p,) weight after less weight before of each pair."""
         change: np.ndarray = (
             self.after.weights[self.pairs[:, 1]] - self.before.weights[self.pairs[:, 0]]
         )
         return change
 
-    def largest(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def largest(self, count: int) -> tuple[Int[np.ndarray, "c 2"], Float[np.ndarray, " c"]]:
         """The labels whose weight changed most; a lost or gained one changes from or to 0.
 
         Returns:

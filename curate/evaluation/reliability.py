@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError
@@ -66,10 +67,10 @@ class Judgement:
         ground_truths: number of annotations to be found, per category.
     """
 
-    right: np.ndarray
-    counted: np.ndarray
-    matched: np.ndarray
-    iou: np.ndarray
+    right: Bool[np.ndarray, " n"]
+    counted: Bool[np.ndarray, " n"]
+    matched: Int[np.ndarray, " n"]
+    iou: Float[np.ndarray, " n"]
     ground_truths: Mapping[str, int]
 
 
@@ -80,7 +81,7 @@ def judge(
     detections: Detections,
     annotations: Annotations,
     settings: JudgeSettings = _DEFAULT,
-    rectangles: np.ndarray | None = None,
+    rectangles: Float[np.ndarray, "n 4"] | None = None,
 ) -> Judgement:
     """Tell right from wrong labels of one frame.
 
@@ -119,17 +120,19 @@ def judge(
     return Judgement(right, right | ~neutral, matched, best, ground_truths)
 
 
-def weighted_precision(weights: np.ndarray, right: np.ndarray) -> float:
+def weighted_precision(weights: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> float:
     """Share of the (n,) weights that lies on right labels; NaN where all weights are 0."""
     return _ratio(float(weights[right].sum()), float(weights.sum()))
 
 
-def weighted_recall(weights: np.ndarray, right: np.ndarray, ground_truths: int) -> float:
+def weighted_recall(
+    weights: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"], ground_truths: int
+) -> float:
     """Weight on right labels per object to be found; NaN without objects."""
     return _ratio(float(weights[right].sum()), ground_truths)
 
 
-def auroc(weights: np.ndarray, right: np.ndarray) -> float:
+def auroc(weights: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> float:
     """Chance that a right label weighs more than a wrong one, ties counted half."""
     value, inverse, count = np.unique(weights, return_inverse=True, return_counts=True)
     right_per_value = np.bincount(inverse[right], minlength=len(value))
@@ -139,7 +142,7 @@ def auroc(weights: np.ndarray, right: np.ndarray) -> float:
     return _ratio(float(wins), float(right_per_value.sum()) * float(wrong_per_value.sum()))
 
 
-def average_precision(weights: np.ndarray, right: np.ndarray) -> float:
+def average_precision(weights: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> float:
     """Precision averaged over the steps in recall as the weight falls; equal weights step as one.
 
     NaN where no label is right.
@@ -162,15 +165,18 @@ class ReliabilityBins:
         recall: (b,) right labels per object to be found, NaN without objects.
     """
 
-    edges: np.ndarray
-    labels: np.ndarray
-    mean_weight: np.ndarray
-    precision: np.ndarray
-    recall: np.ndarray
+    edges: Float[np.ndarray, " b_plus_1"]
+    labels: Int[np.ndarray, " b"]
+    mean_weight: Float[np.ndarray, " b"]
+    precision: Float[np.ndarray, " b"]
+    recall: Float[np.ndarray, " b"]
 
 
 def reliability_bins(
-    weights: np.ndarray, right: np.ndarray, ground_truths: int, bins: int = 10
+    weights: Float[np.ndarray, " n"],
+    right: Bool[np.ndarray, " n"],
+    ground_truths: int,
+    bins: int = 10,
 ) -> ReliabilityBins:
     """Precision and recall of the labels in bins of equal width over [0, 1]."""
     edges = np.arange(bins + 1) / bins  # the nearest numbers to 0.1, 0.2, 0.3
@@ -187,7 +193,9 @@ def reliability_bins(
         )
 
 
-def expected_calibration_error(weights: np.ndarray, right: np.ndarray, bins: int = 10) -> float:
+def expected_calibration_error(
+    weights: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"], bins: int = 10
+) -> float:
     """Mean distance of weight and precision over the bins, by their labels; NaN without labels."""
     table = reliability_bins(weights, right, 0, bins)
     gap = np.abs(table.precision - table.mean_weight)

@@ -5,12 +5,15 @@ sum over labels with these multiplicities.
 """
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numba import njit
 
 _BLOCK = 256  # draws whose sums stay in the fastest cache
 
 
-def draw_frames(generator: np.random.Generator, frames: int, replicates: int) -> np.ndarray:
+def draw_frames(
+    generator: np.random.Generator, frames: int, replicates: int
+) -> Float[np.ndarray, "r f"]:
     """(r, f) float64, how often each of f frames is among f that are drawn with replacement.
 
     A frame's column lies in one piece, as `ranked_replicates` reads it.
@@ -22,8 +25,11 @@ def draw_frames(generator: np.random.Generator, frames: int, replicates: int) ->
 
 
 def ranked_replicates(
-    weights: np.ndarray, right: np.ndarray, frame_index: np.ndarray, draws: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    weights: Float[np.ndarray, " n"],
+    right: Bool[np.ndarray, " n"],
+    frame_index: Int[np.ndarray, " n"],
+    draws: Float[np.ndarray, "r f"],
+) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
     """AUROC and average precision of the weight in every draw, NaN where undefined.
 
     Args:

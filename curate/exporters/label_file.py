@@ -9,10 +9,11 @@ of further evidence may only be plain columns.
 import json
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Final
 
 from curate.errors import DataError, LeakageError, one_line
 from curate.exporters.base import named
@@ -23,6 +24,7 @@ _VERSIONS = ("1", "2")
 _KEYS = ("categories", "round", "policy", "root")
 # Behind the core columns of `label`, in a file of version 2.
 _FURTHER_COLUMNS = r"(?: [a-z]\w* (?:INTEGER|REAL|TEXT)(?: NOT NULL)?,)*"
+_PYTHON_TYPES: Final = {"INTEGER": int, "REAL": float, "TEXT": str}
 # No cell of a label file is longer; SQLite's own limit is a gigabyte.
 _LONGEST_CELL = 1 << 24
 
@@ -145,6 +147,22 @@ def read_frames(path: Path) -> LabelFileFrames:
         truth = dict(rows.execute("SELECT frame, count(*) FROM ground_truth GROUP BY frame"))
         [labels] = rows.execute("SELECT count(*) FROM label").fetchone()
     return LabelFileFrames(splits, frozenset(truth), sum(truth.values()), labels)
+
+
+@contextmanager
+def read_label_rows(
+    path: Path,
+) -> Iterator[tuple[Mapping[str, type[int] | type[float] | type[str]], Iterator[Sequence[Any]]]]:
+    """Open a label file for its labels: the Python type of each column, and the rows.
+
+    Raises:
+        DataError: the file is missing or damaged, or of another version or kind.
+    """
+    with open_label_file(path) as rows:
+        read_meta(rows, path)
+        declared = rows.execute("SELECT name, type FROM pragma_table_info('label')").fetchall()
+        kinds = {name: _PYTHON_TYPES[kind] for name, kind in declared}
+        yield kinds, rows.execute(f"SELECT {', '.join(kinds)} FROM label ORDER BY rowid")  # noqa: S608
 
 
 def _check_tables(rows: sqlite3.Connection, path: Path) -> None:

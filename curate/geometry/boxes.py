@@ -1,12 +1,13 @@
 """Corners of boxes: the eight of the cuboid, and the four of its footprint in bird's eye view."""
 
 import numpy as np
+from jaxtyping import Float, Num
 
 # Front left, rear left, rear right, front right: counter-clockwise seen from above.
 _FOOTPRINT_SIGNS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
 
 
-def as_boxes(boxes: np.ndarray) -> np.ndarray:
+def as_boxes(boxes: Num[np.ndarray, " ..."]) -> Float[np.ndarray, "n 7"]:
     """(n, 7) boxes as C-contiguous float64, the one layout that the kernels are compiled for.
 
     Raises:
@@ -18,8 +19,8 @@ def as_boxes(boxes: np.ndarray) -> np.ndarray:
     return boxes
 
 
-def bev_corners(boxes: np.ndarray) -> np.ndarray:
-    """Footprints of (n, 7) boxes.
+def bev_corners(boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 4 2"]:
+    """Return the corners of the boxes' footprints, in the frame of the boxes.
 
     Returns:
         (n, 4, 2) x and y in metres, counter-clockwise from the front left corner.
@@ -33,8 +34,8 @@ def bev_corners(boxes: np.ndarray) -> np.ndarray:
     return corners
 
 
-def box_corners(boxes: np.ndarray) -> np.ndarray:
-    """Corners of (n, 7) boxes.
+def box_corners(boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 8 3"]:
+    """Return the eight corners of each box, in the frame of the boxes.
 
     Returns:
         (n, 8, 3) in metres: the footprint of `bev_corners` at the bottom, then the same at the top.

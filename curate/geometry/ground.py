@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from jaxtyping import Float
 
 _SQUARE_METRES = 3.0
 # Points farther from the sensor tell nothing of the ground, and would make the map large.
@@ -20,11 +21,11 @@ class GroundMap:
             tells.
     """
 
-    low: np.ndarray
-    heights: np.ndarray
+    low: Float[np.ndarray, " 2"]
+    heights: Float[np.ndarray, "columns rows"]
 
     @classmethod
-    def of(cls, points: np.ndarray) -> Self:
+    def of(cls, points: Float[np.ndarray, "n _"]) -> Self:
         """The map of (n, >=3) points.
 
         A square has the second lowest of its own and its eight neighbours' lowest points, or the
@@ -45,7 +46,7 @@ class GroundMap:
         heights = np.where(np.isinf(second), first, second)
         return cls(low, np.where(np.isinf(heights), np.nan, heights))
 
-    def at(self, places: np.ndarray) -> np.ndarray:
+    def at(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """(n,) height of the ground at (n, 2) places, NaN where no point tells."""
         reach = 2 * _REACH_METRES
         off = np.clip(places, -reach, reach) - self.low
@@ -54,14 +55,14 @@ class GroundMap:
         column, row = np.where(on_map[:, None], square, 0).T
         return np.where(on_map, self.heights[column, row], np.nan)
 
-    def lowered(self, rows: np.ndarray) -> np.ndarray:
+    def lowered(self, rows: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
         """A copy of (n, >=3) points or boxes whose z is measured from the ground below them.
 
         Where no point tells how high it is, the ground has the median height of the rest.
         """
         return self._shifted(rows, -1)
 
-    def raised(self, rows: np.ndarray) -> np.ndarray:
+    def raised(self, rows: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
         """The inverse of `lowered`: a copy whose z is again that of the sensor's frame."""
         return self._shifted(rows, 1)
 

@@ -1,15 +1,21 @@
 """Non-maximum suppression of rotated boxes in bird's eye view."""
 
 import numpy as np
+from jaxtyping import Int, Num
 
 from curate.geometry.boxes import as_boxes
 
 
-def nms_bev(boxes: np.ndarray, scores: np.ndarray, iou_threshold: float) -> np.ndarray:
-    """Keeps each box unless a better kept box overlaps it with a BEV IoU above the threshold.
+def nms_bev(
+    boxes: Num[np.ndarray, "n 7"], scores: Num[np.ndarray, " n"], iou_threshold: float
+) -> Int[np.ndarray, " k"]:
+    """Return the boxes that non-maximum suppression in bird's eye view keeps.
+
+    A box is dropped where a kept box with a higher score has a BEV IoU above the threshold with it.
 
     Args:
-        boxes: (n, 7); one category, or all where categories shall suppress each other.
+        boxes: (n, 7) in metres and radians; of one category, or of all where categories shall
+            suppress each other.
         scores: (n,) higher is better; equal scores are ranked by index.
         iou_threshold: in [0, 1].
 

@@ -6,21 +6,44 @@ overlaps nothing, itself included.
 """
 
 import numpy as np
+from jaxtyping import Float, Int, Num
 
 from curate.geometry.boxes import as_boxes
 
 
-def bev_iou(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
-    """(n, m) bird's eye view IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
+def bev_iou(
+    boxes_a: Num[np.ndarray, "n 7"], boxes_b: Num[np.ndarray, "m 7"]
+) -> Float[np.ndarray, "n m"]:
+    """Return the bird's eye view IoU of every pair of boxes, in [0, 1].
+
+    Args:
+        boxes_a: (n, 7) in metres and radians; both in the same frame of reference.
+        boxes_b: (m, 7).
+
+    Raises:
+        ValueError: if boxes are not rows of seven numbers.
+    """
     return _iou(boxes_a, boxes_b, with_height=False)
 
 
-def iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
-    """(n, m) volume IoU in [0, 1] of (n, 7) and (m, 7) boxes."""
+def iou_3d(
+    boxes_a: Num[np.ndarray, "n 7"], boxes_b: Num[np.ndarray, "m 7"]
+) -> Float[np.ndarray, "n m"]:
+    """Return the volume IoU of every pair of boxes, in [0, 1].
+
+    Args:
+        boxes_a: (n, 7) in metres and radians; both in the same frame of reference.
+        boxes_b: (m, 7).
+
+    Raises:
+        ValueError: if boxes are not rows of seven numbers.
+    """
     return _iou(boxes_a, boxes_b, with_height=True)
 
 
-def paired_iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
+def paired_iou_3d(
+    boxes_a: Num[np.ndarray, "n 7"], boxes_b: Num[np.ndarray, "n 7"]
+) -> Float[np.ndarray, " n"]:
     """(n,) volume IoU in [0, 1] of each of (n, 7) boxes with the other's box in the same row."""
     from curate.geometry.kernels import paired_iou
 
@@ -28,8 +51,16 @@ def paired_iou_3d(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
 
 
 def overlapping_pairs(
-    boxes_a: np.ndarray, starts_a: np.ndarray, boxes_b: np.ndarray, starts_b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    boxes_a: Num[np.ndarray, "n 7"],
+    starts_a: Int[np.ndarray, " groups_plus_1"],
+    boxes_b: Num[np.ndarray, "m 7"],
+    starts_b: Int[np.ndarray, " groups_plus_1"],
+) -> tuple[
+    Int[np.ndarray, " pairs"],
+    Int[np.ndarray, " pairs"],
+    Float[np.ndarray, " pairs"],
+    Float[np.ndarray, " pairs"],
+]:
     """All pairs with a BEV IoU above 0 within groups of boxes, such as the frames of a split.
 
     Args:

@@ -7,6 +7,7 @@ its cell: one pass over the points, whatever the number of boxes.
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool, Int, Num
 
 from curate.geometry.boxes import as_boxes
 
@@ -19,12 +20,15 @@ _MOST_CELLS = 256
 _MARGIN_METRES = 1e-3
 
 
-def count_points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """(n,) int64 number of points in each of (n, 7) boxes.
+def count_points_in_boxes(
+    points: Num[np.ndarray, "p _"], boxes: Num[np.ndarray, "n 7"]
+) -> Int[np.ndarray, " n"]:
+    """Return the number of points in each box.
 
     Args:
         points: (p, >=3) x, y, z in metres in the frame of the boxes; NaN is in no box.
-        boxes: (n, 7); a point in several boxes counts in each; NaN contains nothing.
+        boxes: (n, 7) in metres and radians; a point in several boxes counts in each; NaN contains
+            nothing.
     """
     from curate.geometry.point_kernels import count_points
 
@@ -32,16 +36,30 @@ def count_points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return count_points(_as_points(points), placed, *_grid(placed))
 
 
-def box_of_points(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """(p,) int64 index of the first of (n, 7) boxes that contains each point, -1 where none."""
+def box_of_points(
+    points: Num[np.ndarray, "p _"], boxes: Num[np.ndarray, "n 7"]
+) -> Int[np.ndarray, " p"]:
+    """Return the index of the first box that contains each point, -1 where none does.
+
+    Args:
+        points: (p, >=3) x, y, z in metres in the frame of the boxes; NaN is in no box.
+        boxes: (n, 7) in metres and radians.
+    """
     from curate.geometry.point_kernels import first_box
 
     placed = _placed(as_boxes(boxes))
     return first_box(_as_points(points), placed, *_grid(placed))
 
 
-def points_in_box_mask(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """(p,) bool, whether each point lies in the (7,) box."""
+def points_in_box_mask(
+    points: Num[np.ndarray, "p _"], box: Num[np.ndarray, " 7"]
+) -> Bool[np.ndarray, " p"]:
+    """Return whether each point lies in one box.
+
+    Args:
+        points: (p, >=3) x, y, z in metres in the frame of the box.
+        box: (7,) in metres and radians.
+    """
     inside: np.ndarray = box_of_points(points, np.reshape(box, (1, 7))) == 0
     return inside
 

@@ -4,11 +4,12 @@ Quaternions are (w, x, y, z), scalar first, of unit length.
 """
 
 import numpy as np
+from jaxtyping import Float, Num
 
 from curate.geometry.similarity import wrap_angle
 
 
-def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
+def rotation_matrices(quaternions: Num[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
     """(n, 3, 3) rotations of (n, 4) unit quaternions w, x, y, z."""
     w, x, y, z = np.asarray(quaternions, dtype=np.float64).reshape(-1, 4).T
     return np.stack(
@@ -21,15 +22,17 @@ def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
     )
 
 
-def pose_matrix(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+def pose_matrix(
+    translation: Num[np.ndarray, " 3"], quaternion: Num[np.ndarray, " 4"]
+) -> Float[np.ndarray, "4 4"]:
     """(4, 4) from the frame of reference that stands at `translation`, turned by `quaternion`."""
     pose = np.eye(4)
-    pose[:3, :3] = rotation_matrices(quaternion)[0]
+    pose[:3, :3] = rotation_matrices(np.reshape(quaternion, (1, 4)))[0]
     pose[:3, 3] = translation
     return pose
 
 
-def invert_pose(pose: np.ndarray) -> np.ndarray:
+def invert_pose(pose: Num[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Inverse of a (4, 4) rigid pose."""
     inverse = np.eye(4)
     inverse[:3, :3] = pose[:3, :3].T
@@ -38,8 +41,11 @@ def invert_pose(pose: np.ndarray) -> np.ndarray:
 
 
 def boxes_in_frame(
-    centres: np.ndarray, sizes: np.ndarray, quaternions: np.ndarray, pose: np.ndarray
-) -> np.ndarray:
+    centres: Num[np.ndarray, "n 3"],
+    sizes: Num[np.ndarray, "n 3"],
+    quaternions: Num[np.ndarray, "n 4"],
+    pose: Num[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "n 7"]:
     """Boxes of an outer frame of reference (a map's) in the one that stands at `pose` (a LiDAR's).
 
     A box keeps its yaw about the inner z: the direction of its length, seen from above. What it is

@@ -1,6 +1,7 @@
 """Projection from the LiDAR frame into the image (KITTI: Geiger et al., IJRR 2013, eq. 8)."""
 
 import numpy as np
+from jaxtyping import Bool, Float, Num
 
 from curate.frames import Calibration
 from curate.geometry.boxes import box_corners
@@ -18,8 +19,8 @@ _EDGE_ENDS = np.array([1, 2, 3, 0, 5, 6, 7, 4, 4, 5, 6, 7])
 
 
 def project_points(
-    points_lidar: np.ndarray, calibration: Calibration
-) -> tuple[np.ndarray, np.ndarray]:
+    points_lidar: Num[np.ndarray, "n _"], calibration: Calibration
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Where points appear in the image.
 
     Args:
@@ -37,12 +38,12 @@ def project_points(
 
 
 def in_view(
-    points: np.ndarray, calibration: Calibration, image_size: tuple[int, int]
-) -> np.ndarray:
-    """(n,) bool, whether (n, >=3) LiDAR points lie before the camera and inside its image.
+    points: Num[np.ndarray, "n _"], calibration: Calibration, image_size: tuple[int, int]
+) -> Bool[np.ndarray, " n"]:
+    """Return whether each LiDAR point lies before the camera and inside its image.
 
     Args:
-        points: x, y, z in metres in the LiDAR frame, first of the columns.
+        points: (n, >=3) x, y, z in metres in the LiDAR frame, first of the columns.
         calibration: of the frame.
         image_size: (width, height) in pixels.
     """
@@ -65,9 +66,9 @@ def in_view(
 
 
 def image_rectangles(
-    boxes: np.ndarray, calibration: Calibration, image_size: tuple[int, int]
-) -> np.ndarray:
-    """The 2D boxes of 3D boxes: the rectangle around each projected box, clipped to the image.
+    boxes: Num[np.ndarray, "n 7"], calibration: Calibration, image_size: tuple[int, int]
+) -> Float[np.ndarray, "n 4"]:
+    """Return the 2D boxes of 3D boxes: the rectangle around each projected box, within the image.
 
     Of a box that reaches behind the camera, the part before the near plane counts.
 

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from jaxtyping import Float, Num
 
 from curate.errors import ConfigError
 
 
-def wrap_angle(angle_rad: np.ndarray) -> np.ndarray:
+def wrap_angle(angle_rad: Num[np.ndarray, " *shape"]) -> Float[np.ndarray, " *shape"]:
     """Angles in radians, wrapped to (-pi, pi]; those in the range already stay as they are."""
     angle_rad = np.asarray(angle_rad, dtype=np.float64)
     wrapped = np.pi - np.mod(np.pi - angle_rad, 2 * np.pi)
@@ -57,13 +58,13 @@ class Similarity:
             float(generator.uniform(*scale_range)),
         )
 
-    def apply_to_points(self, points: np.ndarray) -> np.ndarray:
+    def apply_to_points(self, points: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
         """A of (n, >=3) points; columns after the third are kept. Same dtype."""
         moved = points.copy()
         moved[:, :3] = points[:, :3] @ self._matrix().T.astype(points.dtype)
         return moved
 
-    def apply_to_boxes(self, boxes: np.ndarray) -> np.ndarray:
+    def apply_to_boxes(self, boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 7"]:
         """A of (n, 7) boxes."""
         moved = np.array(boxes, dtype=np.float64)
         moved[:, :3] = moved[:, :3] @ self._matrix().T
@@ -72,7 +73,7 @@ class Similarity:
         moved[:, 6] = wrap_angle(yaw + self.rotation_rad)
         return moved
 
-    def invert_boxes(self, boxes: np.ndarray) -> np.ndarray:
+    def invert_boxes(self, boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 7"]:
         """A^-1 of (n, 7) boxes."""
         moved = np.array(boxes, dtype=np.float64)
         moved[:, :3] = moved[:, :3] @ self._matrix() / self.scale**2

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from jaxtyping import Float
 
 from curate.detections import Detections
 from curate.errors import ConfigError
@@ -77,7 +78,7 @@ class DensityPrior(EvidenceSource):
         return {**measured, "rho_density": rho}
 
 
-def visible_areas(boxes: np.ndarray) -> np.ndarray:
+def visible_areas(boxes: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, " n"]:
     """Return the area of each box as seen from the origin, projected along the line of sight.
 
     Args:
@@ -101,7 +102,9 @@ def visible_areas(boxes: np.ndarray) -> np.ndarray:
     return np.where(around, 0.0, area)
 
 
-def expected_densities(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+def expected_densities(
+    points: Float[np.ndarray, "m _"], boxes: Float[np.ndarray, "n 7"]
+) -> Float[np.ndarray, " n"]:
     """Return the density that the sweep gives at the range and in the direction of each box.
 
     Args:

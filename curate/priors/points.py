@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
+from jaxtyping import Float, Num
 
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError
@@ -55,7 +56,7 @@ _DEFAULT = PointSettings()
 
 
 def points_threshold(
-    counts_per_ground_truth: np.ndarray, settings: PointSettings = _DEFAULT
+    counts_per_ground_truth: Num[np.ndarray, " g"], settings: PointSettings = _DEFAULT
 ) -> float:
     """m_th of one category, at least 1 so that a box without a point is never trusted.
 
@@ -75,7 +76,9 @@ def points_threshold(
     return max(float(value), 1.0)
 
 
-def point_trust(points: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+def point_trust(
+    points: Num[np.ndarray, " n"], thresholds: Num[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
     """rho_diff (Eq. 8) from (n,) point counts m and (n,) thresholds m_th."""
     rho: np.ndarray = np.minimum(points, thresholds) / thresholds
     return rho

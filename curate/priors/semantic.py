@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
+from jaxtyping import Float, Int, Num, Shaped
 
 from curate.detections import Detections
 from curate.errors import ConfigError, ModelError
@@ -115,11 +116,11 @@ class SemanticPrior(EvidenceSource):
 
 
 def semantic_trust(
-    scores: np.ndarray,
-    mask_pixels: np.ndarray,
-    box_pixels: np.ndarray,
+    scores: Float[np.ndarray, " n"],
+    mask_pixels: Num[np.ndarray, " n"],
+    box_pixels: Num[np.ndarray, " n"],
     settings: SemanticSettings = _DEFAULT,
-) -> np.ndarray:
+) -> Float[np.ndarray, " n"]:
     """rho_anno (Eq. 9) from (n,) scores and (n,) pixel counts S and A."""
     share = mask_pixels / np.maximum(box_pixels, 1)
     if settings.mean == "geometric":
@@ -132,8 +133,10 @@ def semantic_trust(
 
 
 def count_pixels(
-    rectangles: np.ndarray, categories: np.ndarray, semantic_map: SemanticMap
-) -> tuple[np.ndarray, np.ndarray]:
+    rectangles: Float[np.ndarray, "n 4"],
+    categories: Shaped[np.ndarray, " n"],
+    semantic_map: SemanticMap,
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """S and A of each rectangle: a pixel counts where the rectangle touches any part of it.
 
     As in KITTI, pixel (row r, column c) is centred on the coordinates (c, r) and the whole image is

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from jaxtyping import UInt8
 
 from curate.frames import Frame
 
@@ -19,7 +20,7 @@ class SemanticMap:
             and person.
     """
 
-    class_ids: np.ndarray
+    class_ids: UInt8[np.ndarray, "height width"]
     category_classes: Mapping[str, tuple[int, ...]]
 
 

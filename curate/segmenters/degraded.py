@@ -16,13 +16,13 @@ For each frame, from a generator of (seed, frame id) alone, in this order:
 
 import hashlib
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
 from curate.errors import ConfigError
+from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import class_map
@@ -81,7 +81,7 @@ class DegradedSegmenter:
     needs_image = False
     needs_points = False
 
-    def __init__(self, directory: Path, *, seed: int = 0, **rates: Any) -> None:
+    def __init__(self, directory: StrPath, *, seed: int = 0, **rates: Any) -> None:
         self.seed = seed
         known = {field.name for field in fields(ErrorModel)}
         if unknown := sorted(set(rates) - known):

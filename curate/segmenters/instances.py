@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from curate.errors import ConfigError, DataError, one_line
+from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes, free_id
@@ -38,7 +39,7 @@ class InstanceSegmenter:
     needs_image = False
 
     def __init__(
-        self, path: Path, classes: Mapping[str, Sequence[int]], *, minimum_score: float = 0.5
+        self, path: StrPath, classes: Mapping[str, Sequence[int]], *, minimum_score: float = 0.5
     ) -> None:
         if not 0 <= minimum_score <= 1:
             raise ConfigError(f"segmenter minimum_score {minimum_score}: 0 to 1")

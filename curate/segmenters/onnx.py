@@ -23,6 +23,7 @@ import numpy as np
 
 from curate.errors import ConfigError, ModelError
 from curate.files.onnx_session import are_numbers
+from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes
@@ -56,7 +57,7 @@ class OnnxSegmenter:
 
     def __init__(
         self,
-        model: Path,
+        model: StrPath,
         classes: Mapping[str, Sequence[int]],
         *,
         tiles: int = 5,
@@ -67,7 +68,7 @@ class OnnxSegmenter:
             raise ConfigError(f"segmenter tiles {tiles}: at least 1")
         self.classes = checked_classes(classes)
         self.tiles = tiles
-        self._model = ImageModel(model, scaling, threads)
+        self._model = ImageModel(Path(model), scaling, threads)
         self._output = _map_output(self._model)
 
     def segment(self, frame: Frame) -> SemanticMap:

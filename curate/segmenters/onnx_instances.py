@@ -13,6 +13,7 @@ import numpy as np
 
 from curate.errors import ConfigError, ModelError
 from curate.files.onnx_session import are_numbers
+from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes, free_id
@@ -47,7 +48,7 @@ class OnnxInstanceSegmenter:
 
     def __init__(
         self,
-        model: Path,
+        model: StrPath,
         classes: Mapping[str, Sequence[int]],
         *,
         outputs: Mapping[str, str] | None = None,
@@ -61,7 +62,7 @@ class OnnxInstanceSegmenter:
         self.classes = checked_classes(classes)
         self.minimum_score = minimum_score
         self.mask_threshold = mask_threshold
-        self._model = ImageModel(model, scaling, threads, single=True)
+        self._model = ImageModel(Path(model), scaling, threads, single=True)
         self._outputs = self._declared(dict(outputs or _OUTPUTS))
 
     def segment(self, frame: Frame) -> SemanticMap:

@@ -8,6 +8,7 @@ import numpy as np
 
 from curate.datasets.formats.images import decode_image
 from curate.errors import ConfigError, DataError
+from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes, foreign_ids
@@ -34,7 +35,7 @@ class SavedSegmenter:
 
     def __init__(
         self,
-        directory: Path,
+        directory: StrPath,
         classes: Mapping[str, Sequence[int]],
         *,
         divisor: int | None = None,

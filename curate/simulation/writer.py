@@ -25,6 +25,7 @@ import numpy as np
 from curate.datasets.kitti.labels import from_annotations, write_objects
 from curate.errors import ConfigError, CurateError, DataError
 from curate.files.atomic import replace_file
+from curate.files.paths import StrPath
 from curate.simulation.camera import render
 from curate.simulation.labels import annotate
 from curate.simulation.lidar import sweep
@@ -56,7 +57,7 @@ class SimulationSettings:
 
 
 def simulate(
-    directory: Path,
+    directory: StrPath,
     frames: int,
     seed: int,
     *,
@@ -64,7 +65,7 @@ def simulate(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Writes a simulated data set; frames that are already there are not made again.
+    """Write a simulated data set in KITTI's layout; frames that are already there are kept.
 
     Args:
         directory: the root; gets training/{velodyne,image_2,semantic_2,calib,label_2} and
@@ -84,6 +85,7 @@ def simulate(
         DataError: the directory holds other data or cannot be written, or its simulation.json is
             damaged.
     """
+    directory = Path(directory)
     settings = _settings(frames, seed, val_frames)
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, not {workers}")

@@ -2,17 +2,20 @@
 
 Needs the exported file and the frames it names, nothing else of this project's machinery:
 
-    labels = WeightedLabels(Path("labels.sqlite"))
-    for sample in labels:
-        loss = sum(sample.weights * my_loss(sample.points, sample.boxes, sample.categories))
+    labels = WeightedLabels("labels.sqlite")
+    for batch in DataLoader(labels, batch_size=4, collate_fn=labels.collate):
+        loss = (batch.weights * my_loss_per_box(my_network, batch)).sum()
 """
 
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
 from torch.utils.data import Dataset
 
 from curate.detections import as_categories
@@ -25,6 +28,7 @@ from curate.exporters.label_file import (
     read_meta,
     read_zero_weight,
 )
+from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.projection import in_view
 
@@ -32,11 +36,49 @@ from curate.geometry.projection import in_view
 NEIGHBOURS: Final = {"Van": "Car", "Person_sitting": "Pedestrian"}
 
 
+@dataclass(frozen=True)
+class LabelBatch:
+    """Several frames with their boxes as tensors, from `WeightedLabels.collate`.
+
+    The p points and n boxes of all frames are concatenated; `point_frames` and `box_frames` say
+    which frame of the batch each belongs to. Boxes of weight 0 that are background are left out,
+    so a weight of 0 marks a region to ignore: loss times weight is right for every box.
+
+    Attributes:
+        frame_ids: names of the b frames.
+        labeled: (b,) bool, whether a frame's boxes are ground truth (X_l) or pseudo-labels (X_u).
+        points: (p, 4) float32 x, y, z in metres in the LiDAR frame, and intensity in [0, 1].
+        point_frames: (p,) int64 in [0, b).
+        boxes: (n, 7) float32 x, y, z, length, width, height in metres and yaw in radians, at the
+            box centre in the LiDAR frame.
+        box_frames: (n,) int64 in [0, b).
+        categories: (n,) int64 index into `WeightedLabels.categories`.
+        weights: (n,) float32 v in [0, 1]; 1 for ground truth.
+    """
+
+    frame_ids: tuple[str, ...]
+    labeled: Bool[torch.Tensor, " b"]
+    points: Float[torch.Tensor, "p 4"]
+    point_frames: Int[torch.Tensor, " p"]
+    boxes: Float[torch.Tensor, "n 7"]
+    box_frames: Int[torch.Tensor, " n"]
+    categories: Int[torch.Tensor, " n"]
+    weights: Float[torch.Tensor, " n"]
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the batch with its tensors on a device."""
+        _, *tensors = (getattr(self, each.name) for each in fields(self))
+        return type(self)(self.frame_ids, *(tensor.to(device) for tensor in tensors))
+
+
 class WeightedLabels(Dataset[Sample]):
     """The frames of an exported label file with their boxes and weights, in the order of frames.
 
+    A torch `Dataset` of `Sample`. Source of the weights: An et al., Remote Sensing 15(3):627, 2023,
+    Eqs. 6 and 10: v multiplies an object's classification and box loss.
+
     Args:
-        path: the SQLite file.
+        path: the SQLite file, text or `Path`.
         read: gives the frame of an id; by default the frames of the data set that the file names,
             in KITTI's layout below its root.
         root: where that data set lies now, if it has moved since the export.
@@ -48,14 +90,15 @@ class WeightedLabels(Dataset[Sample]):
 
     def __init__(
         self,
-        path: Path,
+        path: StrPath,
         *,
         read: Callable[[str], Frame] | None = None,
-        root: Path | None = None,
+        root: StrPath | None = None,
     ) -> None:
+        path = Path(path)
         with open_label_file(path) as rows:
             self._load(rows, path)
-        self._read = read or _kitti_reader(root or Path(self.meta["root"]))
+        self._read = read or _kitti_reader(root or self.meta["root"])
 
     def _load(self, rows: sqlite3.Connection, path: Path) -> None:
         self.meta = read_meta(rows, path)
@@ -95,6 +138,31 @@ class WeightedLabels(Dataset[Sample]):
         labeled = bool(self.labeled[index])
         points = frame.points[seen]
         return Sample(frame_id, labeled, points, boxes, categories, weights, self.zero_weight)
+
+    def collate(self, samples: Sequence[Sample]) -> LabelBatch:
+        """Return samples as one batch of tensors: `DataLoader(..., collate_fn=labels.collate)`."""
+        boxes, weights = [], []
+        for sample in samples:
+            kept = (sample.weights > 0) | sample.ignored
+            categories = [self.categories.index(name) for name in sample.categories[kept].tolist()]
+            boxes.append(np.column_stack([sample.boxes[kept], categories]))
+            weights.append(sample.weights[kept])
+        numbers = torch.from_numpy(np.concatenate(boxes))
+        return LabelBatch(
+            frame_ids=tuple(sample.frame_id for sample in samples),
+            labeled=torch.tensor([sample.labeled for sample in samples]),
+            points=torch.from_numpy(np.concatenate([sample.points for sample in samples])),
+            point_frames=_frame_numbers([len(sample.points) for sample in samples]),
+            boxes=numbers[:, :7].float(),
+            box_frames=_frame_numbers([len(own) for own in weights]),
+            categories=numbers[:, 7].long(),
+            weights=torch.from_numpy(np.concatenate(weights)).float(),
+        )
+
+
+def _frame_numbers(counts: Sequence[int]) -> torch.Tensor:
+    """(sum of counts,) the number of each row's frame within the batch."""
+    return torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
 
 
 _NO_BOXES = (np.zeros((0, 7)), as_categories([]), np.zeros(0))
@@ -137,7 +205,7 @@ def _numbers(path: Path, frame: str, entries: list[tuple]) -> np.ndarray:
     return numbers
 
 
-def _kitti_reader(root: Path) -> Callable[[str], Frame]:
+def _kitti_reader(root: StrPath) -> Callable[[str], Frame]:
     from curate.datasets.kitti.dataset import KittiDataset
 
     return KittiDataset(root).read

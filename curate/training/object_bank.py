@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from jaxtyping import Float, Float32
 
 from curate.detections import as_categories
 from curate.detectors.base import Sample
@@ -35,8 +36,8 @@ class BankObject:
     """One object: its category, its (7,) box and its (n, 4) points, where they were seen."""
 
     category: str
-    box: np.ndarray
-    points: np.ndarray
+    box: Float[np.ndarray, " 7"]
+    points: Float32[np.ndarray, "n 4"]
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import torch
 
 from curate.detectors.base import Student, TrainableDetector, choose_preset
 from curate.errors import ConfigError, first_line
+from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.training.batches import Batches
 from curate.training.labels import WeightedLabels
@@ -37,11 +38,11 @@ _RECENT_STEPS = 50
 
 def train(
     detector: type[TrainableDetector],
-    labels: Path,
-    output: Path,
+    labels: StrPath,
+    output: StrPath,
     settings: TrainingSettings,
     *,
-    start: Path | None = None,
+    start: StrPath | None = None,
     read: Callable[[str], Frame] | None = None,
     progress: Progress | None = None,
 ) -> TrainingReport:
@@ -67,6 +68,8 @@ def train(
             preset or lacks a member, or there is no such device.
     """
     began = time.monotonic()
+    labels, output = Path(labels), Path(output)
+    start = None if start is None else Path(start)
     torch.set_num_threads(settings.threads)
     settings = replace(settings, preset=choose_preset(detector, settings.preset))
     samples = WeightedLabels(labels, read=read)

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 
 from curate.detections import empty_boxes
 from curate.errors import ConfigError, DataError
@@ -57,12 +58,12 @@ class Memory:
         v: (n,) the weight that the policy gave.
     """
 
-    frame_index: np.ndarray
-    category: np.ndarray
-    score: np.ndarray
-    iou: np.ndarray
-    boxes: np.ndarray
-    v: np.ndarray
+    frame_index: Int[np.ndarray, " n"]
+    category: Shaped[np.ndarray, " n"]
+    score: Float[np.ndarray, " n"]
+    iou: Float[np.ndarray, " n"]
+    boxes: Float[np.ndarray, "n 7"]
+    v: Float[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
@@ -118,12 +119,12 @@ class Evidence:
         return len(self.loss)
 
     @property
-    def matched(self) -> np.ndarray:
+    def matched(self) -> Bool[np.ndarray, " n"]:
         """(n,) bool, whether a reprediction matched."""
         return np.asarray(~np.isnan(self.loss))
 
     @cached_property
-    def rho_det(self) -> np.ndarray:
+    def rho_det(self) -> Float[np.ndarray, " n"]:
         """(n,) product of the priors that scored a label; 1 where none did."""
         product = np.ones(len(self))
         for rho in self.rho.values():
@@ -147,9 +148,9 @@ class Weights:
             a weight of 0 means. None, if left out; v is 0 where a label is dropped.
     """
 
-    v: np.ndarray
-    lambda_u: np.ndarray
-    dropped: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    v: Float[np.ndarray, " n"]
+    lambda_u: Float[np.ndarray, " n"]
+    dropped: Bool[np.ndarray, " n_or_0"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
         """Fills in what was left out."""
@@ -157,7 +158,7 @@ class Weights:
             object.__setattr__(self, "dropped", np.zeros(len(self.v), dtype=bool))
 
     @classmethod
-    def without_age(cls, v: np.ndarray) -> "Weights":
+    def without_age(cls, v: Float[np.ndarray, " n"]) -> "Weights":
         """Weights of a policy that has no age parameter."""
         return cls(v, np.full(len(v), np.nan))
 

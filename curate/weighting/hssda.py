@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
+from jaxtyping import Float
 
 from curate.errors import ConfigError
 from curate.weighting.base import Age, Evidence, Policy, Weights, ZeroWeight
@@ -57,7 +58,7 @@ class HSSDA(Policy):
         return Weights(v, np.full(len(evidence), np.nan), poor)
 
 
-def two_centres(values: np.ndarray) -> tuple[float, float]:
+def two_centres(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """The means of the two clusters of (n,) values that have the least variance within.
 
     In one dimension the best clusters are separated by a threshold, so all n - 1 of them are tried,

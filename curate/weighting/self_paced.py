@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
+from jaxtyping import Float
 
 from curate.errors import ConfigError
 from curate.weighting.base import Age, Evidence, Policy, Weights
@@ -75,7 +76,9 @@ class PSPSL(SPSL):
         return Weights(evidence.rho_det * easiness(evidence.loss, lambda_u), lambda_u)
 
 
-def easiness(loss: np.ndarray, lambda_u: np.ndarray) -> np.ndarray:
+def easiness(
+    loss: Float[np.ndarray, " n"], lambda_u: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
     """(n,) 1 - L / lambda where L < lambda, else 0 (Eq. 7); 0 where L is NaN.
 
     At lambda = 0 every v minimises the objective of a label with L = 0. It gets 1, the limit from
@@ -88,7 +91,7 @@ def easiness(loss: np.ndarray, lambda_u: np.ndarray) -> np.ndarray:
 
 def age_parameter(
     evidence: Evidence, age: Age, scope: Scope = "round", quantile: float | None = None
-) -> np.ndarray:
+) -> Float[np.ndarray, " n"]:
     """(n,) lambda = (e/E) max(L) + (1 - e/E) mean(L) of each label's group (Eq. 4).
 
     Unmatched labels do not count; they get their group's lambda, NaN in a group without a match.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+from jaxtyping import Float
 
 from curate.errors import ConfigError
 from curate.weighting.base import Age, Evidence, Policy, Weights
@@ -34,7 +35,9 @@ class Threshold(Policy):
         return Weights.without_age((evidence.score >= threshold).astype(np.float64))
 
 
-def by_category(evidence: Evidence, every: float, own: Mapping[str, float]) -> np.ndarray:
+def by_category(
+    evidence: Evidence, every: float, own: Mapping[str, float]
+) -> Float[np.ndarray, " n"]:
     """(n,) the threshold that holds for each label."""
     threshold = np.full(len(evidence), every)
     for category, value in own.items():

@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Float32
 
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.images import read_sized_image
@@ -22,6 +23,7 @@ from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.atomic import replace_file
+from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles
 
 _log = logging.getLogger(__name__)
@@ -51,7 +53,7 @@ class KittiDataset:
 
     name = "kitti"
 
-    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
+    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         homes = [self.root / "training", self.root]
@@ -150,7 +152,7 @@ class KittiDataset:
         return to_annotations(read_objects(files.label), read_calibration(files.calibration))
 
 
-def read_points(path: Path) -> np.ndarray:
+def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:
     """The (n, 4) float32 points of a velodyne file: x, y, z in metres, intensity. May be empty.
 
     Raises:
@@ -179,7 +181,7 @@ def read_points(path: Path) -> np.ndarray:
     return points
 
 
-def check_point_range(path: Path, points: np.ndarray) -> None:
+def check_point_range(path: Path, points: Float[np.ndarray, "n _"]) -> None:
     """DataError where a finite point of (n, >=3) is farther than any LiDAR sees."""
     far = np.abs(points[:, :3]).max(initial=0)
     if far > FARTHEST_METRES:

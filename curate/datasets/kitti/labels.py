@@ -16,10 +16,12 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from jaxtyping import Float, Int, Shaped
 
 from curate.detections import Annotations, Columns, Detections, as_categories
 from curate.errors import DataError
 from curate.files.atomic import replace_file
+from curate.files.paths import StrPath
 from curate.frames import Calibration
 from curate.geometry.projection import image_rectangles
 from curate.geometry.similarity import wrap_angle
@@ -51,15 +53,15 @@ class KittiObjects(Columns):
         scores: (n,) float64, NaN where the file has none.
     """
 
-    categories: np.ndarray
-    truncated: np.ndarray
-    occluded: np.ndarray
-    alpha: np.ndarray
-    boxes_2d: np.ndarray
-    dimensions: np.ndarray
-    locations: np.ndarray
-    rotations_y: np.ndarray
-    scores: np.ndarray
+    categories: Shaped[np.ndarray, " n"]
+    truncated: Float[np.ndarray, " n"]
+    occluded: Int[np.ndarray, " n"]
+    alpha: Float[np.ndarray, " n"]
+    boxes_2d: Float[np.ndarray, "n 4"]
+    dimensions: Float[np.ndarray, "n 3"]
+    locations: Float[np.ndarray, "n 3"]
+    rotations_y: Float[np.ndarray, " n"]
+    scores: Float[np.ndarray, " n"]
 
     @classmethod
     def empty(cls) -> Self:
@@ -68,10 +70,11 @@ class KittiObjects(Columns):
 
 
 def read_objects(
-    path: Path, *, scored: bool = False, known: Collection[str] | None = KITTI_CATEGORIES
+    path: StrPath, *, scored: bool = False, known: Collection[str] | None = KITTI_CATEGORIES
 ) -> KittiObjects:
-    """The objects of a KITTI label file (15 fields per line) or, if `scored`, result file (16).
+    """Return the objects of a KITTI label file, or of a result file if `scored`.
 
+    Label files have 15 fields per line, result files 16.
     Empty lines are skipped; an empty file holds no objects.
 
     Args:
@@ -85,6 +88,7 @@ def read_objects(
             object that is not DontCare.
     """
     fields = RESULT_FIELDS if scored else LABEL_FIELDS
+    path = Path(path)
     lines = _read_lines(path)
     rows = [row for row in map(str.split, lines) if row]
     categories = [row[0] for row in rows]
@@ -103,8 +107,8 @@ def read_objects(
     return KittiObjects(as_categories(categories), *_columns(values))
 
 
-def write_objects(path: Path, objects: KittiObjects) -> None:
-    """Writes, whole or not at all, a label file, or a result file where the objects have scores.
+def write_objects(path: StrPath, objects: KittiObjects) -> None:
+    """Write a label file, or a result file where the objects have scores, whole or not at all.
 
     KITTI's own files have two decimals. Here alpha, dimensions, location and rotation_y have four,
     so that a box comes back within 0.1 mm per coordinate, and the score has six; truncation and
@@ -113,6 +117,7 @@ def write_objects(path: Path, objects: KittiObjects) -> None:
     Raises:
         DataError: a number is not finite, or only some objects have scores.
     """
+    path = Path(path)
     scored = ~np.isnan(objects.scores)
     if scored.any() and not scored.all():
         raise DataError(f"{path}: {np.sum(~scored)} of {len(scored)} objects have no score")

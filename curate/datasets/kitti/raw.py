@@ -24,6 +24,7 @@ from curate.datasets.kitti.dataset import (
 from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
+from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
@@ -45,7 +46,7 @@ class KittiRawDataset:
 
     name = "kitti-raw"
 
-    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
+    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         found = (path.parent.parent for at in _DRIVES for path in self.root.glob(f"{at}/{_POINTS}"))

@@ -22,6 +22,7 @@ from curate.datasets.nuscenes.names import CATEGORIES
 from curate.datasets.nuscenes.scenes import validation_scenes
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
+from curate.files.paths import StrPath
 from curate.frames import Frame, FrameFiles
 
 _log = logging.getLogger(__name__)
@@ -49,7 +50,7 @@ class NuScenesDataset:
 
     def __init__(
         self,
-        root: Path,
+        root: StrPath,
         *,
         version: str | None = None,
         camera: str = "CAM_FRONT",

@@ -20,6 +20,7 @@ from curate.detectors.pillars.checkpoint import (
 from curate.detectors.pillars.encoding import Pillars, decode, encode_points
 from curate.detectors.pillars.presets import PRESETS
 from curate.errors import ConfigError, ModelError, first_line
+from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.nms import nms_bev
@@ -52,13 +53,14 @@ class PillarDetector:
 
     def __init__(
         self,
-        checkpoint: Path,
+        checkpoint: StrPath,
         *,
         device: str = "cpu",
         minimum_score: float = 0.1,
         nms_iou: float = 0.1,
         threads: int = 1,
     ) -> None:
+        checkpoint = Path(checkpoint)
         self._checkpoint = load_checkpoint(checkpoint)
         self._minimum_score = minimum_score
         self._nms_iou = nms_iou

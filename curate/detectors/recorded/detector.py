@@ -22,6 +22,7 @@ from curate.detectors.recorded.results import (
 )
 from curate.detectors.recorded.table import TableRecord
 from curate.errors import ConfigError, DataError
+from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame
 from curate.geometry.similarity import Similarity
 
@@ -91,7 +92,7 @@ class RecordedDetector:
 
     def __init__(
         self,
-        path: Path,
+        path: StrPath,
         minimum_score: float = 0.0,
         *,
         kind: str = "auto",

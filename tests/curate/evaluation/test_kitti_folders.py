@@ -5,7 +5,7 @@ from support.kitti_scenes import car, to_objects
 
 from curate.datasets.kitti.labels import write_objects
 from curate.errors import DataError
-from curate.evaluation.kitti_folders import read_folders
+from curate.evaluation.kitti_folders import evaluate_folders, read_folders
 
 LINE = "Car 0.00 0 0.50 100 100 180 160 1.5 1.6 4.0 0.0 1.7 20.0 0.3"
 
@@ -27,6 +27,15 @@ def test_frames_are_read_in_order(folders):
     assert frame_ids == ("000001", "000002", "000007")
     assert [len(frame) for frame in labels] == [len(frame) for frame in results] == [0, 1, 0]
     assert results[1].scores.tolist() == [0.5]
+
+
+def test_folders_are_evaluated(folders):
+    """By their names as text: the one car is found."""
+    labels, results = map(str, folders)
+    found = evaluate_folders(labels, results)
+    assert found.objects[0].tolist() == [1, 1, 1]
+    assert found.ap_r40[0, 3].tolist() == [100.0] * 3
+    assert evaluate_folders(labels, results, ["000001"]).objects.sum() == 0
 
 
 def test_only_the_named_frames_are_read(folders):

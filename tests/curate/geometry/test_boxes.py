@@ -33,6 +33,7 @@ def test_the_cuboid_stands_on_the_footprint(boxes):
     assert np.allclose(np.linalg.norm(footprints[:, 1] - footprints[:, 2], axis=1), boxes[:, 4])
 
 
+@pytest.mark.wrong_shapes
 def test_arrays_that_are_no_boxes_are_refused():
     """Another number of columns is an error that names the shape."""
     with pytest.raises(ValueError, match=r"\(3, 6\)"):

@@ -156,5 +156,5 @@ def test_pairs_of_groups_are_the_matrices_of_each_group():
 
 def test_pairs_of_no_groups_are_none():
     """No group at all is no error."""
-    none = np.zeros((0, 7))
-    assert [len(part) for part in overlapping_pairs(none, [0], none, [0])] == [0, 0, 0, 0]
+    none, starts = np.zeros((0, 7)), np.zeros(1, dtype=np.int64)
+    assert [len(part) for part in overlapping_pairs(none, starts, none, starts)] == [0, 0, 0, 0]

@@ -24,9 +24,8 @@ def labels(*boxes: list[float]) -> Detections:
 
 def frame(points: np.ndarray) -> Frame:
     """A sweep of (n, 3) points."""
-    return Frame(
-        "x", np.column_stack([points, np.zeros(len(points))]), toy_calibration(), IMAGE_SIZE
-    )
+    sweep = np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
+    return Frame("x", sweep, toy_calibration(), IMAGE_SIZE)
 
 
 def wall(distance: float, half_width_rad: float = 0.3) -> np.ndarray:

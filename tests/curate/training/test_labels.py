@@ -140,3 +140,42 @@ def test_files_that_are_no_label_files(tmp_path, make_labels):
     change(path, "UPDATE meta SET value = '7' WHERE key = 'format_version'")
     with pytest.raises(DataError, match="label format '7'"):
         WeightedLabels(path)
+
+
+def test_a_batch_concatenates_frames(make_labels):
+    """Points and boxes know their frame, categories are numbers, weights are beside them."""
+    labels = WeightedLabels(make_labels(labeled=1, unlabeled=1, weight=0.25))
+    loader = torch.utils.data.DataLoader(labels, batch_size=2, collate_fn=labels.collate)
+    [batch] = loader
+    first, second = labels[0], labels[1]
+    assert batch.frame_ids == (first.frame_id, second.frame_id)
+    assert batch.labeled.tolist() == [True, False]
+    for number, sample in enumerate((first, second)):
+        assert (batch.points[batch.point_frames == number].numpy() == sample.points).all()
+        own = batch.box_frames == number
+        assert np.allclose(batch.boxes[own].numpy(), sample.boxes)
+        names = [labels.categories[index] for index in batch.categories[own].tolist()]
+        assert names == sample.categories.tolist()
+        assert np.allclose(batch.weights[own].numpy(), sample.weights)
+    assert batch.points.dtype == batch.boxes.dtype == batch.weights.dtype == torch.float32
+    assert batch.to("cpu").boxes.equal(batch.boxes)
+
+
+@pytest.mark.parametrize(("zero_weight", "boxes"), [("background", 0), ("ignore", 3)])
+def test_a_weight_of_zero_in_a_batch_means_ignore(make_labels, zero_weight, boxes):
+    """Background is left out, as all that no box covers."""
+    path = make_labels(labeled=1, unlabeled=1, weight=0.0, zero_weight=zero_weight)
+    labels = WeightedLabels(path)
+    batch = labels.collate([labels[1]])
+    assert batch.boxes.shape == (boxes, 7)
+    assert batch.weights.tolist() == [0.0] * boxes
+
+
+def test_a_batch_may_hold_no_boxes(make_labels):
+    """Frames without objects teach background."""
+    path = make_labels(labeled=1)
+    change(path, "DELETE FROM ground_truth")
+    labels = WeightedLabels(str(path))
+    batch = labels.collate([labels[0]])
+    assert batch.boxes.shape == (0, 7)
+    assert len(batch.points) == len(batch.point_frames) > 0

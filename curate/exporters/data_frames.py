@@ -1,0 +1,209 @@
+"""Exported labels as a pandas or polars DataFrame: `read_labels("labels.sqlite")`.
+
+The three exports that hold every label with its weight are read: SQLite, CSV and Parquet. All give
+the same columns with the same types, those of `weighted_labels`. A table reader that guesses types
+would turn the frame id "000001" into the number 1; here the declared columns decide.
+"""
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.util import find_spec
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, overload
+
+from curate.errors import ConfigError, DataError, one_line
+from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
+from curate.exporters.columns import WEIGHTED_LABELS
+from curate.exporters.label_file import read_label_rows
+from curate.exporters.parquet import FORMAT
+from curate.files.parquet import load_parquet
+from curate.files.paths import StrPath
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import polars as pl
+
+Library = Literal["pandas", "polars"]
+Kind = type[int] | type[float] | type[str]
+Kinds = Mapping[str, Kind]
+"""The Python type of each column's values, any of which may be None."""
+Row = Sequence[Any]
+
+BLOCK_ROWS: Final = 65_536
+_PANDAS: Final = {int: "Int64", float: "float64", str: "string"}
+_CORE: Final[Kinds] = {
+    column.name: {"name": str, "float64": float}.get(column.kind, int) for column in WEIGHTED_LABELS
+}
+
+
+@overload
+def read_labels(path: StrPath, as_: Literal["pandas"]) -> "pd.DataFrame": ...
+@overload
+def read_labels(path: StrPath, as_: Literal["polars"]) -> "pl.DataFrame": ...
+@overload
+def read_labels(path: StrPath, as_: None = None) -> Any: ...
+def read_labels(path: StrPath, as_: Library | None = None) -> Any:
+    """Return exported labels as a DataFrame, a row per label, in the order of the file.
+
+    The columns are those of `weighted_labels`: round, frame, k, category, the box (x, y, z, length,
+    width, height in metres, yaw in radians; box centre, LiDAR frame), score, loss, the evidence,
+    policy and weight. Frame ids are text: "000001" stays "000001". What is unknown is missing: NaN,
+    NA or null. Ground truth of labeled frames is not in the table. What a weight of 0 means depends
+    on the policy; see docs/training.md.
+
+    Args:
+        path: an export in the format sqlite, csv or parquet; the content decides which.
+        as_: "pandas" or "polars"; by default pandas, or polars where only that is installed.
+
+    Raises:
+        ConfigError: if the library is unknown or not installed, or pyarrow is missing for Parquet.
+        DataError: if the file is missing, damaged, or not an export that holds weights.
+    """
+    path = Path(path)
+    library = _choose(as_)
+    start = _start(path)
+    if start.startswith(b"PAR1"):
+        return _read_parquet(path, library)
+    if start.startswith(b"SQLite format 3\0"):
+        with read_label_rows(path) as (kinds, rows):
+            return _as_data_frame(library, kinds, rows)
+    if start.decode("utf-8", "replace").startswith(",".join(WEIGHTED_LABEL_COLUMNS)):
+        return _read_csv(path, library)
+    raise DataError(
+        f"{path}: not exported labels; read_labels reads the formats sqlite, csv and parquet, "
+        "which `curate export --format` writes"
+    )
+
+
+def _choose(as_: str | None) -> Library:
+    for library in ("pandas", "polars"):
+        if as_ in (None, library) and find_spec(library):
+            return library
+    if as_ in (None, "pandas", "polars"):
+        raise ConfigError(f"read_labels needs {as_ or 'pandas or polars'}: pip install pandas")
+    raise ConfigError(f"read_labels: unknown library {as_!r}; use pandas or polars")
+
+
+def _start(path: Path) -> bytes:
+    """As many bytes as it takes to tell the formats apart."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(",".join(WEIGHTED_LABEL_COLUMNS)))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _read_csv(path: Path, library: Library) -> Any:
+    """Read the declared columns by their type, and further ones as numbers where all of them are.
+
+    Raises:
+        DataError: if a row is too short or too long, or a value is not of its column's type.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            lines = csv.reader(file)
+            names = next(lines)
+            further = {
+                name: _kind_of_texts(path, names.index(name)) for name in names[len(_CORE) :]
+            }
+            kinds = {**_CORE, **further}
+            return _as_data_frame(library, kinds, _parse(path, lines, kinds))
+    except (csv.Error, UnicodeDecodeError, OverflowError) as error:
+        raise DataError(f"{path}: cannot be read: {one_line(error)}; export it again") from None
+
+
+def _parse(path: Path, lines: Iterable[Sequence[str]], kinds: Kinds) -> Iterator[Row]:
+    for number, line in enumerate(lines, start=2):
+        try:
+            yield [
+                kind(text) if text else None
+                for kind, text in zip(kinds.values(), line, strict=True)
+            ]
+        except ValueError as error:
+            raise DataError(f"{path} line {number}: {one_line(error)}; export it again") from None
+
+
+def _kind_of_texts(path: Path, place: int) -> Kind:
+    """Return int or float where every value of a column is what such a number is written as.
+
+    So "7" is a number, and "007" is text.
+    """
+    fitting: list[Kind] = [int, float]
+    with path.open(newline="", encoding="utf-8") as file:
+        for line in islice(csv.reader(file), 1, None):
+            text = line[place] if place < len(line) else ""
+            fitting = [kind for kind in fitting if not text or _is_written_as(kind, text)]
+    return fitting[0] if fitting else str
+
+
+def _is_written_as(kind: Kind, text: str) -> bool:
+    try:
+        return str(kind(text)) == text
+    except ValueError:
+        return False
+
+
+def _read_parquet(path: Path, library: Library) -> Any:
+    """Read all columns, and give names, integers and floats the types of the other formats."""
+    arrow, parquet = load_parquet()
+    try:
+        if (parquet.read_schema(path).metadata or {}).get(b"curate.format") != FORMAT.encode():
+            raise DataError(f"{path}: a Parquet file, but not one that curate exported")
+        table = parquet.read_table(path)
+        types = [(field.name, _plain(arrow, field.type)) for field in table.schema]
+        table = table.cast(arrow.schema(types))
+    except (arrow.ArrowException, OSError) as error:
+        raise DataError(f"{path}: cannot be read: {one_line(error)}; export it again") from None
+    if library == "polars":
+        import polars as pl
+
+        return pl.from_arrow(table)
+    import pandas as pd
+
+    nullable = {arrow.int64(): pd.Int64Dtype(), arrow.string(): pd.StringDtype()}
+    return table.to_pandas(types_mapper=nullable.get)
+
+
+def _plain(arrow: Any, kind: Any) -> Any:
+    """Return the one Arrow type for integers, for floats, and for names."""
+    if arrow.types.is_integer(kind):
+        return arrow.int64()
+    return arrow.float64() if arrow.types.is_floating(kind) else arrow.string()
+
+
+def _as_data_frame(library: Library, kinds: Kinds, rows: Iterator[Row]) -> Any:
+    """Build the table block by block: only one block is held as Python objects at a time."""
+    blocks = _blocks(rows)
+    if library == "polars":
+        import polars as pl
+
+        schema = {name: _polars_types()[kind] for name, kind in kinds.items()}
+        return pl.concat([pl.DataFrame(block, schema=schema, orient="row") for block in blocks])
+    import pandas as pd
+
+    made = []
+    for block in blocks:
+        columns = zip(*block, strict=True) if block else [()] * len(kinds)
+        made.append(
+            pd.DataFrame(
+                {
+                    name: pd.Series(values, dtype=_PANDAS[kind])
+                    for (name, kind), values in zip(kinds.items(), columns, strict=True)
+                }
+            )
+        )
+    return pd.concat(made, ignore_index=True)
+
+
+def _polars_types() -> Mapping[Kind, Any]:
+    import polars as pl
+
+    return {int: pl.Int64, float: pl.Float64, str: pl.String}
+
+
+def _blocks(rows: Iterator[Row]) -> Iterator[list[Row]]:
+    """Yield the rows in blocks; an empty one where there are no rows."""
+    yield list(islice(rows, BLOCK_ROWS))
+    while block := list(islice(rows, BLOCK_ROWS)):
+        yield block

@@ -1,0 +1,41 @@
+"""Checks of shapes while the tests run: `make shapes`, jaxtyping's import hook with beartype.
+
+    pytest --jaxtyping-packages=curate,support.shapes.check
+
+Two things need help. The hook wraps every function below its other decorators, where numba would
+have to compile the wrapper: kernels are left as they are, what calls them is checked. And beartype
+checks a method outside of its class, where `Self` means nothing to it: of the types of a function,
+only arrays and tensors are checked, all others are mypy's.
+"""
+
+import ast
+from collections.abc import Callable
+from typing import Any, get_args
+
+from beartype import beartype
+from jaxtyping import AbstractArray, _import_hook
+
+_skipped = _import_hook._is_no_type_check  # noqa: SLF001 - the hook has no public way to skip
+
+
+def _is_skipped(decorator: ast.AST) -> bool:
+    name = decorator.func if isinstance(decorator, ast.Call) else decorator
+    return _skipped(decorator) or (isinstance(name, ast.Name) and name.id == "njit")
+
+
+_import_hook._is_no_type_check = _is_skipped  # noqa: SLF001
+
+
+def check(function: Callable) -> Callable:
+    """Return a function whose arrays are checked against their shapes and types of numbers."""
+    function.__annotations__ = {
+        name: hint if _has_shape(hint) else Any for name, hint in function.__annotations__.items()
+    }
+    return beartype(function)
+
+
+def _has_shape(hint: Any) -> bool:
+    """Whether a type is an array with a shape, or made of such."""
+    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+        return True
+    return any(map(_has_shape, get_args(hint)))
