@@ -40,6 +40,10 @@ ThreadsOption = Annotated[
     Optional[int],  # noqa: UP045
     typer.Option("--threads", min=1, help="Threads; default: train.threads of curate.toml."),
 ]
+ChartFormatOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--format", help="Format of chart files: svg, png or pdf."),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 
 
