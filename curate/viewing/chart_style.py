@@ -135,7 +135,7 @@ class Chart:
 
 
 def figure_content(
-    figure: "Figure", kind: ImageFormat, salt: str, dpi: int = _DPI, **settings: str
+    figure: "Figure", kind: ImageFormat, salt: str, dpi: int = _DPI, **settings: Any
 ) -> bytes:
     """Return a figure as the content of a file; equal figures give equal bytes.
 

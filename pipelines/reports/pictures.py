@@ -5,24 +5,31 @@ from pathlib import Path
 import numpy as np
 
 from curate.errors import ConfigError, DataError
+from curate.files.atomic import replace_file
+from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.viewing.bird_eye import draw_bird_eye
-from curate.viewing.canvas import save_png
-from curate.viewing.frame_view import draw_frame
-from curate.viewing.overlay import draw_overlay
+from curate.viewing.canvas import Canvas, save_png
+from curate.viewing.chart_style import ImageFormat
+from curate.viewing.frame_view import paint_frame
+from curate.viewing.overlay import Shown, draw_overlay
+from curate.viewing.palette import DARK, Style
 from curate.viewing.tags import ShownLabels
 from pipelines.labels.by_frame import FrameLabels, read_labels
-from pipelines.labels.of_one_frame import chosen_round, read_frame
+from pipelines.labels.of_one_frame import FrameBoxes, chosen_round, read_frame
 from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
 
 def draw_example_frame(workspace: Workspace, round_number: int) -> list[Path]:
-    """A bird's eye view and an image overlay of the frame that shows most of all weights."""
+    """Draw a bird's eye view and an image overlay of the frame that `find_telling_frame` finds."""
+    return draw_labels(workspace, round_number, find_telling_frame(workspace, round_number))
+
+
+def find_telling_frame(workspace: Workspace, round_number: int) -> str:
+    """Return the name of the frame with most of both trusted and mistrusted labels."""
     policy = workspace.config.run.method
-    frames = list(read_labels(workspace, round_number, policy))
-    shown = max(frames, key=_variety)
-    return draw_labels(workspace, round_number, shown)
+    return max(read_labels(workspace, round_number, policy), key=_variety).frame
 
 
 def draw_view(
@@ -31,8 +38,11 @@ def draw_view(
     round_number: int | None = None,
     policy: str | None = None,
     output: Path | None = None,
+    *,
+    kind: ImageFormat = "png",
+    style: Style = DARK,
 ) -> Path:
-    """Image and bird's eye view of any frame in one picture; says where it is.
+    """Draw image and bird's eye view of any frame into one file; return its path.
 
     Args:
         workspace: see `Workspace`.
@@ -40,6 +50,8 @@ def draw_view(
         round_number: None for the last that has predictions.
         policy: whose weights; None for the configured one.
         output: None for a file in the folder `pictures`.
+        kind: format of the file.
+        style: colours.
 
     Raises:
         ConfigError: no frame has that name, or a picture cannot be written to `output`.
@@ -47,65 +59,73 @@ def draw_view(
     """
     number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
-    picture = frame_picture(workspace, name, number, policy)
-    path = output or workspace.root / "pictures" / f"round-{number:02d}-{name}-{policy}.png"
+    content = _painted(workspace, name, (number, policy), kind, style).content(kind)
+    path = output or workspace.root / "pictures" / f"round-{number:02d}-{name}-{policy}.{kind}"
     if path.is_dir() or not path.parent.is_dir():
         raise ConfigError(f"--output {path}: name a file in a folder that exists")
-    save_png(path, picture)
+    replace_file(path, content)
     return path
 
 
 def frame_picture(workspace: Workspace, name: str, round_number: int, policy: str) -> np.ndarray:
-    """Image and bird's eye view of any frame as (height, width, 3) uint8 RGB.
+    """Return image and bird's eye view of any frame as (height, width, 3) uint8 RGB.
 
     Raises:
         ConfigError: no frame has that name.
     """
-    found = read_frame(workspace, name, round_number, policy)
-    frame = workspace.dataset.read(name, image=True)
-    counts = count_points_in_boxes(frame.points, found.labels.boxes)
-    labels = ShownLabels(
-        found.labels.boxes,
-        found.labels.categories,
-        found.labels.scores,
+    return _painted(workspace, name, (round_number, policy), "png", DARK).finish()
+
+
+def shown_labels(workspace: Workspace, frame: Frame, found: FrameBoxes, policy: str) -> ShownLabels:
+    """Return the labels of a frame as pictures show them."""
+    labels = found.labels
+    return ShownLabels(
+        labels.boxes,
+        labels.categories,
+        labels.scores,
         found.weights,
-        counts,
+        count_points_in_boxes(frame.points, labels.boxes),
         zero_weight_of(workspace.config, policy),
-    )
-    title = f"frame {name} ({found.split}), round {round_number}, weights by {policy}"
-    return draw_frame(
-        frame,
-        labels,
-        found.truth_boxes,
-        found.repredictions,
-        human_boxes=found.human_boxes,
-        title=title,
+        found.numbers,
     )
 
 
-def draw_labels(workspace: Workspace, round_number: int, shown: FrameLabels) -> list[Path]:
-    """Both pictures of a frame, in the folder `pictures`."""
-    frame = workspace.dataset.read(shown.frame, image=True)
+def draw_labels(workspace: Workspace, round_number: int, name: str) -> list[Path]:
+    """Draw a frame's image and its bird's eye view into two files in the folder `pictures`."""
+    policy = workspace.config.run.method
+    frame = workspace.dataset.read(name, image=True)
     if frame.image is None:
-        raise DataError(f"frame {shown.frame}: the data set has no image")
-    labels = ShownLabels(
-        shown.labels.boxes,
-        shown.labels.categories,
-        shown.labels.scores,
-        shown.weights,
-        shown.points,
-        zero_weight_of(workspace.config, workspace.config.run.method),
-    )
-    title = f"frame {shown.frame}, round {round_number}, weights by {workspace.config.run.method}"
-    stem = f"round-{round_number:02d}-{shown.frame}"
+        raise DataError(f"frame {name}: the data set has no image")
+    found = read_frame(workspace, name, round_number, policy)
+    labels = shown_labels(workspace, frame, found, policy)
+    title = f"frame {name}, round {round_number}, weights by {policy}"
+    stem = f"round-{round_number:02d}-{name}"
     pictures = {
         f"{stem}-bird-eye.png": draw_bird_eye(frame.points, labels, title=title),
         f"{stem}-image.png": draw_overlay(frame.image, frame.calibration, labels, title=title),
     }
     folder = workspace.root / "pictures"
-    for name, picture in pictures.items():
-        save_png(folder / name, picture)
-    return [folder / name for name in pictures]
+    for file, picture in pictures.items():
+        save_png(folder / file, picture)
+    return [folder / file for file in pictures]
+
+
+def _painted(
+    workspace: Workspace, name: str, weighted: tuple[int, str], kind: ImageFormat, style: Style
+) -> Canvas:
+    """Draw a frame in a round under a policy."""
+    number, policy = weighted
+    found = read_frame(workspace, name, number, policy)
+    frame = workspace.dataset.read(name, image=True)
+    shown = Shown(
+        shown_labels(workspace, frame, found, policy),
+        found.truth_boxes,
+        found.repredictions,
+        found.human_boxes,
+        f"frame {name} ({found.split}), round {number}, weights by {policy}",
+        style,
+    )
+    return paint_frame(frame, shown, kind)
 
 
 def _variety(shown: FrameLabels) -> float:

@@ -7,13 +7,12 @@ import numpy as np
 from sqlalchemy import select
 
 from curate.errors import ConfigError
-from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.viewing.recording import RecordedFrame, load_rerun, write_recording
-from curate.viewing.tags import ShownLabels
 from db import bulk
 from db.views import weighted_labels
 from pipelines.labels.columns import numeric_columns
 from pipelines.labels.of_one_frame import read_frame
+from pipelines.reports.pictures import shown_labels
 from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
 
@@ -48,17 +47,10 @@ def _recorded(
     for name in names:
         found = read_frame(workspace, name, round_number, policy)
         frame = workspace.dataset.read(name, image=True)
-        counts = count_points_in_boxes(frame.points, found.labels.boxes)
-        labels = ShownLabels(
-            found.labels.boxes,
-            found.labels.categories,
-            found.labels.scores,
-            found.weights,
-            counts,
-            meaning,
-        )
-        evidence = _evidence(workspace, name, round_number, policy, len(labels))
-        evidence["points"] = counts.astype(np.float64)
+        labels = shown_labels(workspace, frame, found, policy)
+        evidence = _evidence(workspace, name, round_number, policy, found.numbers)
+        if labels.points is not None:
+            evidence["points"] = labels.points.astype(np.float64)
         yield RecordedFrame(
             frame,
             labels,
@@ -72,17 +64,18 @@ def _recorded(
 
 
 def _evidence(
-    workspace: Workspace, name: str, round_number: int, policy: str, count: int
+    workspace: Workspace, name: str, round_number: int, policy: str, numbers: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """(count,) by k of each kind of evidence; NaN where there is none."""
+    """(n,) of each kind of evidence, for the labels with these n values of k; NaN for none."""
     with workspace.database.reading() as connection:
         labels = weighted_labels(connection).c
         columns = [each for each in numeric_columns(connection) if each not in ("score", "weight")]
         query = select(labels.k, *(labels[column] for column in columns)).where(
             labels.round == round_number, labels.frame == name, labels.policy == policy
         )
-        table = np.full((count, len(columns)), np.nan)
+        table = np.full((len(numbers), len(columns)), np.nan)
+        rows = {k: row for row, k in enumerate(numbers.tolist())}
         for k, *values in bulk.select(connection, query):
-            if k < count:  # others are objects that people added
-                table[k] = values
+            if k in rows:  # others are objects that people added
+                table[rows[k]] = values
     return dict(zip(columns, table.T, strict=True))
