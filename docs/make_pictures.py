@@ -3,10 +3,12 @@
     python -m docs.make_pictures DEMO
 
 DEMO is the folder that `curate demo DEMO --frames 60 --val 20 --labeled 0.2` has made. The script
-writes docs/overlay.png, labels over an image, and docs/before-after.png, the predictions as they are
-beside the weighted labels. Both show the frame with most of trusted and of mistrusted labels.
+writes docs/overlay.png, labels over an image, and docs/before-after.png, the predictions as they
+are beside the weighted labels. Both show the frame with most of trusted and of mistrusted labels.
+docs/results.png is drawn from the tables of docs/results.md, also without DEMO.
 """
 
+import re
 import sys
 from pathlib import Path
 
@@ -17,6 +19,8 @@ from curate.frames import Frame
 from curate.geometry.boxes import bev_corners
 from curate.viewing.bird_eye import Region
 from curate.viewing.canvas import Canvas
+from curate.viewing.chart_style import Chart
+from curate.viewing.charts import Curve, CurvePanel, curves_chart
 from curate.viewing.legend import STRIP_HEIGHT, TITLE_HEIGHT, draw_legend
 from curate.viewing.overlay import box_strokes, draw_overlay
 from curate.viewing.palette import DARK, Colour, height_shades, weight_colours
@@ -76,7 +80,7 @@ def _draw_image(
         if len(strokes) == 12:
             canvas.fill(strokes[:4, 0], colour, 0.45 * strength[i])
         if len(strokes):
-            canvas.lines(strokes, colour, 0.5 + 1.5 * strength[i])
+            canvas.lines(strokes, colour, 1.0 + 1.2 * strength[i])
 
 
 def _draw_above(
@@ -91,9 +95,9 @@ def _draw_above(
     for i in np.argsort(strength, kind="stable"):
         outline, colour = footprints[i], tuple(colours[i].tolist())
         canvas.fill(outline, colour, 0.7 * strength[i])
-        canvas.lines(outline, colour, 0.6 + 1.6 * strength[i], closed=True)
+        canvas.lines(outline, colour, 1.0 + 1.4 * strength[i], closed=True)
         front = (outline[0] + outline[3]) / 2
-        canvas.lines(np.stack([outline.mean(axis=0), front]), colour, 0.6 + 1.6 * strength[i])
+        canvas.lines(np.stack([outline.mean(axis=0), front]), colour, 1.0 + 1.4 * strength[i])
 
 
 def save_small_png(path: Path, rgb: np.ndarray) -> None:
@@ -108,8 +112,34 @@ def save_small_png(path: Path, rgb: np.ndarray) -> None:
     picture.quantize(palette=palette, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
+def results_chart(text: str) -> Chart:
+    """Return the chart of docs/results.md: mean 3D AP over the labeled ratio, by method.
+
+    Args:
+        text: of the page, with tables whose cells hold "mean ± standard deviation" or "-".
+    """
+    panels = []
+    for title, table in re.findall(r"### (Mean 3D AP, [^\n]*), by labeled ratio\n\n(.*?)\n\n", text,
+                                   re.DOTALL):  # fmt: skip
+        head, _, *lines = ([cell.strip() for cell in line.split("|")[1:-1]]
+                           for line in table.splitlines())  # fmt: skip
+        shares = np.array([float(name.removesuffix("%")) / 100 for name in head[1:]])
+        curves = []
+        for name, *cells in lines:
+            found = [re.match(r"([\d.]+) ± ([\d.]+)", cell) for cell in cells]
+            values = [[float(f[1]), float(f[2])] if f else [np.nan] * 2 for f in found]
+            curves.append(Curve(name, *np.array(values).T))
+        panels.append(CurvePanel(title, shares, curves))
+    note = (
+        "dot: mean over 3 seeds; bar: standard deviation; legend: AP at a line's end; AP R40, "
+        "mean over categories and difficulties; teacher: on X_l once, baseline: on X_l as long as "
+        "the other methods"
+    )
+    return curves_chart(panels, "AP over labeled ratio", note)
+
+
 def main(folder: Path) -> None:
-    """Draw both pictures.
+    """Draw labels over an image, and the predictions beside the weighted labels.
 
     Args:
         folder: of the demo.
@@ -128,4 +158,6 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    results_chart((DOCS / "results.md").read_text(encoding="utf-8")).save(DOCS / "results.png")
+    if len(sys.argv) > 1:
+        main(Path(sys.argv[1]))

@@ -168,7 +168,7 @@ def audit_chart(audit: Audit, title: str) -> Chart:
 
 
 def curves_chart(panels: Sequence[CurvePanel], title: str, note: str) -> Chart:
-    """Return lines with error bars over a logarithmic share, in panels side by side.
+    """Return AP with error bars over the share of labeled frames, in panels side by side.
 
     Args:
         panels: at least one.
@@ -297,7 +297,7 @@ def _draw_curves(axes: "Axes", panel: CurvePanel) -> None:
     axes.set_xticks([], minor=True)
     if len(panel.shares) == 1:
         axes.set_xlim(panel.shares[0] / 1.5, panel.shares[0] * 1.5)
-    axes.set_xlabel("labeled frames")
+    axes.set(xlabel="labeled frames", ylabel="AP, %")
     axes.grid(visible=False, axis="x")
     ranked = [drawn for _, drawn in sorted(order, key=lambda each: -each[0])]
     if ranked:

@@ -156,7 +156,7 @@ class BenchReport:
             title = self._summary(overlaps).title
             panels.append(CurvePanel(title, np.array(self.finished.ratios), curves))
         note = (
-            "dot: mean over seeds; bar: standard deviation; legend: AP at the last ratio; "
+            "dot: mean over seeds; bar: standard deviation; legend: AP at a line's end; "
             "AP R40, mean over categories and difficulties; teacher: on X_l once, baseline: on X_l "
             "as long as the other methods"
         )

@@ -8,7 +8,7 @@ from support.toys import toy_calibration
 from curate.frames import Frame
 from curate.viewing.palette import weight_colours
 from curate.viewing.tags import ShownLabels
-from docs.make_pictures import _RAW, before_after, save_small_png
+from docs.make_pictures import _RAW, before_after, results_chart, save_small_png
 
 
 def has(picture, colour):
@@ -43,6 +43,24 @@ def test_a_small_picture_keeps_the_colours_of_the_weights(tmp_path):
     save_small_png(tmp_path / "a.png", noise)
     read = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"))
     assert np.abs(read[0, :20].astype(int) - colours).max() <= 6
+
+
+def test_the_chart_of_the_results_shows_their_tables():
+    """Both overlaps; what is not measured is left out."""
+    figure = results_chart((ROOT / "docs" / "results.md").read_text(encoding="utf-8")).figure
+    strict, relaxed = figure.axes
+    assert strict.get_title(loc="left") == "Mean 3D AP, IoU 0.7/0.5/0.5"
+    named = {
+        text.get_text().split()[0]: line.get_ydata().tolist()
+        for text, line in zip(
+            strict.get_legend().get_texts(),
+            sorted(strict.lines, key=lambda line: -line.get_ydata()[-1]),
+            strict=True,
+        )
+    }
+    assert named["pspsl"] == [21.1, 27.9, 28.6]
+    assert named["baseline"] == [18.9, 24.3, 25.4, 27.1]
+    assert len(relaxed.lines) == len(named)
 
 
 def test_the_pictures_of_the_docs_are_small_enough_to_load():
