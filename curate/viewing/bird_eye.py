@@ -1,34 +1,29 @@
 """Bird's eye view: the sweep from above with labels coloured by weight; x (forward) points up."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from curate.geometry.boxes import bev_corners
-from curate.viewing.canvas import Canvas, Colour
+from curate.viewing.canvas import Canvas
 from curate.viewing.legend import (
     HUMAN_DASHES,
     REPREDICTION_DASHES,
     STRIP_HEIGHT,
     TITLE_HEIGHT,
     TRUTH_DOTS,
-    draw_legend,
     draw_title,
 )
-from curate.viewing.palette import (
-    BACKGROUND,
-    FAINT_TEXT,
-    GRID,
-    GROUND_TRUTH,
-    HUMAN,
-    TEXT,
-    height_shades,
-    weight_colours,
-)
+from curate.viewing.overlay import Shown
+from curate.viewing.palette import DARK, Colour, Style, height_shades, weight_colours
 from curate.viewing.tags import ShownLabels, ShownRepredictions, draw_tags
 
 _RING_METRES = 10.0
 _SCALE_BAR_METRES = 10.0
+# A box farther away, which only a broken detector predicts, does not shrink the picture further.
+_FARTHEST_METRES = 120.0
+_MARGIN_METRES = 2.0
 
 
 @dataclass(frozen=True)
@@ -62,7 +57,27 @@ class Region:
         return np.stack([across, down], axis=-1)
 
 
-_DEFAULT_REGION = Region()
+def region_around(boxes: Sequence[np.ndarray], width: int) -> Region:
+    """Return the usual region, widened to where boxes are: also behind the LiDAR.
+
+    Args:
+        boxes: arrays (n, 7) in the LiDAR frame.
+        width: of the picture in pixels.
+    """
+    usual = Region()
+    corners = bev_corners(np.concatenate([np.zeros((0, 7)), *boxes])).reshape(-1, 2)
+    corners = np.clip(corners, -_FARTHEST_METRES, _FARTHEST_METRES)
+    low, high = corners.min(axis=0, initial=np.inf), corners.max(axis=0, initial=-np.inf)
+    half = max(
+        width / usual.pixels_per_metre / 2, high[1] + _MARGIN_METRES, _MARGIN_METRES - low[1]
+    )
+    return Region(
+        min(usual.x_min, low[0] - _MARGIN_METRES),
+        max(usual.x_max, high[0] + _MARGIN_METRES),
+        -half,
+        half,
+        width / (2 * half),
+    )
 
 
 def draw_bird_eye(
@@ -70,52 +85,60 @@ def draw_bird_eye(
     labels: ShownLabels,
     truth_boxes: np.ndarray | None = None,
     *,
-    repredictions: ShownRepredictions | None = None,
-    human_boxes: np.ndarray | None = None,
-    region: Region = _DEFAULT_REGION,
+    region: Region | None = None,
     title: str = "",
+    style: Style = DARK,
 ) -> np.ndarray:
-    """The picture.
+    """Return the picture, (height, width, 3) uint8 RGB.
 
     Args:
         points: (n, >=3) LiDAR points in metres.
-        labels: coloured by weight, the highest on top, with captions where there is room.
-        truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None where it is unknown.
-        repredictions: dashed, in the colour of the label that each was matched with.
-        human_boxes: (h, 7) what people decided on, in long dashes; None for none.
-        region: what to show, and how large.
+        labels: see `Shown`.
+        truth_boxes: see `Shown`.
+        region: what to show, and how large; None for all labels.
         title: written at the top.
-
-    Returns:
-        (height, width, 3) uint8 RGB.
+        style: colours.
     """
-    width, height = region.size
-    canvas = Canvas(width, height + TITLE_HEIGHT + STRIP_HEIGHT, BACKGROUND)
-    _draw_rings(canvas, region)
-    _draw_points(canvas, region, points)
-    footprints = region.to_pixels(bev_corners(labels.boxes))
-    emphasis = labels.emphasis
-    for index in np.argsort(emphasis, kind="stable"):
-        _draw_label(canvas, footprints[index], labels.colour(int(index)), emphasis[index])
-    if repredictions is not None:
-        _draw_repredictions(canvas, region, repredictions)
-    if human_boxes is not None:
-        canvas.dashes(_sides(human_boxes, region), HUMAN, 2.0, HUMAN_DASHES)
-    if truth_boxes is not None:
-        _draw_truth(canvas, region, truth_boxes)
-    anchors = np.concatenate([footprints.min(axis=1), footprints.max(axis=1)], axis=1)
-    draw_tags(canvas, labels, anchors, np.array([0, TITLE_HEIGHT, width, TITLE_HEIGHT + height]))
-    draw_title(canvas, title, "bird's eye view, x forward, metres")
-    draw_legend(
-        canvas,
-        zero_weight=labels.zero_weight,
-        truth=truth_boxes is not None,
-        repredictions=repredictions is not None,
-        unweighted=bool(np.isnan(labels.weights).any()),
-        human=human_boxes is not None and len(human_boxes) > 0,
-    )
-    _draw_scale_bar(canvas, region)
+    shown = Shown(labels, truth_boxes, title=title, style=style)
+    region = region or region_around([labels.boxes, shown.known_truth], Region().size[0])
+    canvas = Canvas(*bird_eye_size(region), style.background)
+    paint_bird_eye(canvas, points, shown, region)
     return canvas.finish()
+
+
+def bird_eye_size(region: Region) -> tuple[int, int]:
+    """Return width and height of the picture of a region."""
+    width, height = region.size
+    return width, height + TITLE_HEIGHT + STRIP_HEIGHT
+
+
+def paint_bird_eye(canvas: Canvas, points: np.ndarray, shown: Shown, region: Region) -> None:
+    """Draw the points and all boxes, the highest weight on top, and the legend.
+
+    Args:
+        canvas: of `bird_eye_size`.
+        points: (n, >=3) LiDAR points in metres.
+        shown: the boxes.
+        region: what to show.
+    """
+    style, labels, (width, height) = shown.style, shown.labels, region.size
+    _draw_rings(canvas, region, style)
+    _draw_points(canvas, region, points, style)
+    footprints = region.to_pixels(bev_corners(labels.boxes))
+    for index in np.argsort(labels.emphasis, kind="stable").tolist():
+        colour = labels.colour(index, style)
+        _draw_label(canvas, footprints[index], colour, labels.emphasis[index])
+    if shown.repredictions is not None:
+        _draw_repredictions(canvas, region, shown.repredictions, style)
+    if shown.human_boxes is not None:
+        canvas.dashes(_sides(shown.human_boxes, region), style.human, 2.0, HUMAN_DASHES)
+    canvas.dashes(_sides(shown.known_truth, region), style.ground_truth, 1.5, TRUTH_DOTS)
+    anchors = np.concatenate([footprints.min(axis=1), footprints.max(axis=1)], axis=1)
+    bounds = np.array([0, TITLE_HEIGHT, width, TITLE_HEIGHT + height])
+    draw_tags(canvas, labels, anchors, bounds, style)
+    draw_title(canvas, shown.title, "bird's eye view, x forward, metres", style)
+    shown.draw_legend(canvas)
+    _draw_scale_bar(canvas, region, style)
 
 
 def _draw_label(canvas: Canvas, footprint: np.ndarray, colour: Colour, weight: float) -> None:
@@ -128,16 +151,12 @@ def _draw_label(canvas: Canvas, footprint: np.ndarray, colour: Colour, weight: f
     canvas.lines(np.stack([footprint.mean(axis=0), ahead]), colour, stroke)
 
 
-def _draw_truth(canvas: Canvas, region: Region, boxes: np.ndarray) -> None:
-    """Footprints without regions that have no box, dotted and over the labels."""
-    known = boxes[~np.isnan(boxes).any(axis=1)]
-    canvas.dashes(_sides(known, region), GROUND_TRUTH, 1.5, TRUTH_DOTS)
-
-
-def _draw_repredictions(canvas: Canvas, region: Region, shown: ShownRepredictions) -> None:
-    """Footprints in dashes, the highest weight on top."""
+def _draw_repredictions(
+    canvas: Canvas, region: Region, shown: ShownRepredictions, style: Style
+) -> None:
+    """Draw footprints in dashes, the highest weight on top."""
     sides = _sides(shown.boxes, region).reshape(-1, 4, 2, 2)
-    colours = weight_colours(shown.weights).tolist()
+    colours = weight_colours(shown.weights, style).tolist()
     for index in np.argsort(shown.weights, kind="stable"):
         canvas.dashes(sides[index], tuple(colours[index]), 1.2, REPREDICTION_DASHES)
 
@@ -148,26 +167,27 @@ def _sides(boxes: np.ndarray, region: Region) -> np.ndarray:
     return np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
 
 
-def _draw_points(canvas: Canvas, region: Region, points: np.ndarray) -> None:
+def _draw_points(canvas: Canvas, region: Region, points: np.ndarray, style: Style) -> None:
     order = np.argsort(points[:, 2], kind="stable")
     places = region.to_pixels(points[order, :2].astype(np.float64))
-    canvas.dots(places, height_shades(points[order, 2]))
+    canvas.dots(places, height_shades(points[order, 2], style))
 
 
-def _draw_rings(canvas: Canvas, region: Region) -> None:
+def _draw_rings(canvas: Canvas, region: Region, style: Style) -> None:
     """Distances from the LiDAR, and the LiDAR itself."""
     origin = region.to_pixels(np.zeros(2))
-    for metres in np.arange(_RING_METRES, region.x_max + _RING_METRES, _RING_METRES):
-        canvas.circle(origin, metres * region.pixels_per_metre, GRID, 1)
+    farthest = max(region.x_max, -region.x_min, region.y_max)
+    for metres in np.arange(_RING_METRES, farthest + _RING_METRES, _RING_METRES):
+        canvas.circle(origin, metres * region.pixels_per_metre, style.grid, 1)
         label = region.to_pixels(np.array([metres, 0.0]))
-        canvas.text(label[0] + 4, label[1] - 4, f"{metres:.0f} m", FAINT_TEXT, 10.5)
+        canvas.text(label[0] + 4, label[1] - 4, f"{metres:.0f} m", style.faint_text, 10.5)
     arrow = np.array([[0.0, -10], [7, 8], [-7, 8]]) + origin
-    canvas.fill(arrow, TEXT, 0.9)
+    canvas.fill(arrow, style.text, 0.9)
 
 
-def _draw_scale_bar(canvas: Canvas, region: Region) -> None:
+def _draw_scale_bar(canvas: Canvas, region: Region, style: Style) -> None:
     length = _SCALE_BAR_METRES * region.pixels_per_metre
     right, level = canvas.width - 14.0, canvas.height - 16.0
     bar = np.array([[right - length, level - 5], [right - length, level], [right, level]])
-    canvas.lines(np.vstack([bar, [[right, level - 5]]]), TEXT, 1.5)
-    canvas.text(right - length + 6, level - 5, f"{_SCALE_BAR_METRES:.0f} m", TEXT, 12)
+    canvas.lines(np.vstack([bar, [[right, level - 5]]]), style.text, 1.5)
+    canvas.text(right - length + 6, level - 5, f"{_SCALE_BAR_METRES:.0f} m", style.text, 12)

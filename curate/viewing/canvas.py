@@ -1,16 +1,18 @@
 """A picture in the making: drawn at twice its size and reduced at the end, for smooth edges.
 
-Coordinates, line widths and text sizes are in pixels of the finished picture.
+Coordinates, line widths and text sizes are in pixels of the finished picture. `VectorCanvas` has
+the same methods and makes vectors of them.
 """
 
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
 
 from curate.files.atomic import replace_file
-
-Colour = tuple[int, int, int]
+from curate.viewing.chart_style import ImageFormat
+from curate.viewing.palette import Colour
 
 _SUPER = 2
 # OpenCV takes coordinates as integers with this many binary places.
@@ -32,6 +34,13 @@ class Canvas:
     def __init__(self, width: int, height: int, colour: Colour) -> None:
         self.width, self.height = width, height
         self._pixels = np.full((height * _SUPER, width * _SUPER, 3), colour, np.uint8)
+
+    def part(self, top: int, height: int) -> Self:
+        """Return the rows from `top` on as a canvas of its own; nothing leaves it."""
+        part = object.__new__(type(self))
+        part.width, part.height = self.width, height
+        part._pixels = self._pixels[top * _SUPER : (top + height) * _SUPER]
+        return part
 
     def image(self, left: int, top: int, width: int, height: int, image: np.ndarray) -> None:
         """Places an RGB image, scaled to (width, height)."""
@@ -111,23 +120,32 @@ class Canvas:
         at = (round(left * _SUPER), round(baseline * _SUPER))
         cv2.putText(self._pixels, text, at, _FONT, _font_scale(size), colour, 1, cv2.LINE_AA)
 
+    def text_width(self, text: str, size: float = 13.0) -> float:
+        """Return the width of a line of text of a size."""
+        (width, _), _ = cv2.getTextSize(text, _FONT, _font_scale(size), 1)
+        return float(width) / _SUPER
+
+    def content(self, kind: ImageFormat) -> bytes:
+        """Return the content of a file; this canvas has only PNG."""
+        if kind != "png":
+            raise ValueError(kind)
+        return png(self.finish())
+
     def finish(self) -> np.ndarray:
         """The (height, width, 3) uint8 RGB picture."""
         size = (self.width, self.height)
         return np.asarray(cv2.resize(self._pixels, size, interpolation=cv2.INTER_AREA))
 
 
-def text_width(text: str, size: float = 13.0) -> float:
-    """Width in pixels of a line of text of a size."""
-    scale = _font_scale(size)
-    (width, _), _ = cv2.getTextSize(text, _FONT, scale, 1)
-    return float(width) / _SUPER
+def png(rgb: np.ndarray) -> bytes:
+    """Return an (h, w, 3) uint8 RGB picture as the content of a PNG file."""
+    _, content = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    return content.tobytes()
 
 
 def save_png(path: Path, rgb: np.ndarray) -> None:
-    """Writes an (h, w, 3) uint8 RGB picture as PNG, whole or not at all."""
-    _, content = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-    replace_file(path, content.tobytes())
+    """Write an (h, w, 3) uint8 RGB picture as PNG, whole or not at all."""
+    replace_file(path, png(rgb))
 
 
 def jpeg(rgb: np.ndarray, quality: int = 82) -> bytes:

@@ -6,9 +6,12 @@ import numpy as np
 
 from curate.errors import DataError
 from curate.frames import Frame
-from curate.viewing.bird_eye import Region, draw_bird_eye
-from curate.viewing.overlay import draw_overlay
+from curate.viewing.bird_eye import bird_eye_size, paint_bird_eye, region_around
+from curate.viewing.canvas import Canvas
+from curate.viewing.chart_style import ImageFormat
+from curate.viewing.overlay import Shown, overlay_size, paint_overlay
 from curate.viewing.tags import ShownLabels, ShownRepredictions
+from curate.viewing.vector_canvas import VectorCanvas
 
 
 def draw_frame(
@@ -20,7 +23,7 @@ def draw_frame(
     human_boxes: np.ndarray | None = None,
     title: str = "",
 ) -> np.ndarray:
-    """The picture.
+    """Return the picture in the dark style, (height, width, 3) uint8 RGB.
 
     Args:
         frame: with its image.
@@ -30,32 +33,33 @@ def draw_frame(
         human_boxes: (h, 7) what people decided on; None for none.
         title: written at the top.
 
-    Returns:
-        (height, width, 3) uint8 RGB.
+    Raises:
+        DataError: the frame has no image.
+    """
+    shown = Shown(labels, truth_boxes, repredictions, human_boxes, title)
+    return paint_frame(frame, shown).finish()
+
+
+def paint_frame(frame: Frame, shown: Shown, kind: ImageFormat = "png") -> Canvas:
+    """Return a canvas with the picture, whose content in a format is that of a file.
+
+    Args:
+        frame: with its image.
+        shown: the boxes.
+        kind: lines and texts are vectors where it is pdf or svg.
 
     Raises:
         DataError: the frame has no image.
     """
     if frame.image is None:
         raise DataError(f"frame {frame.frame_id}: the data set has no image")
-    overlay = draw_overlay(
-        frame.image,
-        frame.calibration,
-        labels,
-        truth_boxes,
-        repredictions=repredictions,
-        human_boxes=human_boxes,
-        title=title,
-        legend=False,
-    )
-    region = Region()
-    half = overlay.shape[1] / region.pixels_per_metre / 2
-    below = draw_bird_eye(
-        frame.points,
-        labels,
-        truth_boxes,
-        repredictions=repredictions,
-        human_boxes=human_boxes,
-        region=replace(region, y_min=-half, y_max=half),
-    )
-    return np.concatenate([overlay, below])
+    width, above = overlay_size(frame.image)
+    boxes = [shown.labels.boxes, shown.known_truth]
+    boxes += [] if shown.human_boxes is None else [shown.human_boxes]
+    region = region_around(boxes, width)
+    below = bird_eye_size(region)[1]
+    kind_of_canvas = Canvas if kind == "png" else VectorCanvas
+    canvas = kind_of_canvas(width, above + below, shown.style.background)
+    paint_overlay(canvas.part(0, above), frame.image, frame.calibration, shown)
+    paint_bird_eye(canvas.part(above, below), frame.points, replace(shown, title=""), region)
+    return canvas

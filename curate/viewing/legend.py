@@ -2,17 +2,8 @@
 
 import numpy as np
 
-from curate.viewing.canvas import Canvas, Colour, text_width
-from curate.viewing.palette import (
-    FAINT_TEXT,
-    GROUND_TRUTH,
-    HUMAN,
-    PANEL,
-    TEXT,
-    UNWEIGHTED,
-    ZERO_WEIGHT,
-    weight_colours,
-)
+from curate.viewing.canvas import Canvas
+from curate.viewing.palette import DARK, Colour, Style, weight_colours
 from curate.weighting.base import ZeroWeight
 
 STRIP_HEIGHT = 40
@@ -23,15 +14,17 @@ REPREDICTION_DASHES = (6.0, 4.0)
 TRUTH_DOTS = (1.5, 3.0)
 HUMAN_DASHES = (12.0, 3.0)
 
-_BAR_PIXELS = 150
-_GAP = 28.0
+_BAR_PIXELS = 120
+_GAP = 24.0
+_ZERO_WEIGHT_WORDS = {"background": "v = 0: background", "ignore": "v = 0: ignored"}
 
 
-def draw_title(canvas: Canvas, title: str, note: str) -> None:
-    """The strip above the picture: a title, and a note at the right."""
-    canvas.box(0, 0, canvas.width, TITLE_HEIGHT, PANEL)
-    canvas.text(14, 24, title, TEXT, 16)
-    canvas.text(canvas.width - 14 - text_width(note, 12), 23, note, FAINT_TEXT, 12)
+def draw_title(canvas: Canvas, title: str, note: str, style: Style = DARK) -> None:
+    """Draw the strip above the picture: a title, and a note at the right."""
+    canvas.box(0, 0, canvas.width, TITLE_HEIGHT, style.panel)
+    canvas.text(14, 24, title, style.text, 16)
+    left = canvas.width - 14 - canvas.text_width(note, 12)
+    canvas.text(left, 23, note, style.faint_text, 12)
 
 
 def draw_legend(
@@ -42,53 +35,51 @@ def draw_legend(
     repredictions: bool = False,
     unweighted: bool = False,
     human: bool = False,
+    style: Style = DARK,
 ) -> None:
-    """The strip at the bottom: the weight scale, and the line styles and colours that occur."""
+    """Draw the strip at the bottom: the weight scale, and the line styles that occur."""
     top = canvas.height - STRIP_HEIGHT
-    canvas.box(0, top, canvas.width, canvas.height, PANEL)
+    canvas.box(0, top, canvas.width, canvas.height, style.panel)
     baseline = top + 25.0
-    left = _weight_bar(canvas, 14.0, top + 13.0, baseline)
-    left = _swatch(canvas, left, baseline, f"weight 0: {zero_weight}", ZERO_WEIGHT)
-    if unweighted:
-        left = _swatch(canvas, left, baseline, "not weighted", UNWEIGHTED)
-    if repredictions:
-        left = _swatch(canvas, left, baseline, "prediction", TEXT)
-        left = _swatch(canvas, left, baseline, "reprediction", TEXT, REPREDICTION_DASHES)
-    if human:
-        left = _swatch(canvas, left, baseline, "human", HUMAN, HUMAN_DASHES)
-    if truth:
-        _swatch(canvas, left, baseline, "ground truth", GROUND_TRUTH, TRUTH_DOTS)
+    left = _weight_bar(canvas, 14.0, top + 13.0, baseline, style)
+    entries: list[tuple[bool, str, Colour, tuple[float, float] | None]] = [
+        (True, _ZERO_WEIGHT_WORDS[zero_weight], style.zero_weight, None),
+        (unweighted, "not weighted", style.unweighted, None),
+        (repredictions, "prediction", style.text, None),
+        (repredictions, "reprediction", style.text, REPREDICTION_DASHES),
+        (human, "human", style.human, HUMAN_DASHES),
+        (truth, "ground truth", style.ground_truth, TRUTH_DOTS),
+    ]
+    for shown, name, colour, pattern in entries:
+        if shown:
+            _swatch(canvas, (left, baseline), colour, pattern)
+            canvas.text(left + 28, baseline, name, style.text)
+            left += 28 + canvas.text_width(name) + _GAP
 
 
-def _weight_bar(canvas: Canvas, left: float, top: float, baseline: float) -> float:
-    """The colour bar from 0 to 1; returns where the next entry may start."""
-    canvas.text(left, baseline, "weight", TEXT)
-    left += text_width("weight") + 10
-    canvas.text(left, baseline, "0", FAINT_TEXT)
-    left += text_width("0") + 6
-    colours = weight_colours(np.linspace(1e-6, 1, _BAR_PIXELS))
+def _weight_bar(canvas: Canvas, left: float, top: float, baseline: float, style: Style) -> float:
+    """Draw the colour bar from 0 to 1; return where the next entry may start."""
+    for text, colour, gap in (("weight v", style.text, 10), ("0", style.faint_text, 6)):
+        canvas.text(left, baseline, text, colour)
+        left += canvas.text_width(text) + gap
+    colours = weight_colours(np.linspace(1e-6, 1, _BAR_PIXELS), style)
     for offset, (red, green, blue) in enumerate(colours.tolist()):
         canvas.box(left + offset, top, left + offset + 1, top + 14, (red, green, blue))
     left += _BAR_PIXELS + 6
-    canvas.text(left, baseline, "1", FAINT_TEXT)
-    return left + text_width("1") + _GAP
+    canvas.text(left, baseline, "1", style.faint_text)
+    return left + canvas.text_width("1") + _GAP
 
 
 def _swatch(
     canvas: Canvas,
-    left: float,
-    baseline: float,
-    name: str,
+    place: tuple[float, float],
     colour: Colour,
-    pattern: tuple[float, float] | None = None,
-) -> float:
+    pattern: tuple[float, float] | None,
+) -> None:
     corners = np.array([[0, -10], [20, -10], [20, 1], [0, 1]])
-    outline = corners + np.array([left, baseline])
+    outline = corners + np.array(place)
     if pattern is None:
         canvas.lines(outline, colour, 1.5, closed=True)
     else:
-        canvas.dashes(
-            np.stack([outline, np.roll(outline, -1, axis=0)], axis=1), colour, 1.5, pattern
-        )
-    canvas.text(left + 28, baseline, name, TEXT)
-    return left + 28 + text_width(name) + _GAP
+        sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
+        canvas.dashes(sides, colour, 1.5, pattern)

@@ -1,11 +1,14 @@
 """The camera's image with the labels' 3D boxes over it, coloured by weight."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from curate.frames import Calibration
 from curate.geometry.boxes import box_corners
 from curate.geometry.projection import image_rectangles
-from curate.viewing.canvas import Canvas, Colour
+from curate.viewing.canvas import Canvas
 from curate.viewing.legend import (
     HUMAN_DASHES,
     REPREDICTION_DASHES,
@@ -15,8 +18,10 @@ from curate.viewing.legend import (
     draw_legend,
     draw_title,
 )
-from curate.viewing.palette import BACKGROUND, GROUND_TRUTH, HUMAN, weight_colours
+from curate.viewing.palette import DARK, Colour, Style, weight_colours
 from curate.viewing.tags import ShownLabels, ShownRepredictions, draw_tags
+
+_Pattern = tuple[float, float]
 
 _LEAST_WIDTH = 1200
 _NEAR_METRES = 0.1
@@ -28,73 +33,123 @@ _FRONT_EDGES = 4
 _PIXEL_LIMIT = 10_000.0
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What a picture shows of a frame, over its image or from above.
+
+    Attributes:
+        labels: coloured by weight, with captions.
+        truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None where it is unknown.
+        repredictions: dashed, in the colour of the label that each was matched with.
+        human_boxes: (h, 7) what people decided on, in long dashes; None for none.
+        title: written at the top.
+        style: colours.
+    """
+
+    labels: ShownLabels
+    truth_boxes: np.ndarray | None = None
+    repredictions: ShownRepredictions | None = None
+    human_boxes: np.ndarray | None = None
+    title: str = ""
+    style: Style = DARK
+
+    @property
+    def known_truth(self) -> np.ndarray:
+        """(m, 7) ground truth without regions that have no box."""
+        if self.truth_boxes is None:
+            return np.zeros((0, 7))
+        known: np.ndarray = self.truth_boxes[~np.isnan(self.truth_boxes).any(axis=1)]
+        return known
+
+    def draw_legend(self, canvas: Canvas) -> None:
+        """Draw the strip at the bottom that explains what is shown."""
+        draw_legend(
+            canvas,
+            zero_weight=self.labels.zero_weight,
+            truth=self.truth_boxes is not None,
+            repredictions=self.repredictions is not None,
+            unweighted=bool(np.isnan(self.labels.weights).any()),
+            human=self.human_boxes is not None and len(self.human_boxes) > 0,
+            style=self.style,
+        )
+
+
 def draw_overlay(
     image: np.ndarray,
     calibration: Calibration,
     labels: ShownLabels,
     truth_boxes: np.ndarray | None = None,
     *,
-    repredictions: ShownRepredictions | None = None,
-    human_boxes: np.ndarray | None = None,
     title: str = "",
-    legend: bool = True,
+    style: Style = DARK,
 ) -> np.ndarray:
-    """The picture.
+    """Return the picture with a legend, (height, width, 3) uint8 RGB.
 
     Args:
         image: (h, w, 3) uint8 RGB; enlarged by a whole factor where it is small.
         calibration: of the frame.
-        labels: coloured by weight, far ones first, with captions where there is room.
-        truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None where it is unknown.
-        repredictions: dashed, in the colour of the label that each was matched with.
-        human_boxes: (h, 7) what people decided on, in long dashes; None for none.
+        labels: see `Shown`.
+        truth_boxes: see `Shown`.
         title: written above the image.
-        legend: false leaves out the strip below it, where another picture brings it.
+        style: colours.
+    """
+    width, height = overlay_size(image)
+    canvas = Canvas(width, height + STRIP_HEIGHT, style.background)
+    shown = Shown(labels, truth_boxes, title=title, style=style)
+    paint_overlay(canvas.part(0, height), image, calibration, shown)
+    shown.draw_legend(canvas)
+    return canvas.finish()
 
-    Returns:
-        (height, width, 3) uint8 RGB.
+
+def overlay_size(image: np.ndarray) -> tuple[int, int]:
+    """Return width and height of the picture of an image without its legend."""
+    height, width = image.shape[:2]
+    factor = _enlargement(image)
+    return width * factor, height * factor + TITLE_HEIGHT
+
+
+def paint_overlay(
+    canvas: Canvas, image: np.ndarray, calibration: Calibration, shown: Shown
+) -> None:
+    """Draw an image, and over it all boxes, far labels first.
+
+    Args:
+        canvas: of `overlay_size`.
+        image: (h, w, 3) uint8 RGB.
+        calibration: of the frame.
+        shown: the boxes.
     """
     height, width = image.shape[:2]
-    factor = max(1, -(-_LEAST_WIDTH // width))
-    shown = (width * factor, height * factor)
-    canvas = Canvas(shown[0], shown[1] + TITLE_HEIGHT + legend * STRIP_HEIGHT, BACKGROUND)
-    canvas.image(0, TITLE_HEIGHT, *shown, image)
-    offset = np.array([0.0, TITLE_HEIGHT])
-    if truth_boxes is not None:
-        known = truth_boxes[~np.isnan(truth_boxes).any(axis=1)]
-        for strokes in box_strokes(known, calibration, (width, height)):
-            canvas.dashes(strokes * factor + offset, GROUND_TRUTH, 1.6, TRUTH_DOTS)
-    if repredictions is not None:
-        strokes_of = box_strokes(repredictions.boxes, calibration, (width, height))
-        colours = weight_colours(repredictions.weights).tolist()
-        for strokes, colour in zip(strokes_of, colours, strict=True):
-            canvas.dashes(strokes * factor + offset, tuple(colour), 1.3, REPREDICTION_DASHES)
-    strokes_of = box_strokes(labels.boxes, calibration, (width, height))
-    for index in np.argsort(-np.linalg.norm(labels.boxes[:, :2], axis=1), kind="stable"):
+    factor, style, labels = _enlargement(image), shown.style, shown.labels
+    size, within = (width, height), canvas.part(TITLE_HEIGHT, canvas.height - TITLE_HEIGHT)
+    within.image(0, 0, width * factor, height * factor, image)
+
+    def dash(boxes: np.ndarray, colours: Sequence[Colour], stroke: float, how: _Pattern) -> None:
+        for strokes, colour in zip(box_strokes(boxes, calibration, size), colours, strict=True):
+            within.dashes(strokes * factor, colour, stroke, how)
+
+    truth = shown.known_truth
+    dash(truth, [style.ground_truth] * len(truth), 1.6, TRUTH_DOTS)
+    if shown.repredictions is not None:
+        colours = [tuple(c) for c in weight_colours(shown.repredictions.weights, style).tolist()]
+        dash(shown.repredictions.boxes, colours, 1.3, REPREDICTION_DASHES)
+    strokes_of = box_strokes(labels.boxes, calibration, size)
+    for index in np.argsort(-np.linalg.norm(labels.boxes[:, :2], axis=1), kind="stable").tolist():
         weight = float(labels.emphasis[index])
-        stroke = 1.0 if weight <= 0 else 1.5 + weight
-        strokes = strokes_of[index] * factor + offset
         _draw_strokes(
-            canvas, strokes, labels.colour(int(index)), stroke, shade=0.22 if weight > 0 else 0.0
+            within, strokes_of[index] * factor, labels.colour(index, style), weight, style
         )
-    if human_boxes is not None:
-        for strokes in box_strokes(human_boxes, calibration, (width, height)):
-            canvas.dashes(strokes * factor + offset, HUMAN, 2.0, HUMAN_DASHES)
-    rectangles = image_rectangles(labels.boxes, calibration, (width, height))
-    anchors = rectangles * factor + np.tile(offset, 2)
-    bounds = np.array([0, TITLE_HEIGHT, shown[0], TITLE_HEIGHT + shown[1]])
-    draw_tags(canvas, labels, anchors, bounds)
-    draw_title(canvas, title, "camera image")
-    if legend:
-        draw_legend(
-            canvas,
-            zero_weight=labels.zero_weight,
-            truth=truth_boxes is not None,
-            repredictions=repredictions is not None,
-            unweighted=bool(np.isnan(labels.weights).any()),
-            human=human_boxes is not None and len(human_boxes) > 0,
-        )
-    return canvas.finish()
+    if shown.human_boxes is not None:
+        dash(shown.human_boxes, [style.human] * len(shown.human_boxes), 2.0, HUMAN_DASHES)
+    anchors = image_rectangles(labels.boxes, calibration, size) * factor
+    bounds = np.array([0, 0, width * factor, height * factor])
+    draw_tags(within, labels, anchors, bounds, style)
+    draw_title(canvas, shown.title, "camera image, k: number of a label", style)
+
+
+def _enlargement(image: np.ndarray) -> int:
+    """Return the whole factor that makes a small image large enough to read captions on."""
+    return int(max(1, -(-_LEAST_WIDTH // image.shape[1])))
 
 
 def box_strokes(
@@ -143,11 +198,12 @@ def _drawn_ahead(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def _draw_strokes(
-    canvas: Canvas, strokes: np.ndarray, colour: Colour, width: float, *, shade: float
+    canvas: Canvas, strokes: np.ndarray, colour: Colour, weight: float, style: Style
 ) -> None:
-    """A box with its front face shaded; a dark rim keeps it apart from a light image."""
-    if shade > 0 and len(strokes) == len(_STARTS):
-        canvas.fill(strokes[:_FRONT_EDGES, 0], colour, shade)
+    """Draw a box with its front face shaded; a rim keeps it apart from the image."""
+    width = 1.0 if weight <= 0 else 1.5 + weight
+    if weight > 0 and len(strokes) == len(_STARTS):
+        canvas.fill(strokes[:_FRONT_EDGES, 0], colour, 0.22)
     if len(strokes):
-        canvas.lines(strokes, BACKGROUND, width + 1.6)
+        canvas.lines(strokes, style.background, width + 1.6)
         canvas.lines(strokes, colour, width)

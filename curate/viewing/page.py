@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from curate.viewing.canvas import jpeg
+from curate.viewing.chart_style import Chart
 
 _STYLE = """
 :root { color-scheme: light dark; --ground: #fff; --text: #1b2129; --faint: #5b6675;
@@ -33,12 +34,6 @@ th:first-child, td.text { text-align: left; } tr.all td { font-weight: 600; }
 .facts div { padding: 8px 12px; background: var(--panel); border-radius: 6px; min-width: 0; }
 .facts dt { font-size: 13px; color: var(--faint); }
 .facts dd { margin: 0; font-size: 20px; overflow-wrap: anywhere; }
-.bar { fill: var(--bar); } .grid { stroke: var(--line); }
-.mark { stroke: var(--mark); stroke-width: 2; }
-.marked { fill: var(--mark); font-size: 12px; }
-.tick, .axis { fill: var(--faint); font-size: 11px; }
-.diagonal { stroke: var(--faint); stroke-dasharray: 4 4; }
-.curve { fill: none; stroke: var(--bar); stroke-width: 2; } .dot { fill: var(--bar); }
 """
 
 
@@ -53,10 +48,17 @@ class Figure:
     Attributes:
         content: finished SVG, or an <img>, see `picture`; it is not escaped.
         caption: plain text.
+        chart: the chart, which can be saved as a file too; None for a picture.
     """
 
     content: str
     caption: str
+    chart: Chart | None = None
+
+    @classmethod
+    def of_chart(cls, chart: Chart, caption: str) -> "Figure":
+        """A chart inside the page."""
+        return cls(chart.inline(), caption, chart)
 
     @classmethod
     def picture(cls, rgb: np.ndarray, caption: str) -> "Figure":

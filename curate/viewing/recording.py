@@ -124,11 +124,11 @@ def camera_pose(calibration: Calibration) -> tuple[np.ndarray, np.ndarray, np.nd
 def captions(labels: ShownLabels, evidence: Mapping[str, np.ndarray]) -> list[str]:
     """What is written at each label: weight, category, score, points, and the evidence."""
     lines = []
-    for k in range(len(labels)):
-        weight, rest = labels.caption(k)
-        known = {name: values[k] for name, values in evidence.items() if np.isfinite(values[k])}
+    for i in range(len(labels)):
+        known = {name: values[i] for name, values in evidence.items() if np.isfinite(values[i])}
         shown = "  ".join(f"{name} {value:.3g}" for name, value in known.items())
-        words = [f"k {k}  weight {weight}" if weight else f"k {k}", rest, shown]
+        weight = f"  weight {labels.weights[i]:.2f}" if labels.weights[i] > 0 else ""
+        words = [f"k {labels.number(i)}{weight}", labels.details(i), shown]
         lines.append("\n".join(filter(None, words)))
     return lines
 

@@ -152,10 +152,10 @@ def describe_audit(found: AuditedRound) -> list[str]:
     return words
 
 
-def picture_path(workspace: Workspace, found: AuditedRound) -> Path:
-    """Where the reliability diagram belongs."""
+def picture_path(workspace: Workspace, found: AuditedRound, suffix: str = "png") -> Path:
+    """Return where the reliability diagram belongs."""
     frames = found.request.frames.replace(" ", "-")
-    name = f"audit-round-{found.context.number:02d}-{frames}-{found.request.overlap}.png"
+    name = f"audit-round-{found.context.number:02d}-{frames}-{found.request.overlap}.{suffix}"
     return workspace.root / "reports" / name
 
 

@@ -1,4 +1,4 @@
-"""What a bench found: terminal tables, results.md, results.json and curve.png."""
+"""What a bench found: terminal tables, results.md, results.json and a chart."""
 
 import json
 import math
@@ -15,22 +15,28 @@ from curate.datasets.kitti.labels import from_annotations
 from curate.evaluation.comparison import PairedDifference
 from curate.evaluation.object_statistics import QUANTILES, object_statistics
 from curate.files.atomic import replace_file
-from curate.viewing.canvas import save_png
-from curate.viewing.curves import Curve, CurvePanel, draw_curves
+from curate.viewing.chart_style import Chart, ImageFormat
+from curate.viewing.charts import Curve, CurvePanel, curves_chart
 from pipelines.bench.results import OVERLAPS, JobResult, read_results
 from pipelines.bench.settings import SYNTHETIC, Bench
 from pipelines.bench.tables import Entry, Finished, Table, Value, all_tables, signed
 from pipelines.stages.methods import METHODS
 from pipelines.workspace.workspace import open_dataset
 
-MARKDOWN, NUMBERS, PICTURE = "results.md", "results.json", "curve.png"
+MARKDOWN, NUMBERS = "results.md", "results.json"
 
 
 @dataclass(frozen=True)
 class BenchReport:
-    """The state of a bench."""
+    """The state of a bench.
+
+    Attributes:
+        bench: see `Bench`.
+        image_format: of the chart.
+    """
 
     bench: Bench
+    image_format: ImageFormat = "png"
 
     @cached_property
     def results(self) -> list[JobResult]:
@@ -48,14 +54,14 @@ class BenchReport:
         return [*self._hardness(), *all_tables(self.finished)]
 
     def write(self) -> list[Path]:
-        """Writes results.md, results.json and, where a cell is finished, curve.png."""
+        """Write results.md, results.json and, where a cell is finished, the chart."""
         root = self.bench.root
         replace_file(root / MARKDOWN, self.markdown().encode())
         replace_file(root / NUMBERS, (json.dumps(self.numbers(), indent=1) + "\n").encode())
         written = [root / MARKDOWN, root / NUMBERS]
         if self.finished.methods:
-            save_png(root / PICTURE, self.picture())
-            written.append(root / PICTURE)
+            self.chart().save(root / self._chart_name)
+            written.append(root / self._chart_name)
         return written
 
     def numbers(self) -> dict[str, Any]:
@@ -81,7 +87,7 @@ class BenchReport:
         lines = ["# The methods, compared by `curate bench`", ""]
         lines += [f"- {condition}" for condition in self.conditions()]
         if self.finished.methods:
-            lines += ["", f"![Mean AP over labeled ratio]({PICTURE})"]
+            lines += ["", f"![Mean AP over labeled ratio]({self._chart_name})"]
         for table in self.tables:
             lines += ["", f"## {table.title[0].upper()}{table.title[1:]}", ""]
             names = [name.replace("\n", " ") for name in table.columns]
@@ -128,8 +134,12 @@ class BenchReport:
         if failed:
             yield f"{failed} results of single frames failed and were left out"
 
-    def picture(self) -> np.ndarray:
-        """Mean 3D AP over the labeled ratio, at KITTI's overlaps and at loose ones."""
+    @property
+    def _chart_name(self) -> str:
+        return f"curve.{self.image_format}"
+
+    def chart(self) -> Chart:
+        """Return mean 3D AP over the labeled ratio, at KITTI's overlaps and at loose ones."""
         panels = []
         for overlaps in OVERLAPS:
             values = {
@@ -146,10 +156,11 @@ class BenchReport:
             title = self._summary(overlaps).title
             panels.append(CurvePanel(title, np.array(self.finished.ratios), curves))
         note = (
-            "line: mean over seeds; band: standard deviation; AP R40, mean over categories and "
-            "difficulties; teacher: on X_l once, baseline: on X_l as long as the other methods"
+            "dot: mean over seeds; bar: standard deviation; legend: AP at a line's end; "
+            "AP R40, mean over categories and difficulties; teacher: on X_l once, baseline: on X_l "
+            "as long as the other methods"
         )
-        return draw_curves(panels, "AP over labeled ratio", note)
+        return curves_chart(panels, "AP over labeled ratio", note)
 
     def _summary(self, overlaps: str) -> Table:
         return next(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from pipelines.commands.options import (
+    ChartFormatOption,
     ExecutorOption,
     JsonOption,
     RoundOption,
@@ -53,6 +54,7 @@ def audit(
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     threads: ThreadsOption = None,
+    image_format: ChartFormatOption = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -72,12 +74,13 @@ def audit(
     from curate.errors import ConfigError
     from curate.evaluation.audit_summary import as_numbers
     from curate.evaluation.reliability import Overlap
-    from curate.viewing.canvas import save_png
-    from curate.viewing.reliability_diagram import draw_reliability
+    from curate.viewing.chart_style import check_format
+    from curate.viewing.charts import audit_chart
     from pipelines.assessment.audit import AuditRequest, describe_audit, picture_path, run_audit
     from pipelines.assessment.store import store_audit
     from pipelines.engine.progress import Bar
 
+    kind = check_format(image_format or "png")
     if overlap not in get_args(Overlap):
         raise ConfigError(f"--overlap {overlap}: use bev or 3d")
     options: dict[str, Any] = {"names": tuple(dict.fromkeys(policy))} if policy else {}
@@ -92,8 +95,8 @@ def audit(
     opened = open_workspace(workspace, executor, workers, threads)
     found = run_audit(opened, request, Bar(), (lambda _: None) if as_json else print_report)
     store_audit(opened, found)
-    picture = picture_path(opened, found)
-    save_png(picture, draw_reliability(found.figures, _title(found)))
+    picture = picture_path(opened, found, kind)
+    audit_chart(found.figures, _title(found)).save(picture)
     words = describe_audit(found)
     if as_json:
         about = {

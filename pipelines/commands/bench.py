@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pipelines.commands.options import JsonOption
+from pipelines.commands.options import ChartFormatOption, JsonOption
 from pipelines.reports.terminal import print_json, print_table
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ def bench(
         str,
         typer.Option(help="IoU thresholds of the tables to print: kitti, loose (relaxed) or all."),
     ] = "kitti",
+    image_format: ChartFormatOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare methods over labeled shares and seeds, on simulated data or on yours.
@@ -102,8 +103,10 @@ def bench(
     Example: curate bench bench --methods baseline,pspsl --ratios 0.08 --seeds 0 --steps 300
     """
     from curate.errors import CellsFailed, ConfigError
+    from curate.viewing.chart_style import check_format
     from pipelines.bench.report import BenchReport
 
+    kind = check_format(image_format or "png")
     if overlaps not in {"kitti", "loose", "all"}:
         raise ConfigError(f"--overlaps {overlaps}: use kitti, loose or all")
     asked = {
@@ -122,9 +125,9 @@ def bench(
         if not report:
             _run(chosen, workers or os.cpu_count() or 1, quiet=as_json)
     except CellsFailed:
-        _announce(BenchReport(chosen), overlaps, as_json=as_json)
+        _announce(BenchReport(chosen, kind), overlaps, as_json=as_json)
         raise
-    _announce(BenchReport(chosen), overlaps, as_json=as_json)
+    _announce(BenchReport(chosen, kind), overlaps, as_json=as_json)
 
 
 def bench_cell(

@@ -100,6 +100,10 @@ DryRunOption = Annotated[
         help="Print what would be done, why, and how long it takes; do nothing and write nothing.",
     ),
 ]
+ChartFormatOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--format", help="Format of chart files: svg, png or pdf."),
+]
 
 
 def open_workspace(

@@ -1,12 +1,15 @@
 """curate view: pictures or a 3D recording of frames."""
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
 from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption, open_workspace
 from pipelines.reports.terminal import print_json
+
+if TYPE_CHECKING:
+    from curate.viewing.chart_style import ImageFormat
 
 
 def view(
@@ -30,10 +33,17 @@ def view(
     policy: PolicyOption = None,
     output: Annotated[
         Optional[Path],  # noqa: UP045
+        typer.Option(help="File for one frame; default: in the folder pictures of the workspace."),
+    ] = None,
+    image_format: Annotated[
+        Optional[str],  # noqa: UP045
         typer.Option(
-            help="PNG file for one frame; default: in the folder pictures of the workspace."
+            "--format", help="png, pdf or svg. Default: the suffix of --output, else png."
         ),
     ] = None,
+    style: Annotated[
+        str, typer.Option(help="Colours: dark, or paper with a white ground.")
+    ] = "dark",
     recording: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--rerun", help="Write one .rrd recording of all frames instead of images."),
@@ -44,16 +54,19 @@ def view(
     """Draw frames: camera image and bird's eye view with all boxes, coloured by weight.
 
     Predictions are solid, repredictions dashed, ground truth dotted. Ground truth is drawn for
-    labeled and val frames only. Labels show their weight, score and LiDAR points where there is
-    room. A recording holds points, image, boxes and the evidence of each label, frame by frame;
+    labeled and val frames only. Each label shows its k, to type `curate explain FRAME K`, and its
+    weight, score and LiDAR points where there is room. In PDF and SVG files boxes and texts are
+    vectors. A recording holds points, image, boxes and the evidence of each label, frame by frame;
     open it with `rerun FILE` (pip install 'curate-pseudo-labels[rerun]').
 
-    Example: curate view 000008 --round 1 --policy pspsl --output 000008.png
+    Example: curate view 000008 --round 1 --policy pspsl --style paper --output 000008.pdf
     """
     from curate.errors import ConfigError
+    from curate.viewing.palette import find_style
     from pipelines.labels.of_one_frame import chosen_round, labeled_by
     from pipelines.reports.pictures import draw_view
 
+    colours, kind = find_style(style), _image_format(image_format, output)
     opened = open_workspace(workspace)
     if bool(frames) == every:
         raise ConfigError("name frames to draw, or give --all")
@@ -68,13 +81,32 @@ def view(
         path = record_frames(opened, names, number, method, recording)
         paths, found = [path], {"recording": str(path), "frames": len(names)}
     else:
-        paths = [draw_view(opened, name, number, method, output) for name in names]
+        paths = [
+            draw_view(opened, name, number, method, output, kind=kind, style=colours)
+            for name in names
+        ]
         found = {"picture": str(paths[0])} if len(paths) == 1 else {"pictures": paths}
     if as_json:
         print_json(found)
     else:
         for path in paths:
             typer.echo(f"{'recording' if recording else 'picture'}: {path}")
+
+
+def _image_format(name: str | None, output: Path | None) -> "ImageFormat":
+    """Return the format of the picture.
+
+    Raises:
+        ConfigError: it is unknown, or the file's suffix says another one.
+    """
+    from curate.errors import ConfigError
+    from curate.viewing.chart_style import check_format
+
+    suffix = output.suffix[1:].lower() if output else ""
+    kind = check_format(name or suffix or "png")
+    if suffix and suffix != kind:
+        raise ConfigError(f"--output {output}: the suffix of a {kind} file is .{kind}")
+    return kind
 
 
 def register(app: typer.Typer) -> None:

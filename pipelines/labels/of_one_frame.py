@@ -23,6 +23,7 @@ class FrameBoxes:
     Attributes:
         split: of the frame.
         labels: the predictions.
+        numbers: (n,) k of each label.
         weights: (n,) of one policy; 0 where it dropped the label, NaN where it weighted nothing.
         repredictions: of all views, with the weight of the label that each was matched with.
         truth: NaN boxes for DontCare; None for frames of X_u.
@@ -32,6 +33,7 @@ class FrameBoxes:
 
     split: str
     labels: Detections
+    numbers: np.ndarray
     weights: np.ndarray
     repredictions: ShownRepredictions
     truth: Annotations | None
@@ -101,6 +103,7 @@ def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) 
     return FrameBoxes(
         split,
         labels.select(~replaced),
+        np.flatnonzero(~replaced),
         weights[~replaced],
         _repredictions(workspace, round_number, key, weights),
         truth,

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from sqlalchemy import case, func, select
 
+from curate.viewing.charts import Mark, histogram
 from curate.viewing.page import ALL, Figure, Section
-from curate.viewing.svg import Mark, histogram
 from db import bulk
 from pipelines.reports.totals import BANDS, SHOWN_AGES, RoundTotals, Sums
 from pipelines.stages.methods import ZERO_WEIGHT_WORDS, zero_weight_of
@@ -57,16 +57,16 @@ def distributions(totals: RoundTotals) -> Section:
             f"the loss of {totals.matched:,} labels; {n - totals.matched:,} without a matched "
             "reprediction left out"
         )
-        chart = histogram(loss.counts, loss.edges, "consistency loss L", marks)
-        figures.append(Figure(chart, unmatched))
+        chart = histogram("loss", loss.counts, loss.edges, "consistency loss L", marks)
+        figures.append(Figure.of_chart(chart, unmatched))
     for name, meaning in totals.shares.items():
         found = totals.histograms[name]
         if not found.above:
             continue
         # Most weights are 0: in the same chart they would flatten all others.
         left_out = f"; {found.zeros:,} labels with 0 left out" if found.zeros else ""
-        chart = histogram(found.counts, found.edges, name)
-        figures.append(Figure(chart, f"{meaning}; {found.above:,} labels{left_out}"))
+        chart = histogram(name, found.counts, found.edges, name)
+        figures.append(Figure.of_chart(chart, f"{meaning}; {found.above:,} labels{left_out}"))
     return Section("Losses, priors and weights", figures=figures)
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from sqlalchemy import select
 
 from curate.errors import ConfigError
-from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.viewing.recording import RecordedFrame, load_rerun, write_recording
 from db import bulk
 from db.views import weighted_labels
@@ -46,10 +45,10 @@ def _recorded(
     for name in names:
         found = read_frame(workspace, name, round_number, policy)
         frame = workspace.dataset.read(name, image=True)
-        counts = count_points_in_boxes(frame.points, found.labels.boxes)
-        labels = shown_labels(workspace, policy, found, counts)
-        evidence = _evidence(workspace, name, round_number, policy, len(labels))
-        evidence["points"] = counts.astype(np.float64)
+        labels = shown_labels(workspace, frame, found, policy)
+        evidence = _evidence(workspace, name, round_number, policy, found.numbers)
+        if labels.points is not None:
+            evidence["points"] = labels.points.astype(np.float64)
         yield RecordedFrame(
             frame,
             labels,
@@ -63,17 +62,18 @@ def _recorded(
 
 
 def _evidence(
-    workspace: Workspace, name: str, round_number: int, policy: str, count: int
+    workspace: Workspace, name: str, round_number: int, policy: str, numbers: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """(count,) by k of each kind of evidence; NaN where there is none."""
+    """(n,) of each kind of evidence, for the labels with these n values of k; NaN for none."""
     with workspace.database.reading() as connection:
         labels = weighted_labels(connection).c
         columns = [each for each in numeric_columns(connection) if each not in ("score", "weight")]
         query = select(labels.k, *(labels[column] for column in columns)).where(
             labels.round == round_number, labels.frame == name, labels.policy == policy
         )
-        table = np.full((count, len(columns)), np.nan)
+        table = np.full((len(numbers), len(columns)), np.nan)
+        rows = {k: row for row, k in enumerate(numbers.tolist())}
         for k, *values in bulk.select(connection, query):
-            if k < count:  # others are objects that people added
-                table[k] = values
+            if k in rows:  # others are objects that people added
+                table[rows[k]] = values
     return dict(zip(columns, table.T, strict=True))

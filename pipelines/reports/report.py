@@ -8,9 +8,10 @@ import numpy as np
 from sqlalchemy import select
 
 from curate.files.atomic import replace_file
+from curate.viewing.chart_style import Chart, ImageFormat
+from curate.viewing.charts import reliability
 from curate.viewing.close_up import LabelShown, draw_close_up
 from curate.viewing.page import Figure, Section, render_page
-from curate.viewing.svg import share_curve
 from db import bulk
 from db.views import WEIGHTED_LABELS
 from pipelines.labels.by_frame import weighted_round
@@ -31,13 +32,19 @@ from pipelines.workspace.workspace import Workspace
 _PICTURES = 6
 
 
-def write_report(workspace: Workspace, round_number: int | None, policy: str | None) -> Path:
-    """Writes the report into the folder `reports` and says where.
+def write_report(
+    workspace: Workspace,
+    round_number: int | None,
+    policy: str | None,
+    kind: ImageFormat | None = None,
+) -> tuple[Path, list[Path]]:
+    """Write the report into the folder `reports`; return its path and those of its charts.
 
     Args:
         workspace: see `Workspace`.
         round_number: None for the last that the policy weighted.
         policy: whose weights; None for the configured one.
+        kind: also write each chart as a file of this format, into a folder beside the report.
 
     Raises:
         WorkspaceError: the policy has weighted nothing in that round.
@@ -86,7 +93,16 @@ def write_report(workspace: Workspace, round_number: int | None, policy: str | N
         note += f". People decided on some labels, whatever the policy says: {told}."
     path = workspace.root / "reports" / f"round-{number:02d}-{policy}.html"
     replace_file(path, render_page(title, note, sections).encode("utf-8"))
-    return path
+    charts = [each.chart for section in sections for each in section.figures if each.chart]
+    return path, _save(charts, path.with_suffix(""), kind) if kind else []
+
+
+def _save(charts: Sequence[Chart], folder: Path, kind: ImageFormat) -> list[Path]:
+    """Write each chart into a folder."""
+    paths = [folder / f"{chart.name}.{kind}" for chart in charts]
+    for chart, path in zip(charts, paths, strict=True):
+        chart.save(path)
+    return paths
 
 
 def _round_before(workspace: Workspace, number: int, policy: str) -> int | None:
@@ -191,7 +207,7 @@ def _figure(value: float) -> str:
 
 
 def _reliability(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:
-    """A curve per stored audit of the round."""
+    """A chart per stored audit of the round."""
     bins = bulk.table("audit_bin")
     names = ("frames", "overlap", "mean_weight", "precision", "labels")
     query = (
@@ -201,23 +217,27 @@ def _reliability(workspace: Workspace, number: int, policy: str) -> Iterator[Sec
     )
     rows = workspace.database.rows(query)
     figures = [
-        Figure(
-            _curve([row[2:] for row in rows if row[:2] == kind]),
-            f"audit on {kind[0]}, right by {kind[1]} overlap",
+        Figure.of_chart(
+            _chart(
+                f"reliability-{kind[0].replace(' ', '-')}-{kind[1]}",
+                [row[2:] for row in rows if row[:2] == kind],
+            ),
+            f"audit on {kind[0]}, correct by {kind[1]} overlap",
         )
         for kind in dict.fromkeys(row[:2] for row in rows)
     ]
     if figures:
         note = (
-            "Share of right labels over their mean weight; on the diagonal it means what it says."
+            "Share of correct labels over their mean weight, with 95 % Wilson intervals; on the "
+            "diagonal the weight is that share. Hollow dots stand for fewer than 10 labels."
         )
         yield Section("Reliability", note, figures=figures)
 
 
-def _curve(rows: Sequence[Sequence[float]]) -> str:
+def _chart(name: str, rows: Sequence[Sequence[float]]) -> Chart:
     table = np.array(rows, dtype=np.float64)
     table = table[~np.isnan(table).any(axis=1)]
-    return share_curve(table[:, 0], table[:, 1], table[:, 2], "mean weight of the bin")
+    return reliability(name, *table.T)
 
 
 def _box(workspace: Workspace, number: int, policy: str, frame: str, k: int) -> np.ndarray:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from support.shown_labels import labels
 
-from curate.viewing.bird_eye import Region, draw_bird_eye
+from curate.viewing.bird_eye import Region, draw_bird_eye, region_around
 from curate.viewing.legend import TITLE_HEIGHT
-from curate.viewing.palette import GROUND_TRUTH, weight_colours
+from curate.viewing.palette import GROUND_TRUTH, PAPER, weight_colours
 from curate.viewing.tags import ShownLabels
 
 REGION = Region(0, 40, -20, 20, 10)
@@ -63,6 +63,46 @@ def test_titles_are_written():
     titled = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION, title="frame 000008")
     assert (plain[:TITLE_HEIGHT] != titled[:TITLE_HEIGHT]).any()
     assert (plain[TITLE_HEIGHT:] == titled[TITLE_HEIGHT:]).all()
+
+
+def test_the_region_grows_to_where_labels_are():
+    """Behind the LiDAR, far ahead, and at the sides; without need it is the usual one."""
+    usual = Region()
+    ahead = np.array([[30.0, 5, 0, 4, 2, 1.5, 0]])
+    width = usual.size[0]
+    assert region_around([ahead], width) == usual
+    assert region_around([], width) == usual
+    behind = region_around([ahead, np.array([[-25.0, 0, 0, 4, 2, 1.5, 0]])], width)
+    assert behind.x_min == pytest.approx(-25 - 2 - 2)
+    assert (behind.x_max, behind.y_max) == (usual.x_max, usual.y_max)
+    wide = region_around([np.array([[70.0, 50, 0, 4, 2, 1.5, 0]])], width)
+    assert wide.x_max == pytest.approx(74)
+    assert wide.y_max == -wide.y_min == pytest.approx(53)
+    assert wide.size[0] == width
+    broken = region_around([np.array([[1e9, -1e9, 0, 4, 2, 1.5, 0]])], width)
+    assert max(broken.x_max, broken.y_max) < 130
+
+
+def test_labels_behind_the_vehicle_are_drawn():
+    """In the colour of their weight, with their points."""
+    shown = labels([[-12.0, 3, 0, 4, 2, 1.5, 0]], [0.6])
+    points = np.array([[-11.0, 8.0, 1.0, 0]])
+    picture = draw_bird_eye(points, shown)
+    region = region_around([shown.boxes], Region().size[0])
+    colour = weight_colours(np.array([0.6]))[0].astype(int)
+    column, row = np.rint(region.to_pixels(np.array([-14.0, 4.0]))).astype(int)
+    assert (np.abs(picture[row - 2 : row + 3, column - 2 : column + 3].astype(int) - colour)
+            .max(axis=2) < 40).any()  # fmt: skip
+    without = draw_bird_eye(np.zeros((0, 4)), shown)
+    assert (picture != without).any()
+
+
+def test_the_paper_style_has_a_white_ground():
+    """And its own colours."""
+    shown = labels([[20, 5, 0, 4, 2, 1.5, 0]], [0.6])
+    picture = draw_bird_eye(np.zeros((0, 4)), shown, region=REGION, style=PAPER)
+    assert (picture == 255).all(axis=2).mean() > 0.7
+    assert near(picture, (22, 6), weight_colours(np.array([0.6]), PAPER)[0].astype(int))
 
 
 @pytest.mark.parametrize("frame_id", ["000008", "000023"])

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from curate.viewing.canvas import Canvas, save_png, text_width
+from curate.viewing.canvas import Canvas, save_png
 
 BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
@@ -74,8 +74,8 @@ def test_text_is_as_wide_as_foretold(canvas):
     wide.text(10, 30, "Car 0.87", WHITE, 14)
     columns = np.flatnonzero(wide.finish().max(axis=(0, 2)) > 60)
     assert columns[0] >= 9
-    assert columns[-1] - 10 <= text_width("Car 0.87", 14) + 2
-    assert columns[-1] - 10 > 0.8 * text_width("Car 0.87", 14)
+    assert columns[-1] - 10 <= wide.text_width("Car 0.87", 14) + 2
+    assert columns[-1] - 10 > 0.8 * wide.text_width("Car 0.87", 14)
 
 
 def test_saved_pictures_keep_their_colours(tmp_path, canvas):
@@ -85,3 +85,16 @@ def test_saved_pictures_keep_their_colours(tmp_path, canvas):
     bgr = cv2.imread(str(tmp_path / "deep" / "a.png"))
     assert bgr[20, 30].tolist() == [0, 0, 255]
     assert len(list((tmp_path / "deep").iterdir())) == 1
+
+
+def test_a_part_draws_into_its_rows_only(canvas):
+    """Its own top is 0; what leaves it is cut."""
+    part = canvas.part(10, 20)
+    assert (part.width, part.height) == (60, 20)
+    part.box(0, 0, 5, 5, WHITE)
+    part.lines(np.array([[30.0, -50], [30, 90]]), WHITE, 2)
+    picture = canvas.finish()[..., 0]
+    assert picture[12, 2] == 255
+    assert picture[11:29, 29:31].min() > 200
+    assert not picture[:10].any()
+    assert not picture[30:].any()

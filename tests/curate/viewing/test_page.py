@@ -2,16 +2,15 @@
 
 import re
 from html.parser import HTMLParser
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 from support.toys import toy_calibration
 
 from curate.frames import Frame
+from curate.viewing.charts import histogram
 from curate.viewing.close_up import LabelShown, draw_close_up
 from curate.viewing.page import Figure, Section, render_page
-from curate.viewing.svg import Mark, histogram, share_curve
 
 EVIL = "<script>alert('x')</script> & \"q\""
 
@@ -42,15 +41,16 @@ class Reader(HTMLParser):
 def test_a_page_is_well_formed_and_loads_nothing():
     """Hostile texts stay texts; the only source is the picture inside."""
     picture = Figure.picture(np.zeros((8, 8, 3), np.uint8), EVIL)
-    chart = Figure(histogram(np.array([1, 2]), np.array([0, 0.5, 1]), EVIL), EVIL)
+    chart = histogram("a", np.array([1, 2]), np.array([0, 0.5, 1]), EVIL)
+    figures = [picture, Figure.of_chart(chart, EVIL)]
     rows = [(EVIL, 1.23456, None, float("nan"))]
-    section = Section(EVIL, EVIL, (EVIL, "b", "c", "d"), rows, [picture, chart], [(EVIL, EVIL)])
+    section = Section(EVIL, EVIL, (EVIL, "b", "c", "d"), rows, figures, [(EVIL, EVIL)])
     reader = Reader()
     text = render_page(EVIL, EVIL, [section])
     reader.feed(text)
     assert reader.open == []
     assert "script" not in reader.tags
-    assert {"table", "img", "svg", "rect"} <= set(reader.tags)
+    assert {"table", "img", "svg", "path"} <= set(reader.tags)
     assert [link[:23] for link in reader.links] == ["data:image/jpeg;base64,"]
     assert not re.search(r"https?://|url\(|@import", text)
     assert "<td>1.235</td><td></td><td></td>" in text
@@ -63,33 +63,6 @@ def test_numbers_are_written_to_be_read():
     text = render_page("t", "", [section])
     assert '<td class="text">Car</td><td>1,234,567</td>' in text
     assert '<tr class="all"><td class="text">all</td><td>98,765</td>' in text
-
-
-def bars(svg):
-    """Heights of the bars."""
-    return [float(bar.get("height")) for bar in ET.fromstring(svg).iter("rect")]  # noqa: S314
-
-
-def test_bars_are_as_high_as_their_counts():
-    """Empty ones have no height; a mark outside the edges is left out."""
-    edges = np.linspace(0, 2, 5)
-    svg = histogram(np.array([4, 0, 2, 1]), edges, "L", [Mark(1.0, "λ 1"), Mark(3.0, "λ 3")])
-    heights = np.array(bars(svg))
-    assert heights / heights[0] == pytest.approx([1, 0, 0.5, 0.25], abs=1e-3)
-    assert "λ 1" in svg
-    assert "λ 3" not in svg
-
-
-def test_a_histogram_of_nothing_is_flat():
-    """And still a chart."""
-    assert bars(histogram(np.zeros(3, int), np.linspace(0, 1, 4), "v")) == [0, 0, 0]
-
-
-def test_a_curve_rises_with_its_shares():
-    """Up is a smaller y."""
-    svg = share_curve(np.array([0.1, 0.9]), np.array([0.2, 0.8]), np.array([10, 20]), "weight")
-    low, high = (float(dot.get("cy")) for dot in ET.fromstring(svg).iter("circle"))  # noqa: S314
-    assert high < low
 
 
 @pytest.mark.parametrize("place", [(12.0, 1.0), (12.0, 11.9), (-5.0, 0.0)])

@@ -1,8 +1,18 @@
 """Tests of the colour scales."""
 
 import numpy as np
+import pytest
 
-from curate.viewing.palette import BACKGROUND, ZERO_WEIGHT, height_shades, weight_colours
+from curate.errors import ConfigError
+from curate.viewing.palette import (
+    BACKGROUND,
+    DARK,
+    PAPER,
+    ZERO_WEIGHT,
+    find_style,
+    height_shades,
+    weight_colours,
+)
 
 
 def lightness(colours):
@@ -41,3 +51,35 @@ def test_points_are_lighter_the_higher_they_are():
     shades = height_shades(np.array([-50.0, -1.7, 0.0, 1.5, 50.0]))
     assert (np.diff(shades.astype(int), axis=0) >= 0).all()
     assert shades[0].tolist() < shades[2].tolist() < shades[4].tolist()
+
+
+def test_on_paper_a_higher_weight_is_darker_and_all_are_darker_than_the_ground():
+    """So that a print in grey keeps their order."""
+    steps = lightness(weight_colours(np.linspace(0.001, 1, 200), PAPER).astype(float))
+    assert (np.diff(steps) < 0.4).all()
+    assert steps[0] - steps[-1] > 40
+    assert lightness(np.array([PAPER.background], dtype=float)) - steps[0] > 20
+
+
+@pytest.mark.parametrize("style", [DARK, PAPER])
+def test_what_is_read_stands_out_from_its_ground(style):
+    """WCAG's contrast of 4.5 for texts, 3 for lines."""
+
+    def contrast(colour):
+        one, other = (
+            np.where(c <= 10, c / 255 / 12.92, ((c / 255 + 0.055) / 1.055) ** 2.4)
+            @ np.array([0.2126, 0.7152, 0.0722])
+            for c in (np.array(colour, float), np.array(style.background, float))
+        )
+        return (max(one, other) + 0.05) / (min(one, other) + 0.05)
+
+    assert min(contrast(style.text), contrast(style.faint_text)) >= 4.5
+    lines = (style.ground_truth, style.human, style.zero_weight, style.unweighted)
+    assert min(map(contrast, lines)) >= 3
+
+
+def test_an_unknown_style_is_an_error():
+    """Its message lists the known ones."""
+    assert find_style("paper") is PAPER
+    with pytest.raises(ConfigError, match="--style light: use dark or paper"):
+        find_style("light")

@@ -1,9 +1,12 @@
 """Tests of captions."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from curate.viewing.canvas import Canvas
-from curate.viewing.tags import ShownLabels, draw_tags
+from curate.viewing.tags import ShownLabels, draw_tags, place_tags
 
 BOUNDS = np.array([0.0, 0, 400, 300])
 
@@ -21,11 +24,29 @@ def drawn(shown, anchors):
     return (canvas.finish() < 250).any(axis=2)
 
 
-def test_captions_tell_category_score_weight_and_points():
-    """The points are told only where they were counted."""
-    assert labels(1, [0.5], np.array([12])).caption(0) == ("0.50", "Car 0.87  12 pts")
-    assert labels(1, [0.5]).caption(0) == ("0.50", "Car 0.87")
-    assert labels(1, [0.0]).caption(0) == ("", "Car 0.87")
+def placed(shown, anchors):
+    """Captions and their places."""
+    return place_tags(Canvas(400, 300, (0, 0, 0)), shown, np.array(anchors, dtype=float), BOUNDS)
+
+
+def common_areas(tags):
+    """Areas that every two captions share."""
+    return [
+        np.prod(np.maximum(np.minimum(a.place, b.place)[2:] - np.maximum(a.place, b.place)[:2], 0))
+        for i, a in enumerate(tags)
+        for b in tags[:i]
+    ]
+
+
+def test_captions_begin_with_k():
+    """Then the weight; the points are there only where they were counted."""
+    assert labels(1, [0.5], np.array([12])).caption(0) == ("k0  0.50", "Car 0.87  12 pts")
+    assert labels(1, [0.5]).caption(0) == ("k0  0.50", "Car 0.87")
+    assert labels(2, [0.5, 0.0]).caption(1) == ("", "k1  Car 0.87")
+    assert labels(1, [np.nan]).caption(0) == ("", "k0  Car 0.87")
+    shown = replace(labels(1, [0.5]), numbers=np.array([7]))
+    assert shown.caption(0)[0] == "k7  0.50"
+    assert shown.short_caption(0) == "k7"
 
 
 def test_a_caption_stands_beside_its_box():
@@ -45,14 +66,41 @@ def test_boxes_that_are_not_seen_have_no_caption():
     assert not drawn(labels(1, [0.5]), [[np.nan] * 4]).any()
 
 
-def test_captions_stay_in_bounds_and_give_way_to_higher_weights():
-    """Where all boxes are at one place, four captions fit around it, not twenty."""
-    anchors = [[0, 0, 400, 300]]
-    assert not drawn(labels(1, [0.5]), anchors).any()
-    anchors = [[190, 140, 210, 160]] * 20
-    many = drawn(labels(20, np.linspace(0.1, 1, 20)), anchors).sum()
-    one = drawn(labels(1, [1.0]), anchors[:1]).sum()
-    assert one < many <= 4.5 * one
+@pytest.mark.parametrize("seed", range(5))
+def test_every_label_shows_its_k_and_none_covers_another(seed):
+    """In a crowd, the highest weights have whole captions, the others their number at least."""
+    generator = np.random.default_rng(seed)
+    low = generator.uniform([0, 0], [380, 280], (25, 2))
+    anchors = np.concatenate([low, low + generator.uniform(5, 60, (25, 2))], axis=1)
+    shown = labels(25, np.linspace(0.04, 1, 25))
+    tags = placed(shown, anchors)
+    assert sorted(tag.index for tag in tags) == list(range(25))
+    for tag in tags:
+        assert f"k{tag.index}" in " ".join(tag.lines).split()
+        assert (tag.place[:2] >= BOUNDS[:2]).all()
+        assert (tag.place[2:] <= BOUNDS[2:]).all()
+    assert not any(common_areas(tags))
+    whole = [tag.index for tag in tags if tag.lines == shown.caption(tag.index)]
+    assert len(whole) >= 5
+    assert whole == sorted(whole, reverse=True)
+
+
+def test_where_all_boxes_are_at_one_place_lines_lead_to_their_numbers():
+    """Up to four captions fit around the box; the other numbers stand farther away."""
+    tags = placed(labels(20, np.linspace(0.1, 1, 20)), [[190, 140, 210, 160]] * 20)
+    assert 2 <= sum(bool(tag.lines[0]) for tag in tags) <= 4
+    assert sum(not tag.beside for tag in tags) >= 12
+    assert not any(common_areas(tags))
+    # The lines begin in the middle of the box.
+    assert drawn(labels(20, np.linspace(0.1, 1, 20)), [[190, 140, 210, 160]] * 20)[150, 200]
+    assert not drawn(labels(1, [1.0]), [[190, 140, 210, 160]])[150, 200]
+
+
+def test_a_box_that_fills_the_picture_has_its_number_inside():
+    """There is no room beside it."""
+    [tag] = placed(labels(1, [0.5]), [[-100, -100, 500, 400]])
+    assert tag.lines == ("", "k0")
+    assert (tag.place >= 0).all()
 
 
 def test_no_labels():

@@ -112,6 +112,9 @@ def test_the_report_leaves_markdown_numbers_and_a_picture(toy_kitti: Path, tmp_p
     assert len(numbers["jobs"]) == len(CARS)
     [summary] = [t for t in numbers["tables"] if t["title"].startswith("mean 3D AP, IoU 0.7")]
     assert summary["rows"][2][1]["mean"] == pytest.approx(15.1667, abs=1e-3)
+    [_, _, chart] = BenchReport(bench, "pdf").write()
+    assert chart.read_bytes().startswith(b"%PDF")
+    assert "](curve.pdf)" in (tmp_path / "results.md").read_text()
 
 
 def test_entries_without_values() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from support.pipelines_cli import Curate
 
-from curate.errors import WorkspaceError
+from curate.errors import ConfigError, WorkspaceError
 from pipelines.workspace.workspace import Workspace
 
 
@@ -68,6 +68,22 @@ def test_a_report_tells_a_round_its_changes_and_its_audit(
     assert "Beside other policies" in headings
     assert text.count("(this page)") == 1
     assert "Reliability" in headings
+    code, out, _ = curate("report", "--format", "png", "--json", "-w", root)
+    assert code == 0
+    charts = [Path(path) for path in json.loads(out)["charts"]]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in charts)
+    assert {path.parent for path in charts} == {second.with_suffix("")}
+    assert {"loss.png", "weight.png", "reliability-val-bev.png"} <= {path.name for path in charts}
+    assert second.read_text(encoding="utf-8") == text
+
+
+def test_an_unknown_chart_format_is_found_first(curate: Curate, workspace: Workspace) -> None:
+    """By all commands that draw charts, before they work."""
+    for command in ("report", "audit"):
+        code, out, err = curate(command, "--format", "gif", "-w", workspace.root)
+        assert code == ConfigError.exit_code
+        assert "--format gif: use svg, png, pdf" in err
+        assert out == ""
 
 
 def test_without_weights_the_remedy_is_named(curate: Curate, workspace: Workspace) -> None:

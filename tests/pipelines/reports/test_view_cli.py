@@ -1,6 +1,7 @@
 """curate view: what it draws, where it leaves it, what it refuses."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,8 +72,63 @@ def test_output_and_policy_are_obeyed(curate: Curate, weighted: Workspace, tmp_p
 
 
 @pytest.mark.parametrize(
+    ("options", "suffix", "start"),
+    [
+        (["--format", "pdf"], "pdf", b"%PDF"),
+        (["--output", "OUT.svg"], "svg", b"<?xml"),
+        (["--output", "OUT.PNG", "--format", "png"], "PNG", b"\x89PNG"),
+        (["--style", "paper"], "png", b"\x89PNG"),
+    ],
+)
+def test_the_format_is_that_of_the_option_or_of_the_suffix(
+    curate: Curate,
+    weighted: Workspace,
+    tmp_path: Path,
+    options: list[str],
+    suffix: str,
+    start: bytes,
+) -> None:
+    """PNG where neither says otherwise."""
+    name = next(iter(weighted.frames("unlabeled")))
+    words = [str(tmp_path / each) if each.startswith("OUT") else each for each in options]
+    code, out, err = curate("view", name, *words, "-w", weighted.root)
+    assert (code, err) == (0, "")
+    path = Path(out.removeprefix("picture: ").strip())
+    assert path.suffix == f".{suffix}"
+    assert path.read_bytes().startswith(start)
+    if "paper" in options:
+        assert (drawn(path) == 255).all(axis=2).mean() > 0.5
+
+
+def test_a_picture_shows_the_k_that_explain_takes(weighted: Workspace) -> None:
+    """Also where a label before it gave way to a human one."""
+    from pipelines.reports.pictures import shown_labels
+
+    name = next(iter(weighted.frames("unlabeled")))
+    found = read_frame(weighted, name, 1, "pspsl")
+    frame = weighted.dataset.read(name)
+    assert found.numbers.tolist() == [0, 1, 2]
+    left = replace(
+        found,
+        labels=found.labels.select(np.array([False, True, True])),
+        numbers=found.numbers[1:],
+        weights=found.weights[1:],
+    )
+    shown = shown_labels(weighted, frame, left, "pspsl")
+    assert [shown.short_caption(i) for i in range(2)] == ["k1", "k2"]
+    assert shown.zero_weight == "background"
+    assert shown_labels(weighted, frame, left, "st3d").zero_weight == "ignore"
+
+
+@pytest.mark.parametrize(
     ("arguments", "word"),
-    [(["gone"], "no frame is named 'gone'"), (["FRAME", "--output", "no/where.png"], "--output")],
+    [
+        (["gone"], "no frame is named 'gone'"),
+        (["FRAME", "--output", "no/where.png"], "--output"),
+        (["FRAME", "--format", "gif"], "--format gif: use svg, png, pdf"),
+        (["FRAME", "--output", "a.png", "--format", "pdf"], "the suffix of a pdf file is .pdf"),
+        (["FRAME", "--style", "light"], "--style light: use dark or paper"),
+    ],
 )
 def test_a_wrong_call_is_one_line(
     curate: Curate, weighted: Workspace, arguments: list[str], word: str

@@ -22,7 +22,7 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def report(weighted: Workspace) -> Path:
     """The report of the only round."""
-    return write_report(weighted, None, None)
+    return write_report(weighted, None, None)[0]
 
 
 @pytest.mark.parametrize("width", WIDTHS)

@@ -1,0 +1,170 @@
+"""One style for all charts, and their output as SVG, PNG or PDF.
+
+Charts are matplotlib figures without pyplot. Equal data gives equal bytes: no dates, fixed ids. The
+colours of a page's inline SVG are the page's own, so that they follow its light or dark scheme.
+"""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from html import escape
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from curate.errors import ConfigError
+from curate.files.atomic import replace_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ImageFormat = Literal["svg", "png", "pdf"]
+
+INK, FAINT, RULE, GROUND = "#1b2129", "#5b6675", "#d5dae2", "#ffffff"
+BAR, MARK = "#2a7fb8", "#c2410c"
+_PAGE_COLOURS = {
+    INK: "--text", FAINT: "--faint", RULE: "--line", GROUND: "--panel", BAR: "--bar",
+    MARK: "--mark",
+}  # fmt: skip
+
+_DPI = 160
+_RC: dict[str, Any] = {
+    "font.family": ["DejaVu Sans"],
+    "font.size": 8.5,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": FAINT,
+    "axes.facecolor": "none",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "grid.color": RULE,
+    "grid.linewidth": 0.7,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.major.size": 3,
+    "ytick.major.size": 0,
+    "text.color": INK,
+    "legend.frameon": False,
+    "figure.facecolor": GROUND,
+    "figure.constrained_layout.use": True,
+    "pdf.fonttype": 42,  # keeps text as text, also for editors of PDF
+}
+
+
+@contextmanager
+def chart_style(**settings: Any) -> Iterator[None]:
+    """Set matplotlib's settings for a while; `settings` come on top of the style."""
+    from matplotlib import rc_context
+
+    known: Any = {**_RC, **settings}
+    with rc_context(known):
+        yield
+
+
+def new_figure(width: float, height: float) -> "Figure":
+    """Return an empty figure of a size in inches, within `chart_style`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def check_format(name: str) -> ImageFormat:
+    """Return the format with this name.
+
+    Raises:
+        ConfigError: the name is not svg, png or pdf.
+    """
+    for known in get_args(ImageFormat):
+        if name == known:
+            return known  # type: ignore[no-any-return]
+    raise ConfigError(f"--format {name}: use {', '.join(get_args(ImageFormat))}")
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A finished chart.
+
+    Attributes:
+        name: stem of its file's name; unique within a page.
+        description: what it shows, for readers who cannot see it.
+        figure: of matplotlib.
+    """
+
+    name: str
+    description: str
+    figure: "Figure"
+
+    def content(self, kind: ImageFormat) -> bytes:
+        """Return the content of a file in this format."""
+        return figure_content(self.figure, kind, self.name)
+
+    def save(self, path: Path) -> None:
+        """Write a file, whole or not at all; its suffix is the format."""
+        replace_file(path, self.content(check_format(path.suffix[1:])))
+
+    def inline(self) -> str:
+        """Return an <svg> element that takes its colours from the page."""
+        content = figure_content(self.figure, "svg", self.name, _DPI, **{"svg.fonttype": "none"})
+        text = content.decode("utf-8")
+        text = text[text.index("<svg") :].rstrip()
+        text = re.sub(r"\s*<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+        width, height = re.findall(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', text)[0]
+        text = re.sub(
+            r"<svg[^>]*>",
+            f'<svg viewBox="0 0 {width} {height}" role="img" '
+            f'aria-label="{escape(self.description)}">',
+            text,
+            count=1,
+        )
+        text = re.sub(r"<defs>\s*<style.*?</defs>", "", text, flags=re.DOTALL)
+        # A page may hold several charts: their parts get classes, because ids must not repeat.
+        text = re.sub(r'<g id="([a-z]+)[^"]*"', r'<g class="\1"', text)
+        text = _without_references(text).replace("'DejaVu Sans'", "system-ui")
+        for colour, variable in _PAGE_COLOURS.items():
+            text = text.replace(colour, f"var({variable})")
+        return text
+
+
+def figure_content(
+    figure: "Figure", kind: ImageFormat, salt: str, dpi: int = _DPI, **settings: Any
+) -> bytes:
+    """Return a figure as the content of a file; equal figures give equal bytes.
+
+    Args:
+        figure: of matplotlib.
+        kind: of the file.
+        salt: the ids in an SVG follow from it and from what they stand for.
+        dpi: resolution of a PNG, and of what is not drawn as vectors.
+        settings: of matplotlib, on top of the style.
+    """
+    dates = {"svg": {"Date": None}, "png": {"Software": None}, "pdf": {"CreationDate": None}}
+    buffer = BytesIO()
+    with chart_style(**settings, **{"svg.hashsalt": salt}):
+        figure.savefig(buffer, format=kind, dpi=dpi, metadata=dates[kind])
+    return buffer.getvalue()
+
+
+def _without_references(svg: str) -> str:
+    """Return an SVG with each <use> replaced by the path that it refers to."""
+    shapes = dict(re.findall(r'<path id="(\w+)" d="([^"]*)"', svg))
+    svg = re.sub(r"<defs>.*?</defs>", "", svg, flags=re.DOTALL)
+    return re.sub(
+        r'<use xlink:href="#(\w+)" x="([-\d.]+)" y="([-\d.]+)"',
+        lambda use: f'<path d="{shapes[use[1]]}" transform="translate({use[2]} {use[3]})"',
+        svg,
+    )
+
+
+def unclip(axes: "Axes") -> None:
+    """Let nothing be cut at the edge of the axes, such as half of a dot on it."""
+    for artist in axes.findobj():
+        artist.set_clip_on(False)
