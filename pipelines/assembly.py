@@ -182,7 +182,7 @@ def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, .
 
     if classes is None:
         raise ConfigError(
-            f"segmenter '{segmenter}': the meaning of its class numbers is not set: set "
+            f"segmenter '{segmenter}': nothing says what its class numbers mean: set "
             f"segmenter.classes to one of {', '.join(CLASS_MAPS)}, or segmenter.options.classes "
             "to a table like {Car = [7]}"
         )
