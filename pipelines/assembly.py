@@ -241,6 +241,19 @@ def check_labels_format(config: Config) -> None:
         registry.EXPORTERS.build(config.train.labels_format, offered={}, options={})
 
 
+def check_extensions(config: Config) -> None:
+    """Check every class that the configuration names, without loading a model.
+
+    Raises:
+        ConfigError: if a class cannot be imported or does not accept its options.
+    """
+    check_detector(config)
+    check_segmenter(config)
+    check_policy(config, config.run.method)
+    check_executor(config)
+    check_labels_format(config)
+
+
 def consistency_settings(config: Config) -> ConsistencySettings:
     """Return how predictions and repredictions are compared."""
     return _from_section(ConsistencySettings, config.repredict)

@@ -20,9 +20,9 @@ MAY_IMPORT = {
 # The rooms of each package, from the ground up: a room imports only rooms before it.
 LAYERS = {
     "curate": (
-        "errors", "files", "frames", "geometry", "detections", "consistency", "datasets",
-        "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters", "detectors",
-        "firewall", "viewing", "review", "training",
+        "errors", "spelling", "files", "frames", "geometry", "detections", "consistency",
+        "datasets", "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters",
+        "detectors", "firewall", "viewing", "review", "training",
     ),
     "pipelines": (
         "user_modules", "registry", "workspace", "assembly", "engine", "labels", "firewall",
