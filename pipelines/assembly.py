@@ -182,7 +182,7 @@ def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, .
 
     if classes is None:
         raise ConfigError(
-            f"segmenter '{segmenter}': the meaning of its class numbers is not set: set "
+            f"segmenter '{segmenter}': nothing says what its class numbers mean: set "
             f"segmenter.classes to one of {', '.join(CLASS_MAPS)}, or segmenter.options.classes "
             "to a table like {Car = [7]}"
         )
@@ -239,6 +239,19 @@ def check_labels_format(config: Config) -> None:
     """
     with _naming("train.labels_format"):
         registry.EXPORTERS.build(config.train.labels_format, offered={}, options={})
+
+
+def check_extensions(config: Config) -> None:
+    """Check every class that the configuration names, without loading a model.
+
+    Raises:
+        ConfigError: if a class cannot be imported or does not accept its options.
+    """
+    check_detector(config)
+    check_segmenter(config)
+    check_policy(config, config.run.method)
+    check_executor(config)
+    check_labels_format(config)
 
 
 def consistency_settings(config: Config) -> ConsistencySettings:

@@ -21,7 +21,7 @@ from curate.evaluation.reliability import JudgeSettings, Overlap
 from curate.geometry.projection import image_rectangles
 from curate.weighting.base import Evidence
 from db import bulk
-from pipelines.assembly import open_policy
+from pipelines.assembly import check_executor, open_policy
 from pipelines.assessment.audit_folds import open_folds
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
@@ -165,6 +165,7 @@ def _check(workspace: Workspace, request: AuditRequest) -> None:
         raise ConfigError(
             f"--split {request.split}: only val and labeled frames have ground truth to ask"
         )
+    check_executor(workspace.config)
     for name in request.policies:
         open_policy(workspace.config, name)
     if request.folds:

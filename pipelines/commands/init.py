@@ -94,7 +94,7 @@ def init(
     Example: curate init work --root data/simulated --labeled 0.06 --segmenter simulated
     """
     from curate.errors import ConfigError
-    from pipelines.assembly import trainable_detector
+    from pipelines.assembly import check_extensions
     from pipelines.workspace.config import change_setting, make_config
     from pipelines.workspace.setup import initialise
 
@@ -120,8 +120,7 @@ def init(
     for setting in settings or ():
         change_setting(document, setting)
     config = make_config(document, "curate init")
-    if config.train.preset != "auto":
-        trainable_detector(config)
+    check_extensions(config)
     workspace = initialise(directory, config, labeled, val)
     counts = {split: len(workspace.frames(split)) for split in ("labeled", "unlabeled", "val")}
     if as_json:

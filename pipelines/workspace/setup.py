@@ -20,13 +20,6 @@ from curate.segmenters.classes import CLASS_MAPS
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
-from pipelines.assembly import (
-    check_detector,
-    check_executor,
-    check_labels_format,
-    check_policy,
-    check_segmenter,
-)
 from pipelines.workspace.config import Config
 from pipelines.workspace.split_record import split_rows
 from pipelines.workspace.splits import SPLITS
@@ -69,7 +62,7 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
         DataError: if a label or calibration file of X_l or val is damaged.
         WorkspaceError: if the workspace exists with other frames or settings.
     """
-    _check_extensions(config)
+    _check_files(config)
     dataset = open_dataset(config)
     split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
     truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
@@ -87,12 +80,11 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
     return workspace
 
 
-def _check_extensions(config: Config) -> None:
-    """Check that detector, segmenter, policy, executor and label format can be used.
+def _check_files(config: Config) -> None:
+    """Check the files of detector and segmenter.
 
     Raises:
-        ConfigError: if a class cannot be imported or does not accept its options, a file is
-            missing, or nothing says what the segmenter's class numbers mean.
+        ConfigError: if a file is missing, or nothing says what the segmenter's class numbers mean.
     """
     needs_path = {"detector": ("onnx", "recorded"), "segmenter": tuple(registry.SEGMENTERS.classes)}
     for section, names in needs_path.items():
@@ -113,11 +105,6 @@ def _check_extensions(config: Config) -> None:
             f"{', '.join(CLASS_MAPS)}; or a table of your own: --set "
             '"segmenter.options.classes={Car=[7]}"'
         )
-    check_detector(config)
-    check_segmenter(config)
-    check_policy(config, config.run.method)
-    check_executor(config)
-    check_labels_format(config)
 
 
 def choose_split(
