@@ -36,7 +36,7 @@ class ConsistencySettings:
     minimum_iou: float = 0.1
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a setting without meaning."""
+        """Raise ConfigError for a setting without meaning."""
         if self.score_weight < 0 or self.box_weight < 0:
             raise ConfigError("consistency: score_weight and box_weight must not be negative")
         if self.beta <= 0:
@@ -93,7 +93,7 @@ def consistency(
         settings: see `ConsistencySettings`.
 
     Raises:
-        ModelError: a matched box is not finite or has no size, so that it has no residual.
+        ModelError: if a matched box is not finite or has no size, so that it has no residual.
     """
     matched, iou = match(predictions, repredictions, settings.minimum_iou)
     found = matched >= 0

@@ -32,7 +32,7 @@ class Columns:
         return len(getattr(self, fields(self)[0].name))
 
     def select(self, index: Int[np.ndarray, " m"] | Bool[np.ndarray, " m"]) -> Self:
-        """The rows at `index` (integers or a mask), in that order."""
+        """Return the rows at `index` (integers or a mask), in that order."""
         return type(self)(*(getattr(self, column.name)[index] for column in fields(self)))
 
 
@@ -54,7 +54,7 @@ class Detections(Columns):
     iou: Float[np.ndarray, " n_or_0"] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        """Fills in estimates that were left out."""
+        """Fill in estimates that were left out."""
         if len(self.iou) == 0:
             object.__setattr__(self, "iou", np.full(len(self.boxes), np.nan))
 

@@ -35,10 +35,10 @@ class Calibration:
         return np.asarray(self.projection @ self.lidar_to_camera)
 
     def pose_in_map(self) -> Float[np.ndarray, "4 4"]:
-        """(4, 4) LiDAR frame to the frame of the map.
+        """Return (4, 4) LiDAR frame to the frame of the map.
 
         Raises:
-            ConfigError: the data set has no poses.
+            ConfigError: if the data set has no poses.
         """
         if self.lidar_to_map is None:
             raise ConfigError(
@@ -67,7 +67,7 @@ class Frame:
     image: UInt8[np.ndarray, "height width 3"] | None = None
 
     def with_points(self, points: Float32[np.ndarray, "n 4"]) -> Self:
-        """The same frame with other points."""
+        """Return the same frame with other points."""
         return replace(self, points=points)
 
 

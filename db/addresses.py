@@ -7,10 +7,10 @@ from curate.errors import ConfigError
 
 
 def parse_url(address: str) -> URL:
-    """An SQLAlchemy URL; a password in its query is moved to where it is not shown.
+    """Return an SQLAlchemy URL; a password in its query is moved to where it is not shown.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: if it is none.
     """
     try:
         # No driver takes a zero byte, and each says so with an error of its own.

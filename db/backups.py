@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 def back_up(url: URL, revision: str, folder: Path | None) -> None:
-    """Copies a database of an older schema.
+    """Copy a database of an older schema.
 
     An SQLite file is copied beside itself. A PostgreSQL database is dumped into `folder` where
     pg_dump is installed; where it is not, a warning says that there is no copy: the migration is
@@ -28,7 +28,7 @@ def back_up(url: URL, revision: str, folder: Path | None) -> None:
         folder: for dumps; None where there is none.
 
     Raises:
-        DatabaseError: there is no room for it, its folder cannot be written, or pg_dump refuses.
+        DatabaseError: if there is no room for it, its folder cannot be written, or pg_dump refuses.
     """
     if url.get_backend_name() == "sqlite":
         path = Path(str(url.database))

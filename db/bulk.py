@@ -87,12 +87,12 @@ def _part(value: Any, start: int, length: int) -> Iterable[Any]:
 
 
 def on_server(connection: Connection) -> bool:
-    """Whether a PostgreSQL server answers."""
+    """Return whether a PostgreSQL server answers."""
     return connection.dialect.name == "postgresql"
 
 
 def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
-    """All rows of a query as plain tuples."""
+    """Return all rows of a query as plain tuples."""
     result = connection.execute(statement)
     if result.cursor is not None and _unchanged(connection, statement):
         rows: Sequence[Row] = result.cursor.fetchall()
@@ -110,7 +110,7 @@ def grouped(rows: Iterable[Row], keys: Iterable[Any] = ()) -> dict[Any, list[Row
 
 
 def _unchanged(connection: Connection, statement: Select[Any]) -> bool:
-    """Whether SQLite's driver gives the values that are meant, as it does but for times.
+    """Return whether SQLite's driver gives the values that are meant, as it does but for times.
 
     An object of SQLAlchemy per row takes as long as the row itself.
     """
@@ -122,7 +122,7 @@ def _unchanged(connection: Connection, statement: Select[Any]) -> bool:
 
 
 def blocks(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[Row]]:
-    """The rows of a query, some at a time."""
+    """Yield the rows of a query, some at a time."""
     if _unchanged(connection, statement):
         result = connection.execute(statement)
         cursor = result.cursor
@@ -139,7 +139,7 @@ def select_columns(connection: Connection, statement: Select[Any]) -> dict[str, 
     """Return the columns of a query by name: (n,) int64, float64 with NaN for null, or str.
 
     Raises:
-        TypeError: a null among integers.
+        TypeError: if a null among integers.
     """
     kinds = {column.name: column.type.python_type for column in statement.selected_columns}
     parts = {name: [np.zeros(0, kind)] for name, kind in kinds.items()}
@@ -150,7 +150,7 @@ def select_columns(connection: Connection, statement: Select[Any]) -> dict[str, 
 
 
 def refresh_statistics(connection: Connection) -> None:
-    """Lets the database look at samples of the tables that questions about labels touch.
+    """Let the database look at samples of the tables that questions about labels touch.
 
     Without them SQLite reads all weights where somebody asks for one frame, and a server joins row
     by row what this transaction has written, until it looks by itself a minute later. Where another
@@ -169,6 +169,6 @@ def refresh_statistics(connection: Connection) -> None:
 def delete_frames(
     connection: Connection, name: str, round_number: int, frame_ids: Sequence[int]
 ) -> None:
-    """Deletes the rows of some frames of a round, and what hangs on them."""
+    """Delete the rows of some frames of a round, and what hangs on them."""
     of = table(name)
     connection.execute(of.delete().where(of.c.round == round_number, of.c.frame_id.in_(frame_ids)))

@@ -70,13 +70,13 @@ def round_resources(number: int, policy: str | None = None) -> tuple[Resource, .
 
 @contextmanager
 def claimed(engine: Engine, resources: Sequence[Resource], purpose: str) -> Iterator[Check]:
-    """Holds resources against every other process until the block ends.
+    """Hold resources against every other process until the block ends.
 
     Yields:
         What raises where the claim was lost in the meantime, so that others may work on the same.
 
     Raises:
-        DatabaseError: another process has one of them; the message says which and since when.
+        DatabaseError: if another process has one of them; the message says which and since when.
     """
     owner = f"{purpose}, process {os.getpid()} on {socket.gethostname()}"
     checks: list[Check] = []
@@ -94,7 +94,7 @@ def claimed(engine: Engine, resources: Sequence[Resource], purpose: str) -> Iter
 
 
 def one_at_a_time(connection: Connection, lock: int) -> None:
-    """Waits for other transactions with this lock to end; SQLite's writers always do."""
+    """Wait for other transactions with this lock to end; SQLite's writers always do."""
     if connection.dialect.name == "postgresql":
         connection.execute(text(f"SELECT pg_advisory_xact_lock({lock})"))
 
@@ -149,7 +149,7 @@ def _claimed_file(folder: Path, resource: Resource, owner: str) -> Iterator[Chec
 
 
 def _check_lock_file(path: Path, file: "TextIOWrapper") -> None:
-    """DatabaseError where the file that is locked is not the one that others would try."""
+    """Raise DatabaseError if the file that is locked is not the one that others would try."""
     try:
         same = os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except FileNotFoundError:

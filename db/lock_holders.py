@@ -13,7 +13,7 @@ _LOCKS = Path("/proc/locks")  # Linux
 
 
 def holders(database: Path) -> tuple[str, ...]:
-    """The processes that write a SQLite database, as "process 123 (its command line)"."""
+    """Return the processes that write a SQLite database, as "process 123 (its command line)"."""
     database = database.resolve()  # what SQLite keeps beside it lies beside no link
     shared = database.with_name(database.name + "-shm")
     # In the file itself any locked byte counts.
@@ -44,7 +44,7 @@ def _write_locks() -> Iterator[tuple[int, int, int, float]]:
 
 
 def _command(pid: int) -> str:
-    """The command line of a process, in one line."""
+    """Return the command line of a process, in one line."""
     try:
         text = Path(f"/proc/{pid}/cmdline").read_text()
     except OSError:

@@ -90,10 +90,10 @@ class Database:
 
     @contextmanager
     def claiming_round(self, number: int, policy: str | None, purpose: str) -> Iterator[None]:
-        """Keeps every other process off a round, or off what a policy makes of it.
+        """Keep every other process off a round, or off what a policy makes of it.
 
         Raises:
-            DatabaseError: another process works on it; the message says who.
+            DatabaseError: if another process works on it; the message says who.
         """
         resources = round_resources(number, policy)
         with ExitStack() as held:
@@ -104,7 +104,7 @@ class Database:
             yield
 
     def close(self) -> None:
-        """Gives every connection back."""
+        """Return every connection back."""
         self.engine.dispose()
 
     def _migrate(self, backups: Path | None) -> None:
@@ -134,13 +134,13 @@ class Database:
             create_views(connection)
 
     def _write_ahead(self) -> None:
-        """Lets readers of an SQLite file go on beside a writer; the file remembers it."""
+        """Let readers of an SQLite file go on beside a writer; the file remembers it."""
         if self.engine.dialect.name == "sqlite":
             with closing(self.engine.raw_connection()) as connection:
                 connection.cursor().execute("PRAGMA journal_mode = WAL")
 
     def _require_tables(self, connection: Connection) -> None:
-        """DatabaseError where somebody has dropped a table of this schema."""
+        """Raise DatabaseError if somebody has dropped a table of this schema."""
         missing = sorted(set(Base.metadata.tables) - set(inspect(connection).get_table_names()))
         if missing:
             raise DatabaseError(
@@ -148,7 +148,7 @@ class Database:
             )
 
     def _check_tables(self, connection: Connection) -> None:
-        """DatabaseError where a database without a schema of ours has tables.
+        """Raise DatabaseError if a database without a schema of ours has tables.
 
         A server's database may hold others beside ours, a file is for curate alone.
         """
@@ -178,7 +178,7 @@ class Database:
 
     @contextmanager
     def _translate_errors(self) -> Iterator[None]:
-        """Turns the driver's errors into one line that names the database and the remedy."""
+        """Turn the driver's errors into one line that names the database and the remedy."""
         try:
             yield
         except DBAPIError as error:

@@ -49,7 +49,7 @@ _REAL, _INTEGER = _NULLS["float64"], _NULLS["int32"]
 # would make it read all frames into a Bloom filter before the first row, hence the CASE on a k.
 # A server finds one frame's labels of all rounds by their key only where it is given the rounds.
 def _weighted_labels(further: Sequence[Declaration]) -> str:
-    """The view with the columns of further sources behind the core ones."""
+    """Return the view with the columns of further sources behind the core ones."""
     aliases = {each: f"s{i}" for i, each in enumerate(further)}
     columns = [(alias, column) for each, alias in aliases.items() for column in each.columns]
     found = "".join(f', {alias}."{column.name}"' for alias, column in columns)

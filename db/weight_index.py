@@ -25,7 +25,7 @@ _LOCK = 0x776569676874  # "weight" in ASCII
 
 
 def index_of(policy: str) -> Index:
-    """The index of a policy's weights, by round and value."""
+    """Return the index of a policy's weights, by round and value."""
     named = _PLAIN.fullmatch(policy)
     name = policy if named else sha256(policy.encode()).hexdigest()[:32]
     # A copy of the table: an index joins the models of the one that it is made for.
@@ -37,7 +37,7 @@ def index_of(policy: str) -> Index:
 
 
 def prepare(database: Database, policy: str) -> None:
-    """Sees to it that a policy has its index.
+    """See to it that a policy has its index.
 
     In a transaction of its own: a server waits for whoever is writing weights, who must not be the
     one that asks.

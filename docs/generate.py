@@ -69,7 +69,7 @@ def cli_page() -> str:
 
 
 def _exit_codes() -> list[str]:
-    """The exit status of each class of error."""
+    """Return the exit status of each class of error."""
     kinds = sorted(CurateError.__subclasses__(), key=lambda kind: kind.exit_code)
     return [
         "## Exit codes",
@@ -181,7 +181,7 @@ def config_schema() -> str:
 
 
 def queries_page() -> str:
-    """Every question that ships with the project."""
+    """Return every question that ships with the project."""
     parts = ["# Questions that ship with curate", _NOTE]
     parts.append(
         "`curate query --named NAME` asks them of the working database, with `--file` of an"
@@ -221,7 +221,7 @@ def _sql_functions() -> str:
 
 
 def python_api_page() -> str:
-    """Every public name: how it is called, with shapes, and the start of its docstring."""
+    """Return every public name: how it is called, with shapes, and the start of its docstring."""
     parts = [
         "# Python API",
         _NOTE,
@@ -244,7 +244,7 @@ def python_api_page() -> str:
 
 
 def _api_entry(module: str, name: str, found: object) -> list[str]:
-    """A heading, the signature, what it is, and the methods of a class."""
+    """Return a heading, the signature, what it is, and the methods of a class."""
     heading = [f"### {name}", "", f"`{module}`", ""]
     if not callable(found):
         return [*heading, f"```python\n{name} = {found!r}\n```"]
@@ -257,7 +257,7 @@ def _api_entry(module: str, name: str, found: object) -> list[str]:
 
 
 def _methods(found: object) -> list[str]:
-    """A list of the public methods and properties that a class itself defines."""
+    """Return a list of the public methods and properties that a class itself defines."""
     members = [
         (name, member)
         for name, member in (vars(found) if isinstance(found, type) else {}).items()
@@ -273,7 +273,7 @@ def _first_paragraph(found: object) -> str:
 
 
 def _signature(name: str, found: Callable[..., object], *, returns: bool = True) -> str:
-    """A call with types and shapes, an argument per line where it is long."""
+    """Return a call with types and shapes, an argument per line where it is long."""
     signature = inspect.signature(found)
     parameters = [
         each.replace(default=_Shown(each.default)) if each.default is not each.empty else each
@@ -302,7 +302,7 @@ class _Shown:
 
 
 def main() -> None:
-    """Writes them."""
+    """Write them."""
     for path, text in references().items():
         path.write_text(text)
 

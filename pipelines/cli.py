@@ -91,7 +91,7 @@ def _curate(
         ),
     ] = False,
 ) -> None:
-    """Takes the options that come before a command."""
+    """Take the options that come before a command."""
 
 
 for _heading, _modules in GROUPS.items():

@@ -71,7 +71,7 @@ class Demo:
         return self.workers or os.cpu_count() or 1
 
     def config(self) -> Config:
-        """The workspace's settings."""
+        """Return the workspace's settings."""
         document = {
             "dataset": {"root": self.data},
             "segmenter": {"name": "simulated"},
@@ -86,7 +86,7 @@ class Demo:
 
 
 def run_demo(demo: Demo, say: Say) -> None:
-    """Simulates, trains, weighs, trains again, compares, draws; continues where it was killed."""
+    """Simulate, trains, weighs, trains again, compares, draws; continues where it was killed."""
     start = time.perf_counter()
     _simulate(demo, say)
     workspace = initialise(demo.directory, demo.config(), str(demo.labeled), "")
@@ -198,7 +198,7 @@ def _print_detectors(workspace: Workspace) -> None:
 
 
 def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:
-    """The detectors to compare, with their checkpoints."""
+    """Return the detectors to compare, with their checkpoints."""
     rounds = workspace.config.run.rounds
     first = open_round(workspace, 1)
     policy = workspace.config.run.method
@@ -230,5 +230,5 @@ def _draw(workspace: Workspace, say: Say) -> None:
 
 
 def _shown(path: Path) -> str:
-    """A path as a person in the current folder would type it."""
+    """Return a path as a person in the current folder would type it."""
     return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)

@@ -46,7 +46,7 @@ class Registry:
             )
 
     def load(self, name: str) -> Any:
-        """The class behind a name.
+        """Return the class behind a name.
 
         Raises:
             ConfigError: nobody knows the name, or what it names cannot be imported or called.
@@ -82,7 +82,7 @@ class Registry:
         return found
 
     def takes(self, name: str, argument: str) -> bool:
-        """Whether the constructor behind a name has an argument of that name."""
+        """Return whether the constructor behind a name has an argument of that name."""
         return argument in inspect.signature(self.load(name)).parameters
 
     def check(

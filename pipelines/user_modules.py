@@ -48,7 +48,7 @@ def import_user_module(name: str) -> ModuleType:
 
 
 def _shadowed_packages() -> dict[str, Path]:
-    """The packages of the user with the names of curate's, with the file of each."""
+    """Return the packages of the user with the names of curate's, with the file of each."""
     elsewhere = [entry for entry in sys.path if Path(entry).resolve() != _HOME]
     found = {name: PathFinder.find_spec(name, elsewhere) for name in _PACKAGES}
     # A folder without __init__.py has no origin: Python prefers a package that has one.
@@ -56,13 +56,13 @@ def _shadowed_packages() -> dict[str, Path]:
 
 
 def _package_of(error: ImportError | AttributeError) -> str:
-    """The package in which something was not found."""
+    """Return the package in which something was not found."""
     name = getattr(error.obj, "__name__", "") if isinstance(error, AttributeError) else error.name
     return (name or "").partition(".")[0]
 
 
 def _imported_packages(module: ModuleType) -> Iterator[str]:
-    """The packages that a module outside curate's folders imports anywhere in its source."""
+    """Yield the packages that a module outside curate's folders imports anywhere in its source."""
     file = Path(getattr(module, "__file__", None) or "")
     own = any(file.is_relative_to(_HOME / package) for package in _PACKAGES)
     if own or file.suffix != ".py" or not file.is_file():

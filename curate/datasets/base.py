@@ -17,7 +17,7 @@ class Dataset(Protocol):
     name: str
 
     def frame_ids(self) -> tuple[str, ...]:
-        """All frames, in sorted order."""
+        """Return all frames, in sorted order."""
         ...
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
@@ -33,7 +33,7 @@ class Dataset(Protocol):
         ...
 
     def annotations(self, frame_id: str) -> Annotations:
-        """The frame's ground truth."""
+        """Return the frame's ground truth."""
         ...
 
 
@@ -42,12 +42,12 @@ class Sequenced(Protocol):
     """A data set that knows which frames were recorded one after the other."""
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """The sequence (drive, scene, clip) of a frame; None where it is not known."""
+        """Return the sequence (drive, scene, clip) of a frame; None where it is not known."""
         ...
 
 
 def sequences_of(dataset: Dataset, frames: Iterable[str]) -> Mapping[str, str]:
-    """The sequence of each frame that the data set knows one of."""
+    """Return the sequence of each frame that the data set knows one of."""
     if not isinstance(dataset, Sequenced):
         return {}
     found = {frame: dataset.sequence_of(frame) for frame in frames}

@@ -69,7 +69,7 @@ class FolderDataset:
         self._boundary.check(*(self.root / name for name in named if isinstance(name, str)))
 
     def frame_ids(self) -> tuple[str, ...]:
-        """All frames with a point file, in sorted order."""
+        """Return all frames with a point file, in sorted order."""
         return tuple(self._points)
 
     @cached_property
@@ -80,10 +80,10 @@ class FolderDataset:
         return {path.stem: path for path in paths}
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
-        """The lists of the folder `splits`, by file name.
+        """Return the lists of the folder `splits`, by file name.
 
         Raises:
-            DataError: the folder is named, but holds none; no frame would be kept for val.
+            DataError: if the folder is named, but holds none; no frame would be kept for val.
         """
         if "splits" not in self._told:
             return {}
@@ -97,7 +97,7 @@ class FolderDataset:
         """Where the frame's files lie, or an image would; the calibration is that of all frames.
 
         Raises:
-            DataError: there is no such frame.
+            DataError: if there is no such frame.
         """
         check_frame_id(frame_id)
         if frame_id not in self._points:
@@ -126,7 +126,7 @@ class FolderDataset:
         """The frame's calibration, its points unless unwanted, and its image where asked for.
 
         Raises:
-            DataError: a file is missing, damaged or malformed.
+            DataError: if a file is missing, damaged or malformed.
         """
         files = self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
@@ -149,10 +149,10 @@ class FolderDataset:
         return (width, height), None
 
     def annotations(self, frame_id: str) -> Annotations:
-        """The frame's ground truth in the LiDAR frame.
+        """Return the frame's ground truth in the LiDAR frame.
 
         Raises:
-            DataError: there is no label file, or it is malformed.
+            DataError: if there is no label file, or it is malformed.
         """
         label = self.files(frame_id).label
         if label is None:
@@ -210,7 +210,7 @@ def _read_description(path: Path) -> Mapping[str, Any]:
 
 
 def _is_size(value: object) -> bool:
-    """Whether it is width and height in pixels."""
+    """Return whether it is width and height in pixels."""
     return (
         isinstance(value, list)
         and len(value) == 2

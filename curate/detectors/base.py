@@ -25,7 +25,7 @@ class Detector(Protocol):
     """Finds boxes in a frame; raises `ModelError` where the model cannot be used as it is."""
 
     def predict(self, frame: Frame) -> Detections:
-        """All boxes of the frame, low scores too, after non-maximum suppression.
+        """Return all boxes of the frame, low scores too, after non-maximum suppression.
 
         Boxes are in the frame of reference of `frame.points`, which the caller may have cropped
         to the camera's view or transformed by a similarity.

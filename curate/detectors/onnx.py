@@ -86,7 +86,7 @@ class OnnxDetector:
         """See `curate.detectors.base.Detector`; a sweep without points has no boxes.
 
         Raises:
-            ModelError: the model fails, or answers what was not declared.
+            ModelError: if the model fails, or answers what was not declared.
         """
         if len(frame.points) == 0:
             return Detections.empty()
@@ -112,7 +112,7 @@ class OnnxDetector:
         return {self._input: rows[None] if len(self._shape) == 3 else rows}
 
     def _run(self, inputs: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-        """The model's outputs by name."""
+        """Return the model's outputs by name."""
         names = [one.name for one in self._session.get_outputs()]
         try:
             return dict(zip(names, self._session.run(None, dict(inputs)), strict=True))
@@ -120,7 +120,7 @@ class OnnxDetector:
             raise ModelError(f"{self.model}: {first_line(error)}") from error
 
     def _detections(self, named: Mapping[str, np.ndarray]) -> Detections:
-        """The answer as detections; ModelError where its shapes do not fit."""
+        """Return the answer as detections; ModelError where its shapes do not fit."""
         boxes, scores = (_without_batch(np.asarray(named[key]), key) for key in ("boxes", "scores"))
         labels = named.get("labels")
         if scores.ndim == 2 and scores.shape[1] == 1 and labels is not None:
@@ -194,7 +194,7 @@ class OnnxDetector:
         return one.name, shape
 
     def _find_outputs(self, mapping: Mapping[str, str]) -> Mapping[str, str]:
-        """The names of boxes, scores and, where there are any, labels."""
+        """Return the names of boxes, scores and, where there are any, labels."""
         unknown = sorted(set(mapping) - set(_KEYS))
         if unknown:
             raise ConfigError(f"detector.options.outputs: {unknown[0]}: use {', '.join(_KEYS)}")
@@ -212,12 +212,12 @@ class OnnxDetector:
 
 
 def _free(size: int | str | None) -> bool:
-    """Whether a dimension of a shape is not fixed."""
+    """Return whether a dimension of a shape is not fixed."""
     return not isinstance(size, int)
 
 
 def _without_batch(answer: np.ndarray, key: str) -> np.ndarray:
-    """An output without its leading batch of one."""
+    """Return an output without its leading batch of one."""
     batched = answer.ndim == 3 or (key == "scores" and answer.ndim == 2 and answer.shape[0] == 1)
     return answer[0] if batched and answer.shape[0] == 1 else answer
 
@@ -230,7 +230,7 @@ def _convention(options: Mapping[str, Any]) -> BoxConvention:
 
 
 def _function(name: str) -> Callable[[Any], Any]:
-    """The function that `package.module:function` names."""
+    """Return the function that `package.module:function` names."""
     module_name, _, function_name = name.partition(":")
     try:
         found = getattr(importlib.import_module(module_name), function_name)
@@ -250,7 +250,7 @@ def _called(function: Callable[[Any], Any], given: Any, model: Path) -> Mapping[
 
 
 def _suppressed(found: Detections, nms_iou: float) -> Detections:
-    """The detections that no better one of their category suppresses."""
+    """Return the detections that no better one of their category suppresses."""
     kept = [np.zeros(0, dtype=np.int64)]
     for category in np.unique(found.categories):
         index = np.flatnonzero(found.categories == category)

@@ -36,7 +36,7 @@ class Estimate:
 
     @classmethod
     def of(cls, value: float, replicates: Float[np.ndarray, " r"], level: float) -> Self:
-        """The figure, and the interval that holds the share `level` of its (r,) replicates.
+        """Return the figure, and the interval that holds the share `level` of its (r,) replicates.
 
         Undefined replicates are left out; the interval is NaN where all of them are.
         """
@@ -116,7 +116,7 @@ class Audit:
     comparisons: tuple[Comparison, ...]
 
     def whole(self, category: str = ALL) -> dict[str, Figures]:
-        """The figures of all distances and point counts, by policy."""
+        """Return the figures of all distances and point counts, by policy."""
         return {
             found.policy: found
             for found in self.figures
@@ -124,7 +124,7 @@ class Audit:
         }
 
     def compare(self, policy: str, other: str, category: str = ALL) -> Comparison:
-        """The comparison of two policies, in this order."""
+        """Return the comparison of two policies, in this order."""
         for found in self.comparisons:
             if (found.category, found.policy, found.other) == (category, policy, other):
                 return found
@@ -143,7 +143,7 @@ def audit(
     level: float = 0.95,
     bins: int = 10,
 ) -> Audit:
-    """All figures, with intervals.
+    """Return all figures, with intervals.
 
     Args:
         labels: see `JudgedLabels`.
@@ -213,7 +213,7 @@ def _figures(
     level: float,
     bins: int,
 ) -> tuple[Figures, np.ndarray]:
-    """The figures of one policy, and the replicates of its AUROC."""
+    """Return the figures of one policy, and the replicates of its AUROC."""
     v, right = of_all[sample.index], sample.right
     frames = draws.shape[1]
     objects = 0 if sample.objects is None else int(sample.objects.sum())
@@ -260,7 +260,7 @@ def _calibration_replicates(
 def _comparisons(
     figures: Sequence[Figures], aurocs: Mapping[str, np.ndarray], level: float
 ) -> list[Comparison]:
-    """Every policy with each that follows it."""
+    """Return every policy with each that follows it."""
     return [
         Comparison(
             one.category,
@@ -278,7 +278,7 @@ def _comparisons(
 
 
 def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """(r,) part / whole, NaN where the whole is 0."""
+    """Return (r,) part / whole, NaN where the whole is 0."""
     return np.asarray(part / np.where(whole > 0, whole, np.nan))
 
 

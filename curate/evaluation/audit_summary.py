@@ -48,7 +48,7 @@ def as_numbers(audit: Audit) -> dict[str, Any]:
 
 
 def _flat(found: Figures) -> dict[str, Any]:
-    """The figures, their bins as rows."""
+    """Return the figures, their bins as rows."""
     bins = found.bins
     rows = [
         {
@@ -149,7 +149,7 @@ def _weight_by_correctness(policies: Sequence[Figures]) -> Iterator[str]:
 
 
 def _verdict(found: Comparison) -> str:
-    """Whether a difference is more than chance."""
+    """Return whether a difference is more than chance."""
     interval = (
         f"{found.difference.value:.3f} ({found.difference.low:.3f} to {found.difference.high:.3f})"
     )
@@ -159,7 +159,7 @@ def _verdict(found: Comparison) -> str:
 
 
 def _by_auroc(by_policy: dict[str, Figures], names: Sequence[str]) -> list[Figures]:
-    """The figures of those whose AUROC is defined, the best first."""
+    """Return the figures of those whose AUROC is defined, the best first."""
     defined = [by_policy[name] for name in names if not math.isnan(by_policy[name].auroc.value)]
     return sorted(defined, key=lambda found: -found.auroc.value)
 

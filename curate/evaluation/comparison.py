@@ -54,7 +54,7 @@ def spread(values: Float[np.ndarray, " n"]) -> Spread:
 def paired_difference(
     values: Float[np.ndarray, " n"], others: Float[np.ndarray, " n"], level: float = 0.95
 ) -> PairedDifference:
-    """The mean of values - others with its t interval.
+    """Return the mean of values - others with its t interval.
 
     Args:
         values: (n,), NaN where it was not measured.

@@ -47,7 +47,7 @@ class Finding:
 
 
 def examine_frame(frame: Frame) -> list[Finding]:
-    """Checks of points, calibration and image.
+    """Check of points, calibration and image.
 
     Args:
         frame: with all its points.
@@ -79,7 +79,7 @@ def examine_frame(frame: Frame) -> list[Finding]:
 
 
 def examine_detections(frame: Frame, found: Detections, categories: Sequence[str]) -> list[Finding]:
-    """Checks of a detector's answer.
+    """Check of a detector's answer.
 
     Args:
         frame: with the points that the detector saw.
@@ -206,7 +206,7 @@ def _suspects(calibration: Calibration) -> Mapping[str, tuple[_Reading, float]]:
 def _with(
     boxes: np.ndarray, yaw: np.ndarray | None = None, centres: np.ndarray | None = None
 ) -> np.ndarray:
-    """The boxes with another yaw or other centres."""
+    """Return the boxes with another yaw or other centres."""
     changed = boxes.copy()
     if yaw is not None:
         changed[:, 6] = wrap_angle(yaw)

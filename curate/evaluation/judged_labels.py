@@ -70,7 +70,7 @@ class JudgedLabels:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The frames of all parts, one after the other."""
+        """Return the frames of all parts, one after the other."""
         starts = np.cumsum([0, *(part.frames for part in parts)])
         numbered = [cls.no_frames()] + [
             replace(
@@ -110,7 +110,7 @@ class Slice:
     high: float = np.inf
 
     def holds(self, values: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """(n,) bool, which of the values it holds."""
+        """Return (n,) bool, which of the values it holds."""
         return np.asarray((values >= self.low) & (values < self.high))
 
     def __str__(self) -> str:
@@ -127,13 +127,13 @@ def judge_frames(frames: Iterable[AuditedFrame], settings: JudgeSettings) -> Jud
     """Ask the truth about the labels of some frames.
 
     Raises:
-        ConfigError: a label's category has no minimum IoU.
+        ConfigError: if a label's category has no minimum IoU.
     """
     return JudgedLabels.joined([_judge_frame(frame, settings) for frame in frames])
 
 
 def slices(labels: JudgedLabels) -> tuple[Slice, ...]:
-    """The ranges of distance, and those of point counts where points were counted."""
+    """Return the ranges of distance, and those of point counts where points were counted."""
     edges: dict[str, tuple[float, ...]] = {"distance": DISTANCES}
     if not np.isnan(labels.points).all():
         edges["points"] = POINTS

@@ -125,7 +125,7 @@ def evaluate(
         kit_sampling: for fewer than 41 objects, sample recall as KITTI's program does.
 
     Raises:
-        DataError: the numbers of frames differ, or a detection has no score.
+        DataError: if the numbers of frames differ, or a detection has no score.
     """
     check_frames(labels, results)
     pooled_labels, pooled_results = PooledFrames.of(labels), PooledFrames.of(results)
@@ -154,7 +154,7 @@ def evaluate(
 
 
 def check_frames(labels: Sequence[KittiObjects], results: Sequence[KittiObjects]) -> None:
-    """Raises `DataError` unless there are as many results as labels and all have scores."""
+    """Raise `DataError` unless there are as many results as labels and all have scores."""
     if len(labels) != len(results):
         raise DataError(
             f"labels of {len(labels)} frames cannot be compared with results of {len(results)}: "
@@ -213,7 +213,7 @@ class _Match:
         return float(np.sum(found) / max(np.sum(counted), 1))
 
     def _orientation_gains(self, pairs: Candidates) -> np.ndarray:
-        """(pairs,) (1 + cos of the difference of the observation angles) / 2."""
+        """Return (pairs,) (1 + cos of the difference of the observation angles) / 2."""
         rows = np.repeat(np.arange(len(self._labels)), np.diff(pairs.starts))
         apart = self._labels.alpha[rows] - self._results.alpha[pairs.results]
         gains: np.ndarray = (1 + np.cos(apart)) / 2
@@ -221,7 +221,7 @@ class _Match:
 
 
 def score_thresholds(scores: Float[np.ndarray, " n"], count: int) -> Float[np.ndarray, " t"]:
-    """The kit's score thresholds: at most 41, each the nearest to the next 1/40 of recall.
+    """Return the kit's score thresholds: at most 41, each the nearest to the next 1/40 of recall.
 
     Args:
         scores: (n,) of the detections that found an object.
@@ -257,7 +257,7 @@ def _running_maximum(values: np.ndarray) -> np.ndarray:
 
 
 def _at_true_recall(curve: np.ndarray, count: int) -> np.ndarray:
-    """The curve of fewer than 41 objects, whose positions are objects, by recall."""
+    """Return the curve of fewer than 41 objects, whose positions are objects, by recall."""
     if count >= _POSITIONS or count == 0:
         return curve
     # Position k of 40 needs ceil(k * count / 40) objects; the first of them is at index 0.

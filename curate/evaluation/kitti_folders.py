@@ -47,7 +47,7 @@ def read_folders(
         The frame ids in sorted order, the labels and the results of each.
 
     Raises:
-        DataError: a folder or file is missing, damaged or malformed.
+        DataError: if a folder or file is missing, damaged or malformed.
     """
     labels, results = Path(labels), Path(results)
     labelled, answered = _frame_ids(labels), _frame_ids(results)
@@ -65,7 +65,7 @@ def read_folders(
 
 
 def _frame_ids(folder: Path) -> set[str]:
-    """The names of the text files in a folder."""
+    """Return the names of the text files in a folder."""
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; name one with a text file per frame")
     # macOS strews hidden ._ files over foreign disks.
@@ -76,7 +76,7 @@ def _frame_ids(folder: Path) -> set[str]:
 
 
 def _require_files(missing: set[str], folder: Path, kind: str) -> None:
-    """Raises `DataError` where frames have no file."""
+    """Raise `DataError` where frames have no file."""
     if not missing:
         return
     first = min(missing)

@@ -32,7 +32,7 @@ class PooledFrames:
 
     @classmethod
     def of(cls, frames: Sequence[KittiObjects]) -> Self:
-        """The frames, in their order."""
+        """Return the frames, in their order."""
         starts = np.zeros(len(frames) + 1, dtype=np.int64)
         np.cumsum([len(frame) for frame in frames], out=starts[1:])
         whole = [KittiObjects.empty(), *frames]
@@ -43,7 +43,7 @@ class PooledFrames:
         return cls(KittiObjects(*columns), starts)
 
     def select(self, keep: Bool[np.ndarray, " n"]) -> Self:
-        """The frames with only the objects in the mask `keep`."""
+        """Return the frames with only the objects in the mask `keep`."""
         kept_before = np.concatenate([[0], np.cumsum(keep)])
         return type(self)(self.objects.select(keep), kept_before[self.starts])
 
@@ -79,7 +79,7 @@ class Contest(NamedTuple):
 
 
 def candidates_by_metric(labels: PooledFrames, results: PooledFrames) -> dict[str, Candidates]:
-    """The overlapping pairs within frames, per metric."""
+    """Return the overlapping pairs within frames, per metric."""
     count = len(labels.objects)
     on_image = _image_pairs(
         labels.objects.boxes_2d, labels.starts, results.objects.boxes_2d, results.starts
@@ -103,7 +103,7 @@ def dont_care_shares(labels: PooledFrames, results: PooledFrames) -> Float[np.nd
 
 
 def camera_boxes(objects: KittiObjects) -> Float[np.ndarray, "n 7"]:
-    """(n, 7) centre boxes in a frame with x to the right, y forward and z up, in metres.
+    """Return (n, 7) centre boxes in a frame with x to the right, y forward and z up, in metres.
 
     The camera's frame turned by 90 degrees, not the LiDAR frame: overlaps need no calibration.
     Seen from above, rotation_y turns clockwise.
@@ -158,7 +158,7 @@ def _image_pairs(
 def _covered_shares(
     regions: np.ndarray, region_starts: np.ndarray, boxes: np.ndarray, starts: np.ndarray
 ) -> np.ndarray:
-    """The kernel of `dont_care_shares`."""
+    """Return the kernel of `dont_care_shares`."""
     shares = np.zeros(len(boxes))
     for frame in range(len(starts) - 1):
         for j in range(starts[frame], starts[frame + 1]):
@@ -202,7 +202,7 @@ def scores_of_found(candidates: Candidates, contest: Contest) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def match_results(candidates: Candidates, contest: Contest, threshold: float) -> np.ndarray:
-    """(labels,) int64 row of the detection that each object takes, -1 where none.
+    """Return (labels,) int64 row of the detection that each object takes, -1 where none.
 
     Objects choose in the order of the labels, among the free detections with a score of at least
     `threshold`: the counted one with the greatest overlap, else the first ignored one.
@@ -235,7 +235,7 @@ def tally(
     in_dont_care: np.ndarray,
     orientation_gains: np.ndarray,
 ) -> np.ndarray:
-    """Counts at each score threshold.
+    """Count at each score threshold.
 
     Args:
         candidates: overlapping pairs.

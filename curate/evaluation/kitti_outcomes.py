@@ -59,7 +59,7 @@ class Outcomes(Columns):
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The rows of all parts."""
+        """Return the rows of all parts."""
         return cls(
             *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls))
         )
@@ -85,8 +85,8 @@ def object_outcomes(
         min_overlaps: the categories to evaluate, and the overlap that a detection must exceed.
 
     Raises:
-        ConfigError: there is no such metric or difficulty.
-        DataError: the numbers of frames differ, or a detection has no score.
+        ConfigError: if there is no such metric or difficulty.
+        DataError: if the numbers of frames differ, or a detection has no score.
     """
     if metric not in METRICS or difficulty not in DIFFICULTIES:
         raise ConfigError(
@@ -171,7 +171,7 @@ def _rows(
 
 
 def _inverse(matches: np.ndarray, count: int) -> np.ndarray:
-    """(count,) row whose match each is, -1 where none."""
+    """Return (count,) row whose match each is, -1 where none."""
     inverse = np.full(count, -1)
     rows = np.flatnonzero(matches >= 0)
     inverse[matches[rows]] = rows
@@ -181,7 +181,7 @@ def _inverse(matches: np.ndarray, count: int) -> np.ndarray:
 def _with_ignored(
     states: np.ndarray, matches: np.ndarray, states_of_others: np.ndarray
 ) -> np.ndarray:
-    """(n,) bool, whether a row or its match is ignored."""
+    """Return (n,) bool, whether a row or its match is ignored."""
     matched = matches >= 0
     ignored: np.ndarray = states == IGNORED
     ignored[matched] |= states_of_others[matches[matched]] == IGNORED
@@ -191,7 +191,7 @@ def _with_ignored(
 def _overlaps(
     candidates: Candidates, contest: Contest, finders: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(labels,) and (results,) overlap with the match, else the greatest that took part."""
+    """Return (labels,) and (results,) overlap with the match, else the greatest that took part."""
     rows = np.repeat(np.arange(len(finders)), np.diff(candidates.starts))
     takes_part = contest.label_states[rows] != ABSENT
     takes_part &= contest.result_states[candidates.results] != ABSENT

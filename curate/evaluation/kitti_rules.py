@@ -32,7 +32,7 @@ COUNTED, IGNORED, ABSENT = 0, 1, -1
 
 
 def label_states(labels: KittiObjects, category: str, difficulty: int) -> Int[np.ndarray, " n"]:
-    """(n,) int8 state of each labelled object.
+    """Return (n,) int8 state of each labelled object.
 
     Args:
         labels: n objects.
@@ -53,7 +53,7 @@ def label_states(labels: KittiObjects, category: str, difficulty: int) -> Int[np
 
 
 def result_states(results: KittiObjects, category: str, difficulty: int) -> Int[np.ndarray, " n"]:
-    """(n,) int8 state of each detection.
+    """Return (n,) int8 state of each detection.
 
     A detection that is too low in the image is ignored whatever its category, so that a low
     detection of another category can take an object out of the count; this is KITTI's own rule.

@@ -67,7 +67,7 @@ class LabelChanges:
         return change
 
     def largest(self, count: int) -> tuple[Int[np.ndarray, "c 2"], Float[np.ndarray, " c"]]:
-        """The labels whose weight changed most; a lost or gained one changes from or to 0.
+        """Return the labels whose weight changed most; a lost or gained one changes from or to 0.
 
         Returns:
             (c, 2) rows before and after, -1 for none, and (c,) changes, the largest first; labels
@@ -90,7 +90,7 @@ class LabelChanges:
 def compare_labels(
     before: RoundLabels, after: RoundLabels, minimum_iou: float = 0.1
 ) -> LabelChanges:
-    """Matches labels of the same frame and category, the largest BEV IoU first.
+    """Match labels of the same frame and category, the largest BEV IoU first.
 
     Args:
         before: labels of the earlier round.
@@ -120,7 +120,7 @@ def compare_labels(
 
 
 def _groups(labels: RoundLabels) -> np.ndarray:
-    """(n,) a number per frame and category."""
+    """Return (n,) a number per frame and category."""
     number: np.ndarray = labels.frames.astype(np.int64) * 2**20 + labels.categories
     return number
 

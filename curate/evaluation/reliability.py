@@ -45,7 +45,7 @@ class JudgeSettings:
     dont_care_share: float = 0.5
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for an unknown option."""
+        """Raise ConfigError for an unknown option."""
         if self.overlap not in get_args(Overlap):
             raise ConfigError(f"reliability: unknown overlap {self.overlap!r}; choose bev or 3d")
         if self.neighbors_are not in get_args(Neighbors):
@@ -97,7 +97,7 @@ def judge(
             None leaves DontCare regions out of account.
 
     Raises:
-        ConfigError: a label's category has no minimum IoU.
+        ConfigError: if a label's category has no minimum IoU.
     """
     n = len(detections)
     right, neutral = np.zeros((2, n), dtype=bool)
@@ -203,7 +203,7 @@ def expected_calibration_error(
 
 
 def _minimum_iou(settings: JudgeSettings, category: str) -> float:
-    """The category's minimum IoU."""
+    """Return the category's minimum IoU."""
     if category not in settings.minimum_iou:
         raise ConfigError(
             f"reliability: no minimum IoU for category {category}; add it to minimum_iou"
@@ -223,13 +223,13 @@ def _own_and_neighbors(
 
 
 def _overlaps(boxes: np.ndarray, others: np.ndarray, overlap: Overlap) -> np.ndarray:
-    """(n, m) IoU."""
+    """Return (n, m) IoU."""
     iou: np.ndarray = bev_iou(boxes, others) if overlap == "bev" else iou_3d(boxes, others)
     return iou
 
 
 def _take_by_score(iou: np.ndarray, rows: Detections, minimum: float) -> np.ndarray:
-    """(n,) column that each row takes, -1 for none; rows choose by falling score."""
+    """Return (n,) column that each row takes, -1 for none; rows choose by falling score."""
     taken = np.full(len(iou), -1, dtype=np.int64)
     if iou.shape[1] == 0:
         return taken
@@ -244,7 +244,7 @@ def _take_by_score(iou: np.ndarray, rows: Detections, minimum: float) -> np.ndar
 
 
 def _in_dont_care(rectangles: np.ndarray, annotations: Annotations, share: float) -> np.ndarray:
-    """(n,) bool, whether more than `share` of the rectangle lies in one DontCare region."""
+    """Return (n,) bool, whether more than `share` of the rectangle lies in one DontCare region."""
     regions = annotations.boxes_2d[annotations.categories == DONT_CARE]
     low = np.maximum(rectangles[:, None, :2], regions[None, :, :2])
     high = np.minimum(rectangles[:, None, 2:], regions[None, :, 2:])

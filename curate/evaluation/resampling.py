@@ -14,7 +14,7 @@ _BLOCK = 256  # draws whose sums stay in the fastest cache
 def draw_frames(
     generator: np.random.Generator, frames: int, replicates: int
 ) -> Float[np.ndarray, "r f"]:
-    """(r, f) float64, how often each of f frames is among f that are drawn with replacement.
+    """Return (r, f) float64, how often each of f frames is among f that are drawn with replacement.
 
     A frame's column lies in one piece, as `ranked_replicates` reads it.
     """

@@ -92,7 +92,7 @@ class LabelSet:
     columns: tuple[Column, ...] = WEIGHTED_LABELS
 
     def __post_init__(self) -> None:
-        """Checks the splits of the frames and of the ground truth."""
+        """Check the splits of the frames and of the ground truth."""
         for each in self.frames:
             if each.split not in ("labeled", "unlabeled"):
                 raise LeakageError(
@@ -119,7 +119,7 @@ class LabelSet:
         """Walk through the labels once, and check them on the way.
 
         Raises:
-            DataError: a weight is not a number in [0, 1], a label is of a frame outside the
+            DataError: if a weight is not a number in [0, 1], a label is of a frame outside the
                 unlabeled split, or a block has other columns.
         """
         unlabeled = self._of_split("unlabeled")
@@ -156,11 +156,11 @@ class Exporter(Protocol):
     """Of the file, such as ".sqlite"; "" for a format that is a folder."""
 
     def write(self, path: Path, labels: LabelSet) -> int:
-        """Writes the file or folder `path`; returns how many labels are in it.
+        """Write the file or folder `path`; returns how many labels are in it.
 
         Raises:
-            ConfigError: something else is in the place.
-            DataError: a label cannot be, such as one with a weight that is not in [0, 1].
+            ConfigError: if something else is in the place.
+            DataError: if a label cannot be, such as one with a weight that is not in [0, 1].
         """
         ...
 
@@ -189,7 +189,7 @@ def _frame_of(part: Columns) -> str:
 
 
 def _plain(block: Block, names: Sequence[str]) -> Columns:
-    """The columns by name and in order, in plain Python values."""
+    """Return the columns by name and in order, in plain Python values."""
     if set(block) != set(names) or len({len(values) for values in block.values()}) != 1:
         raise DataError(
             f"a block of labels has the columns {', '.join(block)}; it needs {', '.join(names)}, "

@@ -36,7 +36,7 @@ class CocoExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
-            DataError: the calibration or the image of a frame cannot be read.
+            DataError: if the calibration or the image of a frame cannot be read.
         """
         check_place(path, says("info", _FORMAT))
         frames = list(frame_objects(labels))
@@ -91,7 +91,7 @@ def _image(number: int, objects: FrameObjects, frame: Frame) -> dict[str, Any]:
 def _annotations(
     objects: FrameObjects, frame: Frame, ids: dict[str, int]
 ) -> Iterator[dict[str, Any]]:
-    """The objects of a frame without their places in the file."""
+    """Yield the objects of a frame without their places in the file."""
     found = objects.detections
     seen = np.nan_to_num(image_rectangles(found.boxes, frame.calibration, frame.image_size))
     sizes = seen[:, 2:] - seen[:, :2]

@@ -25,7 +25,7 @@ _PICKLE_PROTOCOL = 4
 def write_folder(
     directory: Path, format_name: str, fill: Callable[[Path], Mapping[str, Any]]
 ) -> Mapping[str, Any]:
-    """Writes an export folder, whole or not at all; a former export in its place is replaced.
+    """Write an export folder, whole or not at all; a former export in its place is replaced.
 
     Args:
         directory: absent, empty, or a former export of the same format.
@@ -36,7 +36,7 @@ def write_folder(
         What `fill` returned.
 
     Raises:
-        ConfigError: the directory holds something else.
+        ConfigError: if the directory holds something else.
     """
     check_place(directory, lambda former: _is_former(former, format_name))
     partial = _own_partial(directory)
@@ -52,7 +52,7 @@ def write_folder(
 
 
 def write_pickle(path: Path, value: Any) -> None:
-    """Writes plain containers of numpy arrays so that any numpy reads them.
+    """Write plain containers of numpy arrays so that any numpy reads them.
 
     numpy 2 names a module in its own pickles that releases before 1.26 do not have, and these are
     what the frameworks that read such files run on.
@@ -72,7 +72,7 @@ class _ArrayPickler(pickle.Pickler):
 
 
 def _is_former(directory: Path, format_name: str) -> bool:
-    """Whether a folder is empty, or an export of that format."""
+    """Return whether a folder is empty, or an export of that format."""
     if directory.is_dir() and not any(directory.iterdir()):
         return True
     marker = json.loads((directory / _MARKER).read_text(encoding="utf-8"))
@@ -93,7 +93,7 @@ def _own_partial(directory: Path) -> Path:
 
 
 def _runs(process: int) -> bool:
-    """Whether a process of this machine has that number, and is not this one."""
+    """Return whether a process of this machine has that number, and is not this one."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -104,7 +104,7 @@ def _runs(process: int) -> bool:
 
 
 def _take_place(partial: Path, directory: Path) -> None:
-    """Moves a finished folder to its place, and what was there out of the way first."""
+    """Move a finished folder to its place, and what was there out of the way first."""
     former = partial.with_suffix(".former")
     shutil.rmtree(former, ignore_errors=True)
     if directory.exists():

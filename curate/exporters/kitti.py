@@ -68,7 +68,7 @@ class KittiExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
-            DataError: the calibration or the image of a frame cannot be read.
+            DataError: if the calibration or the image of a frame cannot be read.
         """
         zero_weight = labels.description.zero_weight
         return export_kitti(path, _weighted_frames(labels), zero_weight=zero_weight)
@@ -81,7 +81,7 @@ def export_kitti(
     last_field: LastField = "weight",
     zero_weight: ZeroWeight = "background",
 ) -> int:
-    """Writes an export folder, whole or not at all; a former export in its place is replaced.
+    """Write an export folder, whole or not at all; a former export in its place is replaced.
 
     Args:
         directory: absent, empty, or a former export.
@@ -93,8 +93,8 @@ def export_kitti(
         How many labels were written.
 
     Raises:
-        ConfigError: the directory holds something else, or `last_field` is unknown.
-        DataError: a weight is not in [0, 1], or a frame occurs twice.
+        ConfigError: if the directory holds something else, or `last_field` is unknown.
+        DataError: if a weight is not in [0, 1], or a frame occurs twice.
     """
     if last_field not in get_args(LastField):
         raise ConfigError(f"last field {last_field!r}: use one of {', '.join(get_args(LastField))}")
@@ -104,7 +104,7 @@ def export_kitti(
 
 
 def _weighted_frames(labels: LabelSet) -> Iterator[WeightedFrame]:
-    """The unlabeled frames with their labels."""
+    """Yield the unlabeled frames with their labels."""
     for objects in frame_objects(labels):
         if objects.labeled:
             continue

@@ -51,7 +51,7 @@ def open_label_file(path: Path) -> Iterator[sqlite3.Connection]:
     """A connection that can only read the file, whose tables are what an export makes.
 
     Raises:
-        DataError: the file is missing or damaged, or of another version or kind.
+        DataError: if the file is missing or damaged, or of another version or kind.
     """
     if not path.is_file():
         raise DataError(f"{path}: no such label file; export the labels first")
@@ -73,7 +73,7 @@ def read_meta(rows: sqlite3.Connection, path: Path) -> Mapping[str, str]:
     """What the file says about itself.
 
     Raises:
-        DataError: it is of another version, or says too little.
+        DataError: if it is of another version, or says too little.
     """
     meta = dict(rows.execute("SELECT key, value FROM meta"))
     version = meta.get("format_version")
@@ -91,7 +91,7 @@ def read_meta(rows: sqlite3.Connection, path: Path) -> Mapping[str, str]:
 
 
 def read_categories(meta: Mapping[str, str], path: Path) -> tuple[str, ...]:
-    """The categories to learn; DataError where they are no list of names."""
+    """Return the categories to learn; DataError where they are no list of names."""
     try:
         names = json.loads(meta["categories"])
     except (ValueError, RecursionError):
@@ -107,7 +107,7 @@ def read_zero_weight(meta: Mapping[str, str], path: Path) -> ZeroWeight:
     """Return what a label of weight 0 is; "ignore" where an older file does not say.
 
     Raises:
-        DataError: it is neither "background" nor "ignore".
+        DataError: if it is neither "background" nor "ignore".
     """
     match meta.get("zero_weight", "ignore"):
         case "background":
@@ -122,7 +122,7 @@ def read_zero_weight(meta: Mapping[str, str], path: Path) -> ZeroWeight:
 
 
 def check_leakage(rows: sqlite3.Connection, path: Path) -> None:
-    """LeakageError where a label file holds ground truth of frames that are not labeled."""
+    """Raise LeakageError if a label file holds ground truth of frames that are not labeled."""
     leaked = rows.execute(
         "SELECT DISTINCT frame FROM ground_truth WHERE frame NOT IN "
         "(SELECT frame FROM frame WHERE split = 'labeled') ORDER BY frame"
@@ -139,7 +139,7 @@ def read_frames(path: Path) -> LabelFileFrames:
     """Which frames a label file speaks of.
 
     Raises:
-        DataError: the file is missing or damaged, or of another version or kind.
+        DataError: if the file is missing or damaged, or of another version or kind.
     """
     with open_label_file(path) as rows:
         read_meta(rows, path)
@@ -156,7 +156,7 @@ def read_label_rows(
     """Open a label file for its labels: the Python type of each column, and the rows.
 
     Raises:
-        DataError: the file is missing or damaged, or of another version or kind.
+        DataError: if the file is missing or damaged, or of another version or kind.
     """
     with open_label_file(path) as rows:
         read_meta(rows, path)
@@ -166,7 +166,7 @@ def read_label_rows(
 
 
 def _check_tables(rows: sqlite3.Connection, path: Path) -> None:
-    """DataError where a table is not the one that an export makes."""
+    """Raise DataError if a table is not the one that an export makes."""
     found = dict(rows.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     for name, statement in _statements().items():
         if name not in found:
@@ -181,7 +181,7 @@ def _check_tables(rows: sqlite3.Connection, path: Path) -> None:
 
 
 def _statements() -> Mapping[str, str]:
-    """A pattern of the bare CREATE TABLE statement of each table."""
+    """Return a pattern of the bare CREATE TABLE statement of each table."""
     parts = [part.strip() for part in _bare(tables()).split(";") if part.strip()]
     patterns = {part.split()[2]: re.escape(part) for part in parts}
     core, generated, rest = patterns["label"].partition(re.escape(" split TEXT GENERATED"))
@@ -189,5 +189,5 @@ def _statements() -> Mapping[str, str]:
 
 
 def _bare(statement: str) -> str:
-    """An SQL statement without comments, its spaces made one."""
+    """Return an SQL statement without comments, its spaces made one."""
     return " ".join(re.sub(r"--[^\n]*", " ", statement).split())

@@ -51,7 +51,7 @@ class MMDet3DExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
-            DataError: the calibration or the image of a frame cannot be read.
+            DataError: if the calibration or the image of a frame cannot be read.
         """
         return int(write_folder(path, _FORMAT, partial(_fill, labels=labels))["labels"])
 

@@ -36,8 +36,8 @@ class NuScenesExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
-            ConfigError: the data set has no poses.
-            DataError: the calibration of a frame cannot be read, or a category is none of
+            ConfigError: if the data set has no poses.
+            DataError: if the calibration of a frame cannot be read, or a category is none of
                 nuScenes'.
         """
         check_place(path, says("meta", _FORMAT))
@@ -74,7 +74,7 @@ class NuScenesExporter:
 
 
 def _boxes(objects: FrameObjects, calibration: Calibration) -> list[dict[str, Any]]:
-    """The labels of a frame in the frame of the map."""
+    """Return the labels of a frame in the frame of the map."""
     pose = calibration.pose_in_map()
     found = objects.detections
     centres = found.boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3]
@@ -97,7 +97,7 @@ def _boxes(objects: FrameObjects, calibration: Calibration) -> list[dict[str, An
 
 
 def _quaternions(pose: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-    """(n, 4) w, x, y, z in the map of boxes with a yaw in the LiDAR's frame."""
+    """Return (n, 4) w, x, y, z in the map of boxes with a yaw in the LiDAR's frame."""
     if len(yaw) == 0:
         return np.zeros((0, 4))
     turns = Rotation.from_matrix(pose[:3, :3]) * Rotation.from_euler("z", yaw[:, None])

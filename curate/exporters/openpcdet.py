@@ -47,7 +47,7 @@ class OpenPCDetExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
-            DataError: the calibration, the image or the points of a frame cannot be read.
+            DataError: if the calibration, the image or the points of a frame cannot be read.
         """
         return int(write_folder(path, _FORMAT, partial(_fill, labels=labels))["labels"])
 
@@ -91,7 +91,7 @@ def _info(objects: FrameObjects, frame: Frame) -> Info:
 
 
 def _annos(objects: FrameObjects, shown: KittiObjects) -> Info:
-    """The arrays of a frame's objects, all of the same length."""
+    """Return the arrays of a frame's objects, all of the same length."""
     found, count = objects.detections, len(objects.detections)
     names = np.where(objects.weights == 0, DONT_CARE, found.categories)
     return {
@@ -115,7 +115,7 @@ def _annos(objects: FrameObjects, shown: KittiObjects) -> Info:
 
 
 def _cut_out(folder: Path, frame: Frame, annos: Info, database: dict[str, list[Info]]) -> None:
-    """Writes the points of a labeled frame's objects, and counts them in its annos."""
+    """Write the points of a labeled frame's objects, and counts them in its annos."""
     for k, box in enumerate(annos["gt_boxes_lidar"]):
         points = frame.points[points_in_box_mask(frame.points, box)].astype(np.float32)
         points[:, :3] -= box[:3].astype(np.float32)

@@ -61,7 +61,7 @@ class ParquetExporter:
 
 
 def label_schema(about: LabelFileDescription, columns: Iterable[Column] = WEIGHTED_LABELS) -> Any:
-    """The Arrow schema of a label file, with what the labels are about as its metadata."""
+    """Return the Arrow schema of a label file, with what the labels are about as its metadata."""
     arrow, _ = load_parquet()
     types = {
         "int32": arrow.int32(),
@@ -95,7 +95,7 @@ def _metadata(about: LabelFileDescription) -> dict[str, str]:
 
 
 def _groups(blocks: Iterable[Columns], size: int) -> Iterator[Columns]:
-    """The same rows in blocks of that size, of which the last may be smaller."""
+    """Yield the same rows in blocks of that size, of which the last may be smaller."""
     waiting: dict[str, list[Any]] = {}
     for block in blocks:
         for name, values in block.items():
@@ -108,7 +108,7 @@ def _groups(blocks: Iterable[Columns], size: int) -> Iterator[Columns]:
 
 
 def _batch(arrow: Any, schema: Any, rows: Columns) -> Any:
-    """A record batch of the rows."""
+    """Return a record batch of the rows."""
     columns = []
     for field in schema:
         values = rows[field.name]

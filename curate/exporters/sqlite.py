@@ -75,7 +75,7 @@ class SqliteExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
-            DataError: a row does not fit its table, or the disk is full.
+            DataError: if a row does not fit its table, or the disk is full.
         """
         check_label_file_place(path)
         with whole_file(path) as partial:
@@ -111,7 +111,7 @@ def format_version(columns: Sequence[Column]) -> str:
 
 
 def raise_if_locked(path: Path, error: Exception) -> None:
-    """DataError where a label file could not be read for another program's lock."""
+    """Raise DataError if a label file could not be read for another program's lock."""
     if "locked" in str(error):
         raise DataError(
             f"{path}: another program writes into it; end that one and run the command again"
@@ -178,7 +178,7 @@ def _insertion(table: str, names: Sequence[str]) -> str:
 
 
 def _meta(about: LabelFileDescription, version: str) -> Mapping[str, str]:
-    """The rows of `meta`."""
+    """Return the rows of `meta`."""
     return {
         "format_version": version,
         "dataset": about.dataset,

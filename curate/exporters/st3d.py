@@ -44,7 +44,7 @@ class ST3DExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
-            DataError: a label's category is not among the configured ones.
+            DataError: if a label's category is not among the configured ones.
         """
         return int(write_folder(path, _FORMAT, partial(_fill, labels=labels))["labels"])
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Writes `content` to `path`; a reader, or a kill at any moment, never sees half of it.
+    """Write `content` to `path`; a reader, or a kill at any moment, never sees half of it.
 
     Missing parent folders are made. An existing file is replaced.
     """

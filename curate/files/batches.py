@@ -8,7 +8,7 @@ Item = TypeVar("Item")
 
 
 def batched(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
-    """The items, `size` at a time, in their order."""
+    """Yield the items, `size` at a time, in their order."""
     walk = iter(items)
     while batch := list(islice(walk, size)):
         yield batch

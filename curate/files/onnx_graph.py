@@ -25,13 +25,13 @@ class GraphBuilder:
         self._constants: list = []
 
     def node(self, operator: str, *inputs: str, **attributes: Any) -> str:
-        """Adds an operator with one output."""
+        """Add an operator with one output."""
         name = f"value{len(self._nodes)}"
         self._nodes.append(helper.make_node(operator, inputs, [name], **attributes))
         return name
 
     def constant(self, array: np.ndarray) -> str:
-        """Adds a constant."""
+        """Add a constant."""
         name = f"constant{len(self._constants)}"
         self._constants.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
         return name
@@ -44,7 +44,7 @@ class GraphBuilder:
         *,
         full_check: bool = False,
     ) -> ModelProto:
-        """The finished and checked model."""
+        """Return the finished and checked model."""
         graph = helper.make_graph(self._nodes, name, inputs, outputs, self._constants)
         opsets = [helper.make_opsetid("", _OPSET)]
         model = helper.make_model(graph, opset_imports=opsets, ir_version=_IR_VERSION)

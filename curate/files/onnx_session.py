@@ -14,7 +14,7 @@ def are_numbers(answer: Any) -> bool:
 
 
 def open_session(model: Path, threads: int, section: str) -> Any:
-    """A session.
+    """Return a session.
 
     Args:
         model: the .onnx file.
@@ -22,7 +22,7 @@ def open_session(model: Path, threads: int, section: str) -> Any:
         section: of the configuration that names the model, for messages.
 
     Raises:
-        ModelError: the file is missing or no usable ONNX model.
+        ModelError: if the file is missing or no usable ONNX model.
     """
     import onnxruntime
 

@@ -6,7 +6,7 @@ from curate.errors import ConfigError
 
 
 def load_parquet() -> tuple[Any, Any]:
-    """The modules pyarrow and pyarrow.parquet.
+    """Return the modules pyarrow and pyarrow.parquet.
 
     Raises:
         ConfigError: pyarrow is not installed.

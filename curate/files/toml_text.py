@@ -17,11 +17,11 @@ _LONG_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The document in a text.
+    """Return the document in a text.
 
     Raises:
-        ValueError: it is no TOML, longer than any settings, or a key of it has too many parts.
-        RecursionError: its values are nested too deeply.
+        ValueError: if it is no TOML, longer than any settings, or a key of it has too many parts.
+        RecursionError: if its values are nested too deeply.
     """
     if len(text) > MOST_CHARACTERS:
         raise ValueError(f"more than {MOST_CHARACTERS} characters")

@@ -11,7 +11,7 @@ def as_boxes(boxes: Num[np.ndarray, " ..."]) -> Float[np.ndarray, "n 7"]:
     """(n, 7) boxes as C-contiguous float64, the one layout that the kernels are compiled for.
 
     Raises:
-        ValueError: the array is not (n, 7).
+        ValueError: if the array is not (n, 7).
     """
     boxes = np.ascontiguousarray(boxes, dtype=np.float64)
     if boxes.ndim != 2 or boxes.shape[1] != 7:

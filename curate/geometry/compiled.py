@@ -5,7 +5,7 @@ from typing import Any
 
 
 def is_compiled(kernel: Any) -> bool:
-    """Whether numba's cache on disk holds a kernel, as far as names and times of files tell.
+    """Return whether numba's cache on disk holds a kernel, as far as names and times of files tell.
 
     Args:
         kernel: a function under `numba.njit(cache=True)`.

@@ -26,7 +26,7 @@ class GroundMap:
 
     @classmethod
     def of(cls, points: Float[np.ndarray, "n _"]) -> Self:
-        """The map of (n, >=3) points.
+        """Return the map of (n, >=3) points.
 
         A square has the second lowest of its own and its eight neighbours' lowest points, or the
         lowest where there is but one: walls and cars that cover the others do not raise it, nor
@@ -47,7 +47,7 @@ class GroundMap:
         return cls(low, np.where(np.isinf(heights), np.nan, heights))
 
     def at(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """(n,) height of the ground at (n, 2) places, NaN where no point tells."""
+        """Return (n,) height of the ground at (n, 2) places, NaN where no point tells."""
         reach = 2 * _REACH_METRES
         off = np.clip(places, -reach, reach) - self.low
         square = np.floor(off / _SQUARE_METRES).astype(np.int64)
@@ -56,14 +56,14 @@ class GroundMap:
         return np.where(on_map, self.heights[column, row], np.nan)
 
     def lowered(self, rows: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-        """A copy of (n, >=3) points or boxes whose z is measured from the ground below them.
+        """Return a copy of (n, >=3) points or boxes whose z is measured from the ground below them.
 
         Where no point tells how high it is, the ground has the median height of the rest.
         """
         return self._shifted(rows, -1)
 
     def raised(self, rows: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-        """The inverse of `lowered`: a copy whose z is again that of the sensor's frame."""
+        """Return the inverse of `lowered`: a copy whose z is again that of the sensor's frame."""
         return self._shifted(rows, 1)
 
     def _shifted(self, rows: np.ndarray, sign: int) -> np.ndarray:

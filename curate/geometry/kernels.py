@@ -25,7 +25,7 @@ _Pair = tuple[float, float]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rectangle_table(boxes: np.ndarray) -> np.ndarray:
-    """(n, 10) what the other kernels need of (n, 7) boxes, computed once per box.
+    """Return (n, 10) what the other kernels need of (n, 7) boxes, computed once per box.
 
     A box with a side that is not positive gets an area of 0, and one with a number that is not
     finite a row of zeros: they overlap nothing.
@@ -76,7 +76,7 @@ def _edge_integral(from_: _Pair, to: _Pair, half_sides: _Pair) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _precedes(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
-    """Whether row i of `a` is the frame of reference; the same for (a, b) and (b, a)."""
+    """Return whether row i of `a` is the frame of reference; the same for (a, b) and (b, a)."""
     if a[i, _AREA] != b[j, _AREA]:
         return bool(a[i, _AREA] < b[j, _AREA])
     for column in range(_RADIUS):
@@ -117,7 +117,7 @@ def _area_in_frame_of(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _near(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
-    """Whether the circles around a[i] and b[j] meet."""
+    """Return whether the circles around a[i] and b[j] meet."""
     reach = a[i, _RADIUS] + b[j, _RADIUS]
     away_x, away_y = b[j, _X] - a[i, _X], b[j, _Y] - a[i, _Y]
     return bool(away_x * away_x + away_y * away_y < reach * reach)
@@ -159,7 +159,7 @@ def _iou_3d(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def iou_matrix(a: np.ndarray, b: np.ndarray, order: np.ndarray, with_height: bool) -> np.ndarray:
-    """(n, m) IoU of the rectangle tables a and b, of cuboids or of footprints.
+    """Return (n, m) IoU of the rectangle tables a and b, of cuboids or of footprints.
 
     Only pairs whose x ranges can meet are looked at.
 
@@ -186,7 +186,7 @@ def iou_matrix(a: np.ndarray, b: np.ndarray, order: np.ndarray, with_height: boo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def paired_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n,) 3D IoU of row i of the (n, 10) rectangle table a with row i of b."""
+    """Return (n,) 3D IoU of row i of the (n, 10) rectangle table a with row i of b."""
     overlaps = np.zeros(len(a))
     for i in range(len(a)):
         if _near(a, i, b, i):

@@ -24,7 +24,7 @@ class Axes(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _contains(placed: np.ndarray, i: int, x: float, y: float, z: float) -> bool:
-    """Whether box i of `_placed` contains the point."""
+    """Return whether box i of `_placed` contains the point."""
     if not abs(z - placed[i, 2]) <= placed[i, 5]:
         return False
     away_x, away_y = x - placed[i, 0], y - placed[i, 1]
@@ -41,7 +41,7 @@ def _cell(value: float, low: float, cells_per_metre: float) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cell_of_point(x: float, y: float, axes: Axes) -> int:
-    """The cell of a point, -1 outside the grid."""
+    """Return the cell of a point, -1 outside the grid."""
     if not (axes.low_x <= x <= axes.high_x and axes.low_y <= y <= axes.high_y):
         return -1
     column = _cell(x, axes.low_x, axes.cells_per_metre)
@@ -52,7 +52,7 @@ def _cell_of_point(x: float, y: float, axes: Axes) -> int:
 def enter_boxes(
     lows: np.ndarray, highs: np.ndarray, indices: np.ndarray, axes: Axes
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The boxes of every grid cell.
+    """Return the boxes of every grid cell.
 
     Args:
         lows: (k, 2) lowest x and y of each footprint.
@@ -91,7 +91,7 @@ def enter_boxes(
 def count_points(
     points: np.ndarray, placed: np.ndarray, axes: Axes, starts: np.ndarray, entered: np.ndarray
 ) -> np.ndarray:
-    """The kernel of `count_points_in_boxes`."""
+    """Return the kernel of `count_points_in_boxes`."""
     counts = np.zeros(len(placed), np.int64)
     for p in range(len(points)):
         x, y = np.float64(points[p, 0]), np.float64(points[p, 1])
@@ -108,7 +108,7 @@ def count_points(
 def first_box(
     points: np.ndarray, placed: np.ndarray, axes: Axes, starts: np.ndarray, entered: np.ndarray
 ) -> np.ndarray:
-    """The kernel of `box_of_points`."""
+    """Return the kernel of `box_of_points`."""
     owners = np.full(len(points), -1)
     for p in range(len(points)):
         x, y = np.float64(points[p, 0]), np.float64(points[p, 1])

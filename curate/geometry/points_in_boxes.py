@@ -73,7 +73,7 @@ def _as_points(points: np.ndarray) -> np.ndarray:
 
 
 def _placed(boxes: np.ndarray) -> np.ndarray:
-    """(n, 8) centre, half sides, cosine and sine of the yaw; NaN where one is not finite."""
+    """Return (n, 8) centre, half sides, cosine and sine of the yaw; NaN where one is not finite."""
     placed = np.empty((len(boxes), 8))
     placed[:, :3], placed[:, 3:6] = boxes[:, :3], boxes[:, 3:6] / 2
     finite = np.isfinite(boxes).all(axis=1)
@@ -84,7 +84,7 @@ def _placed(boxes: np.ndarray) -> np.ndarray:
 
 
 def _grid(placed: np.ndarray) -> tuple["Axes", np.ndarray, np.ndarray]:
-    """The grid around all boxes, and what `enter_boxes` returns."""
+    """Return the grid around all boxes, and what `enter_boxes` returns."""
     from curate.geometry.point_kernels import Axes, enter_boxes
 
     indices = np.flatnonzero(np.isfinite(placed[:, 0]))

@@ -10,7 +10,7 @@ from curate.geometry.similarity import wrap_angle
 
 
 def rotation_matrices(quaternions: Num[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """(n, 3, 3) rotations of (n, 4) unit quaternions w, x, y, z."""
+    """Return (n, 3, 3) rotations of (n, 4) unit quaternions w, x, y, z."""
     w, x, y, z = np.asarray(quaternions, dtype=np.float64).reshape(-1, 4).T
     return np.stack(
         [

@@ -96,7 +96,7 @@ def image_rectangles(
 
 
 def _homogeneous(points_lidar: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """(n, 3) image points as (u * depth, v * depth, depth)."""
+    """Return (n, 3) image points as (u * depth, v * depth, depth)."""
     matrix = calibration.lidar_to_image
     points = np.asarray(points_lidar, dtype=np.float64)
     projected: np.ndarray = points @ matrix[:, :3].T + matrix[:, 3]

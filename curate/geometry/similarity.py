@@ -51,7 +51,7 @@ class Similarity:
         rotation_limit_rad: float = np.pi / 4,
         scale_range: tuple[float, float] = (0.95, 1.05),
     ) -> Self:
-        """A random similarity, uniform in rotation and scale."""
+        """Return a random similarity, uniform in rotation and scale."""
         return cls(
             bool(generator.random() < flip_probability),
             float(generator.uniform(-rotation_limit_rad, rotation_limit_rad)),
@@ -83,7 +83,7 @@ class Similarity:
         return moved
 
     def _matrix(self) -> np.ndarray:
-        """(3, 3) with A(p) = matrix @ p; its inverse is its transpose over scale squared."""
+        """Return (3, 3) with A(p) = matrix @ p; its inverse is its transpose over scale squared."""
         cos, sin = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
         mirror = -1.0 if self.flip_y else 1.0
         return self.scale * np.array([[cos, -sin * mirror, 0], [sin, cos * mirror, 0], [0, 0, 1]])

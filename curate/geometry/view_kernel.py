@@ -14,7 +14,7 @@ def points_in_view(
     height: float,
     margin: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The kernel of `in_view`: (n,) bool, and (n,) whether it leaves a point undecided.
+    """Return the kernel of `in_view`: (n,) bool, and (n,) whether it leaves a point undecided.
 
     It has no branches: which points are seen is too irregular to be foretold.
     """

@@ -182,7 +182,7 @@ def check_evidence(source: Declared, evidence: Evidence, count: int) -> dict[str
 
 
 def _plain(source: Declared, column: Column, values: np.ndarray, count: int) -> list[Any]:
-    """The values of a column; None for what is unknown."""
+    """Return the values of a column; None for what is unknown."""
     known = f"evidence source '{source.name}': column {column.name}"
     if values.shape != (count,):
         raise DataError(f"{known} has {values.shape[0] if values.ndim else 1} rows, not {count}")

@@ -40,7 +40,7 @@ class PointSettings:
     fallback: float = 5.0
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a setting without meaning."""
+        """Raise ConfigError for a setting without meaning."""
         if self.statistic not in get_args(Statistic):
             known = ", ".join(get_args(Statistic))
             raise ConfigError(
@@ -134,7 +134,7 @@ class PointPrior(EvidenceSource):
     measured_columns: ClassVar[tuple[str, ...]] = ("points",)
 
     def __post_init__(self) -> None:
-        """Raises ConfigError where a threshold is not a positive number."""
+        """Raise ConfigError where a threshold is not a positive number."""
         for category, value in self.thresholds.items():
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(
@@ -150,7 +150,7 @@ class PointPrior(EvidenceSource):
         """Compare the counts with the threshold.
 
         Raises:
-            ConfigError: a detection's category has no threshold.
+            ConfigError: if a detection's category has no threshold.
         """
         points, threshold = measured["points"], self._threshold_per_label(detections.categories)
         rho = point_trust(points, threshold)
@@ -163,7 +163,7 @@ class PointPrior(EvidenceSource):
         ).format(**row)
 
     def _threshold_per_label(self, categories: np.ndarray) -> np.ndarray:
-        """(n,) float64."""
+        """Return (n,) float64."""
         names, inverse = np.unique(categories, return_inverse=True)
         unknown = [str(name) for name in names if name not in self.thresholds]
         if unknown:

@@ -35,7 +35,7 @@ class SemanticSettings:
     outside: Outside = "neutral"
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for an unknown option."""
+        """Raise ConfigError for an unknown option."""
         for value, kind, noun in ((self.mean, Mean, "mean"), (self.outside, Outside, "outside")):
             if value not in get_args(kind):
                 known = ", ".join(get_args(kind))
@@ -81,8 +81,8 @@ class SemanticPrior(EvidenceSource):
         """Segment the frame and look at each box's rectangle; no label, no segmentation.
 
         Raises:
-            ConfigError: there is no segmenter, or it has no classes for a detection's category.
-            ModelError: the semantic map is not in the size of the image.
+            ConfigError: if there is no segmenter, or it has no classes for a detection's category.
+            ModelError: if the semantic map is not in the size of the image.
         """
         if self.segmenter is None:
             raise ConfigError("semantic prior: pixels cannot be counted without a segmenter")
@@ -152,7 +152,7 @@ def count_pixels(
         (n,) int64 pixels of the category's classes, (n,) int64 pixels.
 
     Raises:
-        ConfigError: the semantic map has no classes for a category.
+        ConfigError: if the semantic map has no classes for a category.
     """
     height, width = semantic_map.class_ids.shape
     seen = ~np.isnan(rectangles).any(axis=1)

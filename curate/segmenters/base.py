@@ -34,5 +34,5 @@ class Segmenter(Protocol):
     needs_image: bool
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """The frame's semantic map, in the size of its image."""
+        """Return the frame's semantic map, in the size of its image."""
         ...

@@ -40,10 +40,10 @@ _UNLABELED = 255
 
 
 def class_map(name: str) -> ClassMap:
-    """The classes of each category in a known class set.
+    """Return the classes of each category in a known class set.
 
     Raises:
-        ConfigError: the class set is not known.
+        ConfigError: if the class set is not known.
     """
     if name not in CLASS_MAPS:
         known = ", ".join(sorted(CLASS_MAPS))
@@ -53,10 +53,10 @@ def class_map(name: str) -> ClassMap:
 
 
 def checked_classes(classes: Mapping[str, Sequence[int]]) -> ClassMap:
-    """A class map as the user gave it, with tuples of ids.
+    """Return a class map as the user gave it, with tuples of ids.
 
     Raises:
-        ConfigError: an id is no integer from 0 to 255.
+        ConfigError: if an id is no integer from 0 to 255.
     """
     for category, ids in classes.items():
         for one in ids:
@@ -66,7 +66,7 @@ def checked_classes(classes: Mapping[str, Sequence[int]]) -> ClassMap:
 
 
 def free_id(classes: ClassMap) -> int:
-    """A class id for the pixels of nothing: 0, unless that counts for a category."""
+    """Return a class id for the pixels of nothing: 0, unless that counts for a category."""
     wanted = {one for ids in classes.values() for one in ids}
     return next((one for one in range(256) if one not in wanted), 0)
 

@@ -55,7 +55,7 @@ class ErrorModel:
     blob_px: int = 25
 
     def __post_init__(self) -> None:
-        """Checks the values."""
+        """Check the values."""
         for name, value in asdict(self).items():
             highest = 1.0 if name.startswith(("missed", "confused")) else np.inf
             number = isinstance(value, int | float)
@@ -92,10 +92,10 @@ class DegradedSegmenter:
         self._truth = SavedSegmenter(directory, class_map("simulated"))
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """The frame's degraded map; the same for the same seed.
+        """Return the frame's degraded map; the same for the same seed.
 
         Raises:
-            DataError: there is no map of the truth, or it is no map of the frame's image.
+            DataError: if there is no map of the truth, or it is no map of the frame's image.
         """
         truth = self._truth.segment(frame)
         digest = hashlib.sha256(frame.frame_id.encode()).digest()
@@ -106,7 +106,7 @@ class DegradedSegmenter:
 def degrade(
     class_ids: np.ndarray, errors: ErrorModel, generator: np.random.Generator
 ) -> np.ndarray:
-    """(height, width) uint8 class ids with the errors of the model."""
+    """Return (height, width) uint8 class ids with the errors of the model."""
     degraded = np.zeros_like(class_ids)
     for class_id in (_CAR, _PEDESTRIAN, _CYCLIST):
         count, regions, stats, _ = cv2.connectedComponentsWithStats(
@@ -142,7 +142,7 @@ def _paint_region(
     errors: ErrorModel,
     generator: np.random.Generator,
 ) -> None:
-    """Paints a region with its outline moved in or out."""
+    """Paint a region with its outline moved in or out."""
     limit = errors.boundary_px
     shift = int(generator.integers(-limit, limit + 1))
     smallest = int(min(stats[cv2.CC_STAT_WIDTH], stats[cv2.CC_STAT_HEIGHT]))
@@ -166,7 +166,7 @@ def _paint_ellipse(
     class_id: int,
     generator: np.random.Generator,
 ) -> None:
-    """Paints an ellipse with half axes from the given range."""
+    """Paint an ellipse with half axes from the given range."""
     low, high = half_axes_px
     axes = [int(axis) for axis in generator.integers(low, max(low, high) + 1, size=2)]
     cv2.ellipse(degraded, (column, row), axes, 0, 0, 360, class_id, thickness=-1)

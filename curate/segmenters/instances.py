@@ -49,10 +49,10 @@ class InstanceSegmenter:
         self._frames = None if self.path.is_dir() else _by_frame(self.path)
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """The frame's masks as a semantic map.
+        """Return the frame's masks as a semantic map.
 
         Raises:
-            DataError: there are none for the frame, or one is malformed or of another size.
+            DataError: if there are none for the frame, or one is malformed or of another size.
         """
         width, height = frame.image_size
         wanted = {one for ids in self.classes.values() for one in ids}
@@ -110,7 +110,7 @@ def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
 
 
 def _listed(path: Path, held: Any) -> list[Mapping[str, Any]]:
-    """The annotations of a document or of a bare list."""
+    """Return the annotations of a document or of a bare list."""
     objects = held.get("annotations") if isinstance(held, dict) else held
     if not isinstance(objects, list) or not all(isinstance(one, dict) for one in objects):
         raise DataError(f"{path}: no list of instance masks, nor {{annotations: [...]}}")

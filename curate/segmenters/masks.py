@@ -16,7 +16,7 @@ _FARTHEST = 1e7
 
 
 def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
-    """The pixels of an object.
+    """Return the pixels of an object.
 
     Args:
         segmentation: `{"size": [height, width], "counts": str | list}` or a list of polygons
@@ -27,7 +27,7 @@ def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
         (height, width) bool.
 
     Raises:
-        DataError: it is neither, or its size is another one.
+        DataError: if it is neither, or its size is another one.
     """
     width, height = size
     if isinstance(segmentation, dict):
@@ -50,14 +50,14 @@ def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
 
 
 def decompress(text: str) -> list[int]:
-    """The run lengths in COCO's compressed string.
+    """Return the run lengths in COCO's compressed string.
 
     Each character holds 5 bits, lowest first, and in its sixth whether more follow; the last one's
     fifth bit is the sign. From the fourth run on, the difference to the run before the last is
     written.
 
     Raises:
-        DataError: a character is none of "0" to "o", or the last number is cut off.
+        DataError: if a character is none of "0" to "o", or the last number is cut off.
     """
     runs: list[int] = []
     value = shift = 0
@@ -79,10 +79,10 @@ def decompress(text: str) -> list[int]:
 
 
 def runs_to_mask(runs: Any, size: tuple[int, int]) -> np.ndarray:
-    """The (height, width) bool mask of run lengths.
+    """Return the (height, width) bool mask of run lengths.
 
     Raises:
-        DataError: they are no whole numbers, or do not add up to the image.
+        DataError: if they are no whole numbers, or do not add up to the image.
     """
     width, height = size
     whole = isinstance(runs, list) and all(
@@ -110,7 +110,7 @@ def fill_polygon(polygon: Any, size: tuple[int, int]) -> np.ndarray:
         size: (width, height) of the image in pixels.
 
     Raises:
-        DataError: it is no polygon.
+        DataError: if it is no polygon.
     """
     width, height = size
     corners = _corners(polygon)
@@ -128,7 +128,7 @@ def fill_polygon(polygon: Any, size: tuple[int, int]) -> np.ndarray:
 
 
 def _corners(polygon: Sequence[float] | Any) -> np.ndarray:
-    """(n, 2) x, y."""
+    """Return (n, 2) x, y."""
     try:
         corners = np.asarray(polygon, dtype=np.float64)
     except (OverflowError, TypeError, ValueError):

@@ -72,10 +72,10 @@ class OnnxSegmenter:
         self._output = _map_output(self._model)
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """The frame's semantic map.
+        """Return the frame's semantic map.
 
         Raises:
-            ModelError: the frame has no image, or the model's answer is no semantic map.
+            ModelError: if the frame has no image, or the model's answer is no semantic map.
         """
         image = image_of(frame)
         height, width = image.shape[:2]
@@ -84,7 +84,7 @@ class OnnxSegmenter:
         return SemanticMap(self._merge(crops, tiles), self.classes)
 
     def _merge(self, crops: list["Crop"], tiles: list[np.ndarray]) -> np.ndarray:
-        """(height, width) class ids from those of the crops; see above for the rule."""
+        """Return (height, width) class ids from those of the crops; see above for the rule."""
         class_ids = np.hstack(
             [
                 tile[:, crop.own_left - crop.left : crop.own_right - crop.left]
@@ -100,7 +100,7 @@ class OnnxSegmenter:
         return class_ids
 
     def _crops(self, width: int, height: int) -> list["Crop"]:
-        """The crops of an image; a single one where the model's shape suits it."""
+        """Return the crops of an image; a single one where the model's shape suits it."""
         shape = self._model.input
         whole = [Crop(0, width, 0, width)]
         if shape.height is None or shape.width is None or self.tiles == 1:
@@ -112,7 +112,7 @@ class OnnxSegmenter:
         return cut_along(width, crop_width, max(self.tiles, ceil(squeeze)))
 
     def _run(self, image: np.ndarray) -> np.ndarray:
-        """(h, w) uint8 class ids of an (h, w, 3) image."""
+        """Return (h, w) uint8 class ids of an (h, w, 3) image."""
         height, width = image.shape[:2]
         shape = self._model.input
         target = (shape.width or width, shape.height or height)
@@ -146,7 +146,7 @@ def cut_along(width: int, crop_width: int, count: int) -> list[Crop]:
 
 
 def _map_output(model: ImageModel) -> str:
-    """The output that is the map; ModelError where the model says that it is none."""
+    """Return the output that is the map; ModelError where the model says that it is none."""
     output = model.outputs[0]
     if output.shape and len(output.shape) not in {3, 4}:
         raise ModelError(f"{model.path}: answers {output.name} {output.shape}; {_ANSWER}")
@@ -155,7 +155,7 @@ def _map_output(model: ImageModel) -> str:
 
 
 def _class_ids(answer: np.ndarray, size: tuple[int, int], model: Path) -> np.ndarray:
-    """(h, w) uint8 class ids from the model's answer.
+    """Return (h, w) uint8 class ids from the model's answer.
 
     Scores of classes are told from positions by the shape of the input: of both ways to read the
     answer, the one whose h : w is nearer to the input's is right.

@@ -82,10 +82,10 @@ class ImageModel:
         self.outputs = self._session.get_outputs()
 
     def run(self, pixels: np.ndarray, outputs: Sequence[str]) -> list[Any]:
-        """The named outputs for (height, width, 3) uint8 RGB pixels of the model's size.
+        """Return the named outputs for (height, width, 3) uint8 RGB pixels of the model's size.
 
         Raises:
-            ModelError: the model fails.
+            ModelError: if the model fails.
         """
         try:
             found: list[Any] = self._session.run(
@@ -97,10 +97,10 @@ class ImageModel:
 
 
 def image_of(frame: Frame) -> np.ndarray:
-    """(height, width, 3) uint8 RGB, what a frame's camera saw.
+    """Return (height, width, 3) uint8 RGB, what a frame's camera saw.
 
     Raises:
-        ModelError: the frame was read without it.
+        ModelError: if the frame was read without it.
     """
     if frame.image is None:
         raise ModelError(f"frame {frame.frame_id} was read without the image to segment")

@@ -66,10 +66,10 @@ class OnnxInstanceSegmenter:
         self._outputs = self._declared(dict(outputs or _OUTPUTS))
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """The frame's masks as a semantic map.
+        """Return the frame's masks as a semantic map.
 
         Raises:
-            ModelError: the frame has no image, or the model's answer is of another kind.
+            ModelError: if the frame has no image, or the model's answer is of another kind.
         """
         image = image_of(frame)
         height, width = image.shape[:2]
@@ -106,7 +106,7 @@ class OnnxInstanceSegmenter:
         return outputs
 
     def _fitted(self, image: np.ndarray) -> tuple[np.ndarray, float]:
-        """The image in the size that the model takes, and by what it was scaled."""
+        """Return the image in the size that the model takes, and by what it was scaled."""
         height, width = image.shape[:2]
         shape = self._model.input
         target = (shape.height or height, shape.width or width)
@@ -131,7 +131,7 @@ class OnnxInstanceSegmenter:
     def _instances(
         self, answer: dict[str, np.ndarray], size: tuple[int, int]
     ) -> Iterator[Instance]:
-        """The objects of an answer, one at a time: their masks together may be large."""
+        """Yield the objects of an answer, one at a time: their masks together may be large."""
         try:
             yield from KINDS[frozenset(self._outputs)](answer, size, self.minimum_score)
         except ModelError as error:
@@ -139,6 +139,6 @@ class OnnxInstanceSegmenter:
 
 
 def _scaled(box: Box, scale: float) -> Box:
-    """A box of the model's input in the image."""
+    """Return a box of the model's input in the image."""
     left, top, right, bottom = (value / scale for value in box)
     return left, top, right, bottom

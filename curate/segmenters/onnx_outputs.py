@@ -42,7 +42,7 @@ class Instance:
 def boxed_instances(
     answer: Answer, size: tuple[int, int], minimum_score: float
 ) -> Iterator[Instance]:
-    """The objects of a model of Mask R-CNN's kind, the lowest score first.
+    """Yield the objects of a model of Mask R-CNN's kind, the lowest score first.
 
     Args:
         answer: boxes (n, 4), or (n, 5) with the score behind them, labels (n,), scores (n,), masks
@@ -51,7 +51,7 @@ def boxed_instances(
         minimum_score: objects below it are left out.
 
     Raises:
-        ModelError: a shape or a number cannot be.
+        ModelError: if a shape or a number cannot be.
     """
     boxes = _without_batch(answer["boxes"], 2)
     masks = answer["masks"]
@@ -77,7 +77,7 @@ def boxed_instances(
 def prototype_instances(
     answer: Answer, _size: tuple[int, int], minimum_score: float
 ) -> Iterator[Instance]:
-    """The objects of a model of YOLO's kind, the lowest score first; see `boxed_instances`.
+    """Yield the objects of a model of YOLO's kind, the lowest score first; see `boxed_instances`.
 
     Prototypes cover the whole input, whatever its size.
     """
@@ -120,7 +120,7 @@ def _without_batch(values: np.ndarray, axes: int) -> np.ndarray:
 
 
 def _rising(scores: np.ndarray, minimum_score: float) -> list[int]:
-    """The objects from the lowest score that counts to the highest."""
+    """Return the objects from the lowest score that counts to the highest."""
     order = np.argsort(scores, kind="stable")[-_MOST_OBJECTS:]
     rising: list[int] = order[scores[order] >= minimum_score].tolist()
     return rising

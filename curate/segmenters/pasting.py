@@ -19,7 +19,7 @@ def paste_mask(
     *,
     extended: bool = False,
 ) -> tuple[tuple[slice, slice], np.ndarray]:
-    """The pixels of an object.
+    """Return the pixels of an object.
 
     Args:
         mask: (h, w) values of its cells.

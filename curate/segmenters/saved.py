@@ -49,10 +49,10 @@ class SavedSegmenter:
             raise DataError(f"{self.directory}: no such folder of semantic maps")
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """The frame's saved map.
+        """Return the frame's saved map.
 
         Raises:
-            DataError: there is no map, it is no map of the frame's image, or its class ids are
+            DataError: if there is no map, it is no map of the frame's image, or its class ids are
                 others than those declared.
         """
         path = self.directory / f"{frame.frame_id}.png"
@@ -68,7 +68,7 @@ class SavedSegmenter:
         return SemanticMap(class_ids, self.classes)
 
     def _class_ids(self, path: Path, pixels: np.ndarray) -> np.ndarray:
-        """(h, w) uint8 class ids of what the file holds."""
+        """Return (h, w) uint8 class ids of what the file holds."""
         if pixels.ndim == 2 and pixels.dtype == np.uint8:
             return pixels
         if pixels.ndim == 2 and pixels.dtype == np.uint16 and self.divisor is not None:

@@ -31,7 +31,7 @@ _CAR_STYLES = np.array(
 
 @cache
 def actor_mesh(category: str, variant: int) -> Mesh:
-    """The mesh number `variant` of `category`, the same in every process."""
+    """Return the mesh number `variant` of `category`, the same in every process."""
     generator = np.random.default_rng([list(_BUILDERS).index(category), variant])
     return _BUILDERS[category](generator).standing_on_origin()
 
@@ -54,7 +54,7 @@ def actor_colours(category: str, generator: np.random.Generator) -> dict[Materia
 
 
 def _paint(generator: np.random.Generator) -> np.ndarray:
-    """(3,) RGB: mostly black to white, else a saturated colour."""
+    """Return (3,) RGB: mostly black to white, else a saturated colour."""
     if generator.random() < 0.65:
         return np.full(3, generator.choice([0.06, 0.12, 0.3, 0.5, 0.65, 0.85]))
     colours = [(0.55, 0.05, 0.06), (0.06, 0.13, 0.42), (0.1, 0.3, 0.5), (0.1, 0.25, 0.13)]
@@ -63,7 +63,7 @@ def _paint(generator: np.random.Generator) -> np.ndarray:
 
 
 def _cloth(generator: np.random.Generator) -> np.ndarray:
-    """(3,) RGB: grey to black, denim, or any colour."""
+    """Return (3,) RGB: grey to black, denim, or any colour."""
     grey = np.full(3, generator.uniform(0.08, 0.8))
     tint = generator.uniform(0.05, 0.85, size=3)
     return np.asarray(grey + (tint - grey) * generator.choice([0.05, 0.2, 0.8]))
@@ -105,7 +105,7 @@ def _car_cabin(
     boot: float,
     top: float,
 ) -> list[Mesh]:
-    """The glazed part from the belt line to the roof, and the roof."""
+    """Return the glazed part from the belt line to the roof, and the roof."""
     front, rear = length * (0.5 - bonnet), length * (boot - 0.5)
     bottom = front - rear
     shift = -(bottom * (1 - top) * (0.14 if boot < 0.08 else 0.05))
@@ -219,7 +219,7 @@ def _outfit(
 
 
 def bicycle(generator: np.random.Generator) -> Mesh:
-    """A bicycle without a rider: wheels, frame, handlebar, saddle."""
+    """Return a bicycle without a rider: wheels, frame, handlebar, saddle."""
     wheel = generator.uniform(0.31, 0.36)
     base = generator.uniform(0.98, 1.12)
     front, rear = (base / 2, 0, wheel), (-base / 2, 0, wheel)
@@ -247,7 +247,7 @@ def bicycle(generator: np.random.Generator) -> Mesh:
 
 
 def _cyclist(generator: np.random.Generator) -> Mesh:
-    """A bicycle and a rider: bent legs, leaning torso, arms to the bar, head."""
+    """Return a bicycle and a rider: bent legs, leaning torso, arms to the bar, head."""
     lean = generator.uniform(0.1, 0.42)
     rise = generator.uniform(0.42, 0.52)
     hip = np.array([-0.24, 0.0, 1.0])

@@ -74,7 +74,7 @@ class Light:
         )
 
     def shade(self, normals: np.ndarray, colours: np.ndarray) -> np.ndarray:
-        """(m, 3) float32 colours of lit surfaces."""
+        """Return (m, 3) float32 colours of lit surfaces."""
         facing = np.clip(normals @ self.sun, 0, None)
         upward = 0.75 + 0.25 * normals[:, 2]
         strength = self.ambient * upward + self.direct * facing
@@ -92,7 +92,7 @@ class Light:
 
 
 def render(scene: Scene, caster: Caster, rig: CameraRig, generator: np.random.Generator) -> View:
-    """The camera's view of a scene."""
+    """Return the camera's view of a scene."""
     hits = cast_pixels(caster, rig)
     light = Light.draw(generator)
     surfaces = Surfaces(
@@ -122,7 +122,7 @@ def render(scene: Scene, caster: Caster, rig: CameraRig, generator: np.random.Ge
 
 
 def _markings(street: Street, light: Light) -> Markings:
-    """The lines of a street, interrupted where another crosses."""
+    """Return the lines of a street, interrupted where another crosses."""
     lines = street.axis_d + street.lane_m * np.arange(-street.lanes, street.lanes + 1)
     half = street.crossing_half_m + 1.5
     crossing = (

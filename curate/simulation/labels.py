@@ -72,7 +72,7 @@ def _alpha(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
 
 
 def _outline(scene: Scene, number: int, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """(4,) left, top, right, bottom of the object within the image, and of the whole object.
+    """Return (4,) left, top, right, bottom of the object within the image, and of the whole object.
 
     The edges of the mesh are clipped to the view as segments in homogeneous coordinates, so that
     an object that reaches beside or behind the camera gets the box of the part within the image.
@@ -93,7 +93,7 @@ def _outline(scene: Scene, number: int, calibration: Calibration) -> tuple[np.nd
 
 
 def _clip(edges: np.ndarray, planes: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """The parts of (n, 2, 3) segments where planes @ point >= offset, for every plane."""
+    """Return the parts of (n, 2, 3) segments where planes @ point >= offset, for every plane."""
     for plane, offset in zip(planes, offsets, strict=True):
         side = edges @ plane - offset
         edges, side = edges[(side >= 0).any(axis=1)], side[(side >= 0).any(axis=1)]
@@ -105,7 +105,7 @@ def _clip(edges: np.ndarray, planes: np.ndarray, offsets: np.ndarray) -> np.ndar
 
 
 def _bounds(homogeneous: np.ndarray) -> np.ndarray:
-    """(4,) left, top, right, bottom in pixels of (..., 3) homogeneous points."""
+    """Return (4,) left, top, right, bottom in pixels of (..., 3) homogeneous points."""
     points = homogeneous.reshape(-1, 3)
     pixels = points[:, :2] / points[:, 2:]
     return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
@@ -118,7 +118,7 @@ def _area(box_2d: np.ndarray) -> float:
 def _visible_shares(
     scene: Scene, view: View, rig: CameraRig, numbers: list[int], boxes_2d: np.ndarray
 ) -> np.ndarray:
-    """(n,) the share of each object's pixels in the image that nothing hides.
+    """Return (n,) the share of each object's pixels in the image that nothing hides.
 
     Rays through some pixels of its 2D box, cast into a scene of the actors alone, tell which of
     them the whole object would cover.

@@ -21,7 +21,7 @@ _ELEVATIONS_RAD = np.deg2rad(
 
 
 def sweep(scene: Scene, caster: Caster, generator: np.random.Generator) -> np.ndarray:
-    """The points of one sweep.
+    """Return the points of one sweep.
 
     Returns:
         (n, 4) float32 x, y, z in metres in the LiDAR frame, and intensity in [0, 1].
@@ -44,7 +44,7 @@ def sweep(scene: Scene, caster: Caster, generator: np.random.Generator) -> np.nd
 
 
 def _directions(generator: np.random.Generator) -> np.ndarray:
-    """(n, 3) float32 unit directions, beam by beam, with a little jitter of the mirror."""
+    """Return (n, 3) float32 unit directions, beam by beam, with a little jitter of the mirror."""
     start = generator.uniform(0, AZIMUTH_STEP_DEG)
     half = SECTOR_DEG / 2
     azimuths = np.deg2rad(np.arange(half - start, -half, -AZIMUTH_STEP_DEG)).astype(np.float32)

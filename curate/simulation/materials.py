@@ -123,7 +123,7 @@ _COLOURS = np.array(
 
 
 def palette(colours: Mapping[Material, np.ndarray] | None = None) -> np.ndarray:
-    """(m, 3) float32 RGB of every material: the usual colours, some of them replaced."""
+    """Return (m, 3) float32 RGB of every material: the usual colours, some of them replaced."""
     table = _COLOURS.copy()
     for material, colour in (colours or {}).items():
         table[material] = colour

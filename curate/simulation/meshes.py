@@ -37,19 +37,19 @@ class Mesh:
         return np.asarray(high - low)
 
     def standing_on_origin(self) -> Self:
-        """The mesh moved so that its bounds are centred in x and y and begin at z = 0."""
+        """Return the mesh moved so that its bounds are centred in x and y and begin at z = 0."""
         low, high = self.bounds
         base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
         return replace(self, vertices=(self.vertices - base).astype(np.float32))
 
     def moved(self, rotation: np.ndarray, translation: ArrayLike) -> Self:
-        """The mesh turned by a (3, 3) rotation, then shifted."""
+        """Return the mesh turned by a (3, 3) rotation, then shifted."""
         vertices = self.vertices @ rotation.T.astype(np.float32)
         return replace(self, vertices=vertices + np.asarray(translation, dtype=np.float32))
 
 
 def merge(parts: Sequence[Mesh]) -> Mesh:
-    """All parts as one mesh."""
+    """Return all parts as one mesh."""
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
@@ -61,13 +61,13 @@ def merge(parts: Sequence[Mesh]) -> Mesh:
 
 
 def rotation_z(angle_rad: float) -> np.ndarray:
-    """(3, 3) rotation about z, counter-clockwise."""
+    """Return (3, 3) rotation about z, counter-clockwise."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
 def box(centre: ArrayLike, size: ArrayLike, material: Material) -> Mesh:
-    """An axis-aligned box."""
+    """Return an axis-aligned box."""
     return frustum(centre, size, (1.0, 1.0), material)
 
 
@@ -79,7 +79,7 @@ def frustum(
     *,
     top_shift: float = 0.0,
 ) -> Mesh:
-    """A box whose top is scaled in x and y, and shifted along x by `top_shift` metres."""
+    """Return a box whose top is scaled in x and y, and shifted along x by `top_shift` metres."""
     vertices, triangles = _unit_box()
     shaped = vertices.copy()
     top = shaped[:, 2] > 0
@@ -90,7 +90,7 @@ def frustum(
 
 
 def ellipsoid(centre: ArrayLike, radii: ArrayLike, material: Material, *, sides: int = 8) -> Mesh:
-    """An ellipsoid with axes along x, y and z."""
+    """Return an ellipsoid with axes along x, y and z."""
     vertices, triangles = _unit_sphere(sides)
     shaped = vertices * np.asarray(radii, dtype=np.float32)
     return _mesh(shaped + np.asarray(centre, dtype=np.float32), triangles, material)
@@ -105,7 +105,7 @@ def cylinder(
     end_radius: float | None = None,
     sides: int = 8,
 ) -> Mesh:
-    """A cylinder, or a cone's frustum where `end_radius` differs, from `start` to `end`."""
+    """Return a cylinder, or a cone's frustum where `end_radius` differs, from `start` to `end`."""
     vertices, triangles = _unit_cylinder(sides)
     origin = np.asarray(start, dtype=np.float64)
     axis = np.asarray(end, dtype=np.float64) - origin
@@ -129,7 +129,7 @@ def ring(
     *,
     sides: int = 14,
 ) -> Mesh:
-    """A wheel rim in the x-z plane: outer `radius`, radial `thickness`, `width` along y."""
+    """Return a wheel rim in the x-z plane: outer `radius`, radial `thickness`, `width` along y."""
     angles = np.arange(sides) * 2 * np.pi / sides
     circle = np.stack([np.cos(angles), np.zeros(sides), np.sin(angles)], axis=1)
     side = np.array([0.0, width / 2, 0.0])
@@ -152,14 +152,14 @@ def _mesh(vertices: np.ndarray, triangles: np.ndarray, material: Material) -> Me
 
 
 def _perpendicular(axis: np.ndarray) -> np.ndarray:
-    """A unit vector at right angles to `axis`."""
+    """Return a unit vector at right angles to `axis`."""
     helper = np.eye(3)[np.argmin(np.abs(axis))]
     across = np.cross(axis, helper)
     return np.asarray(across / np.linalg.norm(across))
 
 
 def _split(quads: np.ndarray) -> np.ndarray:
-    """(n, 4) quadrilaterals as (2n, 3) triangles."""
+    """Return (n, 4) quadrilaterals as (2n, 3) triangles."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 

@@ -18,7 +18,7 @@ _GRID = (np.arange(0, _HEIGHT, _STEP)[:, None] * _WIDTH + np.arange(0, _WIDTH, _
 
 
 def cast_pixels(caster: Caster, rig: CameraRig) -> Hits:
-    """The first hit of each pixel's ray, row by row."""
+    """Return the first hit of each pixel's ray, row by row."""
     distance = np.empty(_WIDTH * _HEIGHT, dtype=np.float32)
     triangle = np.full(_WIDTH * _HEIGHT, _UNDECIDED, dtype=np.int32)
     coarse = caster.first_hits(rig.rays(_GRID))
@@ -32,7 +32,7 @@ def cast_pixels(caster: Caster, rig: CameraRig) -> Hits:
 
 @njit(cache=True, nogil=True)
 def _fill_between(distance: np.ndarray, triangle: np.ndarray) -> None:
-    """Gives pixels between equal neighbours their triangle and their mean distance."""
+    """Return pixels between equal neighbours their triangle and their mean distance."""
     height, width = triangle.shape
     for row in range(height):
         above, below = row - row % 2, row + row % 2

@@ -53,7 +53,7 @@ class Population:
     )
 
     def fill(self) -> Sequence[Placement]:
-        """All placements of a random scene."""
+        """Return all placements of a random scene."""
         self._traffic()
         self._crossing_traffic()
         self._people()
@@ -245,13 +245,13 @@ class Population:
         return scenery.scenery_mesh(kind, int(self.generator.integers(scenery.VARIANTS)))
 
     def _taken(self, discs: np.ndarray) -> bool:
-        """Whether any (n, 3) disc overlaps one that is already there."""
+        """Return whether any (n, 3) disc overlaps one that is already there."""
         apart = np.linalg.norm(self._discs[:, None, :2] - discs[None, :, :2], axis=2)
         return bool((apart < self._discs[:, None, 2] + discs[None, :, 2]).any())
 
 
 def _shadow(position: np.ndarray, yaw_rad: float, extent: np.ndarray) -> Placement:
-    """The dark patch under a thing."""
+    """Return the dark patch under a thing."""
     return Placement(
         "shadow",
         scenery.shadow_mesh(),
@@ -263,7 +263,7 @@ def _shadow(position: np.ndarray, yaw_rad: float, extent: np.ndarray) -> Placeme
 
 
 def _in_view(position: np.ndarray, extent: float) -> bool:
-    """Whether a thing may be seen by the sensors' sector."""
+    """Return whether a thing may be seen by the sensors' sector."""
     distance = float(np.hypot(position[0], position[1]))
     if distance > _REACH_M + extent:
         return False
@@ -274,7 +274,7 @@ def _in_view(position: np.ndarray, extent: float) -> bool:
 def _footprint(
     position: np.ndarray, yaw_rad: float, extent: np.ndarray, margin: float
 ) -> np.ndarray:
-    """(n, 3) discs x, y, radius that cover a rectangle of `extent` (length, width)."""
+    """Return (n, 3) discs x, y, radius that cover a rectangle of `extent` (length, width)."""
     long, short = float(extent.max()), float(extent.min())
     radius = short / 2 + margin
     reach = max(0.0, (long - short) / 2)

@@ -36,7 +36,7 @@ class CameraRig:
 
     @classmethod
     def draw(cls, generator: np.random.Generator) -> Self:
-        """A random rig near KITTI's."""
+        """Return a random rig near KITTI's."""
         focal = generator.uniform(707, 722)
         centre = np.array([609.0, 175.0]) + generator.normal(0, (3, 2.5))
         projection = np.array(
@@ -60,7 +60,7 @@ class CameraRig:
         return Calibration(self.projection, lidar_to_camera)
 
     def kitti_text(self) -> str:
-        """The content of KITTI's calibration file; the other cameras repeat this one."""
+        """Return the content of KITTI's calibration file; the other cameras repeat this one."""
         matrices = dict.fromkeys(("P0", "P1", "P2", "P3"), self.projection)
         matrices["R0_rect"] = self.rectification
         matrices["Tr_velo_to_cam"] = self.extrinsic
@@ -89,6 +89,6 @@ class CameraRig:
 
 
 def _rotation(vector_rad: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation about `vector_rad` by its length."""
+    """Return (3, 3) rotation about `vector_rad` by its length."""
     matrix, _ = cv2.Rodrigues(vector_rad)
     return np.asarray(matrix)

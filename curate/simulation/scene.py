@@ -56,14 +56,14 @@ class Scene:
 
     @classmethod
     def draw(cls, generator: np.random.Generator) -> Self:
-        """A random scene."""
+        """Return a random scene."""
         street = Street.draw(generator)
         placements = Population(street, generator).fill()
         return cls.assemble(street, placements)
 
     @classmethod
     def assemble(cls, street: Street, placements: Sequence[Placement]) -> Self:
-        """The scene of a street and the things on it."""
+        """Return the scene of a street and the things on it."""
         ground = street.ground()
         meshes = [ground, *(placement.mesh for placement in placements)]
         vertices = [ground.vertices, *(map(_placed_vertices, placements))]
@@ -84,7 +84,7 @@ class Scene:
         )
 
     def actors(self) -> list[int]:
-        """The numbers of the things that are cars, pedestrians or cyclists."""
+        """Return the numbers of the things that are cars, pedestrians or cyclists."""
         numbered = enumerate(self.placements, start=1)
         return [number for number, placement in numbered if placement.kind in CATEGORIES]
 
@@ -94,7 +94,7 @@ class Scene:
         return np.array([SEMANTIC_CLASSES.get(kind, 0) for kind in kinds], dtype=np.uint8)
 
     def thing_vertices(self, number: int) -> np.ndarray:
-        """(n, 3) vertices of one placement in the LiDAR frame."""
+        """Return (n, 3) vertices of one placement in the LiDAR frame."""
         return _placed_vertices(self.placements[number - 1])
 
 
@@ -107,14 +107,14 @@ class Caster:
         self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
 
     def first_hits(self, rays: np.ndarray) -> Hits:
-        """The first hit of (n, 6) float32 rays: origin and direction in the LiDAR frame."""
+        """Return the first hit of (n, 6) float32 rays: origin and direction in the LiDAR frame."""
         found = self._scene.cast_rays(self._tensor(rays), nthreads=1)
         # "No hit" is the highest uint32, which is -1 when read as int32.
         triangle = found["primitive_ids"].numpy().view(np.int32)
         return Hits(found["t_hit"].numpy(), triangle)
 
     def all_hits(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Every hit of (n, 6) float32 rays, as rows of rays and rows of triangles."""
+        """Return every hit of (n, 6) float32 rays, as rows of rays and rows of triangles."""
         found = self._scene.list_intersections(self._tensor(rays), nthreads=1)
         ray, triangle = found["ray_ids"].numpy(), found["primitive_ids"].numpy()
         return ray.astype(np.int64), triangle.astype(np.int64)
@@ -124,14 +124,14 @@ class Caster:
 
 
 def _placed_vertices(placement: Placement) -> np.ndarray:
-    """(n, 3) float32 vertices in the LiDAR frame."""
+    """Return (n, 3) float32 vertices in the LiDAR frame."""
     scaled = placement.mesh.vertices * placement.scale.astype(np.float32)
     turned = scaled @ rotation_z(placement.yaw_rad).T.astype(np.float32)
     return np.asarray(turned + placement.position.astype(np.float32))
 
 
 def _normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(m, 3) unit normals; zero for triangles without area."""
+    """Return (m, 3) unit normals; zero for triangles without area."""
     first, second, third = (vertices[triangles[:, corner]] for corner in range(3))
     across = np.cross(second - first, third - first)
     length = np.linalg.norm(across, axis=1, keepdims=True)

@@ -32,14 +32,14 @@ CLUTTER = CAR_SIZED + PERSON_SIZED + CYCLIST_SIZED
 
 @cache
 def scenery_mesh(kind: str, variant: int) -> Mesh:
-    """The mesh number `variant` of a kind of scenery, the same in every process."""
+    """Return the mesh number `variant` of a kind of scenery, the same in every process."""
     stream = list(_BUILDERS).index(kind)
     return _BUILDERS[kind](np.random.default_rng([100 + stream, variant]))
 
 
 @cache
 def shadow_mesh() -> Mesh:
-    """A flat octagon of length and width 1."""
+    """Return a flat octagon of length and width 1."""
     blunt = np.array([[0.5, 0.3], [0.3, 0.5], [-0.3, 0.5], [-0.5, 0.3]])
     outline = np.concatenate([blunt, -blunt])
     fan = np.arange(1, len(outline) - 1)
@@ -73,7 +73,7 @@ def scenery_colours(kind: str, generator: np.random.Generator) -> dict[Material,
 
 
 def _tree(generator: np.random.Generator) -> Mesh:
-    """A trunk and a crown of several clumps."""
+    """Return a trunk and a crown of several clumps."""
     trunk, radius = generator.uniform(1.8, 3.2), generator.uniform(0.10, 0.26)
     parts = [
         cylinder((0, 0, -0.3), (0, 0, trunk + 1.0), radius, Material.BARK, end_radius=radius * 0.7)
@@ -90,14 +90,14 @@ def _tree(generator: np.random.Generator) -> Mesh:
 def _clump(
     generator: np.random.Generator, centre: np.ndarray, radii: np.ndarray, sides: int = 8
 ) -> Mesh:
-    """An ellipsoid of leaves with a ragged surface."""
+    """Return an ellipsoid of leaves with a ragged surface."""
     smooth = ellipsoid((0, 0, 0), radii, Material.FOLIAGE, sides=sides)
     ragged = smooth.vertices * generator.uniform(0.8, 1.12, size=(len(smooth.vertices), 1))
     return Mesh((ragged + centre).astype(np.float32), smooth.triangles, smooth.materials)
 
 
 def _pole(generator: np.random.Generator) -> Mesh:
-    """A lamp post or a plain mast."""
+    """Return a lamp post or a plain mast."""
     height, radius = generator.uniform(4.5, 8.0), generator.uniform(0.06, 0.13)
     parts = [cylinder((0, 0, -0.3), (0, 0, height), radius, Material.METAL, sides=6)]
     if generator.random() < 0.6:
@@ -108,7 +108,7 @@ def _pole(generator: np.random.Generator) -> Mesh:
 
 
 def _building(generator: np.random.Generator) -> Mesh:
-    """A block with a flat or a gabled roof; its front lies at y = 0, it extends to y > 0."""
+    """Return a block with a flat or a gabled roof; its front lies at y = 0, it extends to y > 0."""
     length, depth = generator.uniform(8, 20), generator.uniform(7, 12)
     height = generator.uniform(4, 14)
     parts = [box((0, depth / 2, height / 2 - 0.5), (length, depth, height + 1), Material.WALL)]
@@ -126,13 +126,13 @@ def _building(generator: np.random.Generator) -> Mesh:
 
 
 def _wall(generator: np.random.Generator) -> Mesh:
-    """A low garden wall along x."""
+    """Return a low garden wall along x."""
     size = (generator.uniform(5, 12), 0.25, generator.uniform(0.6, 1.5) + 0.3)
     return box((0, 0, size[2] / 2 - 0.3), size, Material.CONCRETE)
 
 
 def _container(generator: np.random.Generator) -> Mesh:
-    """A skip or a closed container with ribs."""
+    """Return a skip or a closed container with ribs."""
     length, width, height = generator.normal((4.0, 1.75, 1.5), (0.4, 0.12, 0.15))
     taper = (generator.uniform(1.0, 1.2) if generator.random() < 0.5 else 1.0, 1.0)
     body = frustum((0, 0, height / 2 + 0.08), (length, width, height), taper, Material.METAL)
@@ -144,7 +144,7 @@ def _container(generator: np.random.Generator) -> Mesh:
 
 
 def _hedge(generator: np.random.Generator) -> Mesh:
-    """A dense, clipped hedge of the outline of a car."""
+    """Return a dense, clipped hedge of the outline of a car."""
     length, width, height = generator.normal((3.9, 1.65, 1.5), (0.5, 0.15, 0.15))
     parts = [
         frustum(
@@ -162,7 +162,7 @@ def _hedge(generator: np.random.Generator) -> Mesh:
 
 
 def _trailer(generator: np.random.Generator) -> Mesh:
-    """A covered cart: a body on a dark base, with a canvas cover set back like a cabin."""
+    """Return a covered cart: a body on a dark base, with a canvas cover set back like a cabin."""
     length, width, height = generator.normal((3.7, 1.7, 1.55), (0.35, 0.1, 0.12))
     return merge(
         [
@@ -198,7 +198,7 @@ def _stack(generator: np.random.Generator) -> Mesh:
 
 
 def _bin(generator: np.random.Generator) -> Mesh:
-    """A tall waste bin, round or square, with a lid."""
+    """Return a tall waste bin, round or square, with a lid."""
     height, radius = generator.uniform(1.1, 1.7), generator.uniform(0.25, 0.36)
     if generator.random() < 0.5:
         body = cylinder((0, 0, 0), (0, 0, height), radius, Material.METAL, end_radius=radius * 1.1)
@@ -210,7 +210,7 @@ def _bin(generator: np.random.Generator) -> Mesh:
 
 
 def _shrub(generator: np.random.Generator) -> Mesh:
-    """A clipped shrub or a young tree in a sleeve: a slim body with a round top."""
+    """Return a clipped shrub or a young tree in a sleeve: a slim body with a round top."""
     height, radius = generator.normal((1.7, 0.3), (0.15, 0.05))
     radii = np.array([radius, radius, 0.34 * height])
     parts = [
@@ -222,7 +222,7 @@ def _shrub(generator: np.random.Generator) -> Mesh:
 
 
 def _column(generator: np.random.Generator) -> Mesh:
-    """A stone column or a hydrant with a head."""
+    """Return a stone column or a hydrant with a head."""
     height, radius = generator.uniform(1.3, 1.8), generator.uniform(0.16, 0.28)
     neck = 0.82 * height
     head = (0, 0, 0.92 * height)
@@ -235,7 +235,7 @@ def _column(generator: np.random.Generator) -> Mesh:
 
 
 def _sign(generator: np.random.Generator) -> Mesh:
-    """A road sign on a post, or a low board."""
+    """Return a road sign on a post, or a low board."""
     height = generator.uniform(1.7, 2.6)
     post = cylinder((0, 0, -0.2), (0, 0, height), 0.04, Material.METAL, sides=6)
     board = (0.04, generator.uniform(0.45, 0.7), generator.uniform(0.45, 0.9))
@@ -247,7 +247,7 @@ def _sign(generator: np.random.Generator) -> Mesh:
 
 
 def _cabinet(generator: np.random.Generator) -> Mesh:
-    """A meter, a parcel box or a cable cabinet."""
+    """Return a meter, a parcel box or a cable cabinet."""
     size = generator.normal((0.45, 0.6, 1.45), (0.08, 0.12, 0.2))
     return merge(
         [
@@ -274,7 +274,7 @@ def _rack(generator: np.random.Generator) -> Mesh:
 
 
 def _scooter(generator: np.random.Generator) -> Mesh:
-    """A motor scooter under a canvas."""
+    """Return a motor scooter under a canvas."""
     height = generator.normal(1.4, 0.15)
     return merge(
         [
@@ -291,7 +291,7 @@ def _scooter(generator: np.random.Generator) -> Mesh:
 
 
 def _tyre(x: float) -> Mesh:
-    """A small wheel at x."""
+    """Return a small wheel at x."""
     return cylinder((x, -0.07, 0.25), (x, 0.07, 0.25), 0.25, Material.RUBBER)
 
 

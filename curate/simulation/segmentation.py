@@ -82,7 +82,7 @@ class SegmentationNet(nn.Module):
         self.answer = nn.Conv2d(8, _CLASSES, 1)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """(b, 4, h, w) logits of (b, h, w, 3) uint8 RGB images."""
+        """Return (b, 4, h, w) logits of (b, h, w, 3) uint8 RGB images."""
         sharp = self.sharp(images.permute(0, 3, 1, 2).float() / 127.5 - 1)
         fine = self.fine(sharp)
         middle = self.middle(fine)
@@ -110,7 +110,7 @@ class _Residual(nn.Module):
 
 
 def train_segmentation(out: Path, settings: SegmentationSettings) -> dict[str, float]:
-    """Trains the model, writes it to `out`, and returns its intersection over union by class."""
+    """Train the model, writes it to `out`, and returns its intersection over union by class."""
     torch.manual_seed(settings.seed)
     torch.set_num_threads(settings.threads)
     start = time.perf_counter()
@@ -160,7 +160,7 @@ def _simulated(
 
 
 def _fit(images: np.ndarray, truth: np.ndarray, settings: SegmentationSettings) -> SegmentationNet:
-    """The trained network, in evaluation mode."""
+    """Return the trained network, in evaluation mode."""
     generator = np.random.default_rng(settings.seed)
     net = SegmentationNet()
     optimiser = torch.optim.AdamW(net.parameters(), weight_decay=1e-4)
@@ -230,13 +230,13 @@ def _intersection_over_union(
 
 
 def _exported(net: SegmentationNet) -> bytes:
-    """The ONNX model."""
+    """Return the ONNX model."""
     weights = {name: tensor.detach().numpy() for name, tensor in net.state_dict().items()}
     return bytes(build_graph(weights, *INPUT_SIZE).SerializeToString())
 
 
 def main() -> None:
-    """Reads the command line and trains."""
+    """Read the command line and trains."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="the .onnx file to write")
     defaults = SegmentationSettings()

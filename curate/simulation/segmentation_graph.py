@@ -13,7 +13,7 @@ from curate.files.onnx_graph import EPSILON, GraphBuilder
 
 
 def build_graph(weights: Mapping[str, np.ndarray], width: int, height: int) -> ModelProto:
-    """The graph of `segmentation.SegmentationNet` with its state `weights`.
+    """Return the graph of `segmentation.SegmentationNet` with its state `weights`.
 
     Input `image` (1, height, width, 3) uint8 RGB, output `class_ids` (1, height, width) uint8.
     """
@@ -36,7 +36,7 @@ class _Graph(GraphBuilder):
     """The parts of the network."""
 
     def image(self, name: str) -> str:
-        """The input as maps (1, 3, height, width) from -1 to 1."""
+        """Return the input as maps (1, 3, height, width) from -1 to 1."""
         pixels = self.node("Cast", name, to=TensorProto.FLOAT)
         maps = self.node("Transpose", pixels, perm=[0, 3, 1, 2])
         half, one = (self.constant(np.array(value, np.float32)) for value in (127.5, 1.0))
@@ -57,12 +57,12 @@ class _Graph(GraphBuilder):
         return self.node("Add", maps, self.convolution(body, f"{name}.body.1", dilation=dilation))
 
     def pointwise(self, maps: str, name: str) -> str:
-        """A 1 x 1 convolution with bias and nothing after it."""
+        """Return a 1 x 1 convolution with bias and nothing after it."""
         parts = (self._weights[f"{name}.{part}"] for part in ("weight", "bias"))
         return self.node("Conv", maps, *map(self.constant, parts))
 
     def enlarged(self, maps: str, like: str) -> str:
-        """Maps in the height and width of others, interpolated."""
+        """Map in the height and width of others, interpolated."""
         size = self.node("Shape", like, start=2)
         channels = self.node("Shape", maps, end=2)
         sizes = self.node("Concat", channels, size, axis=0)
@@ -70,12 +70,12 @@ class _Graph(GraphBuilder):
         return self.node("Resize", maps, "", "", sizes, **modes)
 
     def class_ids(self, logits: str, name: str) -> None:
-        """Names the classes of the highest logits an output."""
+        """Name the classes of the highest logits an output."""
         best = self.node("ArgMax", logits, axis=1, keepdims=0)
         self._nodes.append(helper.make_node("Cast", [best], [name], to=TensorProto.UINT8))
 
     def model(self, shape: tuple[int, ...]) -> ModelProto:
-        """The finished and checked model."""
+        """Return the finished and checked model."""
         describe = helper.make_tensor_value_info
         image = describe("image", TensorProto.UINT8, (*shape, 3))
         answer = describe("class_ids", TensorProto.UINT8, shape)

@@ -92,7 +92,7 @@ def pixel_rays(
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _direction(inverse: np.ndarray, row: _Real, column: _Real) -> tuple[_Real, _Real, _Real]:
-    """The unit direction of a pixel's ray."""
+    """Return the unit direction of a pixel's ray."""
     x = inverse[0, 0] * column + inverse[0, 1] * row + inverse[0, 2]
     y = inverse[1, 0] * column + inverse[1, 1] * row + inverse[1, 2]
     z = inverse[2, 0] * column + inverse[2, 1] * row + inverse[2, 2]
@@ -110,7 +110,7 @@ def shade(
     markings: Markings,
     air: Air,
 ) -> np.ndarray:
-    """The image.
+    """Return the image.
 
     Args:
         inverse: (3, 3) float32 from homogeneous pixels to directions.
@@ -169,7 +169,7 @@ def _grey_level(colour: _Real, grain: _Real) -> np.uint8:
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _texel(across: _Real, along: _Real, material: int, surfaces: Surfaces) -> _Real:
-    """The texture of a material at a place on a surface, by metres across and along it."""
+    """Return the texture of a material at a place on a surface, by metres across and along it."""
     scale = surfaces.texture[material, 1]
     # The offset keeps the numbers positive, where truncation is rounding down.
     column = int((across + np.float32(1024)) * scale) & (TILE - 1)
@@ -199,14 +199,14 @@ def _paint(
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _fraction(value: _Real) -> _Real:
-    """The part after the decimal point, 0 to 1; the remainder operator is slow."""
+    """Return the part after the decimal point, 0 to 1; the remainder operator is slow."""
     whole: _Real = np.floor(value)
     return value - whole
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _is_painted(x: _Real, y: _Real, markings: Markings) -> bool:
-    """Whether a place on the asphalt carries a line."""
+    """Return whether a place on the asphalt carries a line."""
     d = markings.cos * y - markings.sin * x
     last = len(markings.lines_d) - 1
     for line in range(last + 1):

@@ -49,7 +49,7 @@ class Street:
 
     @classmethod
     def draw(cls, generator: np.random.Generator) -> Self:
-        """A random street."""
+        """Return a random street."""
         parking = generator.random(2) < 0.65
         return cls(
             heading_rad=float(np.clip(generator.normal(0, 0.07), -0.25, 0.25)),
@@ -85,20 +85,20 @@ class Street:
         return self.axis_d - self.lanes * self.lane_m - self.parking_right_m
 
     def in_crossing(self, s: np.ndarray | float, margin: float = 0.0) -> np.ndarray:
-        """Whether s lies in the crossing street."""
+        """Return whether s lies in the crossing street."""
         if self.crossing_s is None:
             return np.zeros(np.shape(s), dtype=bool)
         return np.abs(np.asarray(s) - self.crossing_s) < self.crossing_half_m + margin
 
     def to_lidar(self, s: float, d: float) -> np.ndarray:
-        """(3,) x, y, z of a place on the ground in the LiDAR frame."""
+        """Return (3,) x, y, z of a place on the ground in the LiDAR frame."""
         cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
         kerb = 0.0 if self.right_d < d < self.left_d else self._kerb_m
         height = np.interp(s, self._knots_s, self._profile) + self.slope[1] * d + kerb
         return np.array([cos * s - sin * d, sin * s + cos * d, height])
 
     def ground(self) -> Mesh:
-        """The ground as a mesh: asphalt, pavements, yards."""
+        """Return the ground as a mesh: asphalt, pavements, yards."""
         s, d = np.meshgrid(self._knots_s, self._knots_d, indexing="ij")
         outside = (d < self.right_d - 1e-6) | (d > self.left_d + 1e-6)
         z = np.interp(s, self._knots_s, self._profile) + self.slope[1] * d
@@ -119,7 +119,7 @@ class Street:
         )
 
     def _surface(self, s: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """The ground's material at places in road coordinates, uint8."""
+        """Return the ground's material at places in road coordinates, uint8."""
         road = ((d > self.right_d) & (d < self.left_d)) | self.in_crossing(s)
         beside = (d > self.right_d - self.pavement_m) & (d < self.left_d + self.pavement_m)
         surface = np.where(beside, Material.PAVEMENT, Material.GRASS)

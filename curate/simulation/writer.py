@@ -80,9 +80,9 @@ def simulate(
     each worker runs the script's other lines.
 
     Raises:
-        CurateError: a worker was killed, or the script lacks that line.
-        ConfigError: a number is out of range, or the directory holds another simulation.
-        DataError: the directory holds other data or cannot be written, or its simulation.json is
+        CurateError: if a worker was killed, or the script lacks that line.
+        ConfigError: if a number is out of range, or the directory holds another simulation.
+        DataError: if the directory holds other data or cannot be written, or its simulation.json is
             damaged.
     """
     directory = Path(directory)
@@ -104,7 +104,7 @@ def _complete(
     workers: int,
     progress: Callable[[int, int], None] | None,
 ) -> None:
-    """Makes the frames that are not there yet."""
+    """Make the frames that are not there yet."""
     for leftover in home.glob("*/.*.partial"):  # of a run that was killed
         leftover.unlink()
     missing = [index for index in range(settings.frames) if not _is_whole(home, index)]
@@ -121,7 +121,7 @@ def _complete(
 
 
 def _settings(frames: int, seed: int, val_frames: int | None) -> SimulationSettings:
-    """The settings, checked."""
+    """Return the settings, checked."""
     val = frames // 4 if val_frames is None else val_frames
     if not 1 <= frames <= 999_999:
         raise ConfigError(f"frames must be 1 to 999999, not {frames}")
@@ -133,7 +133,7 @@ def _settings(frames: int, seed: int, val_frames: int | None) -> SimulationSetti
 
 
 def _claim(directory: Path, settings: SimulationSettings) -> None:
-    """Marks the directory with the settings, or makes sure that it is marked with the same."""
+    """Mark the directory with the settings, or makes sure that it is marked with the same."""
     marker = directory / SETTINGS_FILE
     if not marker.exists():
         if (directory / "training").exists():
@@ -161,12 +161,12 @@ def _frame_file(home: Path, folder: str, index: int) -> Path:
 
 
 def _is_whole(home: Path, index: int) -> bool:
-    """Whether all files of a frame are there."""
+    """Return whether all files of a frame are there."""
     return all(_frame_file(home, folder, index).exists() for folder in _FOLDERS)
 
 
 def _simulate_frame(home: Path, seed: int, index: int) -> None:
-    """Makes one frame and writes its files, the label last."""
+    """Make one frame and writes its files, the label last."""
     layout, laser, lens = (np.random.default_rng([seed, index, part]) for part in range(3))
     scene = Scene.draw(layout)
     rig = CameraRig.draw(lens)
@@ -184,7 +184,7 @@ def _simulate_frame(home: Path, seed: int, index: int) -> None:
 
 
 def _png(pixels: np.ndarray) -> bytes:
-    """A PNG file of grey or BGR pixels; OpenCV's default compression is its fast one."""
+    """Return a PNG file of grey or BGR pixels; OpenCV's default compression is its fast one."""
     _, encoded = cv2.imencode(".png", pixels)
     return bytes(encoded)
 

@@ -30,7 +30,7 @@ class Augmentation:
     fewest_points: int
 
     def apply(self, sample: Sample, bank: ObjectBank, generator: np.random.Generator) -> Sample:
-        """A new sample; the one given is left as it is.
+        """Return a new sample; the one given is left as it is.
 
         Pseudo-labels of weight 0 that are background are not in it; to what is pasted their place
         is taken. All that weighs 0 afterwards is an ignore region.
@@ -53,7 +53,7 @@ class Augmentation:
 
 
 def _without_background(sample: Sample) -> Sample:
-    """The sample without the boxes of weight 0 that are background."""
+    """Return the sample without the boxes of weight 0 that are background."""
     kept = (sample.weights > 0) | sample.ignored
     return replace(
         sample,

@@ -61,7 +61,7 @@ class Batches:
         return chosen
 
     def _sample(self, index: int) -> Sample:
-        """The sample as read, from memory where there was room for it."""
+        """Return the sample as read, from memory where there was room for it."""
         if index in self._cache:
             return self._cache[index]
         sample = self._labels[index]

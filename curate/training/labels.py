@@ -126,10 +126,10 @@ class WeightedLabels(Dataset[Sample]):
         return len(self.frame_ids)
 
     def __getitem__(self, index: int) -> Sample:
-        """Reads the frame's points.
+        """Read the frame's points.
 
         Raises:
-            DataError: the frame cannot be read.
+            DataError: if the frame cannot be read.
         """
         frame_id = self.frame_ids[index]
         frame = self._read(frame_id)
@@ -174,7 +174,7 @@ def _group(
     """Boxes, categories and weights of each frame; unknown categories are left out.
 
     Raises:
-        DataError: a box is not finite, or a weight not in [0, 1].
+        DataError: if a box is not finite, or a weight not in [0, 1].
     """
     by_frame: dict[str, list[tuple]] = {}
     for frame, category, *numbers in rows:
@@ -192,7 +192,7 @@ def _group(
 
 
 def _numbers(path: Path, frame: str, entries: list[tuple]) -> np.ndarray:
-    """(m, 8) boxes and weights; a damaged file may hold anything in their place."""
+    """Return (m, 8) boxes and weights; a damaged file may hold anything in their place."""
     try:
         numbers = np.array(entries, dtype=np.float64)
     except (TypeError, ValueError):

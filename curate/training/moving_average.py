@@ -30,7 +30,7 @@ class MovingAverage:
         self._kept = step_decay(decay, steps)
 
     def follow(self, student: torch.nn.Module) -> None:
-        """Takes the student's weights in; counters are copied."""
+        """Take the student's weights in; counters are copied."""
         with torch.no_grad():
             own = self.network.state_dict()
             for name, present in student.state_dict().items():

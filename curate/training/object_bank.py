@@ -54,10 +54,10 @@ class ObjectBank:
     def build(
         cls, samples: Iterable[Sample], categories: tuple[str, ...], fewest_points: int = 5
     ) -> Self:
-        """The objects in labeled samples that have enough points to be recognised.
+        """Return the objects in labeled samples that have enough points to be recognised.
 
         Raises:
-            LeakageError: a sample is not of the labeled split.
+            LeakageError: if a sample is not of the labeled split.
         """
         objects: dict[str, list[BankObject]] = {category: [] for category in categories}
         for sample in samples:
@@ -87,7 +87,7 @@ class ObjectBank:
 def paste_objects(
     sample: Sample, bank: ObjectBank, count: int, generator: np.random.Generator
 ) -> Sample:
-    """The sample with up to `count` more objects of each category, each with weight 1."""
+    """Return the sample with up to `count` more objects of each category, each with weight 1."""
     drawn = bank.draw(_TRIES * count, generator)
     if not drawn or len(sample.points) == 0:
         return sample
@@ -139,7 +139,7 @@ class _Outlines:
 
     @classmethod
     def of(cls, boxes: np.ndarray) -> Self:
-        """The outlines of (n, 7) boxes in front of the sensor."""
+        """Return the outlines of (n, 7) boxes in front of the sensor."""
         corners = box_corners(boxes)
         azimuth = np.arctan2(corners[..., 1], corners[..., 0])
         distance = np.maximum(np.hypot(corners[..., 0], corners[..., 1]), 1e-3)
@@ -175,7 +175,7 @@ class _Scene:
         self.azimuths = (float(azimuth.min()), float(azimuth.max()))
 
     def insert(self, outlines: _Outlines, k: int, points: np.ndarray) -> bool:
-        """Puts the points of object k in that are seen, unless it would be hidden or cut off."""
+        """Put the points of object k in that are seen, unless it would be hidden or cut off."""
         low, high = outlines.azimuth[k]
         if low < self.azimuths[0] or high > self.azimuths[1]:
             return False
@@ -198,7 +198,7 @@ class _Scene:
         return True
 
     def left(self) -> np.ndarray:
-        """The points that no pasted object has taken the place of or hidden."""
+        """Return the points that no pasted object has taken the place of or hidden."""
         return self._points[self._kept]
 
 
@@ -224,7 +224,7 @@ class _Seen:
 
 
 def _occupied(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) bool, whether there is more than ground where (n, 7) boxes would stand."""
+    """Return (n,) bool, whether there is more than ground where (n, 7) boxes would stand."""
     above_ground = boxes.copy()
     above_ground[:, 2] += _GROUND_METRES / 2
     above_ground[:, 5] -= _GROUND_METRES
@@ -232,7 +232,7 @@ def _occupied(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _lifted(points: np.ndarray, lift: float) -> np.ndarray:
-    """The points, higher by `lift`; changes them in place."""
+    """Return the points, higher by `lift`; changes them in place."""
     points[:, 2] += lift
     return points
 

@@ -58,7 +58,7 @@ class TrainingSettings:
     statistics_steps: int = 20
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a setting that no training can use."""
+        """Raise ConfigError for a setting that no training can use."""
         for name, least in (
             ("steps", 1), ("batch_size", 1), ("threads", 1), ("pasted", 0), ("seed", 0),
             ("fewest_points", 0), ("unlabeled_batch_size", 0), ("statistics_steps", 1),
@@ -78,7 +78,7 @@ class TrainingSettings:
             raise ConfigError(f"training: unknown teacher {self.teacher!r}; choose {known}")
 
     def augmentation(self) -> Augmentation:
-        """The augmentation that these settings describe."""
+        """Return the augmentation that these settings describe."""
         return Augmentation(
             self.flip_probability,
             self.rotation_limit_rad,

@@ -49,7 +49,7 @@ def save_snapshot(
     optimizer: torch.optim.Optimizer,
     progress: dict[str, Any],
 ) -> None:
-    """Writes the state of a training after some step, whole or not at all.
+    """Write the state of a training after some step, whole or not at all.
 
     Args:
         output: checkpoint that the training will write.
@@ -75,7 +75,7 @@ def load_snapshot(
     networks: Sequence[torch.nn.Module],
     optimizer: torch.optim.Optimizer,
 ) -> dict[str, Any] | None:
-    """Takes up the snapshot of a killed training, and gives its progress.
+    """Take up the snapshot of a killed training, and gives its progress.
 
     None where there is no snapshot, it is damaged, or it is of a training on other labels, with
     other settings or from another start. Only tensors and plain values are read from the file.

@@ -61,9 +61,9 @@ def train(
         progress: called after every step with the step, the number of steps and the loss.
 
     Raises:
-        DataError: the labels or a frame cannot be read.
+        DataError: if the labels or a frame cannot be read.
         LeakageError: ground truth of unlabeled frames is among the labels.
-        ModelError: the start cannot be used.
+        ModelError: if the start cannot be used.
         ConfigError: the start is of another preset or other categories, or the detector has no such
             preset or lacks a member, or there is no such device.
     """
@@ -181,7 +181,7 @@ def _first_student(
     categories: tuple[str, ...],
     start: Path | None,
 ) -> Student:
-    """The student before the first step, on the device of the training."""
+    """Return the student before the first step, on the device of the training."""
     if start is None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)

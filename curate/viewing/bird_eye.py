@@ -162,7 +162,7 @@ def _draw_repredictions(
 
 
 def _sides(boxes: np.ndarray, region: Region) -> np.ndarray:
-    """(4 n, 2, 2) start and end in pixels of the sides of n footprints."""
+    """Return (4 n, 2, 2) start and end in pixels of the sides of n footprints."""
     corners = region.to_pixels(bev_corners(boxes))
     return np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
 

@@ -132,7 +132,7 @@ class Canvas:
         return png(self.finish())
 
     def finish(self) -> np.ndarray:
-        """The (height, width, 3) uint8 RGB picture."""
+        """Return the (height, width, 3) uint8 RGB picture."""
         size = (self.width, self.height)
         return np.asarray(cv2.resize(self._pixels, size, interpolation=cv2.INTER_AREA))
 
@@ -149,7 +149,7 @@ def save_png(path: Path, rgb: np.ndarray) -> None:
 
 
 def jpeg(rgb: np.ndarray, quality: int = 82) -> bytes:
-    """An (h, w, 3) uint8 RGB picture as the content of a JPEG file."""
+    """Return an (h, w, 3) uint8 RGB picture as the content of a JPEG file."""
     settings = [cv2.IMWRITE_JPEG_QUALITY, quality]
     _, content = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), settings)
     return content.tobytes()

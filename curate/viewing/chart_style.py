@@ -81,7 +81,7 @@ def check_format(name: str) -> ImageFormat:
     """Return the format with this name.
 
     Raises:
-        ConfigError: the name is not svg, png or pdf.
+        ConfigError: if the name is not svg, png or pdf.
     """
     for known in get_args(ImageFormat):
         if name == known:

@@ -34,7 +34,7 @@ def draw_frame(
         title: written at the top.
 
     Raises:
-        DataError: the frame has no image.
+        DataError: if the frame has no image.
     """
     shown = Shown(labels, truth_boxes, repredictions, human_boxes, title)
     return paint_frame(frame, shown).finish()
@@ -49,7 +49,7 @@ def paint_frame(frame: Frame, shown: Shown, kind: ImageFormat = "png") -> Canvas
         kind: lines and texts are vectors where it is pdf or svg.
 
     Raises:
-        DataError: the frame has no image.
+        DataError: if the frame has no image.
     """
     if frame.image is None:
         raise DataError(f"frame {frame.frame_id}: the data set has no image")

@@ -155,7 +155,7 @@ def _enlargement(image: np.ndarray) -> int:
 def box_strokes(
     boxes: np.ndarray, calibration: Calibration, image_size: tuple[int, int]
 ) -> list[np.ndarray]:
-    """The edges of each box in the image, cut where they come nearer than the near plane.
+    """Return the edges of each box in the image, cut where they come nearer than the near plane.
 
     Args:
         boxes: (n, 7) in the LiDAR frame.

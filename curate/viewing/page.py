@@ -57,12 +57,12 @@ class Figure:
 
     @classmethod
     def of_chart(cls, chart: Chart, caption: str) -> "Figure":
-        """A chart inside the page."""
+        """Return a chart inside the page."""
         return cls(chart.inline(), caption, chart)
 
     @classmethod
     def picture(cls, rgb: np.ndarray, caption: str) -> "Figure":
-        """An (h, w, 3) uint8 RGB picture inside the page."""
+        """Return an (h, w, 3) uint8 RGB picture inside the page."""
         data = base64.b64encode(jpeg(rgb)).decode("ascii")
         image = f'<img alt="{escape(caption)}" src="data:image/jpeg;base64,{data}">'
         return cls(image, caption)
@@ -91,7 +91,7 @@ class Section:
 
 
 def render_page(title: str, note: str, sections: Iterable[Section]) -> str:
-    """The HTML text; it loads nothing from anywhere."""
+    """Return the HTML text; it loads nothing from anywhere."""
     body = "\n".join(_section(each) for each in sections)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'

@@ -86,7 +86,7 @@ def find_style(name: str) -> Style:
     """Return the style with this name.
 
     Raises:
-        ConfigError: there is no such style.
+        ConfigError: if there is no such style.
     """
     if name not in STYLES:
         raise ConfigError(f"--style {name}: use {' or '.join(STYLES)}")

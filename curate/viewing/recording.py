@@ -55,7 +55,7 @@ class RecordedFrame:
 
 
 def write_recording(path: Path, frames: Iterable[RecordedFrame]) -> int:
-    """Writes an .rrd file; whole, or not at all.
+    """Write an .rrd file; whole, or not at all.
 
     Args:
         path: an existing file is replaced.
@@ -90,10 +90,10 @@ def write_recording(path: Path, frames: Iterable[RecordedFrame]) -> int:
 
 
 def load_rerun() -> ModuleType:
-    """The package, imported only where a recording is written.
+    """Return the package, imported only where a recording is written.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: if it is not installed.
     """
     try:
         import rerun
@@ -106,7 +106,7 @@ def load_rerun() -> ModuleType:
 
 
 def camera_pose(calibration: Calibration) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The camera as a pinhole in the LiDAR frame.
+    """Return the camera as a pinhole in the LiDAR frame.
 
     Returns:
         (3, 3) intrinsics in pixels, (3, 3) rotation from camera to LiDAR frame, and (3,) the
@@ -134,7 +134,7 @@ def captions(labels: ShownLabels, evidence: Mapping[str, np.ndarray]) -> list[st
 
 
 def _open(stream: Any, path: Path) -> None:
-    """Lets the stream write into a file; RERUN=off in the environment would silence it."""
+    """Let the stream write into a file; RERUN=off in the environment would silence it."""
     try:
         stream.save(path, default_blueprint=_blueprint())
     except (OSError, RuntimeError) as error:
@@ -186,7 +186,7 @@ def _log_camera(rerun: ModuleType, stream: Any, frame: Frame) -> None:
 def _boxes(
     rerun: ModuleType, place: str, boxes: np.ndarray, colours: np.ndarray, names: list[str]
 ) -> Any:
-    """(n, 7) boxes; none at all empties what an earlier frame left at the same place."""
+    """Return (n, 7) boxes; none at all empties what an earlier frame left at the same place."""
     half = boxes[:, 6] / 2
     nothing = np.zeros(len(boxes))
     return rerun.Boxes3D(

@@ -210,7 +210,7 @@ def _size(canvas: Canvas, lines: tuple[str, str]) -> np.ndarray:
 
 
 def _clipped(anchor: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """(4,) the part of a rectangle within bounds; empty where there is none."""
+    """Return (4,) the part of a rectangle within bounds; empty where there is none."""
     low, high = np.tile(bounds[:2], 2), np.tile(bounds[2:], 2)
     clipped: np.ndarray = np.clip(np.nan_to_num(anchor, nan=-np.inf), low, high)
     return clipped
@@ -243,7 +243,7 @@ def _cost(
 
 
 def _common_area(place: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(n,) areas that a rectangle shares with (n, 4) others."""
+    """Return (n,) areas that a rectangle shares with (n, 4) others."""
     low = np.maximum(place[:2], others[:, :2])
     high = np.minimum(place[2:], others[:, 2:])
     areas: np.ndarray = np.prod(np.maximum(high - low, 0), axis=1)

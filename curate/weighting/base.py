@@ -32,7 +32,7 @@ class Age:
     rounds: int
 
     def __post_init__(self) -> None:
-        """Raises ConfigError unless 1 <= e <= E."""
+        """Raise ConfigError unless 1 <= e <= E."""
         if not 1 <= self.round <= self.rounds:
             raise ConfigError(
                 f"round {self.round} of {self.rounds} does not exist; "
@@ -94,7 +94,7 @@ class Evidence:
     memory: Memory | None = None
 
     def __post_init__(self) -> None:
-        """Raises DataError where a column is not aligned or out of its range."""
+        """Raise DataError where a column is not aligned or out of its range."""
         if len(self.iou) == 0:
             object.__setattr__(self, "iou", np.full(len(self.loss), np.nan))
         if self.memory is not None and len(self.boxes) != len(self.loss):
@@ -132,7 +132,7 @@ class Evidence:
         return product
 
     def _numbers(self) -> dict[str, np.ndarray]:
-        """The columns that have a range."""
+        """Return the columns that have a range."""
         return {"score": self.score, "loss": self.loss, "iou": self.iou, **self.rho}
 
 
@@ -153,7 +153,7 @@ class Weights:
     dropped: Bool[np.ndarray, " n_or_0"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
-        """Fills in what was left out."""
+        """Fill in what was left out."""
         if len(self.dropped) == 0:
             object.__setattr__(self, "dropped", np.zeros(len(self.v), dtype=bool))
 
@@ -184,5 +184,5 @@ class Policy(Protocol):
         return ("category", "score", "iou", "loss")
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
-        """The weight of every label, in the order of the evidence."""
+        """Return the weight of every label, in the order of the evidence."""
         ...

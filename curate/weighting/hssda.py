@@ -38,7 +38,7 @@ class HSSDA(Policy):
     zero_weight: ClassVar[ZeroWeight] = "ignore"
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a setting without meaning."""
+        """Raise ConfigError for a setting without meaning."""
         if self.ambiguous not in get_args(Ambiguous):
             raise ConfigError(
                 f"policy hssda: unknown ambiguous {self.ambiguous!r}; choose soft or ignore"
@@ -59,7 +59,7 @@ class HSSDA(Policy):
 
 
 def two_centres(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """The means of the two clusters of (n,) values that have the least variance within.
+    """Return the means of the two clusters of (n,) values that have the least variance within.
 
     In one dimension the best clusters are separated by a threshold, so all n - 1 of them are tried,
     and the answer does not depend on a start. Fewer than three values answer (-inf, inf).

@@ -35,7 +35,7 @@ class IoUMatch(Policy):
     name: ClassVar[str] = "3dioumatch"
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a threshold that is no share."""
+        """Raise ConfigError for a threshold that is no share."""
         check_share(self.name, "score", {"every category": self.score, **self.score_per_category})
         check_share(self.name, "iou", {"every category": self.iou, **self.iou_per_category})
 
@@ -43,7 +43,7 @@ class IoUMatch(Policy):
         """1 or 0 for every label.
 
         Raises:
-            ConfigError: the detector estimates no IoU.
+            ConfigError: if the detector estimates no IoU.
         """
         unknown = int(np.isnan(evidence.iou).sum())
         if unknown:

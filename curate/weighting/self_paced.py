@@ -32,7 +32,7 @@ class SPSL(Policy):
     name: ClassVar[str] = "spsl"
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a setting without meaning."""
+        """Raise ConfigError for a setting without meaning."""
         if self.scope not in get_args(Scope):
             known = ", ".join(get_args(Scope))
             raise ConfigError(
@@ -49,7 +49,7 @@ class SPSL(Policy):
         return ("loss", "category") if self.scope == "category" else ("loss",)
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
-        """The weight of every label; 0 where no reprediction matched."""
+        """Return the weight of every label; 0 where no reprediction matched."""
         lambda_u = age_parameter(evidence, age, self.scope, self.quantile)
         return Weights(easiness(evidence.loss, lambda_u), lambda_u)
 
@@ -68,7 +68,7 @@ class PSPSL(SPSL):
     name: ClassVar[str] = "pspsl"
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
-        """The weight of every label; 0 where no reprediction matched."""
+        """Return the weight of every label; 0 where no reprediction matched."""
         if not self.self_paced:
             asked = evidence.matched | (not evidence.matched.any())
             return Weights.without_age(np.where(asked, evidence.rho_det, 0.0))
@@ -79,7 +79,7 @@ class PSPSL(SPSL):
 def easiness(
     loss: Float[np.ndarray, " n"], lambda_u: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """(n,) 1 - L / lambda where L < lambda, else 0 (Eq. 7); 0 where L is NaN.
+    """Return (n,) 1 - L / lambda where L < lambda, else 0 (Eq. 7); 0 where L is NaN.
 
     At lambda = 0 every v minimises the objective of a label with L = 0. It gets 1, the limit from
     above: such a label is as easy as can be.
@@ -92,7 +92,7 @@ def easiness(
 def age_parameter(
     evidence: Evidence, age: Age, scope: Scope = "round", quantile: float | None = None
 ) -> Float[np.ndarray, " n"]:
-    """(n,) lambda = (e/E) max(L) + (1 - e/E) mean(L) of each label's group (Eq. 4).
+    """Return (n,) lambda = (e/E) max(L) + (1 - e/E) mean(L) of each label's group (Eq. 4).
 
     Unmatched labels do not count; they get their group's lambda, NaN in a group without a match.
     """
@@ -111,7 +111,7 @@ def age_parameter(
 
 
 def _group(evidence: Evidence, scope: Scope) -> tuple[np.ndarray, int]:
-    """(n,) int64 number of each label's group, and how many groups there are."""
+    """Return (n,) int64 number of each label's group, and how many groups there are."""
     if scope == "round":
         return np.zeros(len(evidence), dtype=np.int64), 1
     if scope == "frame":
@@ -133,7 +133,7 @@ def _number_categories(category: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _maximum(loss: np.ndarray, member: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """(g,) largest loss of each group, NaN where it has none."""
+    """Return (g,) largest loss of each group, NaN where it has none."""
     largest = np.where(count > 0, -np.inf, np.nan)
     np.maximum.at(largest, member, loss)
     return largest
@@ -142,7 +142,7 @@ def _maximum(loss: np.ndarray, member: np.ndarray, count: np.ndarray) -> np.ndar
 def _quantile(
     loss: np.ndarray, member: np.ndarray, count: np.ndarray, quantile: float
 ) -> np.ndarray:
-    """(g,) linearly interpolated quantile of each group's losses, NaN where it has none."""
+    """Return (g,) linearly interpolated quantile of each group's losses, NaN where it has none."""
     if len(count) == 1:
         return np.array([np.quantile(loss, quantile) if len(loss) else np.nan])
     ordered = loss[np.lexsort((loss, member))]

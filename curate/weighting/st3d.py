@@ -39,7 +39,7 @@ class ST3D(Policy):
     zero_weight: ClassVar[ZeroWeight] = "ignore"
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a setting without meaning."""
+        """Raise ConfigError for a setting without meaning."""
         if not 0 <= self.ignore <= self.keep <= 1:
             raise ConfigError(
                 f"policy st3d: ignore {self.ignore} and keep {self.keep} must be ascending and in "
@@ -56,7 +56,7 @@ class ST3D(Policy):
         """1 or 0 for every label, and which are dropped.
 
         Raises:
-            ConfigError: the confidence is to be the IoU, and the detector estimates none.
+            ConfigError: if the confidence is to be the IoU, and the detector estimates none.
         """
         confidence = self._confidence(evidence)
         if evidence.memory is not None:
@@ -70,7 +70,7 @@ class ST3D(Policy):
         )
 
     def _confidence(self, labels: Evidence | Memory) -> np.ndarray:
-        """(n,) a copy of the column that decides."""
+        """Return (n,) a copy of the column that decides."""
         if self.confidence == "score":
             return labels.score.copy()
         if np.isnan(labels.iou).any():

@@ -26,7 +26,7 @@ class Threshold(Policy):
     reads: ClassVar[tuple[str, ...]] = ("category", "score")
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a threshold that is no score."""
+        """Raise ConfigError for a threshold that is no score."""
         check_share(self.name, "threshold", {"every category": self.threshold, **self.per_category})
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
@@ -38,7 +38,7 @@ class Threshold(Policy):
 def by_category(
     evidence: Evidence, every: float, own: Mapping[str, float]
 ) -> Float[np.ndarray, " n"]:
-    """(n,) the threshold that holds for each label."""
+    """Return (n,) the threshold that holds for each label."""
     threshold = np.full(len(evidence), every)
     for category, value in own.items():
         threshold[evidence.category == category] = value
@@ -46,7 +46,7 @@ def by_category(
 
 
 def check_share(policy: str, setting: str, values: Mapping[str, float]) -> None:
-    """Raises ConfigError for a value outside [0, 1]."""
+    """Raise ConfigError for a value outside [0, 1]."""
     for category, value in values.items():
         if not 0 <= value <= 1:
             raise ConfigError(

@@ -101,7 +101,7 @@ class AuditedRound:
 def run_audit(
     workspace: Workspace, request: AuditRequest, progress: Progress, tell: Tell
 ) -> AuditedRound:
-    """Brings the frames up to date, weighs their labels and asks the truth.
+    """Bring the frames up to date, weighs their labels and asks the truth.
 
     Args:
         workspace: see `Workspace`.
@@ -110,9 +110,9 @@ def run_audit(
         tell: takes what each stage did, as it ends.
 
     Raises:
-        ConfigError: the request makes no sense.
-        LeakageError: the teacher has learned from the frames.
-        WorkspaceError: there are no such frames.
+        ConfigError: if the request makes no sense.
+        LeakageError: if the teacher has learned from the frames.
+        WorkspaceError: if there are no such frames.
     """
     _check(workspace, request)
     reports: list[Report] = []
@@ -160,7 +160,7 @@ def picture_path(workspace: Workspace, found: AuditedRound, suffix: str = "png")
 
 
 def _check(workspace: Workspace, request: AuditRequest) -> None:
-    """Refuses before the detector runs what could not be audited after it."""
+    """Reject before the detector runs what could not be audited after it."""
     if request.split not in ("val", "labeled"):
         raise ConfigError(
             f"--split {request.split}: only val and labeled frames have ground truth to ask"
@@ -183,7 +183,7 @@ def _check(workspace: Workspace, request: AuditRequest) -> None:
 def _places(
     workspace: Workspace, request: AuditRequest, progress: Progress, note: Tell
 ) -> Iterator[tuple[Plan, str, Tell]]:
-    """The rounds and splits to audit, and who is told of the stages there."""
+    """Yield the rounds and splits to audit, and who is told of the stages there."""
     if not request.folds:
         yield open_plan(workspace, request.round_number), request.split, note
         return
@@ -199,7 +199,7 @@ def _places(
 
 
 def _run_stages(plan: Plan, split: str, progress: Progress, done: Tell) -> set[str]:
-    """Brings every frame stage up to date; the frames that failed in one."""
+    """Bring every frame stage up to date; the frames that failed in one."""
     failed: set[str] = set()
     with open_executor(plan.workspace) as executor:
         for stage in plan.graph.frames_stages:
@@ -212,7 +212,7 @@ def _run_stages(plan: Plan, split: str, progress: Progress, done: Tell) -> set[s
 def _judge(
     plan: Plan, split: str, request: AuditRequest, failed: set[str]
 ) -> tuple[JudgedLabels, dict[str, np.ndarray]]:
-    """The labels of a split with what the truth says of them, and their weights."""
+    """Return the labels of a split with what the truth says of them, and their weights."""
     workspace, context = plan.workspace, plan.context
     # By key, as the evidence is ordered.
     frames = sorted(

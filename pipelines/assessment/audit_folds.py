@@ -21,10 +21,10 @@ from pipelines.workspace.workspace import Workspace
 
 
 def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
-    """The workspace of every fold, made where it does not exist yet.
+    """Yield the workspace of every fold, made where it does not exist yet.
 
     Raises:
-        ConfigError: there are fewer labeled frames, or sequences of them, than folds.
+        ConfigError: if there are fewer labeled frames, or sequences of them, than folds.
     """
     labeled = sorted(workspace.frames("labeled"))
     if not 2 <= folds <= len(labeled):
@@ -52,7 +52,7 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
 def _dealt(
     workspace: Workspace, labeled: Sequence[str], folds: int, generator: np.random.Generator
 ) -> list[list[str]]:
-    """The labeled frames in folds of about the same size; no sequence is in two of them.
+    """Return the labeled frames in folds of about the same size; no sequence is in two of them.
 
     Where frames were split singly all the same, too few sequences are cut here, too.
     """
@@ -71,7 +71,7 @@ def _dealt(
 
 
 def _fold_config(workspace: Workspace) -> Config:
-    """The workspace's settings with absolute paths and the fold's own database."""
+    """Return the workspace's settings with absolute paths and the fold's own database."""
     config = workspace.config
     detector, segmenter = config.detector.path, config.segmenter.path
     changes = {

@@ -16,14 +16,14 @@ from pipelines.workspace.workspace import Workspace
 
 
 def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Finding]]:
-    """The frame, and what each check says of it; nothing is stored.
+    """Return the frame, and what each check says of it; nothing is stored.
 
     Args:
         workspace: see `Workspace`.
         frame_id: None for the first unlabeled frame.
 
     Raises:
-        ConfigError: the workspace has no such frame.
+        ConfigError: if the workspace has no such frame.
     """
     names = list(workspace.frames("unlabeled", "val", "labeled"))
     unlabeled = list(workspace.frames("unlabeled"))
@@ -43,7 +43,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
 
 
 def _guarded(check: str, examined: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:
-    """The findings, or the error that keeps a part of the chain from being examined."""
+    """Return the findings, or the error that keeps a part of the chain from being examined."""
     try:
         return examined()
     except CurateError as error:
@@ -73,7 +73,7 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
 
 
 def _no_views(config: Config) -> Finding:
-    """A record without a second pass is fine for methods that need none."""
+    """Return a record without a second pass is fine for methods that need none."""
     if not wants_views(config):
         return Finding("views", "ok", "none recorded; the priors alone weigh")
     return Finding(

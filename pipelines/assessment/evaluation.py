@@ -23,7 +23,7 @@ def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str
     """What a checkpoint finds in the val frames.
 
     Raises:
-        FramesFailed: the detector failed on some frames.
+        FramesFailed: if the detector failed on some frames.
     """
     frames = workspace.frames("val")
     predict = Predict(workspace.config, path)
@@ -43,7 +43,7 @@ def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]
     """What a round's teacher found in the val frames, as `curate predict --split val` stored it.
 
     Raises:
-        WorkspaceError: the round has no predictions for some val frames.
+        WorkspaceError: if the round has no predictions for some val frames.
     """
     keys = workspace.frames("val")
     context = peek_round(workspace, round_number)
@@ -65,7 +65,7 @@ def val_objects(workspace: Workspace, found: Mapping[str, Detections]) -> ValObj
     """Ground truth and detections of the val frames in KITTI's form, in the order of their names.
 
     Raises:
-        WorkspaceError: there are no val frames.
+        WorkspaceError: if there are no val frames.
     """
     truth = workspace.ground_truth("val")
     if not truth:

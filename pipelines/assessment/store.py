@@ -106,7 +106,7 @@ def _replace(connection: Connection, name: str, key: Row, rows: Sequence[Row]) -
 
 
 def _figures(figures: Figures) -> Row:
-    """The columns that `audit` and `audit_slice` have in common."""
+    """Return the columns that `audit` and `audit_slice` have in common."""
     row: Row = {
         "labels": figures.labels,
         "neutral": figures.neutral,
@@ -122,7 +122,7 @@ def _figures(figures: Figures) -> Row:
 
 
 def _bins(figures: Figures) -> Iterator[Row]:
-    """The bins that hold a label."""
+    """Yield the bins that hold a label."""
     bins = figures.bins
     for i in np.flatnonzero(bins.labels).tolist():
         yield {
@@ -179,5 +179,5 @@ def _averages(figures: KittiEvaluation) -> Iterator[Row]:
 
 
 def _finite(value: float) -> float | None:
-    """A number of Python; None where it is undefined or infinite."""
+    """Return a number of Python; None where it is undefined or infinite."""
     return float(value) if math.isfinite(value) else None

@@ -74,7 +74,7 @@ def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
 
 
 def _prepared(bench: Bench, job: Job) -> Workspace:
-    """The workspace with its draw of labeled frames."""
+    """Return the workspace with its draw of labeled frames."""
     config = bench.config(job.seed)
     root = job.folder(bench.root)
     if (root / CONFIG_NAME).exists():
@@ -83,7 +83,7 @@ def _prepared(bench: Bench, job: Job) -> Workspace:
 
 
 def _share(workspace: Workspace, progress: Metered) -> list[Report]:
-    """The teacher, and what round 1 asks of it whatever the method."""
+    """Return the teacher, and what round 1 asks of it whatever the method."""
     firsts = graph_of(workspace).first_stages
     reports = [run_first(workspace, first, progress) for first in firsts]
     plan = open_plan(workspace, 1)
@@ -93,7 +93,7 @@ def _share(workspace: Workspace, progress: Metered) -> list[Report]:
 
 
 def _copied(bench: Bench, job: Job) -> Workspace:
-    """The method's workspace, which starts as a copy of the shared one.
+    """Return the method's workspace, which starts as a copy of the shared one.
 
     Whatever of the copy does not fit the method's settings is stale and done again.
     """
@@ -153,7 +153,7 @@ def _recalls(evaluation: KittiEvaluation) -> dict[str, tuple[float, float, float
 
 
 def _labels(workspace: Workspace, policy: str) -> tuple[LabelFigures, ...]:
-    """The labels of every round under a policy, judged by the simulation's truth."""
+    """Return the labels of every round under a policy, judged by the simulation's truth."""
     rows = []
     for number in range(1, workspace.config.run.rounds + 1):
         [found] = label_quality(workspace, number, (policy,))

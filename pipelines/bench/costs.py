@@ -36,7 +36,7 @@ class Costs:
         return TRAIN in self._measured
 
     def learn(self, result: JobResult) -> None:
-        """Takes the times of a finished job into account."""
+        """Take the times of a finished job into account."""
         for kind, (units, seconds) in result.timings.items():
             before = self._measured.get(kind, (0, 0.0))
             if units:

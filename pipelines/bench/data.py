@@ -8,10 +8,10 @@ from pipelines.workspace.workspace import open_dataset
 
 
 def make_data(bench: Bench, workers: int, say: Say, progress: Progress) -> None:
-    """Simulates the frames that are not there yet, or looks whether a folder can be used.
+    """Simulate the frames that are not there yet, or looks whether a folder can be used.
 
     Raises:
-        DataError: the folder has no lists of training and validation frames.
+        DataError: if the folder has no lists of training and validation frames.
     """
     settings = bench.settings
     if settings.data == SYNTHETIC and settings.frames and settings.val:

@@ -49,11 +49,11 @@ class Job:
         return root / ("shared" if self.method is None else "cells") / self.name
 
     def result(self, root: Path) -> Path:
-        """The file that is there once the job is done."""
+        """Return the file that is there once the job is done."""
         return self.folder(root) / RESULT_FILE
 
     def is_done(self, root: Path) -> bool:
-        """Whether it is finished; it is never done again."""
+        """Return whether it is finished; it is never done again."""
         return self.result(root).is_file()
 
 
@@ -80,7 +80,7 @@ def jobs(axes: Axes) -> list[Job]:
 
 
 def waiting(axes: Axes, root: Path) -> list[Job]:
-    """The jobs that are not done, without preparations that nobody needs any more."""
+    """Return the jobs that are not done, without preparations that nobody needs any more."""
     unfinished = [job for job in jobs(axes) if not job.is_done(root)]
     needed = {job.shared for job in unfinished if job.method is not None}
     return [job for job in unfinished if job.method is not None or job in needed]
@@ -102,5 +102,5 @@ def work(job: Job, config: Config, sizes: Sizes) -> Mapping[str, int]:
 
 
 def frame_stages(config: Config) -> Iterator[str]:
-    """The stages that go through the frames of X_u."""
+    """Return the stages that go through the frames of X_u."""
     return (stage.name for stage in round_graph(config.run.priors).frames_stages)

@@ -34,7 +34,7 @@ class Metered:
 
     @contextmanager
     def track(self, what: str, total: int) -> Iterator[Advance]:  # noqa: ARG002
-        """Yields a function that counts; a training's name is that of its checkpoint."""
+        """Yield a function that counts; a training's name is that of its checkpoint."""
         kind = what if what in self._kinds else TRAIN
         begun: float | None = None
         told, units, untold = time.monotonic(), 0, 0

@@ -28,7 +28,7 @@ class JobProcesses:
         self._lock = threading.Lock()
 
     def __call__(self, job: Job, told: ProgressCallback) -> str | None:
-        """Runs a job to its end; gives None, or in one line why it failed."""
+        """Run a job to its end; gives None, or in one line why it failed."""
         log = self._root / LOGS / f"{job.name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("w", encoding="utf-8") as stream:
@@ -48,7 +48,7 @@ class JobProcesses:
         return None if process.returncode == 0 else _reason(process.returncode, log)
 
     def end(self) -> None:
-        """Kills what runs and starts nothing more; the next run goes on from there."""
+        """Kill what runs and starts nothing more; the next run goes on from there."""
         with self._lock:
             self._ended = True
             for process in self._running:
@@ -76,7 +76,7 @@ class JobProcesses:
 
 
 def end_with_parent() -> None:
-    """Ends this process, whatever it does, once the pipe from its parent closes."""
+    """End this process, whatever it does, once the pipe from its parent closes."""
     threading.Thread(target=_wait_for_end, daemon=True).start()
 
 

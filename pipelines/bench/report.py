@@ -83,7 +83,7 @@ class BenchReport:
         }
 
     def markdown(self) -> str:
-        """The document."""
+        """Return the document."""
         lines = ["# The methods, compared by `curate bench`", ""]
         lines += [f"- {condition}" for condition in self.conditions()]
         if self.finished.methods:
@@ -206,7 +206,7 @@ class BenchReport:
 
 
 def command(bench: Bench) -> str:
-    """The command that makes the bench, for the folder DIR."""
+    """Return the command that makes the bench, for the folder DIR."""
     settings, axes = bench.settings, bench.axes
     words = ["curate bench DIR", f"--data {settings.data}"]
     if settings.data == SYNTHETIC:
@@ -224,7 +224,7 @@ def command(bench: Bench) -> str:
 
 
 def shown(value: Value, *, full: bool = False) -> str:
-    """A value as a table shows it."""
+    """Return a value as a table shows it."""
     if isinstance(value, Entry):
         return value.full if full else value.short
     if isinstance(value, PairedDifference):
@@ -236,7 +236,7 @@ def shown(value: Value, *, full: bool = False) -> str:
 
 
 def _plain(value: Value) -> Any:
-    """A value for JSON, which knows no NaN."""
+    """Return a value for JSON, which knows no NaN."""
     if isinstance(value, Entry):
         return {**_finite(asdict(value.spread)), **_finite({"gain": value.gain})}
     if isinstance(value, PairedDifference):

@@ -75,23 +75,23 @@ class JobResult(Section):
         return self.recall if figure == "recall" else self.ap[overlaps][figure]
 
     def mean(self, overlaps: str, figure: str) -> float:
-        """The mean over categories and difficulties."""
+        """Return the mean over categories and difficulties."""
         return float(np.mean(list(self.table(overlaps, figure).values())))
 
 
 def write_result(root: Path, result: JobResult) -> None:
-    """Marks the job as done, by writing its file whole."""
+    """Mark the job as done, by writing its file whole."""
     content = result.model_dump_json(indent=1) + "\n"
     replace_file(result.job.result(root), content.encode())
 
 
 def read_result(root: Path, job: Job) -> JobResult:
-    """The result of a finished job."""
+    """Return the result of a finished job."""
     return _read(job.result(root))
 
 
 def read_results(root: Path) -> list[JobResult]:
-    """The results of all finished jobs of a bench, those of shared work included."""
+    """Return the results of all finished jobs of a bench, those of shared work included."""
     paths = [path for kind in ("shared", "cells") for path in root.glob(f"{kind}/*/{RESULT_FILE}")]
     found = [_read(path) for path in paths]
     return sorted(found, key=lambda result: (result.ratio, result.seed, result.method or ""))

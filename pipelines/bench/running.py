@@ -27,11 +27,11 @@ class RunJob(Protocol):
     """Where jobs are done."""
 
     def __call__(self, job: Job, told: ProgressCallback) -> str | None:
-        """Runs a job to its end; gives None, or in one line why it failed."""
+        """Run a job to its end; gives None, or in one line why it failed."""
         ...
 
     def end(self) -> None:
-        """Ends what runs, because the grid was interrupted."""
+        """End what runs, because the grid was interrupted."""
         ...
 
 
@@ -39,7 +39,7 @@ def run_grid(bench: Bench, run_job: RunJob, workers: int, say: Say, progress: Pr
     """Does every job that is not done.
 
     Raises:
-        CellsFailed: some cells failed; the others are done.
+        CellsFailed: if some cells failed; the others are done.
     """
     waiting = grid.waiting(bench.axes, bench.root)
     cells = [job for job in grid.jobs(bench.axes) if job.method is not None]
@@ -61,10 +61,10 @@ def run_grid(bench: Bench, run_job: RunJob, workers: int, say: Say, progress: Pr
 
 @contextmanager
 def alone(root: Path) -> Iterator[None]:
-    """Holds the bench's folder; the operating system lets go of it with the process.
+    """Hold the bench's folder; the operating system lets go of it with the process.
 
     Raises:
-        WorkspaceError: another process holds it.
+        WorkspaceError: if another process holds it.
     """
     root.mkdir(parents=True, exist_ok=True)
     with (root / ".lock").open("w") as file:
@@ -93,11 +93,11 @@ class _GridRun:
         self._bar = _GridBar(seconds, rates, advance)
 
     def work(self, job: Job) -> Mapping[str, int]:
-        """The units of work of a job."""
+        """Return the units of work of a job."""
         return grid.work(job, self.bench.config(job.seed, job.method), self.sizes)
 
     def go(self, run_job: RunJob, workers: int) -> int:
-        """Runs all jobs; gives how many cells failed."""
+        """Run all jobs; gives how many cells failed."""
         running: dict[Future[str | None], Job] = {}
         with ThreadPoolExecutor(workers) as pool:
             try:
@@ -115,7 +115,7 @@ class _GridRun:
         return sum(job.method is not None for job in self.failed)
 
     def _ready(self) -> list[Job]:
-        """The waiting jobs whose shared work is done."""
+        """Return the waiting jobs whose shared work is done."""
         root = self.bench.root
         return [job for job in self.waiting if job.method is None or job.shared.is_done(root)]
 
@@ -129,7 +129,7 @@ class _GridRun:
         )
 
     def _end(self, job: Job, fault: str | None) -> None:
-        """Takes a job's end into account, and says how it went."""
+        """Take a job's end into account, and says how it went."""
         self._bar.finish(job)
         if fault is None:
             result = read_result(self.bench.root, job)
@@ -165,7 +165,7 @@ class _GridBar:
         self._lock = threading.Lock()
 
     def progress_of(self, job: Job) -> ProgressCallback:
-        """Takes a job's finished units."""
+        """Take a job's finished units."""
 
         def told(kind: str, units: int) -> None:
             with self._lock:
@@ -176,7 +176,7 @@ class _GridBar:
         return told
 
     def finish(self, job: Job) -> None:
-        """Counts a job as done, however it ended."""
+        """Count a job as done, however it ended."""
         with self._lock:
             self._done[job] = self._seconds[job]
             self._finished += 1

@@ -98,10 +98,10 @@ class Bench:
         return self.settings.data == SYNTHETIC or (self.data / SIMULATION_FILE).is_file()
 
     def config(self, seed: int, method: str | None = None) -> Config:
-        """The settings of a cell's workspace; without a method, of what all methods share.
+        """Return the settings of a cell's workspace; without a method, of what all methods share.
 
         Raises:
-            ConfigError: an override is wrong, or the method decides it.
+            ConfigError: if an override is wrong, or the method decides it.
         """
         overrides = _parsed(self.settings.overrides)
         document: dict[str, Any] = {
@@ -126,10 +126,10 @@ class Bench:
 
 
 def check_axes(axes: Axes) -> Axes:
-    """The axes as they are.
+    """Return the axes as they are.
 
     Raises:
-        ConfigError: an axis is empty or repeats itself, or a method or ratio does not exist.
+        ConfigError: if an axis is empty or repeats itself, or a method or ratio does not exist.
     """
     for name, values in axes.model_dump().items():
         if not values or len(set(values)) < len(values):
@@ -147,10 +147,10 @@ def check_axes(axes: Axes) -> Axes:
 
 
 def read_bench(root: Path) -> Bench | None:
-    """The bench in a folder; None where there is none yet.
+    """Return the bench in a folder; None where there is none yet.
 
     Raises:
-        DataError: its settings are damaged.
+        DataError: if its settings are damaged.
     """
     root = root.resolve()
     path = root / SETTINGS_FILE
@@ -170,10 +170,10 @@ def read_bench(root: Path) -> Bench | None:
 
 
 def claim(bench: Bench) -> None:
-    """Marks the folder with the bench; a grid may grow, what its cells share may not change.
+    """Mark the folder with the bench; a grid may grow, what its cells share may not change.
 
     Raises:
-        WorkspaceError: the folder holds a bench with other settings.
+        WorkspaceError: if the folder holds a bench with other settings.
     """
     stored = read_bench(bench.root)
     if stored is not None and stored.settings != bench.settings:
@@ -195,7 +195,7 @@ def claim(bench: Bench) -> None:
 
 
 def _under(shared: Config, method: str, overrides: Mapping[str, Any]) -> Config:
-    """The shared settings under a method, which must leave the overrides alone."""
+    """Return the shared settings under a method, which must leave the overrides alone."""
     config = with_method(shared, method)
     before, after = shared.model_dump(), config.model_dump()
     for path in _paths(overrides):
@@ -205,7 +205,7 @@ def _under(shared: Config, method: str, overrides: Mapping[str, Any]) -> Config:
 
 
 def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
-    """The overrides as a document."""
+    """Return the overrides as a document."""
     document: dict[str, Any] = {}
     for override in overrides:
         key = override.partition("=")[0].strip()
@@ -216,7 +216,7 @@ def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def _merge(document: dict[str, Any], other: Mapping[str, Any]) -> None:
-    """Puts the other document's values into the first, table by table."""
+    """Put the other document's values into the first, table by table."""
     for key, value in other.items():
         if isinstance(value, dict) and isinstance(document.get(key), dict):
             _merge(document[key], value)
@@ -225,7 +225,7 @@ def _merge(document: dict[str, Any], other: Mapping[str, Any]) -> None:
 
 
 def _paths(document: Mapping[str, Any], of: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """The paths of the document's values."""
+    """Yield the paths of the document's values."""
     for key, value in document.items():
         if isinstance(value, dict):
             yield from _paths(value, (*of, key))

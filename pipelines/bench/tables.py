@@ -47,7 +47,7 @@ class Entry:
 
 
 def signed(points: float) -> str:
-    """A difference with its sign; 0 has none below it."""
+    """Return a difference with its sign; 0 has none below it."""
     return f"{round(points, 1) + 0.0:+.1f}"
 
 
@@ -98,7 +98,7 @@ class Finished:
         return self._by_job.values()
 
     def result(self, method: str | None, ratio: float, seed: int) -> JobResult | None:
-        """A job's result, where it is finished; no method means the teacher."""
+        """Return a job's result, where it is finished; no method means the teacher."""
         return self._by_job.get(Job(ratio, seed, method))
 
     @property
@@ -121,7 +121,7 @@ class Finished:
 
 
 def all_tables(finished: Finished) -> list[Table]:
-    """Every table: the summary first, then those of each ratio."""
+    """Return every table: the summary first, then those of each ratio."""
     if not finished.methods:
         return []
     return [
@@ -166,7 +166,7 @@ def _of_ratio(finished: Finished, ratio: float, overlaps: str, figure: str) -> T
 
 
 def _summary(finished: Finished, overlaps: str, figure: str) -> Table:
-    """The mean over categories and difficulties, by ratio."""
+    """Return the mean over categories and difficulties, by ratio."""
     rows: list[tuple[Value, ...]] = []
     for method in (None, *finished.methods):
         entries = []
@@ -208,7 +208,7 @@ def _differences(finished: Finished, overlaps: str, figure: str) -> Iterator[Tab
 
 
 def _compared(methods: Sequence[str]) -> list[tuple[str, str]]:
-    """Every method with the baseline, and the paper's two with all that are not theirs."""
+    """Return every method with the baseline, and the paper's two with all that are not theirs."""
     pairs = [(method, BASELINE) for method in methods if BASELINE in methods]
     pairs += [
         (own, other)
@@ -220,7 +220,7 @@ def _compared(methods: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _labels(finished: Finished, ratio: float) -> Iterator[Table]:
-    """The labels of the last round, judged by the simulation's truth."""
+    """Yield the labels of the last round, judged by the simulation's truth."""
     rows: list[tuple[Value, ...]] = []
     for method in finished.methods:
         results = [finished.result(method, ratio, seed) for seed in finished.seeds]
@@ -278,7 +278,7 @@ def _overlaps(finished: Finished, overlaps: str) -> str:
 
 
 def _ratio(finished: Finished, ratio: float) -> str:
-    """A ratio with its frames, which are as many for every seed and method."""
+    """Return a ratio with its frames, which are as many for every seed and method."""
     frames = next(result.frames for result in finished.results if result.ratio == ratio)
     train = frames["labeled"] + frames["unlabeled"]
     return f"{100 * ratio:g} % labeled ({frames['labeled']} of {train} frames)"

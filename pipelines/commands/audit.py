@@ -190,5 +190,5 @@ def _shown(value: float) -> str:
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(audit)

@@ -147,7 +147,7 @@ def bench_cell(
 
 
 def _open(directory: Path) -> "Bench":
-    """The bench in a folder."""
+    """Return the bench in a folder."""
     from curate.errors import WorkspaceError
     from pipelines.bench.settings import read_bench
 
@@ -158,7 +158,7 @@ def _open(directory: Path) -> "Bench":
 
 
 def _choose(directory: Path, asked: dict[str, Any], grid: dict[str, str | None]) -> "Bench":
-    """The bench as it is asked for; what is not asked is as it was, or the default."""
+    """Return the bench as it is asked for; what is not asked is as it was, or the default."""
     from curate.errors import ConfigError
     from pipelines.bench.settings import SYNTHETIC, Bench, BenchSettings, check_axes, read_bench
 
@@ -183,13 +183,13 @@ def _choose(directory: Path, asked: dict[str, Any], grid: dict[str, str | None])
 
 
 def _absolute(override: str) -> str:
-    """An override whose path holds wherever the bench is continued."""
+    """Return an override whose path holds wherever the bench is continued."""
     key, _, value = override.partition("=")
     return f"{key}={Path(value).resolve()}" if key.endswith(".path") else override
 
 
 def _axes(grid: dict[str, str | None], stored: "Bench | None") -> Any:
-    """The axes of the grid from the words of the command line."""
+    """Return the axes of the grid from the words of the command line."""
     from curate.errors import ConfigError
     from pipelines.bench.settings import Axes
     from pipelines.stages.methods import METHODS as KNOWN
@@ -212,7 +212,7 @@ def _axes(grid: dict[str, str | None], stored: "Bench | None") -> Any:
 
 
 def _run(bench: "Bench", workers: int, *, quiet: bool) -> None:
-    """Simulates what is to be simulated and runs the grid; in JSON mode it talks on stderr."""
+    """Simulate what is to be simulated and runs the grid; in JSON mode it talks on stderr."""
     from pipelines.bench.data import make_data
     from pipelines.bench.processes import JobProcesses
     from pipelines.bench.running import alone, run_grid
@@ -229,7 +229,7 @@ def _run(bench: "Bench", workers: int, *, quiet: bool) -> None:
 
 
 def _announce(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
-    """Writes the files, and prints the tables."""
+    """Write the files, and prints the tables."""
     from pipelines.bench.report import shown
 
     if not report.results:
@@ -249,6 +249,6 @@ def _announce(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the commands."""
+    """Add the commands."""
     app.command()(bench)
     app.command(name="bench-cell", hidden=True)(bench_cell)

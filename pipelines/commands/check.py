@@ -37,5 +37,5 @@ def check(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> Non
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(check)

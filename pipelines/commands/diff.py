@@ -44,5 +44,5 @@ def diff(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(diff)

@@ -98,7 +98,7 @@ def evaluate(
 
 
 def _read_ids(path: Path) -> list[str]:
-    """The frame ids in a file such as ImageSets/val.txt."""
+    """Return the frame ids in a file such as ImageSets/val.txt."""
     from curate.errors import DataError
 
     try:
@@ -113,7 +113,7 @@ def _read_ids(path: Path) -> list[str]:
 def _evaluate_val(
     workspace: "Workspace", round_number: int | None, checkpoint: Path | None, *, store: bool
 ) -> "tuple[KittiEvaluation, str]":
-    """The evaluation on the val frames, and what to say of it."""
+    """Return the evaluation on the val frames, and what to say of it."""
     from curate.errors import WorkspaceError
     from pipelines.assessment.evaluation import detect_val, stored_val, val_objects
     from pipelines.assessment.store import store_evaluation
@@ -142,7 +142,7 @@ def _evaluate_val(
 def _compare(
     labels: "Sequence[KittiObjects]", results: "Sequence[KittiObjects]"
 ) -> "KittiEvaluation":
-    """The evaluation; says what takes so long where it must be compiled first."""
+    """Return the evaluation; says what takes so long where it must be compiled first."""
     from curate.evaluation import kitti_ap, kitti_matching
     from curate.geometry.compiled import is_compiled
 
@@ -172,5 +172,5 @@ def _percent(value: Any) -> str:
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(evaluate)

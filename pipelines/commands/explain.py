@@ -38,5 +38,5 @@ def explain(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(explain)

@@ -78,5 +78,5 @@ def export(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(export)

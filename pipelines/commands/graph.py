@@ -32,5 +32,5 @@ def graph(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(graph)

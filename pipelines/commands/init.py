@@ -148,5 +148,5 @@ def _option(text: str) -> tuple[str, Any]:
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(init)

@@ -46,5 +46,5 @@ def pretrain(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(pretrain)

@@ -43,5 +43,5 @@ def report(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(report)

@@ -34,5 +34,5 @@ def repredict(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(repredict)

@@ -197,7 +197,7 @@ def clear_reviews(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the commands."""
+    """Add the commands."""
     app.add_typer(group)
 
 

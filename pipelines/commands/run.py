@@ -71,5 +71,5 @@ def run(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(run)

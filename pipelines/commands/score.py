@@ -49,5 +49,5 @@ def score(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(score)

@@ -63,5 +63,5 @@ def _announce(served: "Served", url: str) -> None:
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(serve)

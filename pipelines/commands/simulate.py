@@ -48,5 +48,5 @@ def simulate(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(simulate)

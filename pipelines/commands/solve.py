@@ -42,5 +42,5 @@ def solve(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(solve)

@@ -39,5 +39,5 @@ def status(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(status)

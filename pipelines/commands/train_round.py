@@ -65,7 +65,7 @@ def train_round(
 
 
 def _remember(folder: Path | None, policy: str | None, told: Mapping[str, str]) -> None:
-    """Writes how the next teacher was trained into curate.toml, where later rounds look."""
+    """Write how the next teacher was trained into curate.toml, where later rounds look."""
     from pipelines.workspace.config_file import change_settings
     from pipelines.workspace.location import CONFIG_NAME
     from pipelines.workspace.workspace import Workspace
@@ -83,5 +83,5 @@ def _remember(folder: Path | None, policy: str | None, told: Mapping[str, str]) 
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command(name="train-round")(train_round)

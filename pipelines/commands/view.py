@@ -97,7 +97,7 @@ def _image_format(name: str | None, output: Path | None) -> "ImageFormat":
     """Return the format of the picture.
 
     Raises:
-        ConfigError: it is unknown, or the file's suffix says another one.
+        ConfigError: if it is unknown, or the file's suffix says another one.
     """
     from curate.errors import ConfigError
     from curate.viewing.chart_style import check_format
@@ -110,5 +110,5 @@ def _image_format(name: str | None, output: Path | None) -> "ImageFormat":
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command()(view)

@@ -70,7 +70,7 @@ class TaskKey:
     variant: str
 
     def conditions(self) -> tuple[ColumnElement[bool], ...]:
-        """The task's row in SQL."""
+        """Return the task's row in SQL."""
         task = bulk.table("task")
         mine = {"round": self.round, "stage": self.stage, "variant": self.variant}
         return (*(task.c[name] == value for name, value in mine.items()), task.c.frame_id.is_(None))
@@ -142,7 +142,7 @@ class Plan:
     def waiting_frames(
         self, of: FrameStage, split: str, *, measured: bool
     ) -> Iterator[WaitingFrame]:
-        """The frames to work on.
+        """Yield the frames to work on.
 
         They are those of the split that all earlier stages have finished and this one has not, or
         not with its current fingerprint. They are read page by page: what becomes of them meanwhile
@@ -165,7 +165,7 @@ class Plan:
     def waiting_sequences(
         self, of: FramesStage, split: str
     ) -> Iterator[tuple[str, list[WaitingFrame]]]:
-        """The sequences to work on, each with all its frames in the order of their names.
+        """Yield the sequences to work on, each with all its frames in the order of their names.
 
         They are those with a frame that waits, where no frame still waits for an earlier stage. A
         frame that failed in an earlier stage is left out of its sequence.
@@ -307,14 +307,14 @@ class Plan:
         return [WaitingFrame(key, name, bool(empty)) for key, name, empty in found]
 
     def _failed_before(self, of: FramesStage, split: str) -> set[str]:
-        """The frames that failed in an earlier stage."""
+        """Return the frames that failed in an earlier stage."""
         with self.workspace.database.reading() as connection:
             states = [self._states(connection, other) for other in self.graph.before(of)]
         failed = {key for each in states for key, state in each.items() if state == "failed"}
         return {name for name, key in self.workspace.frames(split).items() if key in failed}
 
     def _states(self, connection: Connection, of: FramesStage) -> Mapping[int, str]:
-        """The state of each frame's task that carries the current fingerprint."""
+        """Return the state of each frame's task that carries the current fingerprint."""
         task = bulk.table("task")
         query = select(task.c.frame_id, task.c.state).where(
             task.c.round == self.context.number,
@@ -325,7 +325,7 @@ class Plan:
         return dict(bulk.select(connection, query))
 
     def _task_of(self, task: Any, of: FramesStage) -> ColumnElement[bool]:
-        """The join of a frame with its task of a stage."""
+        """Return the join of a frame with its task of a stage."""
         return and_(
             task.c.round == self.context.number,
             task.c.stage == of.name,
@@ -340,7 +340,7 @@ def is_current(workspace: Workspace, what: TaskKey, fingerprint: str) -> bool:
 
 
 def _fingerprint(name: str, settings: Any, reads: Sequence[str], known: Mapping[str, str]) -> str:
-    """The hash of a stage's settings and of the fingerprints of what it reads."""
+    """Return the hash of a stage's settings and of the fingerprints of what it reads."""
     return digest([name, settings, [known[each] for each in reads if each in known]])
 
 

@@ -185,7 +185,7 @@ class Preview:
     def _to_do(
         self, plan: Plan, stage: FramesStage, names: Mapping[str, int]
     ) -> dict[str, _Reason]:
-        """The frames that a stage would work on."""
+        """Return the frames that a stage would work on."""
         current, tasks = plan.fingerprint(stage), self._tasks(stage)
         recalls = isinstance(stage, FrameStage) and stage.recall is not None
         measured = current.partition(".")[0]
@@ -219,7 +219,7 @@ class Preview:
     def _whole_sequences(
         self, names: Mapping[str, int], found: Mapping[str, _Reason]
     ) -> dict[str, _Reason]:
-        """All frames of the sequences in which a frame is to be worked on."""
+        """Return all frames of the sequences in which a frame is to be worked on."""
         sequences = sequences_of(self._workspace.dataset, list(names))
         other = _Reason("another frame of its sequence changes")
         return {
@@ -230,7 +230,7 @@ class Preview:
         }
 
     def _waiting_for_others(self, stage: FramesStage, names: Mapping[str, int]) -> set[str]:
-        """The frames that an earlier stage has not finished."""
+        """Return the frames that an earlier stage has not finished."""
         waiting: set[str] = set()
         for other in self._graph.before(stage):
             current = self._plan.fingerprint(other) if self._plan else ""
@@ -240,7 +240,7 @@ class Preview:
         return waiting
 
     def _changing_inputs(self, stage: Stage) -> list[str]:
-        """The stages that would change what a stage reads."""
+        """Return the stages that would change what a stage reads."""
         reads = set(stage.reads)
         return [other.name for other in self._changing if reads & set(other.writes)]
 
@@ -258,7 +258,7 @@ class Preview:
         return "its settings or its input changed"
 
     def _changed_settings(self, stage: FramesStage | RoundStage, policy: str) -> list[str]:
-        """The settings of a stage that differ from those of the round's last run.
+        """Return the settings of a stage that differ from those of the round's last run.
 
         A stage has names of its own for some of them; they are called as in curate.toml where a
         setting of the same name has changed there.
@@ -302,7 +302,7 @@ class Preview:
 def _settings(
     stage: FramesStage | RoundStage, workspace: Workspace, context: RoundContext, policy: str
 ) -> dict[str, Any]:
-    """The settings of a stage, as text by dotted name."""
+    """Return the settings of a stage, as text by dotted name."""
     if isinstance(stage, RoundStage):
         return _flat(stage.settings(workspace, context, policy))
     return _flat(stage.settings(workspace, context))

@@ -17,7 +17,7 @@ class Progress(Protocol):
 
     @contextmanager
     def track(self, what: str, total: int) -> Iterator[Advance]:
-        """Yields a function that takes how much more is done and a word on how it goes."""
+        """Yield a function that takes how much more is done and a word on how it goes."""
         ...
 
 
@@ -25,12 +25,12 @@ class TotalProgress(Protocol):
     """Takes how much is done in all, and of how much."""
 
     def __call__(self, done: int, total: int, note: str = "", /) -> None:
-        """Shows it, with a word on how it goes."""
+        """Show it, with a word on how it goes."""
         ...
 
 
 def as_total(advance: Advance) -> TotalProgress:
-    """Moves `advance` for work that tells how much is done in all, not how much more."""
+    """Move `advance` for work that tells how much is done in all, not how much more."""
     before = 0
 
     def reach(done: int, _total: int, note: str = "") -> None:
@@ -46,7 +46,7 @@ class Bar:
 
     @contextmanager
     def track(self, what: str, total: int) -> Iterator[Advance]:
-        """Yields a function that moves the bar."""
+        """Yield a function that moves the bar."""
         with _bar(what, total) if sys.stderr.isatty() else _lines(what, total) as advance:
             yield advance
 

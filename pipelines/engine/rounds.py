@@ -29,14 +29,14 @@ def is_pretrained(workspace: Workspace) -> bool:
 
 
 def is_student_trained(workspace: Workspace) -> bool:
-    """Whether rounds end with a student: curate's own, or that of the user's command."""
+    """Return whether rounds end with a student: curate's own, or that of the user's command."""
     return is_trainable(workspace) or workspace.config.train.command is not None
 
 
 def open_round(
     workspace: Workspace, number: int | None = None, rounds: int | None = None
 ) -> RoundContext:
-    """A round, made where it does not exist yet.
+    """Return a round, made where it does not exist yet.
 
     Args:
         workspace: see `Workspace`.
@@ -44,9 +44,9 @@ def open_round(
         rounds: E for a round that has no student yet; None for the configured number.
 
     Raises:
-        WorkspaceError: the detector that would answer in the round does not exist yet or is not
+        WorkspaceError: if the detector that would answer in the round does not exist yet or is not
             the one that was stored, or the workspace has no frames.
-        DatabaseError: another process works on the round with other settings.
+        DatabaseError: if another process works on the round with other settings.
     """
     if not _has_frames(workspace):
         raise WorkspaceError(
@@ -99,7 +99,7 @@ def recorded_config(workspace: Workspace, number: int) -> dict[str, Any] | None:
 
 
 def _recorded_config(workspace: Workspace) -> str:
-    """The configuration as JSON, without what says where and by how many the work is done.
+    """Return the configuration as JSON, without what says where and by how many the work is done.
 
     Several processes that differ only in this share a round; and the URL may hold a password.
     """
@@ -108,7 +108,7 @@ def _recorded_config(workspace: Workspace) -> str:
 
 
 def _record_round(workspace: Workspace, row: dict[str, Any]) -> None:
-    """Stores a round; one that another process works on keeps its settings."""
+    """Store a round; one that another process works on keeps its settings."""
     table, number = bulk.table("round"), row["number"]
     query = select(*(table.c[name] for name in row)).where(table.c.number == number)
     stored = workspace.database.rows(query)
@@ -136,7 +136,7 @@ def peek_round(workspace: Workspace, number: int) -> RoundContext | None:
 def find_teacher(
     workspace: Workspace, number: int, *, to_work: bool = False
 ) -> tuple[int | None, Teacher]:
-    """The key and the file of the detector that answers in a round.
+    """Return the key and the file of the detector that answers in a round.
 
     A detector or checkpoint that the user brings answers in the first round, and in later ones as
     well where it is not trained; where it is, the student of the round before does.
@@ -148,9 +148,9 @@ def find_teacher(
             Otherwise nothing is written, and an external detector that was never used has no key.
 
     Raises:
-        WorkspaceError: it does not exist yet, or is another.
-        ConfigError: the user's file does not exist.
-        ModelError: it is about to answer and is not a checkpoint of the configured detector.
+        WorkspaceError: if it does not exist yet, or is another.
+        ConfigError: if the user's file does not exist.
+        ModelError: if it is about to answer and is not a checkpoint of the configured detector.
     """
     trainable = trainable_detector(workspace.config)
     brought = not is_pretrained(workspace)
@@ -191,10 +191,10 @@ def find_teacher(
 
 
 def newest_checkpoint(workspace: Workspace) -> Path:
-    """The student of the last round under the configured policy, else the first teacher.
+    """Return the student of the last round under the configured policy, else the first teacher.
 
     Raises:
-        WorkspaceError: there is no detector yet.
+        WorkspaceError: if there is no detector yet.
     """
     students = _students(workspace)
     number = max(students, default=0) + 1
@@ -204,7 +204,7 @@ def newest_checkpoint(workspace: Workspace) -> Path:
 def register_checkpoint(
     connection: Connection, workspace: Workspace, round_number: int, policy: str, path: Path
 ) -> None:
-    """Stores a checkpoint in place of an earlier one of the same round and policy."""
+    """Store a checkpoint in place of an earlier one of the same round and policy."""
     table = bulk.table("checkpoint")
     row = {
         "detector": workspace.config.detector.name,
@@ -218,7 +218,7 @@ def register_checkpoint(
 
 
 def _external_detector(workspace: Workspace, *, record: bool) -> tuple[int | None, Teacher]:
-    """The detector that the user brought, which answers in every round."""
+    """Return the detector that the user brought, which answers in every round."""
     path = workspace.config.detector.path
     if path is None:
         raise WorkspaceError(
@@ -244,7 +244,7 @@ def _has_frames(workspace: Workspace) -> bool:
 
 
 def _students(workspace: Workspace) -> set[int]:
-    """The rounds that have trained a student with the configured policy."""
+    """Return the rounds that have trained a student with the configured policy."""
     table = bulk.table("checkpoint")
     query = select(table.c.round).where(table.c.policy == workspace.config.run.method)
     return {row[0] for row in workspace.database.rows(query)}

@@ -207,7 +207,7 @@ def _outcomes(
     executor: Executor,
     skip: Callable[[Sequence[int]], None],
 ) -> Iterator[Outcome]:
-    """The executor works on frames or sequences; frames with valid measurements need none."""
+    """Yield the executor works on frames or sequences; frames with valid measurements need none."""
     if isinstance(stage, SequenceStage):
         jobs: Iterator[Job] = _sequence_jobs(plan, plan.waiting_sequences(stage, split))
     else:
@@ -233,7 +233,7 @@ def _frame_jobs(
     skip: Callable[[Sequence[int]], None],
     recall: ReusableMeasurements | None = None,
 ) -> Iterator[FrameJob]:
-    """The jobs of frames, with their predictions and measurements where they are needed.
+    """Yield the jobs of frames, with their predictions and measurements where they are needed.
 
     Frames that an earlier stage found empty are not jobs; `skip` records them.
     """
@@ -253,7 +253,7 @@ def _frame_jobs(
 def _sequence_jobs(
     plan: Plan, sequences: Iterable[tuple[str, list[WaitingFrame]]]
 ) -> Iterator[SequenceJob]:
-    """The jobs of sequences, each frame with its predictions, empty ones too."""
+    """Yield the jobs of sequences, each frame with its predictions, empty ones too."""
     for name, frames in sequences:
         keys = [frame.key for frame in frames]
         found = plan.workspace.predictions(plan.context.number, keys)
@@ -370,7 +370,7 @@ class _Writer:
     def _task(
         self, key: int, state: str, error: str | None, seconds: float, job: Job | None = None
     ) -> dict[str, Any]:
-        """A row of `task`; its variant is the sequence, for a stage of sequences."""
+        """Return a row of `task`; its variant is the sequence, for a stage of sequences."""
         return {
             "round": self.round,
             "stage": self.stage.name,
@@ -384,7 +384,7 @@ class _Writer:
 
 
 def _frames_of(outcome: Outcome) -> Iterator[tuple[FrameJob, FrameRows]]:
-    """Each frame of an outcome with its rows, which a failed one does not have."""
+    """Return each frame of an outcome with its rows, which a failed one does not have."""
     rows = outcome.rows or ({},) * len(outcome.job.frames)
     return zip(outcome.job.frames, rows, strict=True)
 
@@ -394,7 +394,7 @@ def _length(columns: Mapping[str, Sequence[Any]]) -> int:
 
 
 def _joined(parts: Sequence[tuple[int, Mapping[str, Sequence[Any]]]]) -> dict[str, list[Any]]:
-    """The columns of several frames below each other, with the key of the frame."""
+    """Return the columns of several frames below each other, with the key of the frame."""
     joined: dict[str, list[Any]] = {"frame_id": []}
     for key, columns in parts:
         joined["frame_id"] += [key] * _length(columns)

@@ -54,7 +54,7 @@ def _fault(found: LabelFileFrames, own: Mapping[str, str]) -> str:
 
 
 def _written(workspace: Workspace) -> dict[str, str]:
-    """The hash of each label file as it was exported."""
+    """Return the hash of each label file as it was exported."""
     table = bulk.table("label_file")
     return dict(workspace.database.rows(select(table.c.path, table.c.sha256)))
 
@@ -62,7 +62,7 @@ def _written(workspace: Workspace) -> dict[str, str]:
 def object_bank(
     workspace: Workspace, record: SplitRecord, files: Mapping[Path, LabelFileFrames]
 ) -> Finding:
-    """The bank is cut from the ground truth of label files, or was exported as a folder."""
+    """Return the bank is cut from the ground truth of label files, or was exported as a folder."""
     rule = "the object bank is of X_l"
     strangers = {name for name, split in record.split_of.items() if split != "labeled"}
     truth = {name for found in files.values() for name in found.truth}

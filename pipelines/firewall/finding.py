@@ -23,6 +23,6 @@ class Finding:
 
 
 def raise_finding(finding: Finding) -> None:
-    """LeakageError where a rule is broken."""
+    """Raise LeakageError if a rule is broken."""
     if not finding.held:
         raise LeakageError(f"{finding.rule}: {finding.told}; {finding.remedy}")

@@ -14,7 +14,7 @@ from pipelines.workspace.workspace import Workspace
 
 
 def check(workspace: Workspace) -> Iterator[Finding]:
-    """Every rule, one after the other, on everything that the workspace holds."""
+    """Yield every rule, one after the other, on everything that the workspace holds."""
     record = SplitRecord.read(workspace)
     yield from _of_the_database(workspace, record)
     yield copied_truth(workspace, record, predicted_rounds(workspace), thorough=True)
@@ -30,7 +30,7 @@ def check(workspace: Workspace) -> Iterator[Finding]:
 
 
 def enforce(workspace: Workspace, round_number: int = 0, file: Path | None = None) -> None:
-    """Looks at the rules before a command exports or trains.
+    """Look at the rules before a command exports or trains.
 
     Predictions are compared with label files in a sample of frames, files are not looked at for
     duplicates: that is left to `check`.
@@ -41,8 +41,8 @@ def enforce(workspace: Workspace, round_number: int = 0, file: Path | None = Non
         file: the label file that is written or read; one that is not there yet is no matter.
 
     Raises:
-        LeakageError: a rule is broken; the message names the frames and the remedy.
-        DataError: the label file is damaged.
+        LeakageError: if a rule is broken; the message names the frames and the remedy.
+        DataError: if the label file is damaged.
     """
     record = SplitRecord.read(workspace)
     for finding in _of_the_database(workspace, record):

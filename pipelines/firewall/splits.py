@@ -9,7 +9,7 @@ from pipelines.workspace.workspace import Workspace
 
 
 def recorded_splits(record: SplitRecord) -> Finding:
-    """The splits of the database are those that init recorded."""
+    """Return the splits of the database are those that init recorded."""
     rule = "splits are those of init"
     if record.damaged:
         fault = f"the record of {', '.join(record.damaged)} does not fit its hash"
@@ -27,7 +27,7 @@ def recorded_splits(record: SplitRecord) -> Finding:
 
 
 def unchanged_lists(workspace: Workspace, record: SplitRecord) -> Finding:
-    """The lists of the data set, and those that init was given, are as they were."""
+    """Return the lists of the data set, and those that init was given, are as they were."""
     rule = "split lists are unchanged"
     outside = sum(found.source != "chosen" for found in record.lists)
     changed = changed_lists(workspace, record)

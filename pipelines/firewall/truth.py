@@ -79,7 +79,7 @@ def copied_truth(
 
 
 def _suspects(workspace: Workspace, number: int, frames: Mapping[str, int]) -> Mapping[str, int]:
-    """The frames with a prediction that is certain, and others spread over the rest."""
+    """Return the frames with a prediction that is certain, and others spread over the rest."""
     table = bulk.table("prediction")
     query = select(table.c.frame_id).distinct()
     query = query.where(table.c.round == number, table.c.score >= _CERTAIN)
@@ -98,7 +98,7 @@ def _repeated(workspace: Workspace, frame: str, boxes: np.ndarray) -> np.ndarray
 
 
 def predicted_rounds(workspace: Workspace) -> list[int]:
-    """The rounds that have predictions."""
+    """Return the rounds that have predictions."""
     with workspace.database.reading() as connection:
         query = select(bulk.table("prediction").c.round).distinct()
         return sorted(row[0] for row in bulk.select(connection, query))

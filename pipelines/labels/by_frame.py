@@ -30,7 +30,7 @@ def unweighted(round_number: int, policy: str) -> WorkspaceError:
 def check_weights(
     connection: Connection, round_number: int, policy: str, frame: str | None = None
 ) -> None:
-    """DataError where a weight of a round, or of one frame in it, is not in [0, 1].
+    """Raise DataError if a weight of a round, or of one frame in it, is not in [0, 1].
 
     No policy makes one, but SQLite keeps whatever else writes into the table.
     """

@@ -62,11 +62,11 @@ def numeric_columns(connection: Connection) -> list[str]:
 
 
 def read_columns(workspace: Workspace, round_number: int, policy: str) -> LabelColumns:
-    """All labels of a round.
+    """Return all labels of a round.
 
     Raises:
-        WorkspaceError: the policy has weighted nothing in that round.
-        DataError: a weight is not in [0, 1].
+        WorkspaceError: if the policy has weighted nothing in that round.
+        DataError: if a weight is not in [0, 1].
     """
     with workspace.database.reading() as connection:
         check_weights(connection, round_number, policy)
@@ -79,7 +79,7 @@ def read_columns(workspace: Workspace, round_number: int, policy: str) -> LabelC
 def read_frame_columns(
     workspace: Workspace, round_number: int, policy: str, frame: str
 ) -> LabelColumns:
-    """The labels of one frame; there may be none."""
+    """Return the labels of one frame; there may be none."""
     with workspace.database.reading() as connection:
         return _read(workspace, connection, round_number, policy, [frame])
 
@@ -92,8 +92,8 @@ def read_blocks(
     So much of millions of labels is in memory as a thousand frames hold.
 
     Raises:
-        WorkspaceError: the policy has weighted nothing in one of the rounds.
-        DataError: a weight is not in [0, 1].
+        WorkspaceError: if the policy has weighted nothing in one of the rounds.
+        DataError: if a weight is not in [0, 1].
     """
     frame = bulk.table("frame").c.frame
     labels = dict.fromkeys(rounds, 0)
@@ -117,7 +117,7 @@ def _read(
     policy: str,
     wanted: Sequence[str] | None = None,
 ) -> LabelColumns:
-    """The labels of a round, of all frames or of the wanted ones."""
+    """Return the labels of a round, of all frames or of the wanted ones."""
     view = weighted_labels(connection).c
     kinds: dict[str, Any] = {"frame": Text(), "k": Integer(), "category": Text()}
     kinds |= dict.fromkeys((*BOX_COLUMNS, *numeric_columns(connection)), Float())

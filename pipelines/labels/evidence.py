@@ -39,7 +39,7 @@ def read_evidence(
     boxes: bool = False,
     columns: Collection[str] | None = None,
 ) -> tuple[LabelKeys, Evidence]:
-    """The evidence of all labels of some frames, and their keys.
+    """Return the evidence of all labels of some frames, and their keys.
 
     Args:
         workspace: see `Workspace`.
@@ -78,7 +78,7 @@ def read_evidence(
 
 
 def _aligned(round_number: int, tables: Mapping[str, str]) -> Select[Any]:
-    """The predictions of a round by frame and k, each with columns of several tables.
+    """Return the predictions of a round by frame and k, each with columns of several tables.
 
     Args:
         round_number: e.
@@ -101,10 +101,10 @@ def _aligned(round_number: int, tables: Mapping[str, str]) -> Select[Any]:
 
 
 def read_memory(workspace: Workspace, round_number: int, policy: str) -> Memory:
-    """The labels of a round that a policy has weighed and not dropped.
+    """Return the labels of a round that a policy has weighed and not dropped.
 
     Raises:
-        WorkspaceError: the policy has not weighed that round.
+        WorkspaceError: if the policy has not weighed that round.
     """
     weight, prediction = bulk.table("weight"), bulk.table("prediction")
     same = and_(*(weight.c[key] == prediction.c[key] for key in ("round", "frame_id", "k")))

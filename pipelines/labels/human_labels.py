@@ -43,7 +43,7 @@ def read_human_labels(
     until_round: int | None = None,
     but_of: str | None = None,
 ) -> dict[int, StoredLabels]:
-    """The human labels by frame key.
+    """Return the human labels by frame key.
 
     Args:
         connection: to the database.
@@ -68,7 +68,7 @@ def read_human_labels(
 def refresh_matches(
     connection: Connection, round_number: int, frame_ids: Collection[int] | None = None
 ) -> int:
-    """Finds anew which predictions of a round the human labels speak for.
+    """Find anew which predictions of a round the human labels speak for.
 
     Args:
         connection: of the transaction that changed predictions or human labels.
@@ -111,7 +111,7 @@ def fingerprint(workspace: Workspace, round_number: int) -> str | None:
 
 
 def counts(workspace: Workspace, round_number: int) -> dict[str, int]:
-    """How many human labels of each decision count in a round."""
+    """Return how many human labels of each decision count in a round."""
     table = bulk.table("human_label")
     query = select(table.c.decision).where(table.c.from_round <= round_number)
     found = [row[0] for row in workspace.database.rows(query)]
@@ -119,7 +119,7 @@ def counts(workspace: Workspace, round_number: int) -> dict[str, int]:
 
 
 def human_boxes(workspace: Workspace, round_number: int, frame_id: int) -> np.ndarray:
-    """(n, 7) boxes of the objects of a frame that people decided on, in the LiDAR frame."""
+    """Return (n, 7) boxes of the objects of a frame that people decided on, in the LiDAR frame."""
     with workspace.database.reading() as connection:
         found = read_human_labels(connection, [frame_id], until_round=round_number)
     if frame_id not in found:

@@ -46,10 +46,10 @@ class FrameBoxes:
 
 
 def chosen_round(workspace: Workspace, number: int | None) -> int:
-    """A round that has predictions; None asks for the last one.
+    """Return a round that has predictions; None asks for the last one.
 
     Raises:
-        WorkspaceError: there is none, or not that one.
+        WorkspaceError: if there is none, or not that one.
     """
     table = bulk.table("prediction")
     query = select(func.max(table.c.round))
@@ -67,10 +67,10 @@ def chosen_round(workspace: Workspace, number: int | None) -> int:
 
 
 def labeled_by(workspace: Workspace, round_number: int, policy: str, limit: int) -> list[str]:
-    """The first frames, by name, of which a policy has weighted labels in a round.
+    """Return the first frames, by name, of which a policy has weighted labels in a round.
 
     Raises:
-        WorkspaceError: there are none.
+        WorkspaceError: if there are none.
     """
     frame, weight = bulk.table("frame"), bulk.table("weight")
     query = (
@@ -88,11 +88,11 @@ def labeled_by(workspace: Workspace, round_number: int, policy: str, limit: int)
 
 
 def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) -> FrameBoxes:
-    """The stored boxes of a frame.
+    """Return the stored boxes of a frame.
 
     Raises:
-        ConfigError: no frame has that name.
-        DataError: a weight is not in [0, 1].
+        ConfigError: if no frame has that name.
+        DataError: if a weight is not in [0, 1].
     """
     split, key = _find(workspace, name)
     labels = workspace.predictions(round_number, [key])[key]
@@ -123,7 +123,7 @@ def _find(workspace: Workspace, name: str) -> tuple[str, int]:
 def _weights(
     workspace: Workspace, round_number: int, frame: tuple[int, str], policy: str, count: int
 ) -> np.ndarray:
-    """(count,) by k, of the frame with that key and name."""
+    """Return (count,) by k, of the frame with that key and name."""
     table = bulk.table("weight")
     key, name = frame
     here = (table.c.round == round_number, table.c.policy == policy, table.c.frame_id == key)
@@ -139,7 +139,7 @@ def _weights(
 def _decided(
     workspace: Workspace, round_number: int, key: int, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(count,) bool by k: rejected by people, and giving way to a human label's own box."""
+    """Return (count,) bool by k: rejected by people, and giving way to a human label's own box."""
     match, label = bulk.table("human_match"), bulk.table("human_label")
     same = (label.c.frame_id == match.c.frame_id, label.c.n == match.c.n)
     query = select(match.c.k, label.c.decision).where(

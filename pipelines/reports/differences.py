@@ -64,7 +64,7 @@ class Difference:
 def compare_rounds(
     workspace: Workspace, rounds: tuple[int, int], policy: str, listed: int
 ) -> Difference:
-    """The difference.
+    """Return the difference.
 
     Args:
         workspace: see `Workspace`.
@@ -73,7 +73,7 @@ def compare_rounds(
         listed: how many changed labels to list.
 
     Raises:
-        WorkspaceError: the policy has weighted nothing in one of the rounds.
+        WorkspaceError: if the policy has weighted nothing in one of the rounds.
     """
     found = Comparison(listed)
     for before, after in read_blocks(workspace, rounds, policy):
@@ -106,14 +106,14 @@ class Comparison:
         self.labels = found[: self.listed]
 
     def finish(self, rounds: tuple[int, int], policy: str) -> Difference:
-        """The difference, with the sums over all categories."""
+        """Return the difference, with the sums over all categories."""
         everything = np.sum([*self.sums.values()], axis=0)
         rows = tuple(_row(name, sums) for name, sums in (self.sums | {"all": everything}).items())
         return Difference(rounds, policy, rows, tuple(self.labels))
 
 
 def _row(name: str, sums: np.ndarray) -> dict[str, Any]:
-    """A row of `COLUMNS`: counts, then two sums of weights."""
+    """Return a row of `COLUMNS`: counts, then two sums of weights."""
     counts, weights = map(int, sums[:-2]), map(float, sums[-2:])
     return dict(zip(COLUMNS, (name, *counts, *weights), strict=True))
 
@@ -136,7 +136,7 @@ def _sums(changes: LabelChanges, category: int) -> np.ndarray:
 def _listed(
     changes: LabelChanges, before: LabelColumns, after: LabelColumns, count: int
 ) -> list[ChangedLabel]:
-    """The most changed labels."""
+    """Return the most changed labels."""
     found = []
     for old, new in changes.largest(count)[0].tolist():
         side, row = (after, new) if new >= 0 else (before, old)

@@ -101,8 +101,8 @@ def explain_label(
     """Why label k of a frame has its weight.
 
     Raises:
-        WorkspaceError: the policy has not weighted such a label in that round.
-        DataError: a weight of the frame is not in [0, 1].
+        WorkspaceError: if the policy has not weighted such a label in that round.
+        DataError: if a weight of the frame is not in [0, 1].
     """
     label = _label(workspace, frame, k, round_number, policy)
     if label["provenance"] == "human":
@@ -122,7 +122,7 @@ def _human(workspace: Workspace, label: dict[str, Any]) -> Explanation:
 
 
 def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
-    """The numbers behind a policy's weight."""
+    """Return the numbers behind a policy's weight."""
     frame, k = label["frame"], label["k"]
     views = _views(workspace, label["round"], frame, k)
     config = _stored_config(workspace, label["round"])
@@ -259,19 +259,19 @@ def _rho_again(config: Config, source: Source, label: dict[str, Any]) -> float |
 
 
 def _opened(config: Config, source: Source, label: dict[str, Any]) -> EvidenceSource:
-    """A source that rates one label, with the threshold that is stored with it."""
+    """Return a source that rates one label, with the threshold that is stored with it."""
     thresholds = {label["category"]: label["points_threshold"] or 1.0}
     return open_prior(config, source.configured, thresholds, measures=False)
 
 
 def _detections(label: dict[str, Any]) -> Detections:
-    """The label as the only detection of a frame."""
+    """Return the label as the only detection of a frame."""
     box = [label[name] for name in BOX_COLUMNS]
     return Detections.from_rows([(label["category"], label["score"], *box, None)])
 
 
 def _self_paced(config: Config, policy: str) -> bool:
-    """Whether the policy weighs by the consistency loss."""
+    """Return whether the policy weighs by the consistency loss."""
     section = config.solve
     own = section.options.get(policy, {}).get("self_paced", section.self_paced)
     return policy != "pspsl" or bool(own)
@@ -280,7 +280,7 @@ def _self_paced(config: Config, policy: str) -> bool:
 def _weight(
     label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None, *, alone: bool
 ) -> float | None:
-    """The weight by Eqs. 7 and 11; None for policies that do not use them.
+    """Return the weight by Eqs. 7 and 11; None for policies that do not use them.
 
     A label that matched has a lambda unless the policy was told to do without: it weighs rho_det,
     as do all where the priors are `alone`, without a second pass.
@@ -350,7 +350,7 @@ def _meaning(config: Config, label: dict[str, Any]) -> str:
 
 
 def _numbers(label: dict[str, Any]) -> dict[str, Any]:
-    """The columns of a label as they are printed."""
+    """Return the columns of a label as they are printed."""
     return {
         name: "none" if value is None else f"{value:.4f}" if isinstance(value, float) else value
         for name, value in label.items()

@@ -14,7 +14,7 @@ from pipelines.workspace.workspace import Workspace
 
 
 def is_repredicted(workspace: Workspace, number: int) -> bool:
-    """Whether the round has a second pass over augmented copies."""
+    """Return whether the round has a second pass over augmented copies."""
     view = bulk.table("reprediction_view")
     query = select(view.c.round).where(view.c.round == number).limit(1)
     return bool(workspace.database.rows(query))
@@ -23,7 +23,7 @@ def is_repredicted(workspace: Workspace, number: int) -> bool:
 def summary(
     workspace: Workspace, totals: RoundTotals, number: int, policy: str, *, repredicted: bool
 ) -> Section:
-    """The round in a few numbers."""
+    """Return the round in a few numbers."""
     n, kept, trusted = totals.everything.labels, totals.everything.kept, totals.trusted
     facts = [
         ("labels", f"{n:,}"),
@@ -71,7 +71,7 @@ def distributions(totals: RoundTotals) -> Section:
 
 
 def by_category(totals: RoundTotals, categories: tuple[str, ...]) -> Section:
-    """A row per category and distance, and the sums.
+    """Return a row per category and distance, and the sums.
 
     Args:
         totals: see `RoundTotals`.
@@ -93,7 +93,7 @@ def by_category(totals: RoundTotals, categories: tuple[str, ...]) -> Section:
 
 
 def beside_others(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:
-    """The policies that weighted the same labels, where there are several."""
+    """Yield the policies that weighted the same labels, where there are several."""
     weight, frame = bulk.table("weight"), bulk.table("frame")
     above = [func.sum(case((weight.c.v > least, 1), else_=0)) for least in (0, 0.5)]
     query = (
@@ -134,7 +134,7 @@ def _cells(sums: Sums) -> tuple[int, int, float, float, float, float]:
 
 
 def _age(workspace: Workspace, number: int) -> str:
-    """The round and of how many it is, as it was made."""
+    """Return the round and of how many it is, as it was made."""
     table = bulk.table("round")
     query = select(table.c.rounds).where(table.c.number == number)
     rows = workspace.database.rows(query)

@@ -55,8 +55,8 @@ def draw_view(
         style: colours.
 
     Raises:
-        ConfigError: no frame has that name, or a picture cannot be written to `output`.
-        WorkspaceError: the round has no predictions.
+        ConfigError: if no frame has that name, or a picture cannot be written to `output`.
+        WorkspaceError: if the round has no predictions.
     """
     number = chosen_round(workspace, round_number)
     policy = policy or workspace.config.run.method
@@ -72,7 +72,7 @@ def frame_picture(workspace: Workspace, name: str, round_number: int, policy: st
     """Return image and bird's eye view of any frame as (height, width, 3) uint8 RGB.
 
     Raises:
-        ConfigError: no frame has that name.
+        ConfigError: if no frame has that name.
     """
     return _painted(workspace, name, (round_number, policy), "png", DARK).finish()
 
@@ -130,7 +130,7 @@ def _painted(
 
 
 def _most_varied(found: LabelColumns) -> int:
-    """The frame with most of both trusted and mistrusted labels, the nearer the better."""
+    """Return the frame with most of both trusted and mistrusted labels, the nearer the better."""
     near, count = found.boxes[:, 0] < 40, len(found.frame_names)
     trusted = np.bincount(found.frames[near & (found.weights > 0.3)], minlength=count)
     mistrusted = np.bincount(found.frames[near & (found.weights < 0.1)], minlength=count)

@@ -19,7 +19,7 @@ from pipelines.workspace.workspace import Workspace
 def record_frames(
     workspace: Workspace, names: Sequence[str], round_number: int, policy: str, output: Path
 ) -> Path:
-    """Writes the recording; says where it is.
+    """Write the recording; says where it is.
 
     Args:
         workspace: see `Workspace`.
@@ -41,7 +41,7 @@ def record_frames(
 def _recorded(
     workspace: Workspace, names: Sequence[str], round_number: int, policy: str
 ) -> Iterator[RecordedFrame]:
-    """The frames, one at a time: their points do not fit into memory together."""
+    """Yield the frames, one at a time: their points do not fit into memory together."""
     for name in names:
         found = read_frame(workspace, name, round_number, policy)
         frame = workspace.dataset.read(name, image=True)

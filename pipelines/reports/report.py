@@ -47,7 +47,7 @@ def write_report(
         kind: also write each chart as a file of this format, into a folder beside the report.
 
     Raises:
-        WorkspaceError: the policy has weighted nothing in that round.
+        WorkspaceError: if the policy has weighted nothing in that round.
     """
     policy = policy or workspace.config.run.method
     number = chosen_round(workspace, round_number or weighted_round(workspace, policy))
@@ -106,7 +106,7 @@ def _save(charts: Sequence[Chart], folder: Path, kind: ImageFormat) -> list[Path
 
 
 def _round_before(workspace: Workspace, number: int, policy: str) -> int | None:
-    """The round before, where the policy weighted that."""
+    """Return the round before, where the policy weighted that."""
     weight = bulk.table("weight")
     query = select(weight.c.k).where(weight.c.round == number - 1, weight.c.policy == policy)
     return number - 1 if workspace.database.rows(query.limit(1)) else None
@@ -207,7 +207,7 @@ def _figure(value: float) -> str:
 
 
 def _reliability(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:
-    """A chart per stored audit of the round."""
+    """Yield a chart per stored audit of the round."""
     bins = bulk.table("audit_bin")
     names = ("frames", "overlap", "mean_weight", "precision", "labels")
     query = (

@@ -31,12 +31,12 @@ Cells = Sequence[Sequence[str]]
 
 
 def print_json(value: Any) -> None:
-    """Prints a value, a dataclass or a list of them as JSON; NaN and infinity as null."""
+    """Print a value, a dataclass or a list of them as JSON; NaN and infinity as null."""
     typer.echo(json.dumps(_plain(value), indent=1, default=str, allow_nan=False))
 
 
 def print_json_rows(rows: Iterable[Any]) -> None:
-    """Prints values as the list that `print_json` would print, each as it comes."""
+    """Print values as the list that `print_json` would print, each as it comes."""
     before = "["
     for row in rows:
         text = json.dumps(_plain(row), indent=1, default=str, allow_nan=False)

@@ -136,7 +136,7 @@ def read_shares(workspace: Workspace) -> dict[str, str]:
 
 
 def extent(workspace: Workspace, round_number: int, policy: str) -> tuple[float, float]:
-    """The greatest loss and the least lambda of a round; NaN where there is none."""
+    """Return the greatest loss and the least lambda of a round; NaN where there is none."""
     loss, weight = bulk.table("consistency").c, bulk.table("weight").c
     queries = (
         select(func.max(loss.loss)).where(loss.round == round_number),

@@ -47,11 +47,11 @@ _EDITORS = {
 def write_review(
     workspace: Workspace, folder: Path, sheet: Sheet, editor: Editor, progress: Progress
 ) -> None:
-    """Writes the folder of a review and remembers it.
+    """Write the folder of a review and remembers it.
 
     Raises:
-        ConfigError: the folder holds something: it may be a review with answers in it.
-        DataError: a frame cannot be read.
+        ConfigError: if the folder holds something: it may be a review with answers in it.
+        DataError: if a frame cannot be read.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(
@@ -106,7 +106,7 @@ def _fill(
 
 
 def _remember(workspace: Workspace, sheet: Sheet) -> None:
-    """Stores the review; one that was handed out before keeps its row."""
+    """Store the review; one that was handed out before keeps its row."""
     table = bulk.table("review")
     now = datetime.now(UTC).isoformat(timespec="seconds")
     row = (sheet.id, sheet.round, sheet.policy, sheet.editor, len(sheet.frames), sheet.boxes,

@@ -81,7 +81,7 @@ def apply_review(
     from_round: int | None = None,
     dry_run: bool = False,
 ) -> ReviewImport:
-    """Reads an answer and stores its decisions in place of those of an earlier import of it.
+    """Read an answer and stores its decisions in place of those of an earlier import of it.
 
     Args:
         workspace: see `Workspace`.
@@ -93,8 +93,8 @@ def apply_review(
         dry_run: only says what would be stored.
 
     Raises:
-        DataError: something is missing, damaged, or of another workspace or review.
-        LeakageError: a frame is not unlabeled.
+        DataError: if something is missing, damaged, or of another workspace or review.
+        LeakageError: if a frame is not unlabeled.
         ConfigError: `accept` names no frame of the review.
     """
     sheet = read_sheet(folder)
@@ -129,7 +129,7 @@ def apply_review(
 
 
 def _keys(workspace: Workspace, folder: Path, sheet: Sheet) -> dict[str, int]:
-    """The keys of the frames of a review that this workspace has handed out."""
+    """Return the keys of the frames of a review that this workspace has handed out."""
     table = bulk.table("review")
     known = workspace.database.rows(select(table.c.id).where(table.c.id == sheet.id))
     if not known:
@@ -173,7 +173,7 @@ def _answers(
 
 
 def _check_overlaps(answers: Sequence[FrameEdits]) -> None:
-    """DataError where two objects of an answer lie in each other."""
+    """Raise DataError if two objects of an answer lie in each other."""
     found = []
     for answer in answers:
         rows = [_row(0, decision, 1) for decision in answer.decisions]
@@ -197,7 +197,7 @@ def _as_shown(shown: ShownFrame) -> list[EditedBox]:
 
 
 def _row(frame_id: int, decision: Decision, from_round: int) -> LabelRow:
-    """The columns `_SHARED`."""
+    """Return the columns `_SHARED`."""
     seen = decision.seen or (None,) * len(SEEN_COLUMNS)
     what = (frame_id, decision.number, decision.decision, decision.category, from_round)
     return dict(zip(_SHARED, (*what, *decision.box, *seen), strict=True))
@@ -225,7 +225,7 @@ def _superseded(
 
 
 def _store(connection: Connection, review: str, rows: Sequence[LabelRow], reviewer: str) -> None:
-    """Puts decisions in place of those of the review's earlier import, and what they overrule."""
+    """Put decisions in place of those of the review's earlier import, and what they overrule."""
     label, table = bulk.table("human_label"), bulk.table("review")
     mine = label.c.review == review
     before = bulk.select(connection, select(label.c.frame_id).where(mine).distinct())
@@ -250,13 +250,13 @@ def _store(connection: Connection, review: str, rows: Sequence[LabelRow], review
 
 
 def clear(workspace: Workspace, reviews: Collection[str] = (), frames: Collection[str] = ()) -> int:
-    """Forgets human labels, of reviews or of frames or all; the policies' weights count again.
+    """Forget human labels, of reviews or of frames or all; the policies' weights count again.
 
     Returns:
         How many labels there were.
 
     Raises:
-        ConfigError: no such review or frame.
+        ConfigError: if no such review or frame.
     """
     label, review = bulk.table("human_label"), bulk.table("review")
     with workspace.database.writing() as connection:
@@ -279,7 +279,7 @@ def clear(workspace: Workspace, reviews: Collection[str] = (), frames: Collectio
 
 
 def _by_frame(rows: Iterable[LabelRow]) -> Mapping[int, HumanLabels]:
-    """The labels of each frame."""
+    """Return the labels of each frame."""
     found: dict[int, list[LabelRow]] = {}
     for row in rows:
         found.setdefault(row["frame_id"], []).append(row)
@@ -295,7 +295,7 @@ def _by_frame(rows: Iterable[LabelRow]) -> Mapping[int, HumanLabels]:
 
 
 def _free(taken: set[int]) -> int:
-    """The least number that is not taken; takes it."""
+    """Return the least number that is not taken; takes it."""
     n = next(n for n in range(len(taken) + 1) if n not in taken)
     taken.add(n)
     return n

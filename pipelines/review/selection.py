@@ -48,7 +48,7 @@ class ReviewRequest:
 def make_sheet(
     workspace: Workspace, round_number: int | None, policy: str, editor: str, request: ReviewRequest
 ) -> Sheet:
-    """The wanted labels with the other kept labels of their frames around them.
+    """Return the wanted labels with the other kept labels of their frames around them.
 
     Args:
         workspace: see `Workspace`.
@@ -58,9 +58,9 @@ def make_sheet(
         request: see `ReviewRequest`.
 
     Raises:
-        ConfigError: no such order, frame or category.
-        LeakageError: a frame is not unlabeled.
-        WorkspaceError: the policy has weighted nothing, or no label is wanted.
+        ConfigError: if no such order, frame or category.
+        LeakageError: if a frame is not unlabeled.
+        WorkspaceError: if the policy has weighted nothing, or no label is wanted.
     """
     _check(workspace, request)
     number = _weighted_round(workspace, round_number, policy)
@@ -103,7 +103,7 @@ def _check(workspace: Workspace, request: ReviewRequest) -> None:
 
 
 def _weighted_round(workspace: Workspace, number: int | None, policy: str) -> int:
-    """The round asked for, or the last one; it must have weights of the policy."""
+    """Return the round asked for, or the last one; it must have weights of the policy."""
     found = weighted_round(workspace, policy, number)
     if found is None:
         where = "" if number is None else f" --round {number}"
@@ -115,7 +115,7 @@ def _weighted_round(workspace: Workspace, number: int | None, policy: str) -> in
 
 
 def _first(connection: Connection, number: int, policy: str, request: ReviewRequest) -> Asked:
-    """The labels that come first in the wanted order."""
+    """Return the labels that come first in the wanted order."""
     labels = WEIGHTED_LABELS.c
     orders: dict[str, list[ColumnElement]] = {
         "uncertain": [func.abs(labels.weight - EVEN_ODDS)],
@@ -133,7 +133,7 @@ def _first(connection: Connection, number: int, policy: str, request: ReviewRequ
 
 
 def _changed(workspace: Workspace, number: int, policy: str, request: ReviewRequest) -> Asked:
-    """The labels whose weight changed most since the round before."""
+    """Return the labels whose weight changed most since the round before."""
     if number < 2:
         raise ConfigError("--by changed: round 1 has no round before it; use --by uncertain")
     before, after = (read_columns(workspace, each, policy) for each in (number - 1, number))
@@ -165,7 +165,7 @@ def _human_labels(workspace: Workspace, number: int, policy: str) -> Asked:
 def _shown(
     connection: Connection, number: int, policy: str, name: str, asked: Asked
 ) -> list[ShownBox]:
-    """The boxes of a frame: those asked about, others of some weight, and human labels."""
+    """Return the boxes of a frame: those asked about, others of some weight, and human labels."""
     labels = WEIGHTED_LABELS.c
     names = ("k", "category", *BOX_COLUMNS, "score", "weight", "provenance")
     query = (

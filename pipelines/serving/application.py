@@ -47,7 +47,7 @@ def application(served: Served, host: str) -> Iterator[Any]:
 
     Raises:
         ConfigError: Datasette is not installed.
-        DatabaseError: a file is no database.
+        DatabaseError: if a file is no database.
     """
     try:
         from datasette.app import Datasette

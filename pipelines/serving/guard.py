@@ -27,7 +27,7 @@ _HEADERS = (
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a server that listens there."""
+    """Return whether only this machine can reach a server that listens there."""
     if host == "localhost":
         return True
     try:
@@ -37,7 +37,7 @@ def is_loopback(host: str) -> bool:
 
 
 def guard(application: Application, host: str) -> Application:
-    """The application behind its guard.
+    """Return the application behind its guard.
 
     A page of some other site that is open in the same browser can send requests to this machine.
     Where the server listens on loopback, requests under a foreign name (DNS rebinding) are refused;
@@ -80,7 +80,7 @@ def _rejection(scope: Scope, names: frozenset[str] | None) -> tuple[int, str] | 
 
 
 def _host_name(header: str) -> str:
-    """A Host header without its port."""
+    """Return a Host header without its port."""
     name, colon, port = header.rpartition(":")
     return name if colon and port.isdigit() else header
 
@@ -93,7 +93,7 @@ async def _reject(send: Send, status: int, reason: str) -> None:
 
 
 def _with_headers(send: Send) -> Send:
-    """Adds the headers of every answer."""
+    """Add the headers of every answer."""
 
     async def sending(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":

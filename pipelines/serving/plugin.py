@@ -35,7 +35,7 @@ class CuratePlugin:
 
     @hookimpl
     def asgi_wrapper(self) -> Any:
-        """Puts the guard before the pages."""
+        """Put the guard before the pages."""
 
         def wrap(application: Application) -> Application:
             return guard(application, self._host)
@@ -44,12 +44,12 @@ class CuratePlugin:
 
     @hookimpl
     def extra_css_urls(self) -> list[str]:
-        """The style, from this server as everything else."""
+        """Return the style, from this server as everything else."""
         return [_STYLE]
 
     @hookimpl
     def register_routes(self) -> list[tuple[str, Any]]:
-        """The pages of frames."""
+        """Return the pages of frames."""
         if self._frames is None:
             return []
 
@@ -101,7 +101,7 @@ class CuratePlugin:
         return link.format(urlencode(wanted), shown)
 
     async def _page(self, datasette: Any, request: Any) -> Response:
-        """The page of a frame, with the explanation of a label where one is asked for."""
+        """Return the page of a frame, with the explanation of a label where one is asked for."""
         try:
             shown, k = await asyncio.to_thread(self._requested, request)
             told = await asyncio.to_thread(self._explanation, shown, k)
@@ -123,7 +123,7 @@ class CuratePlugin:
         )
 
     async def _picture(self, request: Any) -> Response:
-        """The picture of a frame."""
+        """Return the picture of a frame."""
         try:
             shown, _ = await asyncio.to_thread(self._requested, request)
             content = await asyncio.to_thread(self._pages.picture, shown)
@@ -154,7 +154,7 @@ class CuratePlugin:
 
 
 def _address(row: Mapping[str, Any], *, with_label: bool) -> dict[str, Any] | None:
-    """The parameters of the page of the frame that a row belongs to; None for no frame."""
+    """Return the parameters of the page of the frame that a row belongs to; None for no frame."""
     plain = {
         name: each["value"] if isinstance(each, Mapping) else each for name, each in row.items()
     }
@@ -169,16 +169,16 @@ def _address(row: Mapping[str, Any], *, with_label: bool) -> dict[str, Any] | No
 
 
 def _link(path: str, shown: ShownFrame, **other: Any) -> str:
-    """The address of a frame's page or picture, with some of its parts changed."""
+    """Return the address of a frame's page or picture, with some of its parts changed."""
     wanted = {"frame": shown.name, "round": shown.round, "policy": shown.policy} | other
     return f"{path}?{urlencode(wanted)}"
 
 
 def _number(text: str | None) -> int | None:
-    """A small number of a request; None where none is given.
+    """Return a small number of a request; None where none is given.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: if it is none.
     """
     if not text:
         return None

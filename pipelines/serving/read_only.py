@@ -55,10 +55,10 @@ class ReadOnlyDatabase(Database):  # type: ignore[misc]
         self._own = threading.local()
 
     def connect(self, write: bool = False) -> sqlite3.Connection:
-        """A connection.
+        """Return a connection.
 
         Raises:
-            DatabaseError: one that writes is asked for.
+            DatabaseError: if one that writes is asked for.
         """
         if write:
             raise DatabaseError(f"{self._file}: served for reading only")
@@ -88,13 +88,13 @@ class ReadOnlyDatabase(Database):  # type: ignore[misc]
 
 
 def connect_read_only(path: Path) -> sqlite3.Connection:
-    """A connection that can read this file's tables and nothing else.
+    """Return a connection that can read this file's tables and nothing else.
 
     Four locks, one behind the other: the file is opened for reading, the connection refuses to
     write, the authorizer admits SELECT alone, and the sizes of values and questions are bounded.
 
     Raises:
-        DatabaseError: there is no SQLite file, or it is damaged.
+        DatabaseError: if there is no SQLite file, or it is damaged.
     """
     try:
         # The URI quotes what would mean something in a path, such as a ? in a folder's name.

@@ -9,14 +9,14 @@ from curate.errors import ConfigError
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that takes connections already.
+    """Return a socket that takes connections already.
 
     Args:
         host: name or address.
         port: 0 for any that is free.
 
     Raises:
-        ConfigError: it is in use, or not to be had.
+        ConfigError: if it is in use, or not to be had.
     """
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
@@ -30,7 +30,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def make_server(application: Any) -> Any:
-    """The server of an ASGI application; its `run` takes the sockets.
+    """Return the server of an ASGI application; its `run` takes the sockets.
 
     It says nothing of single requests, and gives slow readers three seconds at the end.
     """
@@ -50,7 +50,7 @@ def make_server(application: Any) -> Any:
 
 
 def address(taken: socket.socket) -> str:
-    """The URL of what a socket listens to."""
+    """Return the URL of what a socket listens to."""
     host, port = taken.getsockname()[:2]
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 

@@ -63,7 +63,7 @@ class FramePages:
     def find(
         self, name: str | None, key: int | None, round_number: int | None, policy: str | None
     ) -> ShownFrame:
-        """A frame by name or by key.
+        """Return a frame by name or by key.
 
         Args:
             name: None where the key is given.
@@ -72,8 +72,8 @@ class FramePages:
             policy: None for the configured one.
 
         Raises:
-            ConfigError: there is no such frame, or nothing of it in such a round.
-            WorkspaceError: no round has predictions yet.
+            ConfigError: if there is no such frame, or nothing of it in such a round.
+            WorkspaceError: if no round has predictions yet.
         """
         number = chosen_round(self._workspace, round_number)
         policy = policy or self._workspace.config.run.method
@@ -86,7 +86,7 @@ class FramePages:
         return ShownFrame(name, split, number, policy, columns, labels, choices, before, after)
 
     def picture(self, shown: ShownFrame) -> bytes:
-        """The picture of a frame as JPEG."""
+        """Return the picture of a frame as JPEG."""
         wanted = (shown.name, shown.round, shown.policy)
         with self._drawing:
             if wanted not in self._pictures:
@@ -100,7 +100,7 @@ class FramePages:
         """What `curate explain` says of a label.
 
         Raises:
-            WorkspaceError: the policy has not weighted it.
+            WorkspaceError: if the policy has not weighted it.
         """
         from pipelines.reports.explanation import explain_label
 
@@ -137,7 +137,7 @@ class FramePages:
     def _labels(
         self, key: int, number: int, policy: str
     ) -> tuple[tuple[str, ...], tuple[bulk.Row, ...]]:
-        """The columns of the labels, and a row each; frames of any split have them."""
+        """Return the columns of the labels, and a row each; frames of any split have them."""
         prediction, weight = bulk.table("prediction"), bulk.table("weight")
         with self._workspace.database.reading() as connection:
             declared = read_declarations(connection)
@@ -167,5 +167,5 @@ class FramePages:
 
 
 def _is_evidence(column: Column, tables: list[Table]) -> bool:
-    """Whether a column of `weighted_labels` is stored in one of the tables of evidence."""
+    """Return whether a column of `weighted_labels` is stored in one of the tables of evidence."""
     return any(column.name in table.c for table in tables if column.name not in ("round", "k"))

@@ -18,8 +18,8 @@ def choose(argument: Path | None, option: Path | None, file: Path | None) -> Ser
         file: an exported label file; then a workspace only adds pictures.
 
     Raises:
-        ConfigError: both name a workspace, or there is no such file.
-        WorkspaceError: there is no workspace, or nothing of it can be served.
+        ConfigError: if both name a workspace, or there is no such file.
+        WorkspaceError: if there is no workspace, or nothing of it can be served.
     """
     if argument is not None and option is not None:
         raise ConfigError("serve: name the workspace once, as an argument or with --workspace")
@@ -48,7 +48,7 @@ def _of_workspace(workspace: Workspace) -> Served:
 
 
 def _find_workspace(folder: Path | None) -> Workspace | None:
-    """The workspace, for pictures; none is needed unless it is named."""
+    """Return the workspace, for pictures; none is needed unless it is named."""
     if folder is not None:
         return Workspace.open(folder)
     try:

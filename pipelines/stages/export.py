@@ -53,18 +53,18 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
 
 
 def _further_columns(workspace: Workspace) -> list[str]:
-    """The columns behind the core ones, as they are declared."""
+    """Return the columns behind the core ones, as they are declared."""
     with workspace.database.reading() as connection:
         return [repr(each) for each in read_declarations(connection)]
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
-    """The exported file of a round and policy."""
+    """Return the exported file of a round and policy."""
     return workspace.root / "exports" / f"round-{context.number:02d}-{policy}.sqlite"
 
 
 def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
-    """LeakageError where ground truth would reach what it must not, see `firewall`.
+    """Raise LeakageError if ground truth would reach what it must not, see `firewall`.
 
     DataError where a weight is not in [0, 1].
     """
@@ -74,7 +74,7 @@ def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
 
 
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
-    """Writes the round's file; `labels.sqlite` becomes a copy where the policy is the trainer's."""
+    """Write the round's file; `labels.sqlite` becomes a copy where the policy is the trainer's."""
     path = file(workspace, job.context, job.policy)
     current = path.with_name(CURRENT) if job.policy == workspace.config.run.method else None
     if current:
@@ -98,7 +98,7 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
 def register_label_file(
     connection: Connection, workspace: Workspace, path: Path, round_number: int, policy: str
 ) -> None:
-    """Stores the hash of a label file in place of an earlier one's."""
+    """Store the hash of a label file in place of an earlier one's."""
     table, name = bulk.table("label_file"), workspace.relative(path)
     connection.execute(table.delete().where(table.c.path == name))
     row = {"path": name, "round": round_number, "policy": policy, "sha256": sha256(path)}
@@ -117,10 +117,10 @@ def write_label_file(workspace: Workspace, path: Path, round_number: int, policy
 def export_as(
     workspace: Workspace, exporter: Exporter, round_number: int, policy: str, path: Path
 ) -> int:
-    """Writes a policy's labels in some format; returns how many.
+    """Write a policy's labels in some format; returns how many.
 
     Raises:
-        WorkspaceError: the policy has weighted nothing in that round.
+        WorkspaceError: if the policy has weighted nothing in that round.
         LeakageError: ground truth would reach what it must not.
     """
     enforce(workspace, round_number)
@@ -173,7 +173,7 @@ class StoredLabels:
     columns: tuple[Column, ...]
 
     def __iter__(self) -> Iterator[Block]:
-        """A few thousand at a time: two million labels would fill the memory."""
+        """Yield a few thousand at a time: two million labels would fill the memory."""
         names = [each.name for each in self.columns]
         query = self._of(*map(column, names)).order_by(column("frame"), column("k"))
         with self.workspace.database.reading() as connection:
@@ -182,7 +182,7 @@ class StoredLabels:
                 yield dict(zip(names, zip(*rows, strict=True), strict=True))
 
     def frames(self, connection: Connection) -> set[str]:
-        """The frames that have labels."""
+        """Return the frames that have labels."""
         return set(connection.execute(self._of(column("frame")).distinct()).scalars())
 
     def _of(self, *columns: ColumnElement[Any]) -> Select[Any]:
@@ -192,7 +192,7 @@ class StoredLabels:
 
 
 def _frames(connection: Connection, with_labels: set[str]) -> list[FrameFiles]:
-    """All labeled frames, with or without objects, and the unlabeled ones that have labels.
+    """Return all labeled frames, with or without objects, and the unlabeled ones that have labels.
 
     An unlabeled frame in which the teacher found nothing is left out: no weight vouches for its
     emptiness, and as background it would teach what the teacher has missed.

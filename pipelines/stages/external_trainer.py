@@ -23,14 +23,14 @@ _STANDARD_ERROR = 2
 
 
 def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
-    """Runs the configured command, checks what it has produced and moves it to `output`.
+    """Run the configured command, checks what it has produced and moves it to `output`.
 
     The command writes to another place, where what a killed run has left stays for it to continue
     from; a former student in `output` is replaced only by a finished one.
 
     Raises:
-        ConfigError: the command cannot be taken apart or started.
-        TrainerFailed: it ended with an error, or without having written the output.
+        ConfigError: if the command cannot be taken apart or started.
+        TrainerFailed: if it ended with an error, or without having written the output.
     """
     draft = output.parent / "training" / output.name
     values = {
@@ -49,10 +49,10 @@ def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
 
 
 def split_command(command: str, values: dict[str, str]) -> list[str]:
-    """The arguments of a command with values in the place of {names}; other braces stay.
+    """Return the arguments of a command with values in the place of {names}; other braces stay.
 
     Raises:
-        ConfigError: a quote is open, or there is no command.
+        ConfigError: if a quote is open, or there is no command.
     """
     try:
         arguments = shlex.split(command)
@@ -75,7 +75,7 @@ def _filled(argument: str, values: dict[str, str]) -> str:
 
 
 def _labels(workspace: Workspace, job: RoundJob) -> Path:
-    """The exported labels in the format that the trainer wants."""
+    """Return the exported labels in the format that the trainer wants."""
     path = export.file(workspace, job.context, job.policy)
     name = workspace.config.train.labels_format
     if name == "sqlite":
@@ -107,7 +107,7 @@ def _run(arguments: list[str], values: dict[str, str]) -> None:
 
 
 def _check(draft: Path, before: tuple[int, int] | None) -> None:
-    """TrainerFailed where the trainer has not written its output."""
+    """Raise TrainerFailed if the trainer has not written its output."""
     after = _state(draft)
     if after is None:
         fault = "was not written"
@@ -136,7 +136,7 @@ def _state(path: Path) -> tuple[int, int] | None:
 
 
 def _take_place(draft: Path, output: Path) -> None:
-    """Moves what was written to its place; unlike a file, a folder does not replace anything."""
+    """Move what was written to its place; unlike a file, a folder does not replace anything."""
     if output.is_dir():
         shutil.rmtree(output)
     elif draft.is_dir():

@@ -65,7 +65,7 @@ def method_named(name: str) -> Method:
     """The method of that name; any other policy is a method whose student teaches the next round.
 
     Raises:
-        ConfigError: there is no such method or policy.
+        ConfigError: if there is no such method or policy.
     """
     if name in METHODS:
         return METHODS[name]
@@ -78,10 +78,10 @@ def method_named(name: str) -> Method:
 
 
 def with_method(config: Config, name: str) -> Config:
-    """The configuration with another method.
+    """Return the configuration with another method.
 
     Raises:
-        ConfigError: there is no such method; the known ones are named.
+        ConfigError: if there is no such method; the known ones are named.
     """
     method = method_named(name)
     return config.model_copy(
@@ -90,7 +90,7 @@ def with_method(config: Config, name: str) -> Config:
 
 
 def method_of(config: Config, policy: str) -> Method:
-    """The method of a policy, save where `train.teacher` is set."""
+    """Return the method of a policy, save where `train.teacher` is set."""
     method, teacher = method_named(policy), config.train.teacher
     return method if teacher == "method" else replace(method, teacher=teacher)
 

@@ -31,17 +31,17 @@ class Predict:
     teacher: Path
 
     def open(self) -> None:
-        """Loads the detector."""
+        """Load the detector."""
         self.dataset = open_dataset(self.config)
         self.detector = open_detector(self.config, self.teacher)
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """The rows of `prediction`."""
+        """Return the rows of `prediction`."""
         found = self.detect(job.frame)
         return {"prediction": {**detection_columns(found), "iou": _or_none(found.iou)}}
 
     def detect(self, frame_id: str) -> Detections:
-        """The boxes of a frame, by falling score."""
+        """Return the boxes of a frame, by falling score."""
         frame = visible(self.dataset.read(frame_id), self.config)
         return checked(self.detector.predict(frame), self.config)
 
@@ -55,7 +55,7 @@ def visible(frame: Frame, config: Config) -> Frame:
 
 
 def checked(found: Detections, config: Config) -> Detections:
-    """The detections of the configured categories and scores, by falling score.
+    """Return the detections of the configured categories and scores, by falling score.
 
     Raises:
         ModelError: a box is not finite or has no size, or a category is written in other letters.
@@ -76,7 +76,7 @@ def checked(found: Detections, config: Config) -> Detections:
 
 
 def _report_others(others: Sequence[str], config: Config) -> None:
-    """Says which categories are left out; ModelError where a name is ours in other letters."""
+    """State which categories are left out; ModelError where a name is ours in other letters."""
     ours = {name.lower(): name for name in config.dataset.categories}
     for name in others:
         if name.lower() in ours:
@@ -116,7 +116,7 @@ def as_detections(columns: Mapping[str, Sequence[Any]]) -> Detections:
 
 
 def _or_none(numbers: np.ndarray) -> list[float | None]:
-    """The numbers as the database stores them: null, not NaN."""
+    """Return the numbers as the database stores them: null, not NaN."""
     return [None if np.isnan(number) else number for number in numbers.tolist()]
 
 
@@ -140,7 +140,7 @@ def named_files(config: Config) -> dict[str, str]:
 
 
 def _named_paths(options: object) -> Iterator[str]:
-    """Every text within options whose key says that it is a path."""
+    """Yield every text within options whose key says that it is a path."""
     if isinstance(options, Mapping):
         for key, value in options.items():
             if key in {"path", "frame_list"} and isinstance(value, str):

@@ -92,5 +92,5 @@ def run(workspace: Workspace, progress: Progress) -> Product:
 
 
 def _labels(workspace: Workspace) -> Path:
-    """The label file that w_0 learns from."""
+    """Return the label file that w_0 learns from."""
     return workspace.root / "exports" / "labeled.sqlite"

@@ -31,7 +31,7 @@ class Repredict(Predict):
         self.round_number = round_number
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """The rows of `reprediction_view`, `reprediction` and `consistency`."""
+        """Return the rows of `reprediction_view`, `reprediction` and `consistency`."""
         if job.predictions is None:
             raise WorkspaceError(f"frame {job.frame} came without its predictions")
         views = self.views(job.frame)
@@ -54,7 +54,7 @@ class Repredict(Predict):
         }
 
     def views(self, frame_id: str) -> list[View]:
-        """Each A with the detections mapped back into the frame."""
+        """Return each A with the detections mapped back into the frame."""
         if isinstance(self.detector, RecordedViews):
             answers = list(self.detector.views(frame_id))
         else:
@@ -73,7 +73,7 @@ class Repredict(Predict):
 def draw(
     seed: int, round_number: int, frame_id: str, section: RepredictSection
 ) -> list[Similarity]:
-    """The similarities of a frame; they depend on seed, round and frame alone."""
+    """Return the similarities of a frame; they depend on seed, round and frame alone."""
     digest = hashlib.sha256(frame_id.encode()).digest()
     generator = np.random.default_rng([seed, round_number, *digest])
     return [
@@ -100,7 +100,7 @@ def function(workspace: Workspace, context: RoundContext) -> Repredict:
 
 
 def _reprediction_columns(view: int, found: Detections, loss: Consistency) -> dict[str, list[Any]]:
-    """The columns of one view, each reprediction with what it was matched with."""
+    """Return the columns of one view, each reprediction with what it was matched with."""
     matched: list[int | None] = [None] * len(found)
     for k, i in enumerate(loss.matched.tolist()):
         if i >= 0:
@@ -118,13 +118,13 @@ def _reprediction_columns(view: int, found: Detections, loss: Consistency) -> di
 
 
 def _below(parts: Sequence[Mapping[str, list[Any]]]) -> dict[str, list[Any]]:
-    """The columns of several views below each other."""
+    """Return the columns of several views below each other."""
     names = parts[0] if parts else ()
     return {name: [value for part in parts for value in part[name]] for name in names}
 
 
 def _consistency_columns(losses: Sequence[Consistency], count: int) -> dict[str, list[Any]]:
-    """The columns of the labels; without any view each says that there is no evidence."""
+    """Return the columns of the labels; without any view each says that there is no evidence."""
     loss: list[float | None] = [None] * count
     matched = [0] * count
     if losses:

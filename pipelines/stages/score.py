@@ -173,7 +173,7 @@ def _check(name: str, workspace: Workspace) -> None:
 
 
 def _declared(source: Source) -> Settings:
-    """The declaration of a source, as far as no migration of the schema fixes it."""
+    """Return the declaration of a source, as far as no migration of the schema fixes it."""
     if source.table in bulk.SCHEMA_TABLES:
         return {}
     return {"columns": repr(source.declaration)}
@@ -233,7 +233,7 @@ def _learned(workspace: Workspace) -> Mapping[str, float]:
 def _read_measured(
     source: Source, workspace: Workspace, context: RoundContext, frame_ids: Sequence[int]
 ) -> Mapping[int, Measured]:
-    """The measured columns of some frames, in the order of k."""
+    """Return the measured columns of some frames, in the order of k."""
     table, names = bulk.table(source.table), source.measured_columns
     query = (
         select(table.c.frame_id, *(table.c[column] for column in names))
@@ -247,5 +247,5 @@ def _read_measured(
 
 
 def _array(values: Sequence[Any]) -> np.ndarray:
-    """A stored column; NaN for null."""
+    """Return a stored column; NaN for null."""
     return np.array(values, dtype=np.float64) if None in values else np.array(values)

@@ -46,7 +46,7 @@ def check(workspace: Workspace, policy: str) -> None:
 
 
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
-    """The policy's weights of the round."""
+    """Return the policy's weights of the round."""
     report_unused(workspace)
     context, policy = job.context, job.policy
     opened = open_policy(workspace.config, policy)
@@ -101,7 +101,7 @@ def _store(
 
 
 def _columns(keys: LabelKeys, weights: Weights, evidence: Evidence) -> dict[str, np.ndarray]:
-    """The columns of `weight`, of the labels that are not dropped, by frame and k."""
+    """Return the columns of `weight`, of the labels that are not dropped, by frame and k."""
     kept = ~weights.dropped if weights.dropped.any() else slice(None)
     return {
         "frame_id": keys.frame_id[kept],
@@ -115,7 +115,7 @@ def _columns(keys: LabelKeys, weights: Weights, evidence: Evidence) -> dict[str,
 def _counts(
     round_number: int, policy: str, keys: LabelKeys, weights: Weights
 ) -> list[dict[str, Any]]:
-    """The rows of `label_count`."""
+    """Return the rows of `label_count`."""
     kept = ~weights.dropped
     names, category = np.unique(keys.category[kept], return_inverse=True)
     v, size = weights.v[kept], len(names)

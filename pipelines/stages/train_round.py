@@ -63,7 +63,7 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
-    """The checkpoint of the next teacher: the student, or the average of its weights.
+    """Return the checkpoint of the next teacher: the student, or the average of its weights.
 
     It ends like the file that the user brings, so that the detector knows it by its name.
     """
@@ -93,11 +93,11 @@ def check(workspace: Workspace, policy: str) -> None:
 
 
 def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
-    """Trains the student, or has it trained by the user's command.
+    """Train the student, or has it trained by the user's command.
 
     Raises:
         ConfigError: curate cannot train the configured detector, or the command is wrong.
-        TrainerFailed: the command failed, or left no checkpoint.
+        TrainerFailed: if the command failed, or left no checkpoint.
     """
     path = file(workspace, job.context, job.policy)
     trainable = trainable_detector(workspace.config)
@@ -163,7 +163,7 @@ def training_settings(
     round_number: int,
     method: Method,
 ) -> "TrainingSettings":
-    """The trainer's settings.
+    """Return the trainer's settings.
 
     Raises:
         ConfigError: train.options holds what the trainer does not know, or cannot use.
@@ -207,7 +207,7 @@ def train_with_progress(
     read: Callable[[str], Frame],
     progress: Progress,
 ) -> "TrainingReport":
-    """Trains with a bar that counts steps and shows the loss."""
+    """Train with a bar that counts steps and shows the loss."""
     from curate.training.trainer import train
 
     with progress.track(output.stem, settings.steps) as advance:

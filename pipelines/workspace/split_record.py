@@ -22,7 +22,7 @@ def split_rows(
     own: Mapping[str, Iterable[str]],
     files: Mapping[str, Path],
 ) -> list[dict[str, Any]]:
-    """The rows of `split_list`.
+    """Return the rows of `split_list`.
 
     Args:
         chosen: the frames of each split.
@@ -134,7 +134,7 @@ def _row(source: str, name: str, path: str | None, names: SplitList) -> dict[str
 
 
 def _read(path: Path) -> list[str]:
-    """The frames that a file names."""
+    """Return the frames that a file names."""
     try:
         return path.read_text(encoding="utf-8").split()
     except (OSError, UnicodeDecodeError) as error:

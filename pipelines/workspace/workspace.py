@@ -38,11 +38,11 @@ class Workspace:
 
     @classmethod
     def open(cls, folder: Path | None = None) -> "Workspace":
-        """The workspace in `folder`, else in the current folder or the nearest one above it.
+        """Return the workspace in `folder`, else in the current folder or the nearest one above it.
 
         Raises:
-            WorkspaceError: there is none.
-            ConfigError: its configuration is wrong.
+            WorkspaceError: if there is none.
+            ConfigError: if its configuration is wrong.
         """
         root = find_workspace(folder)
         config = _anchored(root, read_config(root / CONFIG_NAME))
@@ -50,10 +50,10 @@ class Workspace:
 
     @classmethod
     def create(cls, root: Path, config: Config) -> "Workspace":
-        """A new workspace with an empty database; one with the same settings is opened.
+        """Return a new workspace with an empty database; one with the same settings is opened.
 
         Raises:
-            WorkspaceError: the folder holds a workspace with other settings.
+            WorkspaceError: if the folder holds a workspace with other settings.
         """
         root = root.resolve()
         path = root / CONFIG_NAME
@@ -68,10 +68,10 @@ class Workspace:
         return cls(root, config, Database(url_of(root, config), root))
 
     def with_settings(self, section: str, **changes: Any) -> "Workspace":
-        """The same workspace with other settings in a section, for this command only.
+        """Return the same workspace with other settings in a section, for this command only.
 
         Raises:
-            ConfigError: a setting is wrong.
+            ConfigError: if a setting is wrong.
         """
         changed = {**dict(getattr(self.config, section)), **changes}
         config = make_config({**dict(self.config), section: changed}, "command line")
@@ -94,7 +94,7 @@ class Workspace:
         return dict(self.database.rows(query.order_by(frame.c.frame)))
 
     def ground_truth(self, *splits: str) -> dict[str, Annotations]:
-        """The stored ground truth per frame; there is none of unlabeled frames."""
+        """Return the stored ground truth per frame; there is none of unlabeled frames."""
         truth, frame = bulk.table("ground_truth"), bulk.table("frame")
         names = ("category", *BOX_COLUMNS, "truncated", "occluded", "alpha", *RECTANGLE_COLUMNS)
         query = (
@@ -107,7 +107,7 @@ class Workspace:
         return {name: _annotations(rows) for name, rows in found.items()}
 
     def predictions(self, round_number: int, frame_ids: Sequence[int]) -> dict[int, Detections]:
-        """The stored predictions of some frames, by frame key, in the order of k."""
+        """Return the stored predictions of some frames, by frame key, in the order of k."""
         table = bulk.table("prediction")
         query = (
             select(
@@ -124,7 +124,7 @@ class Workspace:
 
 
 def open_dataset(config: Config) -> Dataset:
-    """The data set that a configuration names."""
+    """Return the data set that a configuration names."""
     section = config.dataset
     dataset: Dataset = registry.DATASETS.build(
         section.kind,
@@ -136,10 +136,10 @@ def open_dataset(config: Config) -> Dataset:
 
 
 def sha256(path: Path) -> str:
-    """The hash of a file, or of the files in a folder with their names.
+    """Return the hash of a file, or of the files in a folder with their names.
 
     Raises:
-        ConfigError: there is no such file, or it is a pipe or a device, which may have no end.
+        ConfigError: if there is no such file, or it is a pipe or a device, which may have no end.
     """
     if not path.exists():
         raise ConfigError(f"{path}: no such file")

@@ -40,10 +40,10 @@ class _Element:
 
 
 def read_pcd(path: Path, content: bytes) -> np.ndarray:
-    """The (n, 3 or 4) x, y, z and, where there is one, intensity of a PCD file.
+    """Return the (n, 3 or 4) x, y, z and, where there is one, intensity of a PCD file.
 
     Raises:
-        DataError: the file is malformed, truncated, or has no x, y, z.
+        DataError: if the file is malformed, truncated, or has no x, y, z.
     """
     lines, start = _header(path, content, "DATA ")
     try:
@@ -64,10 +64,10 @@ def read_pcd(path: Path, content: bytes) -> np.ndarray:
 
 
 def read_ply(path: Path, content: bytes) -> np.ndarray:
-    """The (n, 3 or 4) x, y, z and, where there is one, intensity of a PLY file's vertices.
+    """Return the (n, 3 or 4) x, y, z and, where there is one, intensity of a PLY file's vertices.
 
     Raises:
-        DataError: the file is malformed, truncated, or has no vertices with x, y, z.
+        DataError: if the file is malformed, truncated, or has no vertices with x, y, z.
     """
     lines, start = _header(path, content, "end_header")
     try:
@@ -89,7 +89,7 @@ def read_ply(path: Path, content: bytes) -> np.ndarray:
 
 
 def _header(path: Path, content: bytes, last: str) -> tuple[list[str], int]:
-    """The lines up to the one that starts with `last`, and where the data begin."""
+    """Return the lines up to the one that starts with `last`, and where the data begin."""
     lines: list[str] = []
     start = 0
     while (end := content.find(b"\n", start, _LONGEST_HEADER)) >= 0:
@@ -187,7 +187,7 @@ def _numbers(path: Path, text: bytes, rows: int, width: int, first: int = 0) -> 
 
 
 def _rows(path: Path, content: bytes, row: np.dtype, count: int, start: int) -> np.ndarray:
-    """(count,) rows of a structured type."""
+    """Return (count,) rows of a structured type."""
     if start + count * row.itemsize > len(content):
         raise DataError(
             f"{path}: its header claims {count} points of {row.itemsize} bytes, and "
@@ -197,7 +197,7 @@ def _rows(path: Path, content: bytes, row: np.dtype, count: int, start: int) -> 
 
 
 def _decompressed(path: Path, content: bytes, points: int, row: np.dtype) -> list[np.ndarray]:
-    """The first column of each field; a compressed PCD keeps field after field."""
+    """Return the first column of each field; a compressed PCD keeps field after field."""
     packed, size = struct.unpack("<II", content[:8]) if len(content) >= 8 else (0, 0)
     known = size == points * row.itemsize and 8 + packed <= len(content)
     if not known or size > packed * _LZF_RATIO:

@@ -26,7 +26,7 @@ CLOUD_SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 
 
 def read_cloud(path: Path, columns: int = 4, intensity_scale: float = 1.0) -> np.ndarray:
-    """The (n, 4) float32 points of a file; points that are not finite are left out.
+    """Return the (n, 4) float32 points of a file; points that are not finite are left out.
 
     Args:
         path: .bin of float32, .npy of (n, columns), .pcd or .ply.
@@ -34,7 +34,7 @@ def read_cloud(path: Path, columns: int = 4, intensity_scale: float = 1.0) -> np
         intensity_scale: what full intensity is in the file, e.g. 255; it is clipped there.
 
     Raises:
-        DataError: the file is missing, damaged or of another format.
+        DataError: if the file is missing, damaged or of another format.
     """
     suffix = path.suffix.lower()
     if suffix == ".bin":

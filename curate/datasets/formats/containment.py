@@ -14,7 +14,7 @@ from curate.errors import DataError
 
 
 def check_frame_id(frame_id: str) -> None:
-    """DataError where the id could lead out of the data set's folders, or garble a message."""
+    """Raise DataError if the id could lead out of the data set's folders, or garble a message."""
     harmless = frame_id.isprintable() and not {"/", "\\"} & set(frame_id)
     if not frame_id or frame_id.startswith(".") or not harmless:
         raise DataError(
@@ -39,7 +39,7 @@ class Boundary:
         self._folders: dict[str, str] = {}
 
     def check(self, *paths: Path) -> None:
-        """DataError where a path leads out, by a link or by its name, or is a pipe or a device.
+        """Raise DataError if a path leads out, by a link or by its name, or is a pipe or a device.
 
         Or where no file could have that name. It need not be there.
         """

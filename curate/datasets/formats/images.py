@@ -21,10 +21,10 @@ MOST_PIXELS = 1 << 25
 
 
 def read_image(path: Path) -> np.ndarray:
-    """The (height, width, 3) uint8 RGB pixels of an image file.
+    """Return the (height, width, 3) uint8 RGB pixels of an image file.
 
     Raises:
-        DataError: the file is missing, truncated or no image.
+        DataError: if the file is missing, truncated or no image.
     """
     import cv2
 
@@ -32,10 +32,10 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def read_image_size(path: Path) -> tuple[int, int]:
-    """(width, height) in pixels; of a PNG only the header is read.
+    """Return (width, height) in pixels; of a PNG only the header is read.
 
     Raises:
-        DataError: the file is missing or no image.
+        DataError: if the file is missing or no image.
     """
     header = _read_bytes(path, PNG_HEADER_BYTES)
     if not header.startswith(PNG_START):
@@ -47,7 +47,7 @@ def read_sized_image(path: Path, *, pixels: bool) -> tuple[tuple[int, int], np.n
     """(width, height) of an image file, and as `read_image` its pixels where they are wanted.
 
     Raises:
-        DataError: the file is missing, truncated or no image.
+        DataError: if the file is missing, truncated or no image.
     """
     if not pixels:
         return read_image_size(path), None
@@ -57,10 +57,10 @@ def read_sized_image(path: Path, *, pixels: bool) -> tuple[tuple[int, int], np.n
 
 
 def decode_image(path: Path, mode: int) -> np.ndarray:
-    """The pixels of an image file as OpenCV decodes them under `mode` (cv2.IMREAD_...).
+    """Return the pixels of an image file as OpenCV decodes them under `mode` (cv2.IMREAD_...).
 
     Raises:
-        DataError: the file is missing, truncated, no PNG or JPEG, or larger than `MOST_PIXELS`.
+        DataError: if the file is missing, truncated, no PNG or JPEG, or larger than `MOST_PIXELS`.
     """
     import cv2
 
@@ -95,7 +95,7 @@ def _claimed_size(content: bytes, path: Path) -> tuple[int, int]:
 
 
 def _has_end(content: bytes) -> bool:
-    """Whether a PNG's chunks lead to its end mark within the file.
+    """Return whether a PNG's chunks lead to its end mark within the file.
 
     A decoder takes memory for as many bytes as a chunk claims before it reads the first.
     """
@@ -108,7 +108,7 @@ def _has_end(content: bytes) -> bool:
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """(width, height) by the first start of a frame; None where there is none."""
+    """Return (width, height) by the first start of a frame; None where there is none."""
     at = len(JPEG_START)
     while at + 9 <= len(content) and content[at] == 0xFF:
         marker = content[at + 1]

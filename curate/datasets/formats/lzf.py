@@ -10,7 +10,7 @@ from numba import njit
 
 @njit(cache=True)
 def unpack(source: np.ndarray, target: np.ndarray) -> int:
-    """Undoes the compression of (n,) bytes into (m,) bytes.
+    """Undo the compression of (n,) bytes into (m,) bytes.
 
     Returns:
         How many bytes it made; -1 where the source is damaged or makes more than m.

@@ -67,7 +67,7 @@ class KittiDataset:
         self._folders = [home / name for name in ("velodyne", "image_2", "calib", "label_2")]
 
     def frame_ids(self) -> tuple[str, ...]:
-        """All frames with a velodyne file, in sorted order."""
+        """Return all frames with a velodyne file, in sorted order."""
         return self._frame_ids
 
     @cached_property
@@ -81,7 +81,7 @@ class KittiDataset:
         of ROOT/training. It is therefore left out where ROOT/training is read.
 
         Raises:
-            DataError: a list names something that is no frame id.
+            DataError: if a list names something that is no frame id.
         """
         lists = {
             path.stem: path for path in sorted(visible_files(self.root / "ImageSets", "*.txt"))
@@ -95,7 +95,7 @@ class KittiDataset:
         """Where the frame's files lie; `label` is None where there is no label file.
 
         Raises:
-            DataError: the name or a link would lead out of the data set.
+            DataError: if the name or a link would lead out of the data set.
         """
         check_frame_id(frame_id)
         velodyne, pictures, calib, labels = self._folders
@@ -114,7 +114,7 @@ class KittiDataset:
         """The drive of a frame, where the mapping of KITTI's development kit lies in the root.
 
         Raises:
-            DataError: the mapping is malformed, or lies elsewhere.
+            DataError: if the mapping is malformed, or lies elsewhere.
         """
         return self._drives.get(frame_id)
 
@@ -132,7 +132,7 @@ class KittiDataset:
         """The frame's calibration, its points unless unwanted, and its image where asked for.
 
         Raises:
-            DataError: a file is missing, damaged or malformed.
+            DataError: if a file is missing, damaged or malformed.
         """
         files = self.files(frame_id)
         sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
@@ -141,10 +141,10 @@ class KittiDataset:
         return Frame(frame_id, sweep, calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
-        """The frame's ground truth in the LiDAR frame, DontCare regions included.
+        """Return the frame's ground truth in the LiDAR frame, DontCare regions included.
 
         Raises:
-            DataError: there is no label file, or it is malformed.
+            DataError: if there is no label file, or it is malformed.
         """
         files = self.files(frame_id)
         if files.label is None:
@@ -156,7 +156,7 @@ def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:
     """The (n, 4) float32 points of a velodyne file: x, y, z in metres, intensity. May be empty.
 
     Raises:
-        DataError: the file is missing or truncated, or holds NaN or infinite numbers.
+        DataError: if the file is missing or truncated, or holds NaN or infinite numbers.
     """
     with opened(path, "velodyne") as file:
         size = os.fstat(file.fileno()).st_size
@@ -182,7 +182,7 @@ def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:
 
 
 def check_point_range(path: Path, points: Float[np.ndarray, "n _"]) -> None:
-    """DataError where a finite point of (n, >=3) is farther than any LiDAR sees."""
+    """Raise DataError if a finite point of (n, >=3) is farther than any LiDAR sees."""
     far = np.abs(points[:, :3]).max(initial=0)
     if far > FARTHEST_METRES:
         k = int(np.abs(points[:, :3]).max(axis=1).argmax())
@@ -193,10 +193,10 @@ def check_point_range(path: Path, points: Float[np.ndarray, "n _"]) -> None:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """The calibration of the left colour camera (P2, R0_rect, Tr_velo_to_cam).
+    """Return the calibration of the left colour camera (P2, R0_rect, Tr_velo_to_cam).
 
     Raises:
-        DataError: the file is missing, or one of the three is missing, has a wrong number of
+        DataError: if the file is missing, or one of the three is missing, has a wrong number of
             entries, or is not finite.
     """
     matrices: dict[str, np.ndarray] = {}
@@ -218,7 +218,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Writes a calibration file that `read_calibration` reads back exactly.
+    """Write a calibration file that `read_calibration` reads back exactly.
 
     The whole way from the LiDAR to the rectified camera is in Tr_velo_to_cam, R0_rect is the
     identity. P0, P1 and P3 repeat P2, for readers that take lines by number.
@@ -256,7 +256,7 @@ def read_drives(folder: Path) -> Mapping[str, str]:
     line, from 1.
 
     Raises:
-        DataError: a file is missing or malformed.
+        DataError: if a file is missing or malformed.
     """
     mapping, path = (folder / name for name in _MAPPING_FILES)
     lines = read_bytes(mapping, "mapping").decode("utf-8", "replace")
@@ -272,7 +272,7 @@ def read_drives(folder: Path) -> Mapping[str, str]:
 
 
 def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
-    """The files of a folder without hidden ones: macOS strews ._ files over foreign disks."""
+    """Yield the files of a folder without hidden ones: macOS strews ._ files over foreign disks."""
     if not folder.is_dir():
         return
     with os.scandir(folder) as entries:  # `glob` would hold an object per file
@@ -282,14 +282,14 @@ def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
 
 
 def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str, ...]]:
-    """The frame lists of a folder by file name; none where it is not there.
+    """Return the frame lists of a folder by file name; none where it is not there.
 
     Args:
         folder: of the lists.
         boundary: that links must not lead out of.
 
     Raises:
-        DataError: a list names something that is no frame id, or lies elsewhere.
+        DataError: if a list names something that is no frame id, or lies elsewhere.
     """
     paths = sorted(visible_files(folder, "*.txt"))
     boundary.check(*paths)
@@ -297,7 +297,7 @@ def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str
 
 
 def read_frame_list(path: Path) -> tuple[str, ...]:
-    """The frame ids of a text file, one per line; DataError for what is no frame id."""
+    """Return the frame ids of a text file, one per line; DataError for what is no frame id."""
     names: list[str] = []
     try:
         text = read_bytes(path, "frame list").decode("utf-8-sig")
@@ -314,7 +314,7 @@ def read_frame_list(path: Path) -> tuple[str, ...]:
 
 
 def read_bytes(path: Path, kind: str) -> bytes:
-    """The content of a file; DataError with its kind where it is missing."""
+    """Return the content of a file; DataError with its kind where it is missing."""
     with opened(path, kind) as file:
         return file.read()
 

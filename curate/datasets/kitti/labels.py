@@ -83,7 +83,7 @@ def read_objects(
         known: the category names that may occur; None accepts any.
 
     Raises:
-        DataError: the file is missing or not text, or a line has too few or too many fields, a
+        DataError: if the file is missing or not text, or a line has too few or too many fields, a
             field that is not a finite number, an unknown category, or a negative dimension of an
             object that is not DontCare.
     """
@@ -115,7 +115,7 @@ def write_objects(path: StrPath, objects: KittiObjects) -> None:
     the 2D box have two.
 
     Raises:
-        DataError: a number is not finite, or only some objects have scores.
+        DataError: if a number is not finite, or only some objects have scores.
     """
     path = Path(path)
     scored = ~np.isnan(objects.scores)
@@ -134,7 +134,7 @@ def write_objects(path: StrPath, objects: KittiObjects) -> None:
 
 
 def to_annotations(objects: KittiObjects, calibration: Calibration) -> Annotations:
-    """The objects as ground truth in the LiDAR frame; boxes of DontCare regions are NaN."""
+    """Return the objects as ground truth in the LiDAR frame; boxes of DontCare regions are NaN."""
     boxes = _boxes_lidar(objects, calibration)
     boxes[objects.categories == DONT_CARE] = np.nan
     return Annotations(
@@ -148,7 +148,7 @@ def to_annotations(objects: KittiObjects, calibration: Calibration) -> Annotatio
 
 
 def to_detections(objects: KittiObjects, calibration: Calibration) -> Detections:
-    """The objects as detections in the LiDAR frame, without DontCare regions."""
+    """Return the objects as detections in the LiDAR frame, without DontCare regions."""
     found = objects.select(objects.categories != DONT_CARE)
     return Detections(_boxes_lidar(found, calibration), found.scores, found.categories)
 
@@ -174,7 +174,7 @@ def from_annotations(annotations: Annotations, calibration: Calibration) -> Kitt
 def from_detections(
     detections: Detections, calibration: Calibration, image_size: tuple[int, int]
 ) -> KittiObjects:
-    """The detections in KITTI's form, in the same order.
+    """Return the detections in KITTI's form, in the same order.
 
     The 2D box is the projected 3D box clipped to the image; a box that does not reach the image
     gets (-1, -1, -1, -1), which has no height, so that KITTI's evaluation ignores it. Truncation
@@ -202,7 +202,7 @@ def from_detections(
 
 
 def _boxes_lidar(objects: KittiObjects, calibration: Calibration) -> np.ndarray:
-    """(n, 7) centre boxes in the LiDAR frame."""
+    """Return (n, 7) centre boxes in the LiDAR frame."""
     height, width, length = objects.dimensions.T
     centres = objects.locations.copy()
     centres[:, 1] -= height / 2  # the camera's y points down
@@ -221,7 +221,7 @@ def _boxes_lidar(objects: KittiObjects, calibration: Calibration) -> np.ndarray:
 def _boxes_camera(
     boxes: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n, 3) height, width, length; (n, 3) bottom centres; (n,) rotation_y."""
+    """Return (n, 3) height, width, length; (n, 3) bottom centres; (n,) rotation_y."""
     to_camera = calibration.lidar_to_camera
     locations = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
     locations[:, 1] += boxes[:, 5] / 2
@@ -229,7 +229,7 @@ def _boxes_camera(
 
 
 def _columns(values: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The fields of `KittiObjects` after the categories, from (n, 14) or (n, 15) numbers."""
+    """Return the fields of `KittiObjects` after the categories, from (n, 14) or (n, 15) numbers."""
     scores = values[:, 14] if values.shape[1] > 14 else np.full(len(values), np.nan)
     return (
         values[:, 0],
@@ -257,7 +257,7 @@ def _format(objects: KittiObjects, index: int) -> str:
 
 
 def _read_lines(path: Path) -> list[str]:
-    """The lines of a text file; DataError where there is none."""
+    """Return the lines of a text file; DataError where there is none."""
     try:
         return path.read_bytes().decode("utf-8-sig").splitlines()
     except FileNotFoundError:
@@ -269,7 +269,7 @@ def _read_lines(path: Path) -> list[str]:
 
 
 def _has_negative_side(categories: Sequence[str], dimensions: np.ndarray) -> bool:
-    """Whether an object that is not DontCare has a negative dimension."""
+    """Return whether an object that is not DontCare has a negative dimension."""
     if dimensions.min(initial=0) >= 0:
         return False
     rows = np.flatnonzero((dimensions < 0).any(axis=1)).tolist()
@@ -279,7 +279,7 @@ def _has_negative_side(categories: Sequence[str], dimensions: np.ndarray) -> boo
 def _first_fault(
     path: Path, lines: Sequence[str], fields: int, known: Collection[str] | None
 ) -> DataError:
-    """The error for the first bad line of a file that has one."""
+    """Return the error for the first bad line of a file that has one."""
     rows = [(number, line.split()) for number, line in enumerate(lines, start=1)]
     faults = ((number, _fault(row, fields, known)) for number, row in rows if row)
     number, fault = next((number, fault) for number, fault in faults if fault)

@@ -58,7 +58,7 @@ class KittiRawDataset:
             )
 
     def frame_ids(self) -> tuple[str, ...]:
-        """All frames with points and image, in sorted order."""
+        """Return all frames with points and image, in sorted order."""
         return tuple(self._homes)
 
     @cached_property
@@ -73,18 +73,18 @@ class KittiRawDataset:
         return dict(sorted(found.items()))
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
-        """The lists of ROOT/ImageSets, by file name."""
+        """Return the lists of ROOT/ImageSets, by file name."""
         return read_frame_lists(self.root / "ImageSets", self._boundary)
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """The drive of a frame."""
+        """Return the drive of a frame."""
         return self._homes[frame_id][0].name if frame_id in self._homes else None
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie; the calibration is the drive's.
 
         Raises:
-            DataError: there is no such frame.
+            DataError: if there is no such frame.
         """
         check_frame_id(frame_id)
         if frame_id not in self._homes:
@@ -104,7 +104,7 @@ class KittiRawDataset:
         """The frame's calibration, its points unless unwanted, and its image where asked for.
 
         Raises:
-            DataError: a file is missing, damaged or malformed.
+            DataError: if a file is missing, damaged or malformed.
         """
         files = self.files(frame_id)
         sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
@@ -113,10 +113,10 @@ class KittiRawDataset:
         return Frame(frame_id, sweep, calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
-        """The frame's ground truth in the LiDAR frame.
+        """Return the frame's ground truth in the LiDAR frame.
 
         Raises:
-            DataError: there is no label file, or it is malformed.
+            DataError: if there is no label file, or it is malformed.
         """
         files = self.files(frame_id)
         if files.label is None:
@@ -130,7 +130,7 @@ def read_raw_calibration(folder: Path) -> Calibration:
     """The calibration of the left colour camera (P_rect_02, R_rect_00, R and T of the LiDAR).
 
     Raises:
-        DataError: a file or an entry is missing or malformed.
+        DataError: if a file or an entry is missing or malformed.
     """
     extrinsic, rectify = np.eye(4), np.eye(4)
     extrinsic[:3, :3] = _entry(folder / _TO_CAMERA, "R", (3, 3))

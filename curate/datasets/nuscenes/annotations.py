@@ -54,10 +54,10 @@ class AnnotationTable:
     def read(
         self, token: str, calibration: Calibration, image_size: tuple[int, int]
     ) -> Annotations:
-        """The objects of a frame that the camera sees, in the order of the table.
+        """Return the objects of a frame that the camera sees, in the order of the table.
 
         Raises:
-            DataError: a table is missing or damaged, or a record cannot be.
+            DataError: if a table is missing or damaged, or a record cannot be.
         """
         records = [one for one in self._records(token) if self._counted(one)]
         boxes = self._boxes(records, calibration)
@@ -141,13 +141,13 @@ def _truncation(
 
 
 def _areas(rectangles: np.ndarray) -> np.ndarray:
-    """(n,) pixels."""
+    """Return (n,) pixels."""
     areas: np.ndarray = np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)
     return areas
 
 
 def _observation_angles(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """(n,) KITTI's alpha: the heading against the ray from the camera, radians."""
+    """Return (n,) KITTI's alpha: the heading against the ray from the camera, radians."""
     to_camera = calibration.lidar_to_camera
     centres = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
     level = np.zeros(len(boxes))

@@ -68,7 +68,7 @@ class NuScenesDataset:
         self._annotated = AnnotationTable(self._tables, names, minimum_points)
 
     def frame_ids(self) -> tuple[str, ...]:
-        """The sample tokens of all key frames with sweep and image, in sorted order."""
+        """Return the sample tokens of all key frames with sweep and image, in sorted order."""
         return self._present
 
     @cached_property
@@ -97,7 +97,7 @@ class NuScenesDataset:
         return present
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
-        """The official train and val of v1.0-trainval and v1.0-mini, by scene; else none."""
+        """Return the official train and val of v1.0-trainval and v1.0-mini, by scene; else none."""
         scenes = {self._keyframes[token].scene for token in self._present}
         held_out = validation_scenes(self.version, scenes)
         if not held_out:
@@ -108,14 +108,14 @@ class NuScenesDataset:
         return {name: tuple(tokens) for name, tokens in lists.items()}
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """The scene of a frame: 20 seconds of one drive."""
+        """Return the scene of a frame: 20 seconds of one drive."""
         return self._keyframes[frame_id].scene if frame_id in self._keyframes else None
 
     def files(self, frame_id: str) -> FrameFiles:
         """Where the frame's files lie; calibration and labels are tables of all frames.
 
         Raises:
-            DataError: there is no such frame, or its files lie elsewhere.
+            DataError: if there is no such frame, or its files lie elsewhere.
         """
         frame = self._frame(frame_id)
         labels = self._annotated.path
@@ -132,7 +132,7 @@ class NuScenesDataset:
         """The frame's calibration, its points unless unwanted, and its image where asked for.
 
         Raises:
-            DataError: a file is missing, damaged or malformed.
+            DataError: if a file is missing, damaged or malformed.
         """
         frame, files = self._frame(frame_id), self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
@@ -147,10 +147,10 @@ class NuScenesDataset:
         return Frame(frame_id, sweep, frame.calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
-        """The objects that the camera sees, in the LiDAR frame.
+        """Return the objects that the camera sees, in the LiDAR frame.
 
         Raises:
-            DataError: the version has no annotations, or they are malformed.
+            DataError: if the version has no annotations, or they are malformed.
         """
         if self.files(frame_id).label is None:
             raise DataError(f"{self._annotated.path}: no such table; {self.version} has no labels")
@@ -167,7 +167,7 @@ class NuScenesDataset:
 
 
 def _version(root: Path, version: str | None) -> str:
-    """The folder of tables below a root."""
+    """Return the folder of tables below a root."""
     found = sorted(path.parent.name for path in root.glob("*/sample_data.json"))
     if not found:
         raise DataError(

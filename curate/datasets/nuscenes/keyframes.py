@@ -65,15 +65,15 @@ class _Sensor:
 
 
 def read_keyframes(tables: Path, camera: str) -> dict[str, Keyframe]:
-    """The key frames that have a sweep and an image of the camera, by sample token, sorted.
+    """Return the key frames that have a sweep and an image of the camera, by sample token, sorted.
 
     Args:
         tables: folder of the tables, such as v1.0-mini.
         camera: channel, such as CAM_FRONT.
 
     Raises:
-        DataError: a table is missing or damaged, or refers to a record that is not there.
-        ConfigError: there is no such camera.
+        DataError: if a table is missing or damaged, or refers to a record that is not there.
+        ConfigError: if there is no such camera.
     """
     sensors = _sensors(tables, camera)
     path = tables / "scene.json"
@@ -95,7 +95,7 @@ def read_keyframes(tables: Path, camera: str) -> dict[str, Keyframe]:
 
 
 def _sensors(tables: Path, camera: str) -> dict[str, _Sensor]:
-    """The LiDAR and the camera as mounted on each vehicle, by token of calibrated_sensor."""
+    """Return the LiDAR and the camera as mounted on each vehicle, by token of calibrated_sensor."""
     path = tables / "sensor.json"
     channels = {token: text(path, one, "channel") for token, one in read_table(path).items()}
     cameras = sorted(name for name in channels.values() if name.startswith("CAM"))
@@ -111,7 +111,7 @@ def _sensors(tables: Path, camera: str) -> dict[str, _Sensor]:
 
 
 def _sensor_data(path: Path, sensors: Mapping[str, _Sensor]) -> dict[str, dict[str, Record]]:
-    """The records of key frames of these sensors, by sample token and channel."""
+    """Return the records of key frames of these sensors, by sample token and channel."""
     found: dict[str, dict[str, Record]] = {}
     for _, content in scan_table(path):
         if not _KEY.search(content):
@@ -125,7 +125,7 @@ def _sensor_data(path: Path, sensors: Mapping[str, _Sensor]) -> dict[str, dict[s
 
 
 def _vehicle_poses(path: Path, needed: set[str]) -> dict[str, np.ndarray]:
-    """(4, 4) vehicle to map, by token of ego_pose."""
+    """Return (4, 4) vehicle to map, by token of ego_pose."""
     found = {}
     for _, content in scan_table(path):
         match = _TOKEN.search(content)
@@ -166,7 +166,7 @@ def _keyframe(
 
 
 def _image_size(path: Path, record: Record) -> tuple[int, int]:
-    """(width, height) in pixels; DataError for none."""
+    """Return (width, height) in pixels; DataError for none."""
     size = count(path, record, "width"), count(path, record, "height")
     if 0 in size or size[0] * size[1] > MOST_PIXELS:
         raise DataError(f"{path}: an image of {size[0]} x {size[1]} pixels")

@@ -35,7 +35,7 @@ rider. The other classes keep their names."""
 
 
 def category_of(general_name: str, rename: Mapping[str, str]) -> str:
-    """The category of an annotation; classes outside the task keep their general name.
+    """Return the category of an annotation; classes outside the task keep their general name.
 
     Args:
         general_name: such as vehicle.car.
@@ -46,7 +46,7 @@ def category_of(general_name: str, rename: Mapping[str, str]) -> str:
 
 
 def detection_name(category: str) -> str | None:
-    """The task's class of a category under `CATEGORIES`, or None where it has none."""
+    """Return the task's class of a category under `CATEGORIES`, or None where it has none."""
     ours = {name: detected for detected, name in CATEGORIES.items()}
     name = ours.get(category, category)
     return name if name in DETECTION_NAMES.values() else None

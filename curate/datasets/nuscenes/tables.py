@@ -30,10 +30,10 @@ _LARGEST, _LONGEST = 1e7, 200
 
 
 def read_table(path: Path) -> dict[str, Record]:
-    """The records of a small table by their token.
+    """Return the records of a small table by their token.
 
     Raises:
-        DataError: the file is missing or no table.
+        DataError: if the file is missing or no table.
     """
     try:
         records = json.loads(path.read_bytes())
@@ -50,7 +50,7 @@ def scan_table(path: Path) -> Iterator[tuple[int, bytes]]:
     """Where each record of a large table begins, and its text.
 
     Raises:
-        DataError: the file is missing, or ends within a record.
+        DataError: if the file is missing, or ends within a record.
     """
     rest, place = b"", 0
     try:
@@ -68,7 +68,7 @@ def scan_table(path: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def parse_record(path: Path, content: bytes) -> Record:
-    """A record of a large table from its text; DataError where it is none."""
+    """Return a record of a large table from its text; DataError where it is none."""
     try:
         record: Record = json.loads(content)
     except (RecursionError, ValueError) as error:
@@ -77,7 +77,7 @@ def parse_record(path: Path, content: bytes) -> Record:
 
 
 def field(path: Path, record: Record, name: str) -> Any:
-    """A value of a record; DataError where there is none."""
+    """Return a value of a record; DataError where there is none."""
     if name not in record:
         raise DataError(f"{path}: record {_named(record)} has no {name}")
     return record[name]
@@ -94,7 +94,7 @@ def text(path: Path, record: Record, name: str) -> str:
 
 
 def count(path: Path, record: Record, name: str) -> int:
-    """A whole number of a record, from 0 on; DataError where it is none."""
+    """Return a whole number of a record, from 0 on; DataError where it is none."""
     found = field(path, record, name)
     if not isinstance(found, int) or not 0 <= found <= _LARGEST:
         raise DataError(f"{path}: record {_named(record)}: {name} is no whole number from 0 on")
@@ -129,12 +129,12 @@ def quaternion(path: Path, record: Record) -> np.ndarray:
 
 
 def pose(path: Path, record: Record) -> np.ndarray:
-    """(4, 4) pose of a record of ego_pose or calibrated_sensor."""
+    """Return (4, 4) pose of a record of ego_pose or calibrated_sensor."""
     return pose_matrix(numbers(path, record, "translation", (3,)), quaternion(path, record))
 
 
 def _named(record: Record) -> str:
-    """The token of a record as a message may repeat it."""
+    """Return the token of a record as a message may repeat it."""
     token = record.get("token")
     return token[:80] if isinstance(token, str) and token.isprintable() else "without a token"
 

@@ -44,7 +44,7 @@ class Checkpoint:
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Writes the checkpoint and, beside it, its ONNX graph; each file whole or not at all."""
+    """Write the checkpoint and, beside it, its ONNX graph; each file whole or not at all."""
     metadata = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -58,7 +58,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def _canonical(content: bytes) -> bytes:
-    """The same safetensors file with its header sorted.
+    """Return the same safetensors file with its header sorted.
 
     The library writes the metadata in an order that it draws anew in every process. Equal weights
     must have equal bytes: what a teacher has said is kept as long as its hash is the same.
@@ -71,10 +71,10 @@ def _canonical(content: bytes) -> bytes:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """The checkpoint in a file.
+    """Return the checkpoint in a file.
 
     Raises:
-        ModelError: the file is missing, damaged, or no checkpoint of this detector, or a weight
+        ModelError: if the file is missing, damaged, or no checkpoint of this detector, or a weight
             of it is no number.
     """
     try:
@@ -107,7 +107,7 @@ def digest_of(path: Path) -> str:
     """SHA-256 of the checkpoint file, in hexadecimal.
 
     Raises:
-        ModelError: the file cannot be read.
+        ModelError: if the file cannot be read.
     """
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
@@ -123,10 +123,10 @@ def graph_path(path: Path) -> Path:
 
 
 def write_graph(path: Path, checkpoint: Checkpoint, digest: str) -> None:
-    """Writes the ONNX graph beside the checkpoint at `path`, marked with the checkpoint's digest.
+    """Write the ONNX graph beside the checkpoint at `path`, marked with the checkpoint's digest.
 
     Raises:
-        ModelError: the checkpoint lacks tensors, or the graph cannot be written.
+        ModelError: if the checkpoint lacks tensors, or the graph cannot be written.
     """
     # Predicting needs onnx only where the graph is missing.
     from curate.detectors.pillars.onnx_graph import build_graph

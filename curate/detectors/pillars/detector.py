@@ -114,7 +114,7 @@ class PillarDetector:
 
 
 def onnx_answers(path: Path, checkpoint: Checkpoint, threads: int) -> Callable[[Pillars], Answers]:
-    """The checkpoint's ONNX graph in ONNX Runtime; made where it is missing or outdated."""
+    """Return the checkpoint's ONNX graph in ONNX Runtime; made where it is missing or outdated."""
     import onnxruntime
     from onnxruntime.capi.onnxruntime_pybind11_state import (
         Fail,
@@ -152,7 +152,7 @@ def onnx_answers(path: Path, checkpoint: Checkpoint, threads: int) -> Callable[[
 
 
 def torch_forward(path: Path, checkpoint: Checkpoint, device: str) -> Callable[[Pillars], Answers]:
-    """The network itself, on a GPU."""
+    """Return the network itself, on a GPU."""
     import torch
 
     from curate.detectors.pillars.network import SingleFrame, network_of

@@ -76,7 +76,7 @@ class Targets:
 
 
 def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
-    """The pillar features of (n, 4) points; points off the grid are left out.
+    """Return the pillar features of (n, 4) points; points off the grid are left out.
 
     Args:
         points: in the LiDAR frame, but z measured from the ground (see `GroundMap.lowered`).
@@ -123,7 +123,7 @@ def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
 def encode_boxes(
     boxes: np.ndarray, category_ids: np.ndarray, weights: np.ndarray, count: int, preset: Preset
 ) -> Targets:
-    """The targets of one frame.
+    """Return the targets of one frame.
 
     Args:
         boxes: (n, 7) in the LiDAR frame but z measured from the ground, sides positive; boxes
@@ -163,7 +163,7 @@ def decode(
     preset: Preset,
     minimum_score: float,
 ) -> Detections:
-    """The boxes in the network's answers, before non-maximum suppression, z from the ground.
+    """Return the boxes in the network's answers, before non-maximum suppression, z from the ground.
 
     Args:
         scores: (x cells, y cells, categories) in [0, 1]. All cells that reach the threshold answer,
@@ -190,7 +190,7 @@ def decode(
 
 
 def decode_boxes(codes: np.ndarray, cells: np.ndarray, preset: Preset) -> np.ndarray:
-    """(n, 7) boxes of (n, BOX_CODE) codes at (n,) flat cells."""
+    """Return (n, 7) boxes of (n, BOX_CODE) codes at (n,) flat cells."""
     column, row = np.divmod(cells, preset.cells[1])
     axis = np.arctan2(codes[:, 6], codes[:, 7]) / 2
     forward = codes[:, 8] * np.sin(axis) + codes[:, 9] * np.cos(axis)
@@ -229,7 +229,7 @@ def _draw(
     weights: np.ndarray,
     cell_m: float,
 ) -> None:
-    """Enters the objects' gaussians and regions into the two maps."""
+    """Enter the objects' gaussians and regions into the two maps."""
     sides = boxes[:, 3:5] / cell_m
     spreads = np.maximum(sides * _SPREAD_PER_SIDE, _NARROWEST_SPREAD_CELLS)
     for k in range(len(boxes)):

@@ -59,7 +59,7 @@ class BatchTargets:
 
     @classmethod
     def stack(cls, targets: Sequence[Targets], device: str = "cpu") -> "BatchTargets":
-        """The targets of several frames."""
+        """Return the targets of several frames."""
         cells = targets[0].background.size
 
         def joined(name: str, step: int = 0) -> Tensor:

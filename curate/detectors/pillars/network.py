@@ -67,7 +67,7 @@ class PillarNetwork(nn.Module):
             bias[:categories] = torch.logit(torch.tensor(_PRIOR))
 
     def forward(self, features: Tensor, slots: Tensor, frames: int) -> Answers:
-        """The answers for a batch.
+        """Return the answers for a batch.
 
         Args:
             features: (n, POINT_FEATURES) of the points of all frames.
@@ -115,7 +115,7 @@ class SlotMaximum(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, slots: Tensor, count: int) -> Tensor:
-        """(count, c) of (n, c) values, whose rows go into these slots."""
+        """Return (count, c) of (n, c) values, whose rows go into these slots."""
         index = slots[:, None].expand(-1, values.shape[1])
         highest = values.new_zeros(count, values.shape[1])
         highest = highest.scatter_reduce(0, index, values, "amax", include_self=True)
@@ -138,7 +138,7 @@ class _Pointwise(nn.Module):
         self.mix = nn.Linear(channels_in, channels_out, bias=False)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """(b, channels_in, x, y) to (b, channels_out, x, y)."""
+        """Return (b, channels_in, x, y) to (b, channels_out, x, y)."""
         mixed: Tensor = self.mix(maps.permute(0, 2, 3, 1))
         return mixed.permute(0, 3, 1, 2)
 
@@ -157,10 +157,10 @@ def _scale(channels_in: int, channels_out: int, depth: int, *, down: bool) -> nn
 
 
 def network_of(checkpoint: Checkpoint) -> PillarNetwork:
-    """The network with the checkpoint's weights, on CPU.
+    """Return the network with the checkpoint's weights, on CPU.
 
     Raises:
-        ModelError: the checkpoint's tensors are not those of its preset.
+        ModelError: if the checkpoint's tensors are not those of its preset.
     """
     network = PillarNetwork(checkpoint.preset, len(checkpoint.categories))
     state = {name: torch.from_numpy(array) for name, array in checkpoint.weights.items()}

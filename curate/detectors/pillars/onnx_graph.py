@@ -15,7 +15,7 @@ from curate.files.onnx_graph import EPSILON, GraphBuilder
 
 
 def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: int) -> ModelProto:
-    """The graph of `network.SingleFrame` with the state `weights` of its `PillarNetwork`.
+    """Return the graph of `network.SingleFrame` with the state `weights` of its `PillarNetwork`.
 
     Inputs `features` (n, POINT_FEATURES) float32 and `slots` (n, 1) int64, n > 0; outputs `scores`
     (x cells, y cells, categories), `codes` (x cells, y cells, BOX_CODE) and `ious` (x cells,
@@ -51,7 +51,7 @@ class _Graph(GraphBuilder):
     """The parts of the network."""
 
     def split(self, value: str, sizes: list[int]) -> list[str]:
-        """The channels of a map in parts of these sizes."""
+        """Return the channels of a map in parts of these sizes."""
         names = [f"{value}.{part}" for part in range(len(sizes))]
         inputs = [value, self.constant(np.array(sizes))]
         self._nodes.append(helper.make_node("Split", inputs, names, axis=1))
@@ -72,35 +72,35 @@ class _Graph(GraphBuilder):
         return self.node("Relu", convolved)
 
     def pointwise(self, maps: str, name: str) -> str:
-        """A 1 x 1 convolution."""
+        """Return a 1 x 1 convolution."""
         kernel = self._weights[f"{name}.mix.weight"]
         return self.node("Conv", maps, self.constant(kernel[:, :, None, None]))
 
     def answers(self, maps: str, name: str) -> str:
-        """A 1 x 1 convolution with bias and nothing after it."""
+        """Return a 1 x 1 convolution with bias and nothing after it."""
         kernel = self.constant(self._weights[f"{name}.weight"][:, :, None, None])
         return self.node("Conv", maps, kernel, self.constant(self._weights[f"{name}.bias"]))
 
     def scale(self, maps: str, name: str, convolutions: int, *, down: bool) -> str:
-        """All convolutions of one scale; the first may go down to it."""
+        """Return all convolutions of one scale; the first may go down to it."""
         for i in range(convolutions):
             stride = 2 if down and i == 0 else 1
             maps = self.convolution(maps, f"{name}.{i}.0", f"{name}.{i}.1", stride)
         return maps
 
     def doubled(self, maps: str) -> str:
-        """Maps at twice the resolution, each cell repeated."""
+        """Map at twice the resolution, each cell repeated."""
         scales = self.constant(np.array([1, 1, 2, 2], np.float32))
         modes = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric"}
         return self.node("Resize", maps, "", scales, nearest_mode="floor", **modes)
 
     def output(self, maps: str, name: str) -> None:
-        """Names (1, c, x, y) maps, as (x, y, c), an output of the graph."""
+        """Name (1, c, x, y) maps, as (x, y, c), an output of the graph."""
         single = self.node("Squeeze", maps, self.constant(np.array([0])))
         self._nodes.append(helper.make_node("Transpose", [single], [name], perm=[1, 2, 0]))
 
     def model(self, outputs: Mapping[str, tuple[int, ...]]) -> ModelProto:
-        """The finished and checked model."""
+        """Return the finished and checked model."""
         describe = helper.make_tensor_value_info
         inputs = [
             describe("features", TensorProto.FLOAT, ["n", POINT_FEATURES]),

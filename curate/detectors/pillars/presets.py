@@ -61,10 +61,10 @@ PRESETS: Final = {
 
 
 def preset_named(name: str) -> Preset:
-    """The preset of that name.
+    """Return the preset of that name.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: if there is none.
     """
     try:
         return PRESETS[name]

@@ -49,7 +49,7 @@ class Record(Protocol):
         ...
 
     def frame_ids(self) -> Iterable[str]:
-        """The recorded frames, in sorted order."""
+        """Return the recorded frames, in sorted order."""
         ...
 
     def answer(self, frame_id: str) -> RecordedResult:
@@ -120,7 +120,7 @@ class RecordedDetector:
             self._report_unmatched(frame_ids)
 
     def frame_ids(self) -> tuple[str, ...]:
-        """The recorded frames, in sorted order."""
+        """Return the recorded frames, in sorted order."""
         return tuple(self._record.frame_ids())
 
     def predict(self, frame: Frame) -> Detections:
@@ -133,7 +133,7 @@ class RecordedDetector:
         return self._detections(frame.frame_id, answer, lambda _: frame.calibration)
 
     def views(self, frame_id: str) -> Sequence[tuple[Similarity, Detections]]:
-        """The recorded augmented copies of the frame, in the order of their numbers.
+        """Return the recorded augmented copies of the frame, in the order of their numbers.
 
         Raises:
             DataError: nothing was recorded for the frame, or what was is malformed.
@@ -156,7 +156,7 @@ class RecordedDetector:
         answer: RecordedResult,
         calibration: Callable[[str], Calibration] | None,
     ) -> Detections:
-        """The answer in the LiDAR frame, with our names, from the lowest score on."""
+        """Return the answer in the LiDAR frame, with our names, from the lowest score on."""
         if not isinstance(answer, Detections):
             if calibration is None:
                 raise ConfigError(f"{self.path}: these results need the calibration of the frames")
@@ -173,7 +173,7 @@ class RecordedDetector:
     def _placed(
         self, frame_id: str, answer: KittiObjects | ForeignBoxes, calibration: Calibration
     ) -> Detections:
-        """The answer in the LiDAR's frame of reference."""
+        """Return the answer in the LiDAR's frame of reference."""
         if not isinstance(answer, KittiObjects):
             return answer.in_lidar(calibration)
         found = to_detections(answer, calibration)
@@ -181,7 +181,7 @@ class RecordedDetector:
         return as_detections(place, found.boxes, found.scores, found.categories)
 
     def _report_unmatched(self, frame_ids: Sequence[str]) -> None:
-        """Says which recorded frames the data set does not have; DataError where it has none."""
+        """State which recorded frames the data set does not have; DataError where it has none."""
         known = set(frame_ids)
         recorded = sum(1 for _ in self._record.frame_ids())
         strays = [name for name in self._record.frame_ids() if name not in known]
@@ -199,7 +199,7 @@ class RecordedDetector:
 
 
 def _check_repeated(place: str, found: Detections) -> None:
-    """DataError where a box comes twice, as all do in a file that was appended to itself."""
+    """Raise DataError if a box comes twice, as all do in a file that was appended to itself."""
     numbers = np.column_stack([found.boxes, found.scores]).tolist()
     seen: set[tuple[Any, ...]] = set()
     for category, box in zip(found.categories.tolist(), map(tuple, numbers), strict=True):

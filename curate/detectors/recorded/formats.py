@@ -29,7 +29,7 @@ def detect_kind(path: Path) -> str:
     """The kind of a record by its suffix: of `KINDS`, or "list" where only the contents tell.
 
     Raises:
-        DataError: the path is missing or of no kind that can be read.
+        DataError: if the path is missing or of no kind that can be read.
     """
     if not path.exists():
         raise DataError(f"{path}: no such file of recorded detections")
@@ -42,7 +42,7 @@ def detect_kind(path: Path) -> str:
 
 
 def read_results(path: Path, kind: str, reading: ReadOptions) -> Answers:
-    """The answers of one pass in any format but tables.
+    """Return the answers of one pass in any format but tables.
 
     Args:
         path: file or folder.
@@ -50,8 +50,8 @@ def read_results(path: Path, kind: str, reading: ReadOptions) -> Answers:
         reading: see there.
 
     Raises:
-        ConfigError: an option that the format needs is not given.
-        DataError: the file is missing, damaged or of another format.
+        ConfigError: if an option that the format needs is not given.
+        DataError: if the file is missing, damaged or of another format.
     """
     if kind == "kitti":
         return KittiResults(path)
@@ -68,7 +68,7 @@ def read_results(path: Path, kind: str, reading: ReadOptions) -> Answers:
 
 
 def _detect_list_kind(path: Path, entries: Sequence[Any]) -> str:
-    """The kind of a list by its first entry."""
+    """Return the kind of a list by its first entry."""
     if not entries:
         raise DataError(f"{path}: holds no frames")
     first = entries[0]

@@ -14,7 +14,7 @@ def read_json(path: Path) -> Any:
     """What a file holds.
 
     Raises:
-        DataError: it is missing or no JSON.
+        DataError: if it is missing or no JSON.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -25,7 +25,7 @@ def read_json(path: Path) -> Any:
 
 
 def holds_object(path: Path) -> bool:
-    """Whether a file begins as a JSON object does."""
+    """Return whether a file begins as a JSON object does."""
     try:
         with path.open("rb") as file:
             return file.read(_PEEKED).lstrip().startswith(b"{")
@@ -39,7 +39,7 @@ def stream_results(path: Path) -> Iterator[tuple[str, Any]]:
     Without ijson the file is read whole, which takes six times its size.
 
     Raises:
-        DataError: it is no JSON, or `results` is missing or no object.
+        DataError: if it is no JSON, or `results` is missing or no object.
     """
     try:
         import ijson

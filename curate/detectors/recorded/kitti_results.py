@@ -27,7 +27,7 @@ class KittiResults(Mapping[str, KittiObjects]):
             raise DataError(f"{folder}: holds no KITTI result files (FRAME.txt)")
 
     def __getitem__(self, frame_id: str) -> KittiObjects:
-        """The objects of a frame; DataError where its file is malformed."""
+        """Return the objects of a frame; DataError where its file is malformed."""
         return read_objects(self._paths[frame_id], scored=True, known=None)
 
     def __iter__(self) -> Iterator[str]:

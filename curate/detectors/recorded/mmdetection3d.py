@@ -22,7 +22,7 @@ _FRAME_KEYS = ("frame_id", "sample_idx", "lidar_path")
 
 
 def read_mmdetection3d(path: Path, entries: Sequence[Any], reading: ReadOptions) -> Answers:
-    """The detections of each frame.
+    """Return the detections of each frame.
 
     Args:
         path: the file or folder, for messages.
@@ -30,8 +30,8 @@ def read_mmdetection3d(path: Path, entries: Sequence[Any], reading: ReadOptions)
         reading: `classes` behind the labels; `frame_list` where the entries do not name frames.
 
     Raises:
-        ConfigError: the classes are not given, or the frames not named.
-        DataError: an entry lacks a key or holds what cannot be, or a frame comes twice.
+        ConfigError: if the classes are not given, or the frames not named.
+        DataError: if an entry lacks a key or holds what cannot be, or a frame comes twice.
     """
     if not reading.classes:
         raise ConfigError(
@@ -49,7 +49,7 @@ def read_mmdetection3d(path: Path, entries: Sequence[Any], reading: ReadOptions)
 
 
 def holds_boxes(entry: Any) -> bool:
-    """Whether an entry looks like one of mmdetection3d's."""
+    """Return whether an entry looks like one of mmdetection3d's."""
     return isinstance(entry, Mapping) and any(key in _inner(entry) for key in BOX_KEYS)
 
 
@@ -80,7 +80,7 @@ def _detections(place: str, entry: Any, classes: Sequence[str]) -> Detections:
 
 
 def _labels(place: str, told: Any) -> np.ndarray:
-    """(n,) labels of any type."""
+    """Return (n,) labels of any type."""
     try:
         return np.asarray(told).reshape(-1)
     except (OverflowError, ValueError):
@@ -88,7 +88,7 @@ def _labels(place: str, told: Any) -> np.ndarray:
 
 
 def _frames(path: Path, entries: Sequence[Any], frame_list: Path | None) -> list[str]:
-    """The frame of each entry: from the list, else as the entries name it."""
+    """Return the frame of each entry: from the list, else as the entries name it."""
     if frame_list is None:
         named = [_frame_of(entry) for entry in entries]
         if None in named:

@@ -51,11 +51,11 @@ class MapBoxes:
     names: Sequence[str]
 
     def in_lidar(self, calibration: Calibration) -> Detections:
-        """The boxes in the LiDAR's frame of reference, under our categories.
+        """Return the boxes in the LiDAR's frame of reference, under our categories.
 
         Raises:
-            DataError: they are not where the vehicle is, or no detector can have answered them.
-            ConfigError: the data set has no poses.
+            DataError: if they are not where the vehicle is, or no detector can have answered them.
+            ConfigError: if the data set has no poses.
         """
         centres, sizes, turns = self.numbers[:, :3], self.numbers[:, 3:6], self.numbers[:, 6:10]
         pose = calibration.pose_in_map()
@@ -75,7 +75,7 @@ class MapBoxes:
 
 
 def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str, MapBoxes]:
-    """The results of each frame; in memory are eleven numbers and a name per box.
+    """Return the results of each frame; in memory are eleven numbers and a name per box.
 
     Args:
         path: the file, for messages.
@@ -103,7 +103,7 @@ def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str
 
 
 def _frame(path: Path, token: str, boxes: Any, known: dict[str, str]) -> MapBoxes:
-    """The boxes of a frame; a name that many of them have is kept once, in `known`."""
+    """Return the boxes of a frame; a name that many of them have is kept once, in `known`."""
     place = f"{path}: results of {_words(token)}"
     if not isinstance(boxes, list):
         raise DataError(f"{place}: expected a list of boxes, not {type(boxes).__name__}")
@@ -113,7 +113,7 @@ def _frame(path: Path, token: str, boxes: Any, known: dict[str, str]) -> MapBoxe
 
 
 def _row(place: str, token: str, box: Any) -> list[float]:
-    """The eleven numbers of a box."""
+    """Return the eleven numbers of a box."""
     missing = [key for key in _KEYS if not isinstance(box, Mapping) or key not in box]
     if missing:
         raise DataError(f"{place}: no {', '.join(missing)}; expected {', '.join(_KEYS)}")
@@ -138,7 +138,7 @@ def _row(place: str, token: str, box: Any) -> list[float]:
 
 
 def _words(text: Any) -> str:
-    """A foreign text as a message may repeat it."""
+    """Return a foreign text as a message may repeat it."""
     return " ".join(text.split())[:80] if isinstance(text, str) else f"a {type(text).__name__}"
 
 

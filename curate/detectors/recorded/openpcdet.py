@@ -15,14 +15,14 @@ KEYS = ("frame_id", "name", "score", "boxes_lidar")
 
 
 def read_openpcdet(path: Path, entries: Sequence[Any], _reading: ReadOptions) -> Answers:
-    """The detections of each frame.
+    """Return the detections of each frame.
 
     Args:
         path: the file, for messages.
         entries: what it holds.
 
     Raises:
-        DataError: an entry lacks a key or holds what cannot be, or a frame comes twice.
+        DataError: if an entry lacks a key or holds what cannot be, or a frame comes twice.
     """
     found: dict[str, RecordedResult] = {}
     for number, entry in enumerate(entries):

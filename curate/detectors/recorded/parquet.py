@@ -55,11 +55,11 @@ class ParquetRecord:
 
     @classmethod
     def read(cls, path: Path) -> "ParquetRecord":
-        """The record in a file, of which only the column of frames is read.
+        """Return the record in a file, of which only the column of frames is read.
 
         Raises:
             ConfigError: pyarrow is not installed.
-            DataError: the file is missing, damaged or no Parquet, or a column is missing or of a
+            DataError: if the file is missing, damaged or no Parquet, or a column is missing or of a
                 wrong type.
         """
         file = _open(path)
@@ -74,7 +74,7 @@ class ParquetRecord:
         return cls(path, bool(own), _runs(path, file))
 
     def frame_ids(self) -> tuple[str, ...]:
-        """The recorded frames, in sorted order."""
+        """Return the recorded frames, in sorted order."""
         return tuple(sorted(self.runs))
 
     def answer(self, frame_id: str) -> Detections:
@@ -83,7 +83,7 @@ class ParquetRecord:
         return found
 
     def views(self, frame_id: str) -> Sequence[View]:
-        """The augmented copies in the order of their numbers; DataError like `answer`."""
+        """Return the augmented copies in the order of their numbers; DataError like `answer`."""
         return [view for number, view in sorted(self._views(frame_id).items()) if number]
 
     @cached_property
@@ -93,7 +93,7 @@ class ParquetRecord:
         return lru_cache(_GROUPS_HELD)(lambda number: _group(self.path, number, columns))
 
     def _views(self, frame_id: str) -> Mapping[int, View]:
-        """All that was recorded for a frame, by the number of the view."""
+        """Return all that was recorded for a frame, by the number of the view."""
         if frame_id not in self.runs:
             raise DataError(f"no recorded detections for frame {frame_id} in {self.path}")
         parts = [self._part(*run) for run in self.runs[frame_id]]
@@ -130,7 +130,7 @@ def _open(path: Path) -> Any:
 
 
 def _check_types(path: Path, schema: Any, names: Sequence[str]) -> None:
-    """DataError where a column holds neither names nor numbers as it should."""
+    """Raise DataError if a column holds neither names nor numbers as it should."""
     arrow, _ = load_parquet()
     for name in names:
         kind = schema.field(name).type
@@ -143,7 +143,7 @@ def _check_types(path: Path, schema: Any, names: Sequence[str]) -> None:
 
 
 def _check_expansion(path: Path, metadata: Any) -> None:
-    """DataError where a file claims far more than its bytes can hold."""
+    """Raise DataError if a file claims far more than its bytes can hold."""
     size = path.stat().st_size
     if metadata.num_rows * _FEWEST_BYTES_PER_ROW > size:
         raise DataError(
@@ -205,21 +205,21 @@ def _values(path: Path, number: int, arrow: Any, name: str, column: Any) -> np.n
 
 
 def _coded(arrow: Any, chunk: Any) -> Any:
-    """A chunk of names as numbers of those that it has."""
+    """Return a chunk of names as numbers of those that it has."""
     if arrow.types.is_dictionary(chunk.type):
         return chunk
     return chunk.cast(arrow.string()).dictionary_encode()
 
 
 def _named(chunk: Any) -> np.ndarray:
-    """(n,) the names; equal ones are one object."""
+    """Return (n,) the names; equal ones are one object."""
     names = np.array([str(name) for name in chunk.dictionary.to_pylist()], dtype=object)
     named: np.ndarray = names[chunk.indices.to_numpy()]
     return named
 
 
 def _check_views(place: str, told: np.ndarray) -> None:
-    """DataError where the four columns of views contradict each other."""
+    """Raise DataError if the four columns of views contradict each other."""
     view, flip_y, _, scale = told.T
     identity = (told[:, 1:] == [0, 0, 1]).all(axis=1)
     _, first, own = np.unique(view, return_index=True, return_inverse=True)

@@ -31,7 +31,7 @@ class PassesRecord:
     def read(
         cls, path: Path, kind: str, reading: ReadOptions, passes: Sequence[Mapping[str, Any]]
     ) -> "PassesRecord":
-        """All passes, in the same format.
+        """Return all passes, in the same format.
 
         Args:
             path: file or folder of the first pass.
@@ -41,8 +41,8 @@ class PassesRecord:
                 and `scale` what A does, of each further pass.
 
         Raises:
-            ConfigError: a pass has other keys, or no A.
-            DataError: a file is missing or malformed.
+            ConfigError: if a pass has other keys, or no A.
+            DataError: if a file is missing or malformed.
         """
         augmented = []
         for number, one in enumerate(passes, start=1):
@@ -59,7 +59,7 @@ class PassesRecord:
         return bool(self.augmented)
 
     def frame_ids(self) -> tuple[str, ...]:
-        """The frames of the first pass, in sorted order."""
+        """Return the frames of the first pass, in sorted order."""
         return tuple(sorted(self.plain))
 
     def answer(self, frame_id: str) -> RecordedResult:

@@ -49,7 +49,7 @@ def read_plain_pickle(path: Path) -> Any:
     """What a pickle file of arrays, numbers, strings and containers holds.
 
     Raises:
-        DataError: the file is missing or damaged, or names anything else; the name is given.
+        DataError: if the file is missing or damaged, or names anything else; the name is given.
     """
     try:
         content = Path(path).read_bytes()
@@ -90,7 +90,7 @@ def _unfolded(held: Any, most: int) -> int:
     someone makes an array or a text of it.
 
     Raises:
-        ValueError: it is more, nested too deep, or holds itself.
+        ValueError: if it is more, nested too deep, or holds itself.
     """
     known: dict[int, int | None] = {}
 
@@ -134,7 +134,7 @@ class _PlainUnpickler(pickle.Unpickler):
     """Looks names up in `_ADMITTED` and imports nothing."""
 
     def find_class(self, module_name: str, global_name: str, /) -> Any:
-        """The stand-in for a name."""
+        """Return the stand-in for a name."""
         name = f"{module_name}.{global_name}"
         if name not in _ADMITTED:
             raise _RejectedError(repr(name[:80]).strip("'\""))
@@ -182,17 +182,17 @@ class _Array(np.ndarray):
 
 
 def _empty_array(_kind: object, _shape: object, _dtype: object) -> np.ndarray:
-    """The array that the pickle's next instruction fills."""
+    """Return the array that the pickle's next instruction fills."""
     return _Array((0,), dtype=np.int8)
 
 
 def _scalar(kind: _Type, content: bytes) -> Any:
-    """A number or string of numpy's."""
+    """Return a number or string of numpy's."""
     return np.frombuffer(content, dtype=kind.made, count=1)[0]
 
 
 def _array_of_bytes(content: Any, kind: _Type, shape: Any, order: Any) -> np.ndarray:
-    """An array from its bytes, as protocol 5 writes it."""
+    """Return an array from its bytes, as protocol 5 writes it."""
     return np.frombuffer(bytes(content), dtype=kind.made).reshape(shape, order=order)
 
 
@@ -209,7 +209,7 @@ def _of_bytes(kind: type, content: bytes = b"") -> Any:
 
 
 def _table() -> Mapping[str, Any]:
-    """Names and what stands in for them; numpy's moved from numpy.core to numpy._core in 2.0."""
+    """Name and what stands in for them; numpy's moved from numpy.core to numpy._core in 2.0."""
     moved: dict[str, Callable[..., Any]] = {
         "multiarray._reconstruct": _empty_array,
         "multiarray.scalar": _scalar,

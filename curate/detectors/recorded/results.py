@@ -21,7 +21,7 @@ class ForeignBoxes(Protocol):
     """Boxes in another frame of reference, waiting for the calibration of their frame."""
 
     def in_lidar(self, calibration: Calibration) -> Detections:
-        """The boxes in the LiDAR's frame of reference; DataError where they cannot be."""
+        """Return the boxes in the LiDAR's frame of reference; DataError where they cannot be."""
         ...
 
 
@@ -46,7 +46,7 @@ class ReadOptions:
 
 
 def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections:
-    """The answers for one frame as `Detections`.
+    """Return the answers for one frame as `Detections`.
 
     Args:
         place: file and entry, for messages.
@@ -55,7 +55,7 @@ def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections
         names: (n,) of the categories.
 
     Raises:
-        DataError: the lengths differ, a number is not finite, a size not positive, or a score is
+        DataError: if the lengths differ, a number is not finite, a size not positive, or a score is
             out of range.
     """
     try:

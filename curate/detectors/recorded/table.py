@@ -55,7 +55,7 @@ class TableRecord:
 
     @classmethod
     def read(cls, path: Path) -> "TableRecord":
-        """Checks every row of a file and notes where its frames stand.
+        """Check every row of a file and notes where its frames stand.
 
         Raises:
             DataError: the file is missing or no CSV file, a column is missing, or a row has a wrong
@@ -81,7 +81,7 @@ class TableRecord:
         return True
 
     def frame_ids(self) -> Iterator[str]:
-        """The recorded frames, in sorted order."""
+        """Return the recorded frames, in sorted order."""
         return (name.decode() for name in np.unique(self.names))
 
     def answer(self, frame_id: str) -> Detections:
@@ -90,7 +90,7 @@ class TableRecord:
         return found
 
     def views(self, frame_id: str) -> Sequence[View]:
-        """The augmented copies in the order of their numbers; DataError like `answer`."""
+        """Return the augmented copies in the order of their numbers; DataError like `answer`."""
         return [view for number, view in sorted(self._views(frame_id).items()) if number]
 
     def _views(self, frame_id: str) -> Mapping[int, View]:
@@ -143,7 +143,7 @@ class _Rows:
         return tuple(header.index(name) for name in _COLUMNS)
 
     def blocks(self, order: Sequence[int]) -> Iterator[_Block]:
-        """All rows, some at a time; DataError for one with a wrong number of fields."""
+        """Yield all rows, some at a time; DataError for one with a wrong number of fields."""
         for block in batched(self._placed(order), BLOCK_ROWS):
             yield _Block([row for row, _ in block], np.array([place for _, place in block]))
 
@@ -161,10 +161,10 @@ class _Rows:
 
 
 def _checked(path: Path, block: _Block) -> tuple[np.ndarray, np.ndarray]:
-    """The frames of the runs of neighbouring rows in a block, and their places.
+    """Return the frames of the runs of neighbouring rows in a block, and their places.
 
     Raises:
-        DataError: a row has a value that cannot be.
+        DataError: if a row has a value that cannot be.
     """
     _views_of(path, block.rows, block.places[:, 2].tolist())
     names = np.array([row[0].encode() for row in block.rows])
@@ -175,10 +175,10 @@ def _checked(path: Path, block: _Block) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _views_of(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> dict[int, View]:
-    """The views in some rows, by number; those of one frame where the rows are of one frame.
+    """Return the views in some rows, by number; those of one frame where the rows are of one frame.
 
     Raises:
-        DataError: a row has a value that cannot be, or rows of one view do not agree.
+        DataError: if a row has a value that cannot be, or rows of one view do not agree.
     """
     numbers = _parse_numbers(path, rows, lines)
     _check_values(path, lines, numbers)
@@ -201,7 +201,7 @@ def _views_of(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -
 
 
 def _parse_numbers(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> np.ndarray:
-    """(n, 12) the columns of `_NUMBERS`."""
+    """Return (n, 12) the columns of `_NUMBERS`."""
     numbers = np.empty((len(rows), len(_NUMBERS)))
     for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
         try:
@@ -235,7 +235,7 @@ def _check_values(path: Path, lines: Sequence[int], numbers: np.ndarray) -> None
 def _rows_by_view(
     rows: Sequence[Sequence[str]], views: np.ndarray
 ) -> Mapping[tuple[str, int], np.ndarray]:
-    """The rows of each frame and view, in the order of the file."""
+    """Return the rows of each frame and view, in the order of the file."""
     groups: dict[tuple[str, int], list[int]] = {}
     for index, (row, view) in enumerate(zip(rows, views, strict=True)):
         groups.setdefault((row[0], int(view)), []).append(index)

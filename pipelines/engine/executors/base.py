@@ -79,11 +79,11 @@ class FrameFunction(Protocol):
     """What a stage does with one frame; travels to workers, so it is small until `open`."""
 
     def open(self) -> None:
-        """Loads the models and the data set; a failure here ends the run."""
+        """Load the models and the data set; a failure here ends the run."""
         ...
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """The frame's rows; a failure here is the frame's alone."""
+        """Return the frame's rows; a failure here is the frame's alone."""
         ...
 
 
@@ -91,7 +91,7 @@ class SequenceFunction(Protocol):
     """What a stage does with one sequence; travels to workers, so it is small until `open`."""
 
     def open(self) -> None:
-        """Loads the models and the data set; a failure here ends the run."""
+        """Load the models and the data set; a failure here ends the run."""
         ...
 
     def __call__(self, job: SequenceJob) -> Sequence[FrameRows]:
@@ -130,12 +130,12 @@ class Executor(Protocol):
         """One outcome per job.
 
         Raises:
-            CurateError: the models cannot be loaded.
+            CurateError: if the models cannot be loaded.
         """
         ...
 
     def close(self) -> None:
-        """Ends its workers."""
+        """End its workers."""
         ...
 
 
@@ -150,11 +150,11 @@ class JobQueue:
         self._dead_openings = 0
 
     def take(self) -> Job | None:
-        """The next job; None where there is none."""
+        """Return the next job; None where there is none."""
         return self._again.popleft() if self._again else next(self._next, None)
 
     def return_jobs(self, jobs: Iterable[Job]) -> None:
-        """Takes jobs back that nobody has begun."""
+        """Take jobs back that nobody has begun."""
         self._again.extend(jobs)
 
     def opened(self) -> None:
@@ -164,7 +164,7 @@ class JobQueue:
     def record_crash(
         self, in_flight: Sequence[Job], reason: str, *, opened: bool
     ) -> Iterator[Outcome]:
-        """Takes back what a dead worker had in hand; a frame that was tried too often has failed.
+        """Take back what a dead worker had in hand; a frame that was tried too often has failed.
 
         Args:
             in_flight: its jobs in their order; it had begun the first, if any.
@@ -195,10 +195,10 @@ class JobQueue:
 
 
 def open_function(function: JobFunction) -> None:
-    """Loads what a function needs, and turns whatever goes wrong into one line.
+    """Load what a function needs, and turns whatever goes wrong into one line.
 
     Raises:
-        CurateError: it cannot be loaded.
+        CurateError: if it cannot be loaded.
     """
     try:
         function.open()
@@ -218,7 +218,7 @@ class RayWorker:
         self.function: JobFunction | None = None
 
     def open(self, packed: bytes) -> CurateError | None:
-        """Loads the models; the error where they cannot be loaded."""
+        """Load the models; the error where they cannot be loaded."""
         self.function = None  # the one before, with its models, makes room first
         function = pickle.loads(packed)  # noqa: S301 - from the runner
         try:
@@ -232,7 +232,7 @@ class RayWorker:
         """Rows, error and seconds of a job.
 
         Raises:
-            CurateError: it has no models.
+            CurateError: if it has no models.
         """
         if self.function is None:
             raise CurateError("asked to work before the models were loaded")
@@ -241,7 +241,7 @@ class RayWorker:
 
 
 def attempt(function: Any, job: Job) -> Outcome:
-    """Works on one job and turns whatever goes wrong into its recorded failure."""
+    """Work on one job and turns whatever goes wrong into its recorded failure."""
     start = time.perf_counter()
     rows: Sequence[FrameRows] = ()
     error = None

@@ -42,7 +42,7 @@ class ProcessExecutor:
         """One outcome per job, as they end.
 
         Raises:
-            CurateError: the models cannot be loaded, or workers die while they load them.
+            CurateError: if the models cannot be loaded, or workers die while they load them.
         """
         queue = JobQueue(jobs, self.workers)
         packed = pickle.dumps(function)
@@ -61,7 +61,7 @@ class ProcessExecutor:
                 self._dismiss(worker)
 
     def close(self) -> None:
-        """Ends the workers."""
+        """End the workers."""
         for worker in self._crew:
             worker.shut_down()
         for worker in list(self._crew):
@@ -120,7 +120,7 @@ class _Worker:
         self._packed = b""
 
     def send(self, packed: bytes, job: Job) -> None:
-        """Hands a job over, and before it the function, where that is another one."""
+        """Hand a job over, and before it the function, where that is another one."""
         self.in_flight.append(job)
         with contextlib.suppress(OSError):  # it has died; its end of the pipe will tell
             if packed != self._packed:
@@ -129,7 +129,7 @@ class _Worker:
             self.connection.send(job)
 
     def shut_down(self) -> None:
-        """Lets it end by itself, which a model may need to put its things in order."""
+        """Let it end by itself, which a model may need to put its things in order."""
         with contextlib.suppress(OSError):
             self.connection.send(None)
 
@@ -156,7 +156,7 @@ def _serve(connection: Connection) -> None:
 
 
 def _receive(connection: Connection, inbox: "SimpleQueue[Any]") -> None:
-    """Empties the pipe, so that the parent never waits while it hands over.
+    """Empty the pipe, so that the parent never waits while it hands over.
 
     Where the parent has closed it, or was killed, nobody needs this process any more.
     """

@@ -68,7 +68,7 @@ class RayExecutor:
         """One outcome per job, as they end.
 
         Raises:
-            CurateError: the models cannot be loaded, actors die while they load them, or the
+            CurateError: if the models cannot be loaded, actors die while they load them, or the
                 cluster has no room for a single actor.
         """
         queue = JobQueue(jobs, self.workers)
@@ -88,14 +88,14 @@ class RayExecutor:
                 self._dismiss(actor)
 
     def close(self) -> None:
-        """Ends the actors, and the cluster if it was started here."""
+        """End the actors, and the cluster if it was started here."""
         for actor in list(self._crew):
             self._dismiss(actor)
         if self._own:
             self._ray.shutdown()
 
     def _dispatch(self, packed: bytes, queue: JobQueue) -> bool:
-        """Gives every actor that has loaded its models work; False where all is done."""
+        """Return every actor that has loaded its models work; False where all is done."""
         while (job := queue.take()) is not None:
             while len(self._crew) < self.workers:
                 self._crew.append(_Actor(self._holder.remote(sys.path)))
@@ -109,7 +109,7 @@ class RayExecutor:
         return any(actor.jobs for actor in self._crew)
 
     def _collect(self, actor: "_Actor", queue: JobQueue) -> Iterator[Outcome]:
-        """The oldest answer of an actor; what it leaves behind if it is dead."""
+        """Yield the oldest answer of an actor; what it leaves behind if it is dead."""
         try:
             answer = self._ray.get(actor.head())
         except self._ray.exceptions.RayTaskError as error:
@@ -168,7 +168,7 @@ class _Actor:
         self._packed = b""
 
     def head(self) -> Any:
-        """The oldest answer that has not been read."""
+        """Return the oldest answer that has not been read."""
         return self.answers[0]
 
     def open(self, packed: bytes) -> None:
@@ -178,7 +178,7 @@ class _Actor:
             self.answers.append(self.handle.open.remote(packed))
 
     def send(self, job: Job) -> None:
-        """Hands a job over."""
+        """Hand a job over."""
         self.jobs.append(job)
         self.answers.append(self.handle.work.remote(job))
 
@@ -196,7 +196,7 @@ def _import_ray() -> Any:
 
 
 def _join(ray: Any, address: str | None, workers: int) -> None:
-    """Joins a cluster, or starts one with a CPU per worker at least."""
+    """Join a cluster, or starts one with a CPU per worker at least."""
     joins = address or os.environ.get("RAY_ADDRESS")
     where: dict[str, Any] = (
         {"address": joins}

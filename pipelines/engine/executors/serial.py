@@ -12,7 +12,7 @@ class SerialExecutor:
         """One outcome per job, in order.
 
         Raises:
-            CurateError: the models cannot be loaded.
+            CurateError: if the models cannot be loaded.
         """
         open_function(function)
         for job in jobs:
