@@ -31,7 +31,7 @@ def print_preview(planned: "Iterable[PlannedStage]", *, as_json: bool) -> None:
     known = [f"about {duration(total)}"] if any(stage.seconds for stage in stages) else []
     if unknown:
         names = ", ".join(dict.fromkeys(unknown))
-        known.append(f"an unknown time for {names}, which never ran here")
+        known.append(f"an unknown time for {names}, which no earlier run has measured")
     typer.echo(f"In all: {', and '.join(known)}. Nothing was done.")
 
 

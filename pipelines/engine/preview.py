@@ -51,7 +51,7 @@ class PlannedStage:
         frames: how many frames it would work on; None for a stage that is not done per frame.
         first_frames: the first of them, by name.
         reasons: why it would run; none where it is up to date.
-        seconds: how long it would take by what it took before; None if it never ran.
+        seconds: how long it would take by what it took before; None if no earlier run says it.
     """
 
     round: int
@@ -329,13 +329,13 @@ def _has_task(workspace: Workspace, key: TaskKey) -> bool:
 def _seconds(
     workspace: Workspace, stage: Stage, count: int, reasons: tuple[str, ...]
 ) -> float | None:
-    """How long a stage takes for so many frames, or once; None where it never ran."""
+    """How long a stage takes for so many frames, or once; None where no task says it."""
     if not reasons:
         return 0.0
     task = bulk.table("task")
     query = (
         select(task.c.variant, task.c.seconds)
-        .where(task.c.stage == stage.name, task.c.state == "done")
+        .where(task.c.stage == stage.name, task.c.state.in_(FINISHED), task.c.seconds > 0)
         .order_by(task.c.id.desc())
         .limit(MEASURED_TASKS)
     )

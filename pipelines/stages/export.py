@@ -27,7 +27,6 @@ from db.views import WEIGHTED_LABELS
 from pipelines.assembly import open_policy
 from pipelines.engine.progress import Progress
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
-from pipelines.firewall.rules import enforce
 from pipelines.labels.by_frame import check_weights
 from pipelines.labels.human_labels import fingerprint
 from pipelines.stages.methods import zero_weight_of
@@ -68,6 +67,8 @@ def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
 
     DataError where a weight is not in [0, 1].
     """
+    from pipelines.firewall.rules import enforce
+
     enforce(workspace, context.number, file(workspace, context, policy))
     with workspace.database.reading() as connection:
         check_weights(connection, context.number, policy)
@@ -123,6 +124,8 @@ def export_as(
         WorkspaceError: if the policy has weighted nothing in that round.
         LeakageError: ground truth would reach what it must not.
     """
+    from pipelines.firewall.rules import enforce
+
     enforce(workspace, round_number)
     labels = label_set(workspace, round_number, policy)
     if all(each.split == "labeled" for each in labels.frames):

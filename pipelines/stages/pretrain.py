@@ -10,7 +10,6 @@ from pipelines.assembly import trained_detector
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import register_checkpoint
 from pipelines.engine.stage import Product
-from pipelines.firewall.rules import enforce
 from pipelines.stages.export import register_label_file, write_label_file
 from pipelines.stages.methods import METHODS
 from pipelines.stages.train_round import (
@@ -59,6 +58,8 @@ def guard(workspace: Workspace) -> None:
     Raises:
         LeakageError: if ground truth would reach what it must not.
     """
+    from pipelines.firewall.rules import enforce
+
     enforce(workspace, file=_labels(workspace))
 
 

@@ -10,9 +10,12 @@ from pathlib import Path
 
 import pytest
 from alembic.autogenerate import compare_metadata
+from alembic.config import Config
 from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, inspect
 from support.older_schema import downgrade
+from support.paths import ROOT
 from support.stored_tuples import COLUMNS, store
 
 from curate.errors import DatabaseError, LeakageError
@@ -20,7 +23,7 @@ from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db import bulk
 from db.addresses import parse_url
 from db.models import Base
-from db.session import Database
+from db.session import REVISIONS, Database
 from db.views import drop_views
 
 ENGINES = ("sqlite", "postgresql")
@@ -294,3 +297,12 @@ def test_a_database_of_another_program_is_left_alone(tmp_path: Path, table: str)
         Database(f"sqlite:///{path}")
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_revisions_by_file_name_are_those_of_alembic() -> None:
+    """From the first to the head, though a database is opened without alembic."""
+    config = Config()
+    config.set_main_option("script_location", str(ROOT / "db" / "migrations"))
+    script = ScriptDirectory.from_config(config)
+    assert [each.revision for each in script.walk_revisions()][::-1] == REVISIONS
+    assert script.get_current_head() == REVISIONS[-1]
