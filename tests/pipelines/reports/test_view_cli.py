@@ -216,3 +216,15 @@ def test_without_predictions_the_remedy_is_named(curate: Curate, workspace: Work
     code, _, err = curate("view", "000000", "-w", workspace.root)
     assert code == WorkspaceError.exit_code
     assert "curate predict" in err
+
+
+def test_evidence_stays_with_its_label(weighted: Workspace) -> None:
+    """Also where a label before it gave way to a human one."""
+    from pipelines.reports.recording import _evidence
+
+    name = next(iter(weighted.frames("unlabeled")))
+    every = _evidence(weighted, name, 1, "pspsl", np.arange(3))
+    some = _evidence(weighted, name, 1, "pspsl", np.array([1, 2]))
+    assert len(set(every["loss"].tolist())) == 3
+    for column, values in every.items():
+        np.testing.assert_array_equal(some[column], values[1:])
