@@ -46,7 +46,7 @@ def _recorded(
         found = read_frame(workspace, name, round_number, policy)
         frame = workspace.dataset.read(name, image=True)
         labels = shown_labels(workspace, frame, found, policy)
-        evidence = _evidence(workspace, name, round_number, policy, found.numbers)
+        evidence = evidence_of_labels(workspace, name, round_number, policy, found.numbers)
         if labels.points is not None:
             evidence["points"] = labels.points.astype(np.float64)
         yield RecordedFrame(
@@ -61,7 +61,7 @@ def _recorded(
         )
 
 
-def _evidence(
+def evidence_of_labels(
     workspace: Workspace, name: str, round_number: int, policy: str, numbers: np.ndarray
 ) -> dict[str, np.ndarray]:
     """(n,) of each kind of evidence, for the labels with these n values of k; NaN for none."""

@@ -11,6 +11,7 @@ from support.pipelines_cli import Curate
 from curate.errors import ConfigError, WorkspaceError
 from pipelines.labels.of_one_frame import read_frame
 from pipelines.reports.pictures import draw_example_frame
+from pipelines.reports.recording import evidence_of_labels
 from pipelines.workspace.workspace import Workspace
 
 
@@ -219,10 +220,20 @@ def test_without_predictions_the_remedy_is_named(curate: Curate, workspace: Work
     assert "curate predict" in err
 
 
-def test_the_telling_frame_is_drawn_twice(weighted: Workspace) -> None:
+def test_example_frame_is_drawn_from_above_and_over_its_image(weighted: Workspace) -> None:
     """From above and over its image, with the labels and weights of that frame alone."""
     paths = draw_example_frame(weighted, 1)
     names = {path.name for path in paths}
     frame = next(name for name in weighted.frames("unlabeled") if any(name in n for n in names))
     assert names == {f"round-01-{frame}-bird-eye.png", f"round-01-{frame}-image.png"}
     assert all(drawn(path).size for path in paths)
+
+
+def test_evidence_stays_with_its_label(weighted: Workspace) -> None:
+    """Also where a label before it gave way to a human one."""
+    name = next(iter(weighted.frames("unlabeled")))
+    every = evidence_of_labels(weighted, name, 1, "pspsl", np.arange(3))
+    some = evidence_of_labels(weighted, name, 1, "pspsl", np.array([1, 2]))
+    assert len(set(every["loss"].tolist())) == 3
+    for column, values in every.items():
+        np.testing.assert_array_equal(some[column], values[1:])
