@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 
+import jaxtyping  # noqa: F401 - loaded first, signatures show it
+
 import curate
 import db.models
 from curate.errors import CurateError

@@ -20,7 +20,7 @@ MAY_IMPORT = {
 # The rooms of each package, from the ground up: a room imports only rooms before it.
 LAYERS = {
     "curate": (
-        "errors", "files", "frames", "geometry", "detections", "consistency", "datasets",
+        "shapes", "errors", "files", "frames", "geometry", "detections", "consistency", "datasets",
         "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters", "detectors",
         "firewall", "viewing", "review", "training",
     ),

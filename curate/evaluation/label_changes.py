@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from curate.errors import ConfigError
 from curate.geometry.overlap import overlapping_pairs
+from curate.shapes import Float, Int
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ for any statistic, by copying labels and a hundred times slower.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 from numba import njit
+
+from curate.shapes import Bool, Float, Int
 
 _BLOCK = 256  # draws whose sums stay in the fastest cache
 

@@ -6,10 +6,10 @@ overlaps nothing, itself included.
 """
 
 import numpy as np
-from jaxtyping import Float, Int, Num
 
 from curate.geometry.boxes import as_boxes
 from curate.geometry.kernels import grouped_iou, iou_matrix, paired_iou, rectangle_table
+from curate.shapes import Float, Int, Num
 
 
 def bev_iou(

@@ -7,10 +7,10 @@ its cell: one pass over the points, whatever the number of boxes.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int, Num
 from numba import njit
 
 from curate.geometry.boxes import as_boxes
+from curate.shapes import Bool, Int, Num
 
 _CELL_METRES = 1.0
 _MOST_CELLS = 256

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float, Num
 
 from curate.errors import ConfigError
+from curate.shapes import Float, Num
 
 
 def wrap_angle(angle_rad: Num[np.ndarray, " *shape"]) -> Float[np.ndarray, " *shape"]:
