@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from curate.detections import Detections
 from curate.errors import ConfigError, ModelError
 from curate.geometry.overlap import bev_iou
+from curate.shapes import Float, Int
 
 SCORE_FLOOR = 1e-6
 """Scores are lifted to this before the logarithm, so that a score of 0 has a finite loss."""

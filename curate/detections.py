@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+
+from curate.shapes import Bool, Float, Int, Shaped
 
 CATEGORIES = ("Car", "Pedestrian", "Cyclist")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
 
 from curate.errors import ConfigError
+from curate.shapes import Float, Float32, UInt8
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 
+import jaxtyping  # noqa: F401 - loaded first, signatures show it
 from pydantic import BaseModel
 
 import curate

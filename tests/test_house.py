@@ -20,7 +20,7 @@ MAY_IMPORT = {
 # The rooms of each package, from the ground up: a room imports only rooms before it.
 LAYERS = {
     "curate": (
-        "errors", "spelling", "files", "frames", "geometry", "detections", "consistency",
+        "shapes", "errors", "spelling", "files", "frames", "geometry", "detections", "consistency",
         "datasets", "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters",
         "detectors", "firewall", "viewing", "review", "training", "__main__",
     ),

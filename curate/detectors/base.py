@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Shaped
 
 from curate.detections import Detections
 from curate.errors import ConfigError
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.similarity import Similarity
+from curate.shapes import Bool, Float, Float32, Shaped
 from curate.spelling import did_you_mean
 from curate.weighting.base import ZeroWeight
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float
 
 from curate.evaluation.judged_labels import ALL, WHOLE, JudgedLabels, Slice, slices
 from curate.evaluation.reliability import (
@@ -24,6 +23,7 @@ from curate.evaluation.reliability import (
     weighted_recall,
 )
 from curate.evaluation.resampling import draw_frames, ranked_replicates
+from curate.shapes import Float
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ Error of a Mean", Biometrika 1908): the pairs share a seed, so what the seed doe
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+
+from curate.shapes import Float
 
 
 @dataclass(frozen=True)

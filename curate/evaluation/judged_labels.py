@@ -6,10 +6,10 @@ from itertools import pairwise
 from typing import Self
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
 
 from curate.detections import Annotations, Detections, as_categories
 from curate.evaluation.reliability import JudgeSettings, judge
+from curate.shapes import Bool, Float, Int, Shaped
 
 ALL = "all"
 """Stands for all categories together."""

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from curate.datasets.kitti.labels import KittiObjects
 from curate.errors import DataError
@@ -37,6 +36,7 @@ from curate.evaluation.kitti_rules import (
     label_states,
     result_states,
 )
+from curate.shapes import Float, Int
 
 FIGURES = ("image", "aos", "bev", "3d")
 """What is averaged: precision by 2D, BEV and 3D overlap; "aos", orientation similarity by 2D."""

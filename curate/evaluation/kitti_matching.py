@@ -9,11 +9,11 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple, Self
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 from numba import njit
 
 from curate.datasets.kitti.labels import DONT_CARE, KittiObjects
 from curate.geometry.overlap import overlapping_pairs
+from curate.shapes import Bool, Float, Int
 
 METRICS = ("image", "bev", "3d")
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
 
 from curate.datasets.kitti.labels import KittiObjects
 from curate.detections import Columns
@@ -28,6 +27,7 @@ from curate.evaluation.kitti_rules import (
     label_states,
     result_states,
 )
+from curate.shapes import Float, Int, Shaped
 
 TRUE_POSITIVE, FALSE_POSITIVE, FALSE_NEGATIVE, LEFT_OUT = "tp", "fp", "fn", "ignored"
 

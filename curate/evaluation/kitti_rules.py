@@ -8,9 +8,9 @@ penalty.
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Int
 
 from curate.datasets.kitti.labels import KittiObjects
+from curate.shapes import Int
 
 DIFFICULTIES = ("easy", "moderate", "hard")
 MIN_HEIGHTS = (40.0, 25.0, 25.0)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from curate.detections import Columns
 from curate.errors import ConfigError
 from curate.geometry.overlap import overlapping_pairs
+from curate.shapes import Float, Int
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError
 from curate.geometry.overlap import bev_iou, iou_3d
+from curate.shapes import Bool, Float, Int
 
 Overlap = Literal["bev", "3d"]
 Neighbors = Literal["neutral", "right"]

@@ -5,8 +5,9 @@ sum over labels with these multiplicities.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 from numba import njit
+
+from curate.shapes import Bool, Float, Int
 
 _BLOCK = 256  # draws whose sums stay in the fastest cache
 

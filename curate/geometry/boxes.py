@@ -1,7 +1,8 @@
 """Corners of boxes: the eight of the cuboid, and the four of its footprint in bird's eye view."""
 
 import numpy as np
-from jaxtyping import Float, Num
+
+from curate.shapes import Float, Num
 
 # Front left, rear left, rear right, front right: counter-clockwise seen from above.
 _FOOTPRINT_SIGNS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float
+
+from curate.shapes import Float
 
 _SQUARE_METRES = 3.0
 # Points farther from the sensor tell nothing of the ground, and would make the map large.

@@ -1,9 +1,9 @@
 """Non-maximum suppression of rotated boxes in bird's eye view."""
 
 import numpy as np
-from jaxtyping import Int, Num
 
 from curate.geometry.boxes import as_boxes
+from curate.shapes import Int, Num
 
 
 def nms_bev(

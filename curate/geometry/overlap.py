@@ -6,9 +6,9 @@ overlaps nothing, itself included.
 """
 
 import numpy as np
-from jaxtyping import Float, Int, Num
 
 from curate.geometry.boxes import as_boxes
+from curate.shapes import Float, Int, Num
 
 
 def bev_iou(

@@ -7,9 +7,9 @@ its cell: one pass over the points, whatever the number of boxes.
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Int, Num
 
 from curate.geometry.boxes import as_boxes
+from curate.shapes import Bool, Int, Num
 
 if TYPE_CHECKING:
     from curate.geometry.point_kernels import Axes

@@ -4,9 +4,9 @@ Quaternions are (w, x, y, z), scalar first, of unit length.
 """
 
 import numpy as np
-from jaxtyping import Float, Num
 
 from curate.geometry.similarity import wrap_angle
+from curate.shapes import Float, Num
 
 
 def rotation_matrices(quaternions: Num[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:

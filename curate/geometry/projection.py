@@ -1,10 +1,10 @@
 """Projection from the LiDAR frame into the image (KITTI: Geiger et al., IJRR 2013, eq. 8)."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
 
 from curate.frames import Calibration
 from curate.geometry.boxes import box_corners
+from curate.shapes import Bool, Float, Num
 
 # What is nearer to the camera than this is cut away: at depth 0 the projection has no bounds.
 _NEAR_METRES = 0.1

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float, Num
 
 from curate.errors import ConfigError
+from curate.shapes import Float, Num
 
 
-def wrap_angle(angle_rad: Num[np.ndarray, " *shape"]) -> Float[np.ndarray, " *shape"]:
+def wrap_angle(angle_rad: Num[np.ndarray, " *shape"] | np.floating) -> Float[np.ndarray, " *shape"]:
     """Angles in radians, wrapped to (-pi, pi]; those in the range already stay as they are."""
     angle_rad = np.asarray(angle_rad, dtype=np.float64)
     wrapped = np.pi - np.mod(np.pi - angle_rad, 2 * np.pi)

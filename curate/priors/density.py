@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float
 
 from curate.detections import Detections
 from curate.errors import ConfigError
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.priors.base import Column, Evidence, EvidenceSource, Measured
+from curate.shapes import Float
 
 CONE_RAD = np.deg2rad(4.0)
 """Half the opening of the cone around a box in which the sweep's density is measured."""

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float, Num
 
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.priors.base import Column, Evidence, EvidenceSource, Measured
+from curate.shapes import Float, Num
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float, Int, Num, Shaped
 
 from curate.detections import Detections
 from curate.errors import ConfigError, ModelError
@@ -17,6 +16,7 @@ from curate.frames import Frame
 from curate.geometry.projection import image_rectangles
 from curate.priors.base import Column, Evidence, EvidenceSource, Measured
 from curate.segmenters.base import Segmenter, SemanticMap
+from curate.shapes import Float, Int, Num, Shaped
 
 Mean = Literal["geometric", "product", "arithmetic"]
 Outside = Literal["neutral", "drop"]

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import UInt8
 
 from curate.frames import Frame
+from curate.shapes import UInt8
 
 
 @dataclass(frozen=True)

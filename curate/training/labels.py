@@ -15,7 +15,6 @@ from typing import Final, Self
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
 from torch.utils.data import Dataset
 
 from curate.detections import as_categories
@@ -31,6 +30,7 @@ from curate.exporters.label_file import (
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.projection import in_view
+from curate.shapes import Bool, Float, Int
 
 # Ground truth that looks like a category without being one: neither object nor background of it.
 NEIGHBOURS: Final = {"Van": "Car", "Person_sitting": "Pedestrian"}

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float, Float32
 
 from curate.detections import as_categories
 from curate.detectors.base import Sample
@@ -20,6 +19,7 @@ from curate.geometry.boxes import box_corners
 from curate.geometry.overlap import bev_iou
 from curate.geometry.points_in_boxes import box_of_points, count_points_in_boxes
 from curate.geometry.similarity import Similarity
+from curate.shapes import Float, Float32
 
 # Tries per object that is asked for; crowded frames get fewer objects.
 _TRIES = 2

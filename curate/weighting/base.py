@@ -6,10 +6,10 @@ from functools import cached_property
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
 
 from curate.detections import empty_boxes
 from curate.errors import ConfigError, DataError
+from curate.shapes import Bool, Float, Int, Shaped
 
 ZeroWeight = Literal["background", "ignore"]
 """What a label of weight 0 is to a student.

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float
 
 from curate.errors import ConfigError
+from curate.shapes import Float
 from curate.weighting.base import Age, Evidence, Policy, Weights, ZeroWeight
 
 Ambiguous = Literal["soft", "ignore"]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float
 
 from curate.errors import ConfigError
+from curate.shapes import Float
 from curate.weighting.base import Age, Evidence, Policy, Weights
 
 Scope = Literal["round", "category", "frame"]

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float
 
 from curate.errors import ConfigError
+from curate.shapes import Float
 from curate.weighting.base import Age, Evidence, Policy, Weights
 
 

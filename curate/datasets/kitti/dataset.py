@@ -15,7 +15,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32
 
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.images import read_sized_image
@@ -25,6 +24,7 @@ from curate.errors import DataError
 from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles
+from curate.shapes import Float, Float32
 
 _log = logging.getLogger(__name__)
 

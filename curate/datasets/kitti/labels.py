@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
 
 from curate.detections import Annotations, Columns, Detections, as_categories
 from curate.errors import DataError
@@ -25,6 +24,7 @@ from curate.files.paths import StrPath
 from curate.frames import Calibration
 from curate.geometry.projection import image_rectangles
 from curate.geometry.similarity import wrap_angle
+from curate.shapes import Float, Int, Shaped
 
 DONT_CARE = "DontCare"
 KITTI_CATEGORIES = frozenset(
