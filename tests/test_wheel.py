@@ -94,9 +94,13 @@ def test_the_demo_runs_outside_the_checkout(installed: Path, tmp_path: Path) -> 
     small = ("--frames", 12, "--val", 4, "--labeled", 0.25, "--steps", 20)
     printed = run(tmp_path, installed / "curate", "demo", "work", *small)
     assert "How good are the detectors" in printed
-    named = run(tmp_path, installed / "curate", "query", "-w", "work", "--named", "policies")
-    assert "pspsl" in named
-    assert "pspsl" in run(tmp_path, installed / "curate", "status", "-w", "work")
+    query = ("query", "-w", "work", "--csv", "SELECT split, count(*) FROM frame GROUP BY split")
+    splits = run(tmp_path, installed / "curate", *query).split()
+    assert sorted(splits[1:]) == ["labeled,3", "unlabeled,9", "val,4"]
+    assert "unlabeled" in run(
+        tmp_path, installed / "curate", "query", "-w", "work", "--named", "splits"
+    )
+    assert "predict" in run(tmp_path, installed / "curate", "status", "-w", "work")
 
 
 @pytest.mark.parametrize(
