@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: venv demo test prove fuzz fuzz-random bench lint docs clean
+.PHONY: venv demo test prove fuzz fuzz-random bench lint docs site clean
 
 venv: $(READY)
 
@@ -44,8 +44,13 @@ lint: $(READY)
 docs: $(READY)
 	$(BIN)/python -m docs.generate
 
+# The pages as a website in site/, which loads nothing from elsewhere.
+site: $(READY)
+	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) demo site
 
 # The CPU build of torch is taken where the index offers one and no GPU is in sight; the constraint
 # accepts either build of the same version.
