@@ -1,86 +1,85 @@
-"""A picture of the round: an SVG with a box for each stage and an arrow for what it hands on."""
+"""A picture of the round: an SVG with a box for each stage, and arrows for the order of work."""
 
 from html import escape
 
 from pipelines.engine.graph import Graph
 
-_WIDTH, _HEIGHT = 190, 46
-_GAP_X, _GAP_Y = 24, 62
+_WIDTH, _HEIGHT = 350, 64
+_GAP_X, _GAP_Y = 20, 34
 _MARGIN = 16
 _HEAD = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-    'width="{width}" height="{height}" font-family="sans-serif">\n'
+    'width="{width}" height="{height}" font-family="sans-serif" text-anchor="middle">\n'
     '<rect width="100%" height="100%" fill="#ffffff"/>\n'
     '<defs><marker id="end" markerWidth="8" markerHeight="8" refX="7" refY="4" orient="auto">'
     '<path d="M0,0 L8,4 L0,8 z" fill="#64748b"/></marker></defs>\n'
 )
-_INPUTS = "data set"
+_BOX = (
+    '<rect x="{x}" y="{y}" width="{width}" height="{height}" rx="6" fill="#dbeafe" '
+    'stroke="#64748b"/>\n'
+    '<text x="{middle}" y="{name_y}" font-size="15" font-weight="bold" fill="#0f172a">'
+    "{name}</text>\n"
+    '<text x="{middle}" y="{reads_y}" font-size="11" fill="#334155">reads {reads}</text>\n'
+    '<text x="{middle}" y="{writes_y}" font-size="11" fill="#334155">writes {writes}</text>\n'
+)
 
 
 def round_picture(graph: Graph) -> str:
-    """Return the SVG: rows from top to bottom, a stage below all stages that it reads from."""
-    writers = {table: stage.name for stage in graph.stages for table in stage.writes}
-    needs = {
-        stage.name: dict.fromkeys(writers.get(table, _INPUTS) for table in stage.reads)
-        for stage in graph.stages
-    }
-    rows: list[list[str]] = [[_INPUTS]]
-    row_of = {_INPUTS: 0}
-    for stage in graph.stages:
-        row = 1 + max(row_of[name] for name in needs[stage.name])
-        row_of[stage.name] = row
-        rows += [[]] * (row + 1 - len(rows))
-        rows[row] = [*rows[row], stage.name]
-    widest = max(map(len, rows))
-    width = 2 * _MARGIN + widest * _WIDTH + (widest - 1) * _GAP_X + 2 * _WIDTH // 3
+    """Return the SVG: rows from top to bottom, each stage below all that it depends on.
+
+    An arrow is left out where another path of arrows leads to the same stage.
+    """
+    before = _dependencies(graph)
+    rows: list[list[str]] = []
+    row_of: dict[str, int] = {}
+    for name, others in before.items():
+        row_of[name] = max((row_of[other] + 1 for other in others), default=0)
+        rows += [[] for _ in range(row_of[name] + 1 - len(rows))]
+        rows[row_of[name]].append(name)
+    width = 2 * _MARGIN + _span(max(map(len, rows)))
     place = {
         name: (
-            (width - len(row) * _WIDTH - (len(row) - 1) * _GAP_X) / 2 + i * (_WIDTH + _GAP_X),
+            (width - _span(len(row))) // 2 + i * (_WIDTH + _GAP_X),
             _MARGIN + number * (_HEIGHT + _GAP_Y),
         )
         for number, row in enumerate(rows)
         for i, name in enumerate(row)
     }
-    height = 2 * _MARGIN + len(rows) * _HEIGHT + (len(rows) - 1) * _GAP_Y
+    height = 2 * _MARGIN + len(rows) * (_HEIGHT + _GAP_Y) - _GAP_Y
     parts = [_HEAD.format(width=width, height=height)]
-    read = sorted({table for stage in graph.stages for table in stage.reads} - set(writers))
-    writes = {_INPUTS: read} | {stage.name: list(stage.writes) for stage in graph.stages}
-    for name, sources in needs.items():
-        parts += [_arrow(place[one], place[name], row_of[name] - row_of[one]) for one in sources]
-    parts += [_box(place[name], name, tables) for name, tables in writes.items()]
+    for name, others in before.items():
+        distant = {one for other in others for one in before[other]}
+        parts += [_arrow(place[other], place[name]) for other in sorted(others - distant)]
+    for stage in graph.stages:
+        x, y = place[stage.name]
+        parts.append(
+            _BOX.format(
+                x=x, y=y, width=_WIDTH, height=_HEIGHT, middle=x + _WIDTH // 2,
+                name=escape(stage.name), name_y=y + 21,
+                reads=escape(", ".join(stage.reads)), reads_y=y + 39,
+                writes=escape(", ".join(stage.writes)), writes_y=y + 54,
+            )
+        )  # fmt: skip
     return "".join([*parts, "</svg>\n"])
 
 
-def _box(place: tuple[float, float], name: str, writes: list[str]) -> str:
-    x, y = place
-    fill = "#f1f5f9" if name == _INPUTS else "#dbeafe"
-    middle = x + _WIDTH / 2
+def _dependencies(graph: Graph) -> dict[str, set[str]]:
+    """Return for each stage all stages that it depends on, directly or through others."""
+    found: dict[str, set[str]] = {}
+    for stage in graph.stages:
+        direct = {other.name for other in graph.stages if set(other.writes) & set(stage.reads)}
+        found[stage.name] = direct.union(*(found[name] for name in direct))
+    return found
+
+
+def _span(boxes: int) -> int:
+    """Return the width of some boxes beside each other."""
+    return boxes * (_WIDTH + _GAP_X) - _GAP_X
+
+
+def _arrow(start: tuple[int, int], end: tuple[int, int]) -> str:
+    x, y = start[0] + _WIDTH // 2, start[1] + _HEIGHT
     return (
-        f'<rect x="{x:.0f}" y="{y}" width="{_WIDTH}" height="{_HEIGHT}" rx="6" fill="{fill}" '
-        'stroke="#64748b"/>\n'
-        f'<text x="{middle:.0f}" y="{y + 19}" font-size="15" font-weight="bold" fill="#0f172a" '
-        f'text-anchor="middle">{escape(name)}</text>\n'
-        f'<text x="{middle:.0f}" y="{y + 37}" font-size="11" fill="#334155" '
-        f'text-anchor="middle">{escape(", ".join(_shortened(writes)))}</text>\n'
+        f'<path d="M{x},{y} L{end[0] + _WIDTH // 2},{end[1]}" stroke="#64748b" '
+        'marker-end="url(#end)"/>\n'
     )
-
-
-def _shortened(tables: list[str]) -> list[str]:
-    """Return as many tables as fit into a box, and dots where some are left out."""
-    for count in range(len(tables), 0, -1):
-        shown = [*tables[:count], *(["..."] * (count < len(tables)))]
-        if len(", ".join(shown)) <= 32:
-            return shown
-    return tables[:1]
-
-
-def _arrow(start: tuple[float, float], end: tuple[float, float], rows: int) -> str:
-    """Return an arrow: straight into the next row, else around the boxes between."""
-    x, y = start[0] + _WIDTH / 2, start[1] + _HEIGHT
-    x2, y2 = end[0] + _WIDTH / 2, end[1]
-    if rows == 1:
-        path = f"M{x:.0f},{y} L{x2:.0f},{y2}"
-    else:
-        side = max(x, x2) + _WIDTH * (0.55 + 0.15 * rows)
-        path = f"M{x:.0f},{y} C{side:.0f},{y + 40} {side:.0f},{y2 - 40} {x2:.0f},{y2}"
-    return f'<path d="{path}" fill="none" stroke="#64748b" marker-end="url(#end)"/>\n'
