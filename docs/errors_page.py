@@ -13,6 +13,7 @@ _PACKAGES = ("curate", "db", "pipelines")
 _INTRODUCTION = """\
 A command that fails prints one line on standard error: what is wrong, where, and what to do. Its
 exit code shows the class of the error. An unknown option or a missing argument has exit code 2 too.
+Errors of the operating system, such as a full disk or a missing permission, have exit code 1.
 
 Work that is finished when an error occurs is kept. Fix the cause and run the same command again.
 """
