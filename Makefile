@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # "no" goes on where the libraries of open3d are missing; only `simulate` and `demo` need them.
 SIMULATION ?= yes
 
-.PHONY: venv demo test shapes prove prove-bare fuzz fuzz-random bench lint docs wheel clean
+.PHONY: venv demo test shapes prove prove-bare fuzz fuzz-random bench lint docs site wheel clean
 
 venv: $(READY)
 
@@ -59,8 +59,13 @@ lint: $(READY)
 docs: $(READY)
 	$(BIN)/python -m docs.generate
 
+# The pages as a website in site/, which loads nothing from elsewhere.
+site: $(READY)
+	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) demo site
 
 # The CPU build of torch is taken where the index offers one and no GPU is in sight; the constraint
 # accepts either build of the same version.

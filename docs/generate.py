@@ -1,4 +1,4 @@
-"""Generate the references: cli, schema, config, queries, python-api, JSON Schema, DAG.
+"""Generate the reference pages of docs/, the JSON Schema, and the graph of the round.
 
 `make docs` writes them; a test compares them with the code.
 """
@@ -16,7 +16,9 @@ from pydantic import BaseModel
 
 import curate
 import db.models
-from curate.errors import CurateError
+from docs.errors_page import errors_page
+from docs.round_picture import round_picture
+from pipelines.engine.graph import Graph
 from pipelines.queries.functions import FUNCTIONS
 from pipelines.queries.named_queries import named_queries
 from pipelines.queries.schema import working_schema
@@ -35,13 +37,32 @@ _SHORT_TYPES = (
     (r"\b(?:[a-z_]\w*\.)+(?=[A-Za-z_])", ""),
     (r"\b(\w+)\[(ndarray|Tensor), '([^']*)'\]", r'\1[\2, "\3"]'),
 )
+_QUERIES = """\
+`curate query "SQL"` runs one statement that reads. The view
+[`weighted_labels`](schema.md#weighted_labels-view) has one row per label and policy, with all
+evidence:
+
+```sh
+curate query "SELECT frame, k, category, score, weight FROM weighted_labels WHERE weight > 0.5"
+curate query --list                                # the named queries
+curate query --named counts                        # run one
+curate query --named kept --file exports/labels.sqlite --csv
+```
+
+The queries below ship with curate. `--named NAME` runs one on the working database, and with
+`--file` on an exported label file, unless the query says that it needs the working database.
+[`curate serve`](serve.md) shows their results in a browser. `--policy` and `--round` select the
+rows of one policy and round. `curate query --schema` lists tables, views and columns with their
+meaning, as the page [on the database](schema.md) does.
+"""
 _DAG = re.compile(r"(<!-- dag -->\n).*?(<!-- /dag -->)", re.DOTALL)
 
 
 def references() -> Mapping[Path, str]:
-    """What every generated file should hold."""
-    readme = ROOT / "README.md"
-    dag = f"```mermaid\n{round_graph().as_mermaid()}\n```\n"
+    """Return what every generated file should hold."""
+    concepts = ROOT / "docs" / "concepts.md"
+    graph = round_graph()
+    dag = graph_table(graph)
     return {
         ROOT / "docs" / "cli.md": cli_page(),
         ROOT / "docs" / "schema.md": schema_page(),
@@ -50,46 +71,43 @@ def references() -> Mapping[Path, str]:
         ROOT / "docs" / SCHEMA_NAME: config_schema(),
         ROOT / "pipelines" / "workspace" / SCHEMA_NAME: config_schema(),
         ROOT / "docs" / "python-api.md": python_api_page(),
-        readme: _DAG.sub(lambda found: found[1] + dag + found[2], readme.read_text()),
+        ROOT / "docs" / "errors.md": errors_page(ROOT, _NOTE),
+        ROOT / "docs" / "round.svg": round_picture(graph),
+        concepts: _DAG.sub(lambda found: found[1] + dag + found[2], concepts.read_text()),
     }
 
 
+def graph_table(graph: Graph) -> str:
+    """Return the stages with what they read and write as a Markdown table."""
+    rows = (
+        f"| {stage.name} | {', '.join(stage.reads)} | {', '.join(stage.writes)} |"
+        for stage in graph.stages
+    )
+    return "\n".join(["| stage | reads | writes |", "|---|---|---|", *rows, ""])
+
+
 def cli_page() -> str:
-    """`--help` of every command."""
+    """Return `--help` of every command."""
     from typer.testing import CliRunner
 
     from pipelines.cli import COMMANDS, app
 
     # The width of the pages must not depend on who generates them.
     os.environ["COLUMNS"] = os.environ["TERMINAL_WIDTH"] = "100"
-    parts = ["# The command line", _NOTE]
+    parts = [
+        "# Command line",
+        _NOTE,
+        "Exit codes are on the page [Errors](errors.md#exit-codes).\n",
+    ]
     for name in ("", *COMMANDS):
         shown = CliRunner().invoke(app, [*name.split(), "--help"], prog_name="curate").output
         parts.append(f"## curate {name}".rstrip() + f"\n\n```text\n{_trimmed(shown)}\n```\n")
-    return "\n".join([*parts, *_exit_codes()])
-
-
-def _exit_codes() -> list[str]:
-    """Return the exit status of each class of error."""
-    kinds = sorted(CurateError.__subclasses__(), key=lambda kind: kind.exit_code)
-    return [
-        "## Exit codes",
-        "",
-        "An error is one line on standard error; its class is the exit code.",
-        "",
-        "| code | meaning |",
-        "|---|---|",
-        "| 0 | all is well |",
-        f"| {CurateError.exit_code} | any other error |",
-        *(f"| {kind.exit_code} | {inspect.getdoc(kind)} |" for kind in kinds),
-        "| 130 | interrupted with Ctrl-C; the same command continues |",
-        "",
-    ]
+    return "\n".join(parts)
 
 
 def schema_page() -> str:
     """Return every view and table with its columns, their units and what they mean."""
-    parts = ["# The database", _NOTE, inspect.getdoc(db.models) or "", ""]
+    parts = ["# Database schema", _NOTE, inspect.getdoc(db.models) or "", ""]
     parts += ["`curate query --schema` prints the same, with further evidence of a workspace.", ""]
     for relation in working_schema():
         kind = " (view)" if relation.kind == "view" else ""
@@ -182,18 +200,8 @@ def config_schema() -> str:
 
 
 def queries_page() -> str:
-    """Return every question that ships with the project."""
-    parts = ["# Questions that ship with curate", _NOTE]
-    parts.append(
-        "`curate query --named NAME` asks them of the working database, with `--file` of an"
-    )
-    parts.append(
-        "exported label file where that holds the answer; `curate query --list` lists them, and\n"
-        "[`curate serve`](serve.md) shows their answers in a browser. `--policy` and `--round`\n"
-        "select the rows of one policy and round. `curate query --schema` lists tables, views and\n"
-        "columns with their meaning, as the page [on the database](schema.md) does.\n"
-    )
-    parts.append(_sql_functions())
+    """Return every named query, and how to run one."""
+    parts = ["# Queries", _NOTE, _QUERIES, _sql_functions()]
     for query in named_queries().values():
         where = "" if query.exported else " Working database only."
         options = " and ".join(f"`--{name}`" for name in query.filters)

@@ -7,7 +7,7 @@ import pytest
 from support.paths import ROOT
 
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-MENTIONED = re.compile(r"(?<![\w./-])(?:curate|db|pipelines|tests|docs)/[\w./-]*")
+MENTIONED = re.compile(r"(?<![\w./-])(?:curate|db|pipelines|tests|docs|examples)/[\w./-]*")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

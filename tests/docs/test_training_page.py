@@ -65,9 +65,9 @@ def run(code: str, *arguments: object) -> str:
 # The slopes at the three labels of the unlabeled frame, and beside all of them.
 CHECK = """
 found, codes, weight = targets(labels[1])
-answer = torch.zeros(1600, 7, requires_grad=True)
-weighted_loss(answer, found, codes, weight, 1).backward()
-print([answer.grad[(cells - torch.tensor([x, 0.5])).norm(dim=1).argmin(), 0].item()
+output = torch.zeros(1600, 7, requires_grad=True)
+weighted_loss(output, found, codes, weight, 1).backward()
+print([output.grad[(cells - torch.tensor([x, 0.5])).norm(dim=1).argmin(), 0].item()
        for x in (8.5, 14.5, 20.5, 35.5)])
 """
 
@@ -116,5 +116,6 @@ def test_the_example_takes_background_for_background(tmp_path: Path) -> None:
 
 def test_every_format_is_described() -> None:
     """And nothing that is not registered."""
-    named = set(re.findall(r"^\| `(\w+)` \|", PAGE.read_text(), re.MULTILINE))
+    page = (ROOT / "docs" / "exports.md").read_text()
+    named = set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE))
     assert named == set(EXPORTERS.classes)
