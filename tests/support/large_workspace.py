@@ -66,7 +66,7 @@ def large_workspace(folder: Path, labels: tuple[int, ...]) -> Workspace:
     write_toy_kitti(folder / "kitti", frames=TOY_FRAMES, val=4)
     (folder / "detector.txt").write_text("")
     document = toy_document(folder / "kitti", folder / "detector.txt")
-    document["dataset"]["kind"] = "large_workspace:EndlessKitti"
+    document["dataset"]["kind"] = "support.large_workspace:EndlessKitti"
     workspace = initialise(folder / "work", make_config(document, "test"), "0.25", "")
     workspace.database.close()
     with closing(sqlite3.connect(workspace.root / "curate.db")) as connection:

@@ -15,7 +15,7 @@ from support.paths import ROOT
 MEASURED = (
     "import time\n"
     "from pipelines.cli import main\n"
-    "from process_tree import peak\n"
+    "from support.process_tree import peak\n"
     "try:\n    main()\n"
     "finally:\n    print('peak', peak(), 'seconds', time.process_time())\n"
 )
