@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from curate.errors import ConfigError, ModelError
-from curate.files.onnx_session import are_numbers
+from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
@@ -162,7 +162,7 @@ def _class_ids(answer: np.ndarray, size: tuple[int, int], model: Path) -> np.nda
     """
     fault = ModelError(f"{model}: answers {answer.dtype} {list(answer.shape)}; {_ANSWER}")
     if (
-        not are_numbers(answer)
+        not is_numeric_array(answer)
         or answer.ndim not in {3, 4}
         or answer.shape[0] != 1
         or 0 in answer.shape

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from curate.errors import ConfigError, ModelError
-from curate.files.onnx_session import are_numbers
+from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
@@ -124,7 +124,7 @@ class OnnxInstanceSegmenter:
         found = self._model.run(pixels, tuple(self._outputs.values()))
         answer = dict(zip(self._outputs, found, strict=True))
         for name, values in answer.items():
-            if not are_numbers(values):
+            if not is_numeric_array(values):
                 raise ModelError(f"{self._model.path}: answers {name} that are no array of numbers")
         return answer
 

@@ -261,7 +261,7 @@ def test_a_file_that_is_no_model_is_named(tmp_path, content):
     """ONNX Runtime's own errors do not leak."""
     path = tmp_path / "a.onnx"
     path.write_bytes(content)
-    with pytest.raises(ModelError, match="no usable ONNX model") as caught:
+    with pytest.raises(ModelError, match="not a usable ONNX model") as caught:
         OnnxSegmenter(path, CLASSES)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
