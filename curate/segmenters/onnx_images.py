@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from curate.datasets.formats.images import MOST_PIXELS
+from curate.datasets.formats.images import MAX_PIXELS
 from curate.errors import ConfigError, ModelError, first_line
 from curate.files.onnx_session import open_session, runtime_errors
 from curate.frames import Frame
@@ -131,8 +131,8 @@ def _image_input(session: Any, model: Path, *, single: bool) -> ImageInput:
     ):
         raise invalid
     height, width = (second, last) if channels_first else (first, second)
-    if 0 in {height, width} or (height or 1) * (width or 1) > MOST_PIXELS:
+    if 0 in {height, width} or (height or 1) * (width or 1) > MAX_PIXELS:
         # Each frame would be enlarged to that size.
-        raise ModelError(f"{model}: takes {shown}; expected an image of 1 to {MOST_PIXELS} pixels")
+        raise ModelError(f"{model}: takes {shown}; expected an image of 1 to {MAX_PIXELS} pixels")
     is_float = image.type == "tensor(float)"
     return ImageInput(image.name, is_float, channels_first, batched, height, width)

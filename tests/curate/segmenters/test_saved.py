@@ -93,7 +93,7 @@ def test_missing_and_unreadable_maps_are_named(tmp_path):
     with pytest.raises(DataError, match=r"000001\.png: no such image file"):
         segmenter.segment(FRAME)
     (tmp_path / "000001.png").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"000001\.png: no readable image"):
+    with pytest.raises(DataError, match=r"000001\.png: not a readable PNG or JPEG image"):
         segmenter.segment(FRAME)
     with pytest.raises(DataError, match="no such folder of semantic maps"):
         SavedSegmenter(tmp_path / "missing", CLASSES)
