@@ -76,7 +76,7 @@ class TrainerFailed(CurateError):  # noqa: N818 - it reports another program's f
 
 
 def one_line(error: BaseException, max_length: int | None = None) -> str:
-    """Return the message of another library's error on one line, to quote in a message of ours.
+    """Return the message of another library's error on one line, to quote in an error message.
 
     Args:
         error: the error; the line is empty if it has no message.

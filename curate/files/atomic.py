@@ -24,7 +24,7 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`; on success that file replaces `path`.
 
     Missing parent folders are created. After an error, an existing file is unchanged.

@@ -77,7 +77,7 @@ class Population:
                 turned = generator.random() < 0.05
                 swerve = generator.uniform(-0.9, 0.9) if turned else generator.normal(0, 0.03)
                 yaw = (0.0 if onward else np.pi) + swerve
-                self._stand("Car", s, d + generator.normal(0, 0.25), yaw)
+                self._place("Car", s, d + generator.normal(0, 0.25), yaw)
                 s += 5.5 + generator.exponential(gap)
 
     def _crossing_traffic(self) -> None:
@@ -89,10 +89,10 @@ class Population:
             s = street.crossing_s - side * street.crossing_half_m / 2
             for _ in range(generator.poisson(0.8)):
                 d = generator.uniform(-30, 30)
-                self._stand("Car", s, d, side * np.pi / 2 + generator.normal(0, 0.05))
+                self._place("Car", s, d, side * np.pi / 2 + generator.normal(0, 0.05))
             for _ in range(generator.poisson(0.35)):
                 d = generator.uniform(-20, 20)
-                self._stand("Cyclist", s + side * 1.2, d, side * np.pi / 2)
+                self._place("Cyclist", s + side * 1.2, d, side * np.pi / 2)
 
     def _people(self) -> None:
         """Place pedestrians, alone or in groups, mostly on the pavements."""
@@ -113,7 +113,7 @@ class Population:
                 yaw = generator.uniform(-np.pi, np.pi)
             for member in range(generator.choice([1, 2, 3], p=[0.68, 0.24, 0.08])):
                 shift = generator.normal(0, 0.2), generator.uniform(0.6, 0.85) * member
-                self._stand("Pedestrian", s + shift[0], d + shift[1], yaw, margin=0.0)
+                self._place("Pedestrian", s + shift[0], d + shift[1], yaw, margin=0.0)
 
     def _riders(self) -> None:
         """Place cyclists at the edge of the lanes, on the pavements, or crossing the street."""
@@ -132,7 +132,7 @@ class Population:
             else:
                 d = generator.uniform(street.right_d - 2, street.left_d + 2)
                 yaw = generator.choice([-1, 1]) * np.pi / 2 + generator.normal(0, 0.3)
-            self._stand("Cyclist", s, d, yaw)
+            self._place("Cyclist", s, d, yaw)
 
     def _parked(self, side: int) -> None:
         """Place a row of parked cars, car-sized clutter and gaps along the kerb."""
@@ -149,9 +149,9 @@ class Population:
             draw = generator.random()
             if not street.in_crossing(s, 3.0):
                 if draw < full:
-                    self._stand("Car", s, d, yaw)
+                    self._place("Car", s, d, yaw)
                 elif draw < full + 0.09:
-                    self._stand(str(generator.choice(scenery.CAR_SIZED)), s, d, yaw)
+                    self._place(str(generator.choice(scenery.CAR_SIZED)), s, d, yaw)
             s += generator.uniform(5.2, 6.6)
 
     def _pavement_clutter(self, side: int) -> None:
@@ -164,7 +164,7 @@ class Population:
                     continue
                 d = self._beside(side, generator.choice([0.35, 0.6, 0.9]) * street.pavement_m)
                 yaw = generator.choice([0.0, np.pi / 2, np.pi, -np.pi / 2])
-                self._stand(str(generator.choice(kinds)), s, d, yaw + generator.normal(0, 0.15))
+                self._place(str(generator.choice(kinds)), s, d, yaw + generator.normal(0, 0.15))
         if generator.random() < 0.7:
             self._row(side, "tree", 0.5, generator.uniform(9, 22))
         self._row(side, "pole", 0.4, generator.uniform(18, 40))
@@ -186,7 +186,7 @@ class Population:
                 kind = str(generator.choice(kinds))
                 quarter = 0 if kind == "wall" else generator.integers(4)
                 yaw = quarter * np.pi / 2 + generator.normal(0, 0.1)
-                self._stand(kind, s, self._beside(side, inward), yaw)
+                self._place(kind, s, self._beside(side, inward), yaw)
 
     def _buildings(self, side: int) -> None:
         """Place a row of buildings with gaps."""
@@ -197,7 +197,7 @@ class Population:
             back = generator.uniform(0, 2.0)
             yaw = 0.0 if side > 0 else np.pi
             if generator.random() < 0.85 and not street.in_crossing(s, 9.0):
-                self._stand("building", s, d + side * back, yaw, apart=False)
+                self._place("building", s, d + side * back, yaw, apart=False)
             s += generator.uniform(14, 22)
 
     def _row(self, side: int, kind: str, inward: float, spacing: float) -> None:
@@ -205,14 +205,14 @@ class Population:
         s = self.generator.uniform(4, 4 + spacing)
         while s < _REACH_M:
             if not self.street.in_crossing(s, 1.0):
-                self._stand(kind, s, self._beside(side, inward), -side * np.pi / 2)
+                self._place(kind, s, self._beside(side, inward), -side * np.pi / 2)
             s += spacing
 
     def _beside(self, side: int, outward: float) -> float:
         """Return the road coordinate d at `outward` metres beyond a kerb (+1 left, -1 right)."""
         return self.street.left_d + outward if side > 0 else self.street.right_d - outward
 
-    def _stand(
+    def _place(
         self, kind: str, s: float, d: float, yaw: float, *, margin: float = 0.25, apart: bool = True
     ) -> None:
         """Place a random mesh of a kind, unless it is out of view or overlaps another object."""
