@@ -1,4 +1,4 @@
-"""Boxes with scores and categories: what a detector answers, and what annotators wrote.
+"""Boxes with categories: the predictions of a detector, and the ground truth.
 
 `boxes` is (n, 7) float64 everywhere: x, y, z of the box centre, length, width, height in metres,
 and yaw in radians, counter-clockwise from the x axis in (-pi, pi], all in the LiDAR frame.
@@ -16,37 +16,37 @@ CATEGORIES = ("Car", "Pedestrian", "Cyclist")
 
 
 def empty_boxes() -> Float[np.ndarray, "0 7"]:
-    """(0, 7) float64."""
+    """Return a (0, 7) float64 array."""
     return np.zeros((0, 7))
 
 
 def as_categories(names: Sequence[str] | np.ndarray) -> Shaped[np.ndarray, " n"]:
-    """Category names as an (n,) array of str that also holds for n = 0."""
+    """Return category names as an (n,) array of str, also for n = 0."""
     return np.asarray(names, dtype=np.str_).reshape(-1)
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Arrays with a row per object each; rows are chosen from all of them together."""
+    """Base of data classes whose fields are arrays with one row per object."""
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
     def select(self, index: Int[np.ndarray, " m"] | Bool[np.ndarray, " m"]) -> Self:
-        """Return the rows at `index` (integers or a mask), in that order."""
+        """Return the rows at `index` (integers or a mask) of every array, in that order."""
         return type(self)(*(getattr(self, column.name)[index] for column in fields(self)))
 
 
 @dataclass(frozen=True)
 class Detections(Columns):
-    """The boxes that a detector finds in one frame, with scores and categories.
+    """The predictions of a detector for one frame: boxes, scores and categories.
 
     Attributes:
         boxes: (n, 7) in the LiDAR frame.
         scores: (n,) float64 in [0, 1].
         categories: (n,) str.
-        iou: (n,) float64 in [0, 1], the detector's own estimate of the 3D IoU of its box with the
-            object; NaN where it makes none, and everywhere if left out.
+        iou: (n,) float64 in [0, 1], the detector's own estimate of the 3D IoU between its box and
+            the object; NaN where there is no estimate, and everywhere if the argument is omitted.
     """
 
     boxes: Float[np.ndarray, "n 7"]
@@ -55,13 +55,13 @@ class Detections(Columns):
     iou: Float[np.ndarray, " n_or_0"] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        """Fill in estimates that were left out."""
+        """Fill in NaN for omitted IoU estimates."""
         if len(self.iou) == 0:
             object.__setattr__(self, "iou", np.full(len(self.boxes), np.nan))
 
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[Any]]) -> Self:
-        """From rows of category, score, the seven numbers of the box, and IoU estimate or None."""
+        """Build detections from rows of category, score, x to yaw (7 numbers), and IoU or None."""
         if not rows:
             return cls.empty()
         categories, scores, *box, iou = zip(*rows, strict=True)
@@ -74,7 +74,7 @@ class Detections(Columns):
 
     @classmethod
     def empty(cls) -> Self:
-        """No detections."""
+        """Return zero detections."""
         return cls(empty_boxes(), np.zeros(0), as_categories([]))
 
 
@@ -87,10 +87,10 @@ class Annotations(Columns):
     Attributes:
         boxes: (n, 7) in the LiDAR frame.
         categories: (n,) str.
-        truncated: (n,) float64, share of the object outside the image, 0 to 1.
-        occluded: (n,) int64, KITTI's levels 0 to 3.
+        truncated: (n,) float64, fraction of the object outside the image, 0 to 1.
+        occluded: (n,) int64, KITTI's occlusion levels 0 to 3.
         alpha: (n,) float64, observation angle in radians.
-        boxes_2d: (n, 4) float64 left, top, right, bottom in pixels.
+        boxes_2d: (n, 4) float64: left, top, right, bottom in pixels.
     """
 
     boxes: Float[np.ndarray, "n 7"]
@@ -102,6 +102,6 @@ class Annotations(Columns):
 
     @classmethod
     def empty(cls) -> Self:
-        """No annotations."""
+        """Return zero annotations."""
         numbers, levels = np.zeros(0), np.zeros(0, dtype=np.int64)
         return cls(empty_boxes(), as_categories([]), numbers, levels, numbers, np.zeros((0, 4)))

@@ -5,18 +5,18 @@ CurateError (1)
 ├── DataError (3)        a file of a data set is missing, damaged or malformed
 ├── ModelError (4)       a detector or segmenter cannot be used as it is
 ├── LeakageError (5)     ground truth would reach a place where it must not be
-├── WorkspaceError (6)   a workspace or a stage's input is not there
-├── DatabaseError (7)    the database refuses, is damaged, or is of another version
-├── FramesFailed (8)     the command ended, but some frames failed; they are recorded
-├── CellsFailed (9)      the grid ended, but some of its cells failed; the others are kept
+├── WorkspaceError (6)   a workspace, or the input of a stage, is missing
+├── DatabaseError (7)    the database is unavailable, damaged, or of another version
+├── FramesFailed (8)     the command finished, but some frames failed; each is recorded
+├── CellsFailed (9)      the grid finished, but some cells failed; the others are kept
 └── TrainerFailed (10)   the user's trainer ended with an error, or without a checkpoint
 
-Each message is one line: what is wrong, in which file and where, what to do.
+Each message is one line: what is wrong, where (file and line), and what to do.
 """
 
 
 class CurateError(Exception):
-    """Root of the tree; `exit_code` is the exit status of the command that raised it."""
+    """Base class of the tree; `exit_code` is the exit status of the command that raised it."""
 
     exit_code = 1
 
@@ -46,25 +46,25 @@ class LeakageError(CurateError):
 
 
 class WorkspaceError(CurateError):
-    """A workspace, or the input of a stage, is not there."""
+    """A workspace, or the input of a stage, is missing."""
 
     exit_code = 6
 
 
 class DatabaseError(CurateError):
-    """The database refuses, is damaged, or is of another version."""
+    """The database is unavailable, damaged, or of another version."""
 
     exit_code = 7
 
 
-class FramesFailed(CurateError):  # noqa: N818 - it reports frames, it is not itself a fault
-    """The command ended, but some frames failed; each is recorded with its error."""
+class FramesFailed(CurateError):  # noqa: N818 - named after the frames, not after an error
+    """The command finished, but some frames failed; each is recorded with its error."""
 
     exit_code = 8
 
 
-class CellsFailed(CurateError):  # noqa: N818 - it reports cells, it is not itself a fault
-    """The grid ended, but some of its cells failed; the others are kept."""
+class CellsFailed(CurateError):  # noqa: N818 - named after the cells, not after an error
+    """The grid finished, but some cells failed; the results of the others are kept."""
 
     exit_code = 9
 
@@ -75,21 +75,21 @@ class TrainerFailed(CurateError):  # noqa: N818 - it reports another program's f
     exit_code = 10
 
 
-def one_line(error: BaseException, longest: int | None = None) -> str:
-    """What another library's error says, as one line for a message of ours.
+def one_line(error: BaseException, max_length: int | None = None) -> str:
+    """Return the message of another library's error on one line, to quote in an error message.
 
     Args:
-        error: may say nothing; then the line is empty.
-        longest: letters to keep; all of them without.
+        error: the error; the line is empty if it has no message.
+        max_length: number of characters to keep; all if None.
     """
-    return " ".join(str(error).split())[:longest]
+    return " ".join(str(error).split())[:max_length]
 
 
 def joined_lines(error: BaseException | None) -> str:
-    """What a database's error says on several lines, as one: parted by semicolons."""
+    """Return the lines of a database's error message joined by semicolons."""
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
 def first_line(error: BaseException) -> str:
-    """What another library's error says first, for one whose message is a page."""
+    """Return the first line of another library's error message, or the error's type name."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,7 +1,7 @@
-"""What the sensors saw: one LiDAR sweep, one image, and the calibration between them.
+"""The sensor data of one frame: a LiDAR sweep, an image, and the calibration between them.
 
-Frames of reference: LiDAR is x forward, y left, z up, metres; the rectified camera is x right,
-y down, z forward, metres; the image is in pixels from the top left corner.
+Frames of reference: LiDAR is x forward, y left, z up, in metres; the rectified camera is x right,
+y down, z forward, in metres; image coordinates are pixels from the top left corner.
 """
 
 from dataclasses import dataclass, replace
@@ -21,8 +21,8 @@ class Calibration:
     Attributes:
         projection: (3, 4) rectified camera frame to image pixels (KITTI's P2).
         lidar_to_camera: (4, 4) LiDAR frame to rectified camera frame (KITTI's R0_rect * Tr).
-        lidar_to_map: (4, 4) pose of the LiDAR at the time of the sweep in the frame of a map, where
-            the data set knows it.
+        lidar_to_map: (4, 4) pose of the LiDAR in the map frame at the time of the sweep; None if
+            the data set has no poses.
     """
 
     projection: Float[np.ndarray, "3 4"]
@@ -31,19 +31,19 @@ class Calibration:
 
     @property
     def lidar_to_image(self) -> Float[np.ndarray, "3 4"]:
-        """(3, 4) LiDAR frame to homogeneous image pixels."""
+        """The (3, 4) projection from the LiDAR frame to homogeneous image pixels."""
         return np.asarray(self.projection @ self.lidar_to_camera)
 
     def pose_in_map(self) -> Float[np.ndarray, "4 4"]:
-        """Return (4, 4) LiDAR frame to the frame of the map.
+        """Return the (4, 4) transform from the LiDAR frame to the map frame.
 
         Raises:
             ConfigError: if the data set has no poses.
         """
         if self.lidar_to_map is None:
             raise ConfigError(
-                "boxes in the frame of a map need the vehicle's poses, which this data set does "
-                "not have; nuScenes' results belong to a workspace with dataset.kind = 'nuscenes'"
+                "boxes in the map frame need the vehicle's poses, and this data set has none; "
+                "use nuScenes results in a workspace with dataset.kind = 'nuscenes'"
             )
         return self.lidar_to_map
 
@@ -54,10 +54,10 @@ class Frame:
 
     Attributes:
         frame_id: name of the frame within its data set, e.g. "000008".
-        points: (n, 4) float32, x, y, z in metres in the LiDAR frame and intensity in [0, 1].
+        points: (n, 4) float32: x, y, z in metres in the LiDAR frame, and intensity in [0, 1].
         calibration: see `Calibration`.
         image_size: (width, height) in pixels.
-        image: (height, width, 3) uint8 RGB, or None where the reader was told to leave it out.
+        image: (height, width, 3) uint8 RGB; None if it was not read.
     """
 
     frame_id: str
@@ -73,7 +73,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """Where a frame's files lie; `label` is None where the frame has no label file."""
+    """The paths of a frame's files; `label` is None if the frame has no label file."""
 
     points: Path
     image: Path
@@ -81,5 +81,5 @@ class FrameFiles:
     label: Path | None
 
     def paths(self) -> tuple[Path, ...]:
-        """Those that the frame has."""
+        """Return all paths of the frame, without the label if there is none."""
         return (self.points, self.image, self.calibration, *((self.label,) if self.label else ()))

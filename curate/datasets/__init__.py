@@ -1,1 +1,1 @@
-"""Readers of LiDAR-camera data sets, one file each."""
+"""Readers of LiDAR-camera data sets, one file or folder each."""

@@ -1,4 +1,4 @@
-"""What every data set offers."""
+"""The protocols of data sets."""
 
 from collections.abc import Iterable, Mapping
 from typing import Protocol, runtime_checkable
@@ -8,28 +8,28 @@ from curate.frames import Frame, FrameFiles
 
 
 class Dataset(Protocol):
-    """LiDAR-camera frames by name.
+    """A set of LiDAR-camera frames, each with a name.
 
-    Every method that reads a file raises `DataError` with the file, the place in it and the remedy
-    where it is missing, damaged or malformed.
+    Every method that reads a file raises `DataError` if the file is missing, damaged or malformed.
+    The message says which file, where in it, and what to do.
     """
 
     name: str
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return all frames, in sorted order."""
+        """Return the ids of all frames, sorted."""
         ...
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
-        """The named lists of frames that the data set ships (KITTI's ImageSets); may be empty."""
+        """Return the frame lists that come with the data set (KITTI's ImageSets); may be empty."""
         ...
 
     def files(self, frame_id: str) -> FrameFiles:
-        """Where the frame's files lie; does not open them."""
+        """Return the paths of the frame's files without opening them."""
         ...
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
-        """The frame's calibration, its points unless unwanted, and its image where asked for."""
+        """Read the frame's calibration and image size, and its points and image if requested."""
         ...
 
     def annotations(self, frame_id: str) -> Annotations:
@@ -39,15 +39,15 @@ class Dataset(Protocol):
 
 @runtime_checkable
 class Sequenced(Protocol):
-    """A data set that knows which frames were recorded one after the other."""
+    """A data set that can tell which frames belong to the same recording."""
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """Return the sequence (drive, scene, clip) of a frame; None where it is not known."""
+        """Return the sequence (drive, scene, clip) of a frame, or None if it is unknown."""
         ...
 
 
 def sequences_of(dataset: Dataset, frames: Iterable[str]) -> Mapping[str, str]:
-    """Return the sequence of each frame that the data set knows one of."""
+    """Return the sequence of each frame, without frames of unknown sequence."""
     if not isinstance(dataset, Sequenced):
         return {}
     found = {frame: dataset.sequence_of(frame) for frame in frames}

@@ -1,15 +1,17 @@
-"""Any folder of point files and images with one calibration, described in ROOT/dataset.toml.
+"""A reader of any folder of point files and images with a single calibration.
+
+The file ROOT/dataset.toml describes the folder:
 
 points = "lidar"              # folder of FRAME.bin, .pcd, .ply or .npy
-images = "camera"             # folder of FRAME.png or .jpg; where there are none, instead:
-# image_size = [1242, 375]    # width and height of what the camera of the calibration sees
-labels = "label_2"            # optional: KITTI label files of the labeled frames
+images = "camera"             # folder of FRAME.png or .jpg; if there are no images, instead:
+# image_size = [1242, 375]    # width and height in pixels of the calibrated camera's image
+labels = "label_2"            # optional: folder of KITTI label files of the labeled frames
 splits = "lists"              # optional: folder of train.txt, val.txt
-sequence_separator = "_"      # optional: frames are named SEQUENCE_NUMBER, split at the last of it
-columns = 4                   # of .bin and .npy files
-intensity_scale = 255.0       # what full intensity is in the files
+sequence_separator = "_"      # optional: frames are named SEQUENCE_NUMBER; the last one separates
+columns = 4                   # columns of .bin and .npy files
+intensity_scale = 255.0       # the value of full intensity in the files
 
-[calibration]                 # or calibration = "calib.txt", a file in KITTI's form
+[calibration]                 # or calibration = "calib.txt", a file in KITTI's format
 projection = [[...], [...], [...]]             # 3 x 4, camera (z forward) to pixels
 lidar_to_camera = [[...], [...], [...]]        # 3 x 4 or 4 x 4, LiDAR (x forward) to camera
 """
@@ -46,15 +48,16 @@ _KEYS = (*_TEXTS, "image_size", "columns", "intensity_scale", "calibration")
 
 
 class FolderDataset:
-    """A `Dataset` in a plain folder; its frames are the ones that have a point file.
+    """A `Dataset` in a plain folder; every point file is a frame.
 
     Args:
-        root: the folder that holds dataset.toml.
-        follow_links: whether links and names in dataset.toml may lead out of it.
+        root: the folder with dataset.toml.
+        follow_links: whether links and paths in dataset.toml may lead out of the folder.
 
     Raises:
-        DataError: the description is missing or malformed, or names neither images nor their size
-            (which points a detector saw, and every 2D box, follow from what the camera sees).
+        DataError: if dataset.toml is missing or malformed, or specifies neither images nor their
+            size. The size is necessary: the camera's field of view decides which points are passed
+            to a detector, and it clips every 2D box.
     """
 
     name = "folder"
@@ -64,66 +67,73 @@ class FolderDataset:
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._path = self.root / DESCRIPTION
         self._boundary.check(self._path)
-        self._told = _read_description(self._path)
-        named = [self._told[key] for key in (*_FOLDERS, "calibration") if key in self._told]
-        self._boundary.check(*(self.root / name for name in named if isinstance(name, str)))
+        self._description = _read_description(self._path)
+        keys = (*_FOLDERS, "calibration")
+        paths = [self._description[key] for key in keys if key in self._description]
+        self._boundary.check(*(self.root / path for path in paths if isinstance(path, str)))
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return all frames with a point file, in sorted order."""
+        """Return the ids of all frames with a point file, sorted."""
         return tuple(self._points)
 
     @cached_property
     def _points(self) -> Mapping[str, Path]:
-        """The point file of each frame."""
-        found = visible_files(self.root / self._told["points"], "*")
-        paths = sorted(path for path in found if path.suffix.lower() in CLOUD_SUFFIXES)
+        """The path of the point file of each frame."""
+        files = visible_files(self.root / self._description["points"], "*")
+        paths = sorted(path for path in files if path.suffix.lower() in CLOUD_SUFFIXES)
         return {path.stem: path for path in paths}
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
-        """Return the lists of the folder `splits`, by file name.
+        """Return the frame lists in the folder `splits`, by file name without suffix.
 
         Raises:
-            DataError: if the folder is named, but holds none; no frame would be kept for val.
+            DataError: if the folder is specified but contains no list. Otherwise, no frame would be
+                kept for val.
         """
-        if "splits" not in self._told:
+        if "splits" not in self._description:
             return {}
-        folder = self.root / self._told["splits"]
-        found = read_frame_lists(folder, self._boundary)
-        if not found:
-            raise DataError(f"{self._path}: splits: {folder} holds no list such as train.txt")
-        return found
+        folder = self.root / self._description["splits"]
+        lists = read_frame_lists(folder, self._boundary)
+        if not lists:
+            raise DataError(
+                f"{self._path}: splits: {folder} contains no frame list such as train.txt"
+            )
+        return lists
 
     def files(self, frame_id: str) -> FrameFiles:
-        """Where the frame's files lie, or an image would; the calibration is that of all frames.
+        """Return the paths of the frame's files; all frames share the calibration.
+
+        The image path is returned even if there is no such file.
 
         Raises:
             DataError: if there is no such frame.
         """
         check_frame_id(frame_id)
         if frame_id not in self._points:
-            raise DataError(f"{self.root / self._told['points']}: no point file of {frame_id}")
-        folder = self.root / self._told.get("images", "images")
+            folder = self.root / self._description["points"]
+            raise DataError(f"{folder}: no point file for frame {frame_id}")
+        folder = self.root / self._description.get("images", "images")
         images = [folder / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
-        calibration = self._told["calibration"]
+        calibration = self._description["calibration"]
         label = self._label(frame_id)
-        found = FrameFiles(
+        files = FrameFiles(
             points=self._points[frame_id],
             image=next((image for image in images if image.exists()), images[0]),
             calibration=self.root / calibration if isinstance(calibration, str) else self._path,
             label=label if label is not None and label.exists() else None,
         )
-        self._boundary.check(*found.paths())
-        return found
+        self._boundary.check(*files.paths())
+        return files
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """What stands before the last separator of the frame's name, where there is one."""
-        separator = self._told.get("sequence_separator", "")
+        """Return the part of the frame's name before the last separator, or None without one."""
+        separator = self._description.get("sequence_separator", "")
         if not separator or separator not in frame_id:
             return None
         return frame_id.rpartition(separator)[0]
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
-        """The frame's calibration, its points unless unwanted, and its image where asked for.
+        """Read the frame's calibration and image size, and its points and image if requested.
 
         Raises:
             DataError: if a file is missing, damaged or malformed.
@@ -131,21 +141,26 @@ class FolderDataset:
         files = self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            scale = float(self._told.get("intensity_scale", 1.0))
-            sweep = read_cloud(files.points, int(self._told.get("columns", 4)), scale)
-        size, pixels = self._seen(files.image, pixels=image)
+            scale = float(self._description.get("intensity_scale", 1.0))
+            sweep = read_cloud(files.points, int(self._description.get("columns", 4)), scale)
+        size, pixels = self._size_and_pixels(files.image, pixels=image)
         return Frame(frame_id, sweep, self._calibration, size, pixels)
 
-    def _seen(self, image: Path, *, pixels: bool) -> tuple[tuple[int, int], np.ndarray | None]:
-        """Size and pixels of an image; the size is known without images too."""
-        if "images" in self._told:
+    def _size_and_pixels(
+        self, image: Path, *, pixels: bool
+    ) -> tuple[tuple[int, int], np.ndarray | None]:
+        """Return (width, height) of an image, from dataset.toml if there are none, and its pixels.
+
+        The pixels are None if they are not requested.
+        """
+        if "images" in self._description:
             return read_sized_image(image, pixels=pixels)
         if pixels:
             raise DataError(
-                f"{self._path}: no key images, but the pixels of {image.stem} are needed; "
-                "name the folder of images"
+                f"{self._path}: the image of frame {image.stem} is needed, but there is no key "
+                "images; set it to the folder of images"
             )
-        width, height = self._told["image_size"]
+        width, height = self._description["image_size"]
         return (width, height), None
 
     def annotations(self, frame_id: str) -> Annotations:
@@ -156,61 +171,78 @@ class FolderDataset:
         """
         label = self.files(frame_id).label
         if label is None:
-            named = self._label(frame_id) or f"{self._path}: names no labels, nor of {frame_id}"
-            raise DataError(f"{named}: no such label file")
-        return to_annotations(read_objects(label, known=None), self._calibration)
+            expected = self._label(frame_id)
+            if expected is None:
+                raise DataError(
+                    f"{self._path}: no labels for frame {frame_id}: there is no key labels; set it "
+                    "to the folder of label files"
+                )
+            raise DataError(f"{expected}: no such label file")
+        return to_annotations(read_objects(label, categories=None), self._calibration)
 
     @cached_property
     def _calibration(self) -> Calibration:
-        told = self._told["calibration"]
-        if isinstance(told, str):
-            return read_calibration(self.root / told)
-        projection = _matrix(self._path, told, "projection", ((3, 4),))
+        calibration = self._description["calibration"]
+        if isinstance(calibration, str):
+            return read_calibration(self.root / calibration)
+        projection = _matrix(self._path, calibration, "projection", ((3, 4),))
         extrinsic = np.eye(4)
-        rows = _matrix(self._path, told, "lidar_to_camera", ((3, 4), (4, 4)))
+        rows = _matrix(self._path, calibration, "lidar_to_camera", ((3, 4), (4, 4)))
         extrinsic[: len(rows)] = rows
         if abs(np.linalg.det(extrinsic)) < 1e-6:
             raise DataError(f"{self._path}: calibration.lidar_to_camera cannot be inverted")
         return Calibration(projection, extrinsic)
 
     def _label(self, frame_id: str) -> Path | None:
-        if "labels" not in self._told:
+        if "labels" not in self._description:
             return None
-        return self.root / str(self._told["labels"]) / f"{frame_id}.txt"
+        return self.root / str(self._description["labels"]) / f"{frame_id}.txt"
 
 
 def _read_description(path: Path) -> Mapping[str, Any]:
-    """What dataset.toml says; DataError where it cannot be."""
+    """Return the content of dataset.toml.
+
+    Raises:
+        DataError: if the file is missing or not TOML, or a key is missing, unknown or invalid.
+    """
     try:
-        told = parse_toml(read_bytes(path, "description").decode("utf-8"))
-    except (RecursionError, ValueError) as error:  # ValueError: also of absurdly long numbers
+        content = parse_toml(read_bytes(path, "description").decode("utf-8"))
+    except (RecursionError, ValueError) as error:  # ValueError also for very long integers
         raise DataError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
-    unknown = sorted(set(told) - set(_KEYS))
+    unknown = sorted(set(content) - set(_KEYS))
     if unknown:
-        raise DataError(f"{path}: unknown key {unknown[0]}; known are {', '.join(_KEYS)}")
+        raise DataError(f"{path}: unknown key {unknown[0]}; use one of {', '.join(_KEYS)}")
     for key in ("points", "calibration"):
-        if key not in told:
+        if key not in content:
             raise DataError(f"{path}: no key {key}")
-    if "images" not in told and "image_size" not in told:
+    if "images" not in content and "image_size" not in content:
         raise DataError(
-            f"{path}: no key images; data sets without a camera are not read: which points a "
-            "detector saw, and every 2D box, come from the image and its calibration; "
-            "where only the images are missing, write image_size = [width, height]"
+            f"{path}: no key images; data sets without a camera are not supported: the camera's "
+            "field of view selects the points and clips every 2D box; if only the images are "
+            "missing, set image_size = [width, height]"
         )
-    if "images" in told and "image_size" in told:
+    if "images" in content and "image_size" in content:
         raise DataError(
-            f"{path}: image_size is for data sets without images; leave one of them out"
+            f"{path}: both images and image_size are set; image_size is only for data sets "
+            "without images, remove one of them"
         )
-    wrong = [key for key in _TEXTS if not isinstance(told.get(key, ""), str)]
-    wrong += [] if _is_size(told.get("image_size", [1, 1])) else ["image_size"]
-    wrong += [key for key in ("columns", "intensity_scale") if not _positive(told.get(key, 1))]
-    if wrong or not isinstance(told["calibration"], str | dict) or told.get("columns", 4) < 3:
-        raise DataError(f"{path}: {(wrong or ['calibration or columns'])[0]} cannot be that")
-    return told
+    invalid = [key for key in _TEXTS if not isinstance(content.get(key, ""), str)]
+    invalid += [] if _is_size(content.get("image_size", [1, 1])) else ["image_size"]
+    invalid += [key for key in ("columns", "intensity_scale") if not _positive(content.get(key, 1))]
+    if (
+        invalid
+        or not isinstance(content["calibration"], str | dict)
+        or content.get("columns", 4) < 3
+    ):
+        raise DataError(
+            f"{path}: invalid value of {(invalid or ['calibration or columns'])[0]}; folders and "
+            "separators are strings, sizes and scales positive numbers, columns at least 3"
+        )
+    return content
 
 
 def _is_size(value: object) -> bool:
-    """Return whether it is width and height in pixels."""
+    """Return whether the value is a list of width and height in pixels."""
     return (
         isinstance(value, list)
         and len(value) == 2
@@ -219,18 +251,18 @@ def _is_size(value: object) -> bool:
 
 
 def _positive(value: object) -> bool:
-    # TOML's integers have no end; floating point numbers have.
+    # tomllib reads integers of any size; larger ones cannot be converted to float.
     return isinstance(value, int | float) and 0 < value <= sys.float_info.max
 
 
 def _matrix(
-    path: Path, told: Mapping[str, Any], key: str, shapes: tuple[tuple[int, int], ...]
+    path: Path, calibration: Mapping[str, Any], key: str, shapes: tuple[tuple[int, int], ...]
 ) -> np.ndarray:
     try:
-        matrix = np.array(told.get(key, ()), dtype=np.float64)
+        matrix = np.array(calibration.get(key, ()), dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape not in shapes or not np.isfinite(matrix).all():
-        known = " or ".join(f"{rows} x {columns}" for rows, columns in shapes)
-        raise DataError(f"{path}: calibration.{key} must be {known} finite numbers")
+        expected = " or ".join(f"{rows} x {columns}" for rows, columns in shapes)
+        raise DataError(f"{path}: calibration.{key} must be {expected} finite numbers")
     return matrix

@@ -16,7 +16,7 @@ import numpy as np
 from curate.detections import Detections, as_categories
 from curate.detectors.conventions import BoxConvention
 from curate.errors import ConfigError, ModelError, first_line
-from curate.files.onnx_session import are_numbers, open_session, runtime_errors
+from curate.files.onnx_session import is_numeric_array, open_session, runtime_errors
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
@@ -129,7 +129,7 @@ class OnnxDetector:
             labels, scores = scores.argmax(axis=1) + self.first_label, scores.max(axis=1)
         labels = np.zeros(0, np.int64) if labels is None else np.asarray(labels).reshape(-1)
         shapes = {"boxes": boxes.shape, "scores": scores.shape, "labels": labels.shape}
-        strange = [each.dtype for each in (boxes, scores, labels) if not are_numbers(each)]
+        strange = [each.dtype for each in (boxes, scores, labels) if not is_numeric_array(each)]
         if strange:
             raise ModelError(f"{self.model}: answers {strange[0]} where numbers were expected")
         if (

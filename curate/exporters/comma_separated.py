@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelSet
 from curate.exporters.place import check_place
-from curate.files.atomic import whole_file
+from curate.files.atomic import atomic_path
 
 _HEADER = ",".join(WEIGHTED_LABEL_COLUMNS)
 
@@ -26,7 +26,7 @@ class CsvExporter:
         """See `curate.exporters.base.Exporter`."""
         check_place(path, _is_former)
         count = 0
-        with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        with atomic_path(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(labels.column_names)
             for block in labels.blocks():

@@ -16,7 +16,7 @@ from curate.errors import DataError, one_line
 from curate.exporters.base import Columns, LabelFileDescription, LabelSet
 from curate.exporters.columns import WEIGHTED_LABELS
 from curate.exporters.place import check_place
-from curate.files.atomic import whole_file
+from curate.files.atomic import atomic_path
 from curate.files.parquet import load_parquet
 from curate.priors.base import Column
 
@@ -50,7 +50,7 @@ class ParquetExporter:
         schema = label_schema(labels.description, labels.columns)
         count = 0
         with (
-            whole_file(path) as partial,
+            atomic_path(path) as partial,
             parquet.ParquetWriter(partial, schema, compression="zstd") as writer,
         ):
             for group in _groups(labels.blocks(), self.rows_per_group):

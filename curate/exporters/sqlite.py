@@ -21,7 +21,7 @@ from curate.errors import DataError
 from curate.exporters.base import GROUND_TRUTH_COLUMNS, Columns, LabelFileDescription, LabelSet
 from curate.exporters.columns import WEIGHTED_LABELS
 from curate.exporters.place import check_place
-from curate.files.atomic import whole_file
+from curate.files.atomic import atomic_path
 from curate.priors.base import Column
 
 _FRAME_INSERTION = "INSERT INTO frame VALUES (:frame, :split, :points, :image, :calibration)"
@@ -78,7 +78,7 @@ class SqliteExporter:
             DataError: if a row does not fit its table, or the disk is full.
         """
         check_label_file_place(path)
-        with whole_file(path) as partial:
+        with atomic_path(path) as partial:
             try:
                 with closing(sqlite3.connect(partial, isolation_level=None)) as connection:
                     return _fill(connection, path, labels)

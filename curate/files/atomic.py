@@ -1,4 +1,4 @@
-"""Files that are either whole or absent: written beside their place, then renamed into it."""
+"""Atomic writes: a file is written under a temporary name in the same folder, then renamed."""
 
 import os
 from collections.abc import Iterator
@@ -7,9 +7,9 @@ from pathlib import Path
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Write `content` to `path`; a reader, or a kill at any moment, never sees half of it.
+    """Write `content` to `path` atomically: a reader never sees part of it, even after a kill.
 
-    Missing parent folders are made. An existing file is replaced.
+    Missing parent folders are created. An existing file is replaced.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -24,10 +24,10 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Give a place beside `path` to write to; what is there in the end takes the place of `path`.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary path in the folder of `path`; on success that file replaces `path`.
 
-    Missing parent folders are made. An error leaves an existing file as it was.
+    Missing parent folders are created. After an error, an existing file is unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")

@@ -1,4 +1,4 @@
-"""Long walks in pieces that fit into memory, or into one question to a database."""
+"""Iteration in batches that fit into memory, or into one database query."""
 
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -8,7 +8,7 @@ Item = TypeVar("Item")
 
 
 def batched(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
-    """Yield the items, `size` at a time, in their order."""
-    walk = iter(items)
-    while batch := list(islice(walk, size)):
+    """Yield lists of `size` items in order; the last list may be shorter."""
+    iterator = iter(items)
+    while batch := list(islice(iterator, size)):
         yield batch

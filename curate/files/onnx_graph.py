@@ -1,4 +1,4 @@
-"""ONNX graphs written node by node."""
+"""A builder that writes ONNX graphs node by node."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 from onnx import ModelProto, ValueInfoProto, checker, helper, numpy_helper
 
-_OPSET = 18  # the first version whose ScatterND takes a maximum
+_OPSET = 18  # the first version with a maximum reduction in ScatterND
 _IR_VERSION = 10
 EPSILON = 1e-5
-"""Of torch's batch norms."""
+"""The default epsilon of torch's batch norm layers."""
 
 
 class GraphBuilder:
-    """Collects nodes and constants; methods take and return names of values.
+    """Collects nodes and constants of a graph; methods take and return names of values.
 
     Args:
-        weights: the state of the network, by the names of its tensors.
+        weights: the tensors of the network by name, as in its state dict.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
@@ -25,13 +25,13 @@ class GraphBuilder:
         self._constants: list = []
 
     def node(self, operator: str, *inputs: str, **attributes: Any) -> str:
-        """Add an operator with one output."""
+        """Add an operator with one output and return the name of the output."""
         name = f"value{len(self._nodes)}"
         self._nodes.append(helper.make_node(operator, inputs, [name], **attributes))
         return name
 
     def constant(self, array: np.ndarray) -> str:
-        """Add a constant."""
+        """Add a constant and return its name."""
         name = f"constant{len(self._constants)}"
         self._constants.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
         return name
@@ -44,7 +44,7 @@ class GraphBuilder:
         *,
         full_check: bool = False,
     ) -> ModelProto:
-        """Return the finished and checked model."""
+        """Return the complete model, checked by ONNX."""
         graph = helper.make_graph(self._nodes, name, inputs, outputs, self._constants)
         opsets = [helper.make_opsetid("", _OPSET)]
         model = helper.make_model(graph, opset_imports=opsets, ir_version=_IR_VERSION)

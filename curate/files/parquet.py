@@ -1,4 +1,4 @@
-"""Loads pyarrow's Parquet, an extra, where it is used."""
+"""Import of pyarrow, an optional dependency, at the time of use."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ def load_parquet() -> tuple[Any, Any]:
     """Return the modules pyarrow and pyarrow.parquet.
 
     Raises:
-        ConfigError: pyarrow is not installed.
+        ConfigError: if pyarrow is not installed.
     """
     try:
         import pyarrow as pa

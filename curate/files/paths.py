@@ -1,6 +1,6 @@
-"""What a public function takes where it needs a path."""
+"""The type of path arguments of public functions."""
 
 import os
 
 StrPath = str | os.PathLike[str]
-"""A path as text or as `pathlib.Path`."""
+"""A path as `str` or as `pathlib.Path`."""

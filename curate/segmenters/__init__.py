@@ -1,1 +1,1 @@
-"""Sources of semantic maps, one file each."""
+"""Segmenters, one file each: they return the semantic map of a frame's image."""

@@ -1,4 +1,4 @@
-"""What every segmenter offers."""
+"""The protocol of segmenters, and the semantic map that they return."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ class SemanticMap:
 
     Attributes:
         class_ids: (height, width) uint8.
-        category_classes: the class ids that count as pixels of a category, e.g. Cyclist = bicycle
-            and person.
+        category_classes: for each category, the class ids that count as its pixels, e.g. bicycle
+            and person for Cyclist.
     """
 
     class_ids: UInt8[np.ndarray, "height width"]
@@ -25,14 +25,14 @@ class SemanticMap:
 
 
 class Segmenter(Protocol):
-    """Names the semantic class of every pixel; raises `ModelError` or `DataError`.
+    """Returns the semantic class of every pixel; raises `ModelError` or `DataError`.
 
-    One that never looks at `frame.points` may have a further attribute, `needs_points`, that is
-    false; the points are then not read for it.
+    A segmenter that never reads `frame.points` may define a further attribute `needs_points` =
+    False. Then the points are not loaded for it.
     """
 
     needs_image: bool
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """Return the frame's semantic map, in the size of its image."""
+        """Return the frame's semantic map, of the same size as its image."""
         ...

@@ -1,9 +1,9 @@
-"""Which classes of a known segmentation data set count as pixels of a detection category.
+"""The built-in class sets: which classes of a segmentation data set count for which category.
 
-A cyclist is rider and bicycle together; a pedestrian is a person on foot. Where a class set has one
-class for all people, it counts for both. The numbers are those of each data set's own definition:
-Pascal VOC's, Cityscapes' train ids, COCO's category ids with 0 as background, and COCO's 80 classes
-counted from 0.
+A cyclist is the rider and the bicycle; a pedestrian is a person on foot. If a class set has one
+class for all people, it counts for both. The ids are those that each data set defines: the classes
+of Pascal VOC, the train ids or label ids of Cityscapes, the category ids of COCO with 0 as
+background, and the 80 classes of COCO counted from 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,8 +29,9 @@ CLASS_MAPS: Mapping[str, ClassMap] = MappingProxyType(
     }
 )
 
-# What maps of a class set can hold besides 255, "none of them"; COCO has several numberings.
-_KNOWN_IDS = {
+# The ids that maps of a class set may contain, besides 255 (unlabeled). COCO is not checked: it has
+# several numberings.
+_VALID_IDS = {
     "voc": range(21),
     "cityscapes": range(19),
     "cityscapes-label-ids": range(34),
@@ -40,52 +41,57 @@ _UNLABELED = 255
 
 
 def class_map(name: str) -> ClassMap:
-    """Return the classes of each category in a known class set.
+    """Return the class ids of each category in a built-in class set.
 
     Raises:
-        ConfigError: if the class set is not known.
+        ConfigError: if there is no class set of that name.
     """
     if name not in CLASS_MAPS:
-        known = ", ".join(sorted(CLASS_MAPS))
-        meant = did_you_mean(name, CLASS_MAPS)
-        raise ConfigError(f"unknown class set {name!r}: use one of {known}{meant}")
+        names = ", ".join(sorted(CLASS_MAPS))
+        suggestion = did_you_mean(name, CLASS_MAPS)
+        raise ConfigError(f"unknown class set {name!r}: use one of {names}{suggestion}")
     return CLASS_MAPS[name]
 
 
 def checked_classes(classes: Mapping[str, Sequence[int]]) -> ClassMap:
-    """Return a class map as the user gave it, with tuples of ids.
+    """Return the user's class map with the ids of each category as a tuple.
 
     Raises:
-        ConfigError: if an id is no integer from 0 to 255.
+        ConfigError: if an id is not an integer from 0 to 255.
     """
     for category, ids in classes.items():
-        for one in ids:
-            if not isinstance(one, int) or not 0 <= one <= 255:
-                raise ConfigError(f"segmenter class {one!r} of {category}: an id is 0 to 255")
+        for class_id in ids:
+            if not isinstance(class_id, int) or not 0 <= class_id <= 255:
+                raise ConfigError(
+                    f"segmenter class {class_id!r} of {category}: an id is an integer from 0 to 255"
+                )
     return {category: tuple(ids) for category, ids in classes.items()}
 
 
-def free_id(classes: ClassMap) -> int:
-    """Return a class id for the pixels of nothing: 0, unless that counts for a category."""
-    wanted = {one for ids in classes.values() for one in ids}
-    return next((one for one in range(256) if one not in wanted), 0)
+def background_id(classes: ClassMap) -> int:
+    """Return a class id for background pixels: the lowest that counts for no category, or 0."""
+    used = {class_id for ids in classes.values() for class_id in ids}
+    return next((class_id for class_id in range(256) if class_id not in used), 0)
 
 
-def foreign_ids(class_ids: "np.ndarray", classes: ClassMap) -> str | None:
-    """What is wrong with (h, w) class ids that the declared class set does not have, else None."""
+def describe_unexpected_ids(class_ids: "np.ndarray", classes: ClassMap) -> str | None:
+    """Return an error text if (h, w) class ids are not of the declared class set, else None."""
     import numpy as np
 
-    for name, known in _KNOWN_IDS.items():
+    for name, valid in _VALID_IDS.items():
         if CLASS_MAPS[name] != classes:
             continue
-        strange = np.setdiff1d(class_ids, [*known, _UNLABELED])
-        if len(strange):
-            fault = f"holds class {strange[0]}, but the classes of {name} are 0 to {known[-1]}"
-            others = [
-                other
-                for other, ids in _KNOWN_IDS.items()
+        unexpected = np.setdiff1d(class_ids, [*valid, _UNLABELED])
+        if len(unexpected):
+            problem = (
+                f"contains class {unexpected[0]}, but the classes of {name} are 0 to {valid[-1]}"
+            )
+            candidates = [
+                candidate
+                for candidate, ids in _VALID_IDS.items()
                 if not len(np.setdiff1d(class_ids, [*ids, _UNLABELED]))
             ]
-            hint = f"; are they {' or '.join(others)}? See segmenter.classes" if others else ""
-            return fault + hint
+            if not candidates:
+                return problem
+            return f"{problem}; if the map uses {' or '.join(candidates)}, set segmenter.classes"
     return None

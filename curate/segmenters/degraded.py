@@ -1,17 +1,18 @@
-"""The renderer's truth of simulated frames, made worse by a stated error model.
+"""Ground-truth semantic maps of simulated frames, degraded by an error model.
 
-For each frame, from a generator of (seed, frame id) alone, in this order:
+The errors of a frame are drawn from a generator seeded with (seed, frame id), in this order:
 
 1. Missed instances: every connected region of a class is erased with probability
-   `missed_instance`, or `missed_small_instance` where it has fewer than `small_px` pixels.
-2. Class confusion: a region that is left becomes another class with probability `confused`,
-   pedestrian and cyclist into each other, a car into either.
-3. Boundary errors: its outline is shrunk or grown by a whole number of pixels, uniform between
-   -`boundary_px` and +`boundary_px` (it never shrinks to less than a third of its height or width).
+   `missed_instance`, or `missed_small_instance` if it has fewer than `small_px` pixels.
+2. Class confusion: a remaining region changes its class with probability `confused`: pedestrian
+   and cyclist into each other, a car into either.
+3. Boundary errors: the outline of a region is shrunk or grown by a whole number of pixels, uniform
+   between -`boundary_px` and +`boundary_px`. It shrinks by at most a third of the smaller of its
+   height and width.
 4. Missed patches: a Poisson number (mean `patches`) of ellipses with half axes of 3 to
    `patch_px` pixels, centred on object pixels, become background.
 5. False blobs: a Poisson number (mean `blobs`) of ellipses with half axes of 4 to `blob_px` pixels,
-   anywhere in the lower two thirds of the image, become a random class.
+   centred anywhere in the lower two thirds of the image, become a random class.
 """
 
 import hashlib
@@ -38,10 +39,11 @@ _CONFUSED_WITH = {
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """Rates and sizes of the errors; the module's text says what each does.
+    """Rates and sizes of the errors; the module docstring describes each.
 
     Raises:
-        ConfigError: a value is negative, a probability is above 1, or pixels are no whole number.
+        ConfigError: if a value is negative, a probability is above 1, or a number of pixels is not
+            an integer.
     """
 
     missed_instance: float = 0.06
@@ -58,24 +60,26 @@ class ErrorModel:
         """Check the values."""
         for name, value in asdict(self).items():
             highest = 1.0 if name.startswith(("missed", "confused")) else np.inf
-            number = isinstance(value, int | float)
-            if not (number and 0 <= value <= highest):
-                raise ConfigError(f"degraded segmenter: {name} is {value!r}, not 0 to {highest:g}")
+            is_number = isinstance(value, int | float)
+            if not (is_number and 0 <= value <= highest):
+                raise ConfigError(
+                    f"degraded segmenter: {name} is {value!r}, expected 0 to {highest:g}"
+                )
             if name.endswith("_px") and not isinstance(value, int):
-                raise ConfigError(f"degraded segmenter: {name} is {value}, not a whole number")
+                raise ConfigError(f"degraded segmenter: {name} is {value}, expected an integer")
 
 
 class DegradedSegmenter:
-    """A `Segmenter` that reads a simulated data set's semantic_2 and degrades it.
+    """A `Segmenter` that reads the maps of a simulated data set and degrades them.
 
     Args:
         directory: the folder semantic_2 of the data set.
-        seed: of the errors.
+        seed: seed of the random errors.
         rates: values of `ErrorModel` that differ from the defaults.
 
     Raises:
-        DataError: there is no such folder.
-        ConfigError: a rate is unknown or out of range.
+        DataError: if the folder does not exist.
+        ConfigError: if a rate is unknown or out of range.
     """
 
     needs_image = False
@@ -83,19 +87,20 @@ class DegradedSegmenter:
 
     def __init__(self, directory: StrPath, *, seed: int = 0, **rates: Any) -> None:
         self.seed = seed
-        known = {field.name for field in fields(ErrorModel)}
-        if unknown := sorted(set(rates) - known):
+        options = {field.name for field in fields(ErrorModel)}
+        if unknown := sorted(set(rates) - options):
             raise ConfigError(
-                f"degraded segmenter: no option {unknown[0]!r}; takes {', '.join(sorted(known))}"
+                f"degraded segmenter: unknown option {unknown[0]!r}; "
+                f"use one of {', '.join(sorted(options))}"
             )
         self.errors = ErrorModel(**rates)
         self._truth = SavedSegmenter(directory, class_map("simulated"))
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """Return the frame's degraded map; the same for the same seed.
+        """Return the frame's degraded map; it depends on the seed and the frame id only.
 
         Raises:
-            DataError: if there is no map of the truth, or it is no map of the frame's image.
+            DataError: if the ground-truth map is missing, or does not fit the frame's image.
         """
         truth = self._truth.segment(frame)
         digest = hashlib.sha256(frame.frame_id.encode()).digest()
@@ -106,7 +111,7 @@ class DegradedSegmenter:
 def degrade(
     class_ids: np.ndarray, errors: ErrorModel, generator: np.random.Generator
 ) -> np.ndarray:
-    """Return (height, width) uint8 class ids with the errors of the model."""
+    """Return a copy of (height, width) uint8 class ids with random errors added."""
     degraded = np.zeros_like(class_ids)
     for class_id in (_CAR, _PEDESTRIAN, _CYCLIST):
         count, regions, stats, _ = cv2.connectedComponentsWithStats(
@@ -117,10 +122,10 @@ def degrade(
             missed = errors.missed_small_instance if small else errors.missed_instance
             if generator.random() < missed:
                 continue
-            answer = class_id
+            painted = class_id
             if generator.random() < errors.confused:
-                answer = int(generator.choice(_CONFUSED_WITH[class_id]))
-            _paint_region(degraded, regions == region, stats[region], answer, errors, generator)
+                painted = int(generator.choice(_CONFUSED_WITH[class_id]))
+            _paint_region(degraded, regions == region, stats[region], painted, errors, generator)
     objects = np.flatnonzero(class_ids)
     if len(objects):
         for _ in range(generator.poisson(errors.patches)):
@@ -142,7 +147,7 @@ def _paint_region(
     errors: ErrorModel,
     generator: np.random.Generator,
 ) -> None:
-    """Paint a region with its outline moved in or out."""
+    """Paint a region with its outline moved in or out by a random number of pixels."""
     limit = errors.boundary_px
     shift = int(generator.integers(-limit, limit + 1))
     smallest = int(min(stats[cv2.CC_STAT_WIDTH], stats[cv2.CC_STAT_HEIGHT]))
@@ -151,10 +156,10 @@ def _paint_region(
     right = int(stats[cv2.CC_STAT_LEFT] + stats[cv2.CC_STAT_WIDTH]) + limit
     bottom = int(stats[cv2.CC_STAT_TOP] + stats[cv2.CC_STAT_HEIGHT]) + limit
     window = np.s_[top:bottom, left:right]
-    reach = 2 * abs(shift) + 1
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    change = cv2.MORPH_DILATE if shift > 0 else cv2.MORPH_ERODE
-    moved = cv2.morphologyEx(region[window].astype(np.uint8), change, kernel)
+    side = 2 * abs(shift) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    operation = cv2.MORPH_DILATE if shift > 0 else cv2.MORPH_ERODE
+    moved = cv2.morphologyEx(region[window].astype(np.uint8), operation, kernel)
     degraded[window][moved > 0] = class_id
 
 
@@ -166,7 +171,7 @@ def _paint_ellipse(
     class_id: int,
     generator: np.random.Generator,
 ) -> None:
-    """Paint an ellipse with half axes from the given range."""
+    """Paint an ellipse with random half axes from the given range."""
     low, high = half_axes_px
     axes = [int(axis) for axis in generator.integers(low, max(low, high) + 1, size=2)]
     cv2.ellipse(degraded, (column, row), axes, 0, 0, 360, class_id, thickness=-1)

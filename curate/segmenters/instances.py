@@ -1,7 +1,7 @@
-"""Masks of single objects that were computed before, in COCO's JSON, laid over each other as a map.
+"""Precomputed instance masks in COCO's JSON format, combined into a semantic map.
 
-Source: COCO's data format, as annotations `{images, annotations}`, as a list of results, or as one
-such file per frame. Where masks overlap, the higher score is on top.
+Source: COCO's data format: annotations `{images, annotations}`, a list of results, or one such file
+per frame. Where masks overlap, the mask with the higher score is on top.
 """
 
 import json
@@ -15,7 +15,7 @@ from curate.errors import ConfigError, DataError, one_line
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
-from curate.segmenters.classes import checked_classes, free_id
+from curate.segmenters.classes import background_id, checked_classes
 from curate.segmenters.masks import decode_mask
 
 Objects = Sequence[Mapping[str, Any]]
@@ -25,15 +25,15 @@ class InstanceSegmenter:
     """A `Segmenter` that reads instance masks from JSON.
 
     Args:
-        path: a file with `images` and `annotations`; a list of results whose `image_id` is the
-            frame's name or its number; or a folder with such a list, or `{annotations: [...]}`, in
-            FRAME.json.
-        classes: the category ids that count for each category.
-        minimum_score: masks below it are left out; masks without score are certain.
+        path: a file with `images` and `annotations`; a file with a list of results, where
+            `image_id` is the frame's name or number; or a folder with a file FRAME.json per frame,
+            which contains such a list or `{annotations: [...]}`.
+        classes: the COCO category ids that count for each category.
+        minimum_score: masks below it are dropped; a mask without a score counts as score 1.
 
     Raises:
-        DataError: the path is missing, or holds no instance masks.
-        ConfigError: a class id or the score is out of range.
+        DataError: if the path is missing, or contains no instance masks.
+        ConfigError: if a class id or the score is out of range.
     """
 
     needs_image = False
@@ -42,7 +42,7 @@ class InstanceSegmenter:
         self, path: StrPath, classes: Mapping[str, Sequence[int]], *, minimum_score: float = 0.5
     ) -> None:
         if not 0 <= minimum_score <= 1:
-            raise ConfigError(f"segmenter minimum_score {minimum_score}: 0 to 1")
+            raise ConfigError(f"segmenter minimum_score {minimum_score}: expected 0 to 1")
         self.path = Path(path)
         self.classes = checked_classes(classes)
         self.minimum_score = minimum_score
@@ -52,55 +52,55 @@ class InstanceSegmenter:
         """Return the frame's masks as a semantic map.
 
         Raises:
-            DataError: if there are none for the frame, or one is malformed or of another size.
+            DataError: if the frame has no masks, or a mask is malformed or of another size.
         """
         width, height = frame.image_size
-        wanted = {one for ids in self.classes.values() for one in ids}
-        nothing = free_id(self.classes)
-        class_ids = np.full((height, width), nothing, dtype=np.uint8)
-        place, objects = self._objects(frame.frame_id)
-        scored = [(_score(place, number, one), number) for number, one in enumerate(objects)]
+        used_ids = {class_id for ids in self.classes.values() for class_id in ids}
+        background = background_id(self.classes)
+        class_ids = np.full((height, width), background, dtype=np.uint8)
+        source, objects = self._objects(frame.frame_id)
+        scored = [(_score(source, number, entry), number) for number, entry in enumerate(objects)]
         for score, number in sorted(scored, key=lambda pair: pair[0]):
             if score < self.minimum_score:
                 continue
-            one = objects[number]
+            entry = objects[number]
             try:
-                mask = decode_mask(one["segmentation"], frame.image_size)
-                category = one["category_id"]
+                mask = decode_mask(entry["segmentation"], frame.image_size)
+                category = entry["category_id"]
             except KeyError as error:
-                raise DataError(f"{place}: object {number} has no {error.args[0]}") from None
+                raise DataError(f"{source}: object {number} has no {error.args[0]}") from None
             except DataError as error:
-                raise DataError(f"{place}: object {number}: {error}") from None
+                raise DataError(f"{source}: object {number}: {error}") from None
             if not isinstance(category, int):
-                raise DataError(f"{place}: object {number}: the category_id is no whole number")
-            class_ids[mask] = category if category in wanted else nothing
+                raise DataError(f"{source}: object {number}: category_id is not an integer")
+            class_ids[mask] = category if category in used_ids else background
         return SemanticMap(class_ids, self.classes)
 
     def _objects(self, frame_id: str) -> tuple[str, Objects]:
-        """Where a frame's objects are written, and they."""
+        """Return the place of a frame's objects, for error messages, and the objects."""
         if self._frames is None:
             path = self.path / f"{frame_id}.json"
-            return str(path), _listed(path, _read(path))
+            return str(path), _object_list(path, _read(path))
         number = int(frame_id) if frame_id.isdecimal() else None
         for key in (frame_id, number):
             if key in self._frames:
                 return f"{self.path}: frame {frame_id}", self._frames[key]
         raise DataError(
-            f"{self.path}: no masks for frame {frame_id}; a frame without objects belongs into "
+            f"{self.path}: no masks for frame {frame_id}; list a frame without objects in "
             '`images`: {"images": [{"id": 1, "file_name": "FRAME.png"}], "annotations": [...]}'
         )
 
 
 def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
-    """The objects of each frame by its name, or by the number that a list of results gives it."""
-    held = _read(path)
-    images = held.get("images", ()) if isinstance(held, dict) else ()
+    """Return the objects of each frame, by its name or by the `image_id` of a list of results."""
+    document = _read(path)
+    images = document.get("images", ()) if isinstance(document, dict) else ()
     try:
         names = {image["id"]: Path(image["file_name"]).stem for image in images}
         frames: dict[str | int, list[Mapping[str, Any]]] = {name: [] for name in names.values()}
-        for one in _listed(path, held):
-            key = one["image_id"]
-            frames.setdefault(names[key] if names else key, []).append(one)
+        for entry in _object_list(path, document):
+            key = entry["image_id"]
+            frames.setdefault(names[key] if names else key, []).append(entry)
     except (KeyError, TypeError) as error:
         words = f"no {error.args[0]!s:.80}" if isinstance(error, KeyError) else str(error)
         raise DataError(
@@ -109,18 +109,20 @@ def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
     return frames
 
 
-def _listed(path: Path, held: Any) -> list[Mapping[str, Any]]:
-    """Return the annotations of a document or of a bare list."""
-    objects = held.get("annotations") if isinstance(held, dict) else held
-    if not isinstance(objects, list) or not all(isinstance(one, dict) for one in objects):
-        raise DataError(f"{path}: no list of instance masks, nor {{annotations: [...]}}")
+def _object_list(path: Path, document: Any) -> list[Mapping[str, Any]]:
+    """Return the annotations of a COCO document or of a list of results."""
+    objects = document.get("annotations") if isinstance(document, dict) else document
+    if not isinstance(objects, list) or not all(isinstance(entry, dict) for entry in objects):
+        raise DataError(
+            f"{path}: expected a list of instance masks, or a document {{annotations: [...]}}"
+        )
     return objects
 
 
-def _score(place: str, number: int, one: Mapping[str, Any]) -> float:
-    score = one.get("score", 1.0)
+def _score(source: str, number: int, entry: Mapping[str, Any]) -> float:
+    score = entry.get("score", 1.0)
     if not isinstance(score, int | float) or not 0 <= score <= 1:
-        raise DataError(f"{place}: object {number}: the score is no number from 0 to 1")
+        raise DataError(f"{source}: object {number}: the score is not a number from 0 to 1")
     return float(score)
 
 

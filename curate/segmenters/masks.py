@@ -1,7 +1,14 @@
-"""Masks of objects in COCO's forms: run lengths, compressed run lengths, and polygons.
+"""Decoding of COCO's object masks: run lengths, compressed run lengths, and polygons.
 
-Source: COCO's data format. Runs go down the columns, left to right, and begin with the pixels that
-are not of the object; pixel (row r, column c) covers the square from (c, r) to (c + 1, r + 1).
+Source: COCO's data format. Runs go down the columns, from the left column to the right one, and
+alternate between background and object, background first. The mask of an image 2 pixels wide and
+3 high with runs [1, 3, 2]:
+
+    . #      column 0: 1 background, 2 object
+    # .      column 1: 1 object, 2 background
+    # .
+
+Pixel (row r, column c) covers the square from (c, r) to (c + 1, r + 1).
 """
 
 from collections.abc import Sequence
@@ -11,38 +18,38 @@ import numpy as np
 
 from curate.errors import DataError
 
-# Pixels from the image's corner; no annotator goes so far.
-_FARTHEST = 1e7
+# Largest accepted coordinate in pixels, far beyond any image.
+_MAX_COORDINATE = 1e7
 
 
 def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
-    """Return the pixels of an object.
+    """Return the mask of an object.
 
     Args:
         segmentation: `{"size": [height, width], "counts": str | list}` or a list of polygons
-            [x0, y0, x1, y1, ...] in pixels, whose areas are united.
+            [x0, y0, x1, y1, ...] in pixels; the mask is the union of the polygons.
         size: (width, height) of the image in pixels.
 
     Returns:
         (height, width) bool.
 
     Raises:
-        DataError: if it is neither, or its size is another one.
+        DataError: if the segmentation is neither, or has another size than the image.
     """
     width, height = size
     if isinstance(segmentation, dict):
-        own = segmentation.get("size")
-        if own != [height, width]:
-            match own:
+        mask_size = segmentation.get("size")
+        if mask_size != [height, width]:
+            match mask_size:
                 case [int(rows), int(columns)]:
-                    shown = f"{columns:.6g} x {rows:.6g} pixels"
+                    shown = f"is {columns:.6g} x {rows:.6g} pixels"
                 case _:
-                    shown = "without a size"
-            raise DataError(f"the mask is {shown}, the image {width} x {height}")
+                    shown = "has no valid size"
+            raise DataError(f"the mask {shown}, the image is {width} x {height}")
         counts = segmentation.get("counts")
         return runs_to_mask(decompress(counts) if isinstance(counts, str) else counts, size)
     if not isinstance(segmentation, list):
-        raise DataError("a segmentation is run lengths {size, counts} or a list of polygons")
+        raise DataError("a segmentation must be run lengths {size, counts} or a list of polygons")
     mask = np.zeros((height, width), dtype=bool)
     for polygon in segmentation:
         mask |= fill_polygon(polygon, size)
@@ -50,21 +57,22 @@ def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
 
 
 def decompress(text: str) -> list[int]:
-    """Return the run lengths in COCO's compressed string.
+    """Return the run lengths of COCO's compressed string.
 
-    Each character holds 5 bits, lowest first, and in its sixth whether more follow; the last one's
-    fifth bit is the sign. From the fourth run on, the difference to the run before the last is
-    written.
+    Each character, minus 48, holds six bits: the lower five are the next five bits of a number,
+    lowest first, and the sixth says whether the number continues. In its last character, the fifth
+    bit is the sign. From the fourth number on, each is the difference to the run two before. So
+    "1331" is 1, 3, 3 and 1 + 3 = 4, and "nO" is (62 - 32) + 32 * (31 - 32) = -2.
 
     Raises:
-        DataError: if a character is none of "0" to "o", or the last number is cut off.
+        DataError: if a character is not one of "0" to "o", or the last number is truncated.
     """
     runs: list[int] = []
     value = shift = 0
     for character in text:
         code = ord(character) - 48
         if not 0 <= code < 64:
-            raise DataError(f"{character!r} is no character of compressed run lengths")
+            raise DataError(f"{character!r} is not a character of compressed run lengths")
         value |= (code & 31) << shift
         shift += 5
         if code & 32:
@@ -74,25 +82,24 @@ def decompress(text: str) -> list[int]:
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
         value = shift = 0
     if shift:
-        raise DataError("the compressed run lengths are cut off")
+        raise DataError("the compressed run lengths are truncated")
     return runs
 
 
 def runs_to_mask(runs: Any, size: tuple[int, int]) -> np.ndarray:
-    """Return the (height, width) bool mask of run lengths.
+    """Return the (height, width) bool mask of run lengths; `size` is (width, height) in pixels.
 
     Raises:
-        DataError: if they are no whole numbers, or do not add up to the image.
+        DataError: if they are not integers, or their sum is not the number of pixels.
     """
     width, height = size
-    whole = isinstance(runs, list) and all(
+    valid = isinstance(runs, list) and all(
         isinstance(run, int) and 0 <= run <= width * height for run in runs
     )
-    if not whole or sum(runs) != width * height:
-        shown = f"{sum(runs)}" if whole else "no whole numbers"
+    if not valid or sum(runs) != width * height:
+        shown = f"add up to {sum(runs)}" if valid else "are not valid integers"
         raise DataError(
-            f"the run lengths are {shown}, not {width * height} pixels for an image of "
-            f"{width} x {height}"
+            f"the run lengths {shown}; an image of {width} x {height} has {width * height} pixels"
         )
     values = np.arange(len(runs)) % 2 == 1
     mask: np.ndarray = np.repeat(values, runs).reshape(width, height).T
@@ -100,17 +107,20 @@ def runs_to_mask(runs: Any, size: tuple[int, int]) -> np.ndarray:
 
 
 def fill_polygon(polygon: Any, size: tuple[int, int]) -> np.ndarray:
-    """The (height, width) bool mask of the pixels whose centre lies in a polygon (even-odd rule).
+    """Return the (height, width) bool mask of pixels with centres in a polygon (even-odd rule).
 
-    A centre on the left or upper edge is inside, on the right or lower edge outside, so that
-    polygons that share an edge share no pixel.
+    A centre on the left or upper edge is inside, a centre on the right or lower edge is outside.
+    Two polygons with a common edge therefore share no pixel.
+
+    For every edge and row, the first pixel centre to the right of the edge is marked. A pixel is
+    inside if the number of marks up to it in its row is odd.
 
     Args:
         polygon: [x0, y0, x1, y1, ...] in pixels, at least three corners.
         size: (width, height) of the image in pixels.
 
     Raises:
-        DataError: if it is no polygon.
+        DataError: if the polygon is malformed.
     """
     width, height = size
     corners = _corners(polygon)
@@ -128,12 +138,12 @@ def fill_polygon(polygon: Any, size: tuple[int, int]) -> np.ndarray:
 
 
 def _corners(polygon: Sequence[float] | Any) -> np.ndarray:
-    """Return (n, 2) x, y."""
+    """Return the (n, 2) corners x, y of a polygon."""
     try:
         corners = np.asarray(polygon, dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
         corners = np.zeros(0)
-    near = (np.abs(corners) < _FARTHEST).all()
-    if corners.ndim != 1 or len(corners) < 6 or len(corners) % 2 or not near:
-        raise DataError("a polygon is a list of at least three corners, x0, y0, x1, y1, ...")
+    in_range = (np.abs(corners) < _MAX_COORDINATE).all()
+    if corners.ndim != 1 or len(corners) < 6 or len(corners) % 2 or not in_range:
+        raise DataError("a polygon must be a list of at least three corners, x0, y0, x1, y1, ...")
     return corners.reshape(-1, 2)

@@ -1,15 +1,20 @@
-"""Any semantic segmentation model that was exported to ONNX.
+"""A segmenter that runs any semantic segmentation model in ONNX format.
 
 The model takes one RGB image, uint8 or float32, [1, height, width, 3] or [1, 3, height, width], of
-a fixed or a free size, and answers class ids [1, h, w] or scores of classes, channels first or
+a fixed or a free size. It returns class ids [1, h, w], or class scores with the channels first or
 last.
 
-A model of a fixed, nearly square shape sees a wide image squeezed, and loses what is small in it.
-Such a model is therefore run on crops as high as the image, evenly spread along it. Where crops
-overlap, each pixel takes its class from the crop whose centre is nearest, which shows most of what
-is around the pixel; where that class counts for no category, but that of another crop does, from
-the other. (DeepLab v3 on 45 cars in 24 KITTI frames: whole image 0.17 of the pixels of their 2D
-boxes, nearest crop 0.59, with the second rule 0.62.)
+If the model has a fixed, nearly square input, a wide image has to be squeezed and small objects
+get lost. Such a model is run on crops instead, each as high as the image, evenly spread over its
+width. Two rules decide where crops overlap:
+
+1. A pixel takes its class from the crop with the nearest centre: it shows most of the pixel's
+   surroundings.
+2. If that class counts for no category, but the class from another crop does, the pixel takes the
+   class of the other crop.
+
+DeepLab v3 on 45 cars in 24 KITTI frames labels this share of the pixels in their 2D boxes as car:
+0.17 with the whole image, 0.59 with rule 1, 0.62 with both rules.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,17 +27,17 @@ import cv2
 import numpy as np
 
 from curate.errors import ConfigError, ModelError
-from curate.files.onnx_session import are_numbers
+from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
 from curate.segmenters.classes import checked_classes
 from curate.segmenters.onnx_images import ImageModel, image_of
 
-# A whole image may be squeezed by this factor before it is cut into crops.
+# An image is cut into crops if it would have to be squeezed by more than this factor.
 _SQUEEZE_LIMIT = 1.5
 
-_ANSWER = "expected class ids [1, h, w], or scores [1, classes, h, w] or [1, h, w, classes]"
+_EXPECTED = "expected class ids [1, h, w], or scores [1, classes, h, w] or [1, h, w, classes]"
 
 
 class OnnxSegmenter:
@@ -41,15 +46,15 @@ class OnnxSegmenter:
     Args:
         model: the .onnx file.
         classes: the class ids that count for each category.
-        tiles: crops along an image that is too wide for the model's shape; more where so many do
-            not cover the image, 1 to always squeeze the whole image.
-        scaling: what a float model wants: "imagenet" (mean 0, deviation 1), "unit" (0 to 1) or
-            "none" (0 to 255).
-        threads: of ONNX Runtime.
+        tiles: number of crops for an image that is too wide for the model's input; more are used if
+            that many do not cover the image. 1: the whole image is always squeezed.
+        scaling: how pixels are scaled for a float model: "imagenet" (mean 0, standard deviation 1),
+            "unit" (0 to 1) or "none" (0 to 255).
+        threads: number of threads of ONNX Runtime.
 
     Raises:
-        ModelError: the file is missing or no ONNX model, or its input is no image.
-        ConfigError: an option or a class id is out of range.
+        ModelError: if the file is missing or not an ONNX model, or its input is not an image.
+        ConfigError: if an option or a class id is out of range.
     """
 
     needs_image = True
@@ -65,7 +70,7 @@ class OnnxSegmenter:
         threads: int = 1,
     ) -> None:
         if tiles < 1:
-            raise ConfigError(f"segmenter tiles {tiles}: at least 1")
+            raise ConfigError(f"segmenter tiles {tiles}: expected at least 1")
         self.classes = checked_classes(classes)
         self.tiles = tiles
         self._model = ImageModel(Path(model), scaling, threads)
@@ -75,7 +80,7 @@ class OnnxSegmenter:
         """Return the frame's semantic map.
 
         Raises:
-            ModelError: if the frame has no image, or the model's answer is no semantic map.
+            ModelError: if the frame has no image, or the model's output is not a semantic map.
         """
         image = image_of(frame)
         height, width = image.shape[:2]
@@ -84,23 +89,23 @@ class OnnxSegmenter:
         return SemanticMap(self._merge(crops, tiles), self.classes)
 
     def _merge(self, crops: list["Crop"], tiles: list[np.ndarray]) -> np.ndarray:
-        """Return (height, width) class ids from those of the crops; see above for the rule."""
+        """Merge the class ids of the crops to (height, width) by the module's two rules."""
         class_ids = np.hstack(
             [
                 tile[:, crop.own_left - crop.left : crop.own_right - crop.left]
                 for crop, tile in zip(crops, tiles, strict=True)
             ]
         )
-        counts = np.zeros(256, dtype=bool)
-        counts[[one for ids in self.classes.values() for one in ids]] = True
+        has_category = np.zeros(256, dtype=bool)
+        has_category[[class_id for ids in self.classes.values() for class_id in ids]] = True
         for crop, tile in zip(crops, tiles, strict=True):
             part = class_ids[:, crop.left : crop.right]
-            lost = counts[tile] & ~counts[part]
-            part[lost] = tile[lost]
+            missed = has_category[tile] & ~has_category[part]
+            part[missed] = tile[missed]
         return class_ids
 
     def _crops(self, width: int, height: int) -> list["Crop"]:
-        """Return the crops of an image; a single one where the model's shape suits it."""
+        """Return the crops of an image; a single one if the model's input shape fits the image."""
         shape = self._model.input
         whole = [Crop(0, width, 0, width)]
         if shape.height is None or shape.width is None or self.tiles == 1:
@@ -112,21 +117,21 @@ class OnnxSegmenter:
         return cut_along(width, crop_width, max(self.tiles, ceil(squeeze)))
 
     def _run(self, image: np.ndarray) -> np.ndarray:
-        """Return (h, w) uint8 class ids of an (h, w, 3) image."""
+        """Return the (h, w) uint8 class ids of an (h, w, 3) image."""
         height, width = image.shape[:2]
         shape = self._model.input
         target = (shape.width or width, shape.height or height)
         shrinks = target[0] < width or target[1] < height
-        kind = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        pixels = cv2.resize(image, target, interpolation=kind)
-        (answer,) = self._model.run(pixels, [self._output])
-        class_ids = _class_ids(answer, target, self._model.path)
+        interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        pixels = cv2.resize(image, target, interpolation=interpolation)
+        (output,) = self._model.run(pixels, [self._output])
+        class_ids = _class_ids(output, target, self._model.path)
         return cv2.resize(class_ids, (width, height), interpolation=cv2.INTER_NEAREST)
 
 
 @dataclass(frozen=True)
 class Crop:
-    """Columns [left, right) of an image, of which [own_left, own_right) are taken from it."""
+    """The columns [left, right) of an image; the crop owns the columns [own_left, own_right)."""
 
     left: int
     right: int
@@ -135,7 +140,12 @@ class Crop:
 
 
 def cut_along(width: int, crop_width: int, count: int) -> list[Crop]:
-    """`count` crops spread evenly over an image's width, each owning the columns nearest to it."""
+    """Return `count` crops spread evenly over an image's width.
+
+    Each crop owns the columns that are nearer to its centre than to any other centre. For example,
+    three crops of 6 columns from an image of 12 start at 0, 3 and 6 and own the columns [0, 4),
+    [4, 7) and [7, 12).
+    """
     lefts = np.round(np.linspace(0, width - crop_width, count)).astype(int)
     middles = (lefts[:-1] + lefts[1:] + crop_width) // 2
     borders = [0, *middles.tolist(), width]
@@ -146,39 +156,48 @@ def cut_along(width: int, crop_width: int, count: int) -> list[Crop]:
 
 
 def _map_output(model: ImageModel) -> str:
-    """Return the output that is the map; ModelError where the model says that it is none."""
+    """Return the name of the output with the map.
+
+    Raises:
+        ModelError: if the declared shape of the output is not that of a map.
+    """
     output = model.outputs[0]
     if output.shape and len(output.shape) not in {3, 4}:
-        raise ModelError(f"{model.path}: answers {output.name} {output.shape}; {_ANSWER}")
+        raise ModelError(f"{model.path}: returns {output.name} {output.shape}; {_EXPECTED}")
     name: str = output.name
     return name
 
 
-def _class_ids(answer: np.ndarray, size: tuple[int, int], model: Path) -> np.ndarray:
-    """Return (h, w) uint8 class ids from the model's answer.
+def _class_ids(output: np.ndarray, size: tuple[int, int], model: Path) -> np.ndarray:
+    """Return (h, w) uint8 class ids from the model's output.
 
-    Scores of classes are told from positions by the shape of the input: of both ways to read the
-    answer, the one whose h : w is nearer to the input's is right.
+    An output of scores has its class axis first or last. The aspect ratio decides which: the two
+    axes that remain must be h and w, and their ratio is compared with that of the input.
+
+    Args:
+        output: the model's output.
+        size: (width, height) of the model's input in pixels.
+        model: the model file, for error messages.
     """
-    fault = ModelError(f"{model}: answers {answer.dtype} {list(answer.shape)}; {_ANSWER}")
+    invalid = ModelError(f"{model}: returns {output.dtype} {list(output.shape)}; {_EXPECTED}")
     if (
-        not are_numbers(answer)
-        or answer.ndim not in {3, 4}
-        or answer.shape[0] != 1
-        or 0 in answer.shape
+        not is_numeric_array(output)
+        or output.ndim not in {3, 4}
+        or output.shape[0] != 1
+        or 0 in output.shape
     ):
-        raise fault
-    scores = answer[0]
-    if np.isnan(scores.max()):  # the highest of them would be class 0, or any other
-        raise ModelError(f"{model}: answers scores that are NaN; mend the model or its scaling")
+        raise invalid
+    scores = output[0]
+    if np.isnan(scores.max()):  # argmax would return the class of a NaN
+        raise ModelError(f"{model}: returns scores that are NaN; fix the model or its scaling")
     if scores.ndim == 3:
         first, second, third = scores.shape
         aspect = np.log(size[1] / size[0])
-        last = abs(np.log(first / second) - aspect) < abs(np.log(second / third) - aspect)
-        axis = 2 if last else 0
+        channels_last = abs(np.log(first / second) - aspect) < abs(np.log(second / third) - aspect)
+        axis = 2 if channels_last else 0
         single = scores.shape[axis] == 1
         scores = scores.squeeze(axis) if single else scores.argmax(axis)
     if not np.issubdtype(scores.dtype, np.integer) or scores.min() < 0 or scores.max() > 255:
-        raise fault
+        raise invalid
     class_ids: np.ndarray = scores.astype(np.uint8)
     return class_ids

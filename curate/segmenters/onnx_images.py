@@ -1,4 +1,4 @@
-"""ONNX models that take an image: its type, the order of its axes, its size, its scaling."""
+"""ONNX models with one image as input: its type, axis order, size and scaling."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,34 +7,35 @@ from typing import Any
 
 import numpy as np
 
-from curate.datasets.formats.images import MOST_PIXELS
+from curate.datasets.formats.images import MAX_PIXELS
 from curate.errors import ConfigError, ModelError, first_line
 from curate.files.onnx_session import open_session, runtime_errors
 from curate.frames import Frame
 
-# Mean and standard deviation of ImageNet's RGB, with which most published models were trained.
+# Mean and standard deviation of ImageNet's RGB, as used to train most published models.
 _IMAGENET = (np.array([0.485, 0.456, 0.406]) * 255, np.array([0.229, 0.224, 0.225]) * 255)
 SCALINGS = {
     "imagenet": _IMAGENET,
     "unit": (np.zeros(3), np.full(3, 255.0)),
     "none": (np.zeros(3), np.ones(3)),
 }
-"""What a float model wants, as mean and deviation of pixels from 0 to 255."""
+"""Mean and standard deviation by which pixels (0 to 255) are normalised for a float model."""
 
 _EXPECTED = "expected one image [1, height, width, 3] or [1, 3, height, width], uint8 or float32"
 
 
 @dataclass(frozen=True)
 class ImageInput:
-    """What a model wants.
+    """The image input of a model.
 
     Attributes:
-        name: of the input.
-        is_float: float32, not uint8.
-        channels_first: of the order of its axes.
-        batched: whether there is an axis of images, of which one is given.
-        height: None where it is free.
-        width: likewise.
+        name: name of the input.
+        is_float: whether the type is float32; otherwise it is uint8.
+        channels_first: whether the axes are channels, height, width; otherwise the channels are
+            last.
+        batched: whether there is a leading batch axis of length 1.
+        height: height in pixels; None if any height is accepted.
+        width: width in pixels; None if any width is accepted.
     """
 
     name: str
@@ -45,7 +46,7 @@ class ImageInput:
     width: int | None
 
     def feed(self, pixels: np.ndarray, scaling: str) -> dict[str, np.ndarray]:
-        """What the session takes for (height, width, 3) uint8 RGB pixels of the model's size."""
+        """Return the session's inputs for (height, width, 3) uint8 RGB pixels of the input size."""
         if self.is_float:
             mean, deviation = SCALINGS[scaling]
             pixels = ((pixels - mean) / deviation).astype(np.float32)
@@ -55,21 +56,21 @@ class ImageInput:
 
 
 class ImageModel:
-    """An ONNX model that takes one image.
+    """An ONNX model with one image as input.
 
     Args:
         path: the .onnx file.
-        scaling: see `SCALINGS`.
-        threads: of ONNX Runtime.
-        single: whether an image without an axis of images is taken too, [3, height, width].
+        scaling: a name in `SCALINGS`.
+        threads: number of threads of ONNX Runtime.
+        single: whether an input without a batch axis, e.g. [3, height, width], is accepted too.
 
     Attributes:
-        input: see `ImageInput`.
-        outputs: what it answers, as ONNX Runtime describes it.
+        input: the image input, see `ImageInput`.
+        outputs: ONNX Runtime's descriptions of the outputs.
 
     Raises:
-        ConfigError: there is no such scaling.
-        ModelError: the file is missing or no ONNX model, or it takes something else.
+        ConfigError: if there is no such scaling.
+        ModelError: if the file is missing or not an ONNX model, or has another kind of input.
     """
 
     def __init__(self, path: Path, scaling: str, threads: int, *, single: bool = False) -> None:
@@ -82,25 +83,25 @@ class ImageModel:
         self.outputs = self._session.get_outputs()
 
     def run(self, pixels: np.ndarray, outputs: Sequence[str]) -> list[Any]:
-        """Return the named outputs for (height, width, 3) uint8 RGB pixels of the model's size.
+        """Return the named outputs for (height, width, 3) uint8 RGB pixels of the input size.
 
         Raises:
             ModelError: if the model fails.
         """
         try:
-            found: list[Any] = self._session.run(
+            values: list[Any] = self._session.run(
                 list(outputs), self.input.feed(pixels, self._scaling)
             )
         except runtime_errors() as error:
             raise ModelError(f"{self.path}: {first_line(error)}") from error
-        return found
+        return values
 
 
 def image_of(frame: Frame) -> np.ndarray:
-    """Return (height, width, 3) uint8 RGB, what a frame's camera saw.
+    """Return the frame's image, (height, width, 3) uint8 RGB.
 
     Raises:
-        ModelError: if the frame was read without it.
+        ModelError: if the frame was read without its image.
     """
     if frame.image is None:
         raise ModelError(f"frame {frame.frame_id} was read without the image to segment")
@@ -108,25 +109,30 @@ def image_of(frame: Frame) -> np.ndarray:
 
 
 def _image_input(session: Any, model: Path, *, single: bool) -> ImageInput:
-    """The input of a model that takes one image; ModelError where it takes something else."""
+    """Return the image input of a model.
+
+    Raises:
+        ModelError: if the model has other inputs, or its image has an invalid size.
+    """
     inputs = session.get_inputs()
-    found = ", ".join(f"{one.name} {one.type}{one.shape}" for one in inputs)
-    fault = ModelError(f"{model}: takes {found}; {_EXPECTED}")
+    shown = ", ".join(f"{value.name} {value.type}{value.shape}" for value in inputs)
+    invalid = ModelError(f"{model}: takes {shown}; {_EXPECTED}")
     if len(inputs) != 1 or len(inputs[0].shape) not in ({3, 4} if single else {4}):
-        raise fault
-    one = inputs[0]
-    sizes = [size if isinstance(size, int) else None for size in one.shape]
+        raise invalid
+    image = inputs[0]
+    sizes = [size if isinstance(size, int) else None for size in image.shape]
     batched = len(sizes) == 4
     batch, first, second, last = sizes if batched else (1, *sizes)
     channels_first = last != 3
     if (
         batch not in {1, None}
         or (first if channels_first else last) != 3
-        or one.type not in {"tensor(uint8)", "tensor(float)"}
+        or image.type not in {"tensor(uint8)", "tensor(float)"}
     ):
-        raise fault
+        raise invalid
     height, width = (second, last) if channels_first else (first, second)
-    if 0 in {height, width} or (height or 1) * (width or 1) > MOST_PIXELS:
-        # Each frame would be blown up to that size.
-        raise ModelError(f"{model}: takes {found}; images of 1 to {MOST_PIXELS} pixels are made")
-    return ImageInput(one.name, one.type == "tensor(float)", channels_first, batched, height, width)
+    if 0 in {height, width} or (height or 1) * (width or 1) > MAX_PIXELS:
+        # Each frame would be enlarged to that size.
+        raise ModelError(f"{model}: takes {shown}; expected an image of 1 to {MAX_PIXELS} pixels")
+    is_float = image.type == "tensor(float)"
+    return ImageInput(image.name, is_float, channels_first, batched, height, width)

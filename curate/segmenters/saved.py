@@ -1,4 +1,4 @@
-"""Semantic maps that were computed before: one PNG of class ids per frame."""
+"""A segmenter that reads precomputed semantic maps: one PNG of class ids per frame."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,23 +11,23 @@ from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
-from curate.segmenters.classes import checked_classes, foreign_ids
+from curate.segmenters.classes import checked_classes, describe_unexpected_ids
 
-_MOST_CLASSES = 256
+_MAX_CLASSES = 256
 
 
 class SavedSegmenter:
-    """A `Segmenter` that reads DIRECTORY/FRAME.png, single-channel, one class id per pixel.
+    """A `Segmenter` that reads DIRECTORY/FRAME.png with a single channel: a class id per pixel.
 
     Args:
         directory: the folder of the maps.
         classes: the class ids that count for each category.
-        divisor: of maps of 16 bits that number the instances too, as class * divisor + instance:
-            1000 for Cityscapes' instanceIds, 256 for KITTI's. What is smaller is a class alone.
+        divisor: for 16-bit maps of class * divisor + instance number: 1000 for Cityscapes'
+            instanceIds, 256 for KITTI's. A value below the divisor is a class id without instance.
 
     Raises:
-        DataError: there is no such folder.
-        ConfigError: a class id or the divisor is out of range.
+        DataError: if the folder does not exist.
+        ConfigError: if a class id or the divisor is out of range.
     """
 
     needs_image = False
@@ -41,7 +41,7 @@ class SavedSegmenter:
         divisor: int | None = None,
     ) -> None:
         if divisor is not None and not (isinstance(divisor, int) and divisor > 1):
-            raise ConfigError(f"segmenter divisor {divisor!r}: a whole number above 1")
+            raise ConfigError(f"segmenter divisor {divisor!r}: expected an integer above 1")
         self.directory = Path(directory)
         self.classes = checked_classes(classes)
         self.divisor = divisor
@@ -52,8 +52,8 @@ class SavedSegmenter:
         """Return the frame's saved map.
 
         Raises:
-            DataError: if there is no map, it is no map of the frame's image, or its class ids are
-                others than those declared.
+            DataError: if the map is missing, has another size than the frame's image, or contains
+                ids that its class set does not have.
         """
         path = self.directory / f"{frame.frame_id}.png"
         class_ids = self._class_ids(path, decode_image(path, cv2.IMREAD_UNCHANGED))
@@ -61,22 +61,25 @@ class SavedSegmenter:
         if class_ids.shape != (height, width):
             raise DataError(
                 f"{path}: the map is {class_ids.shape[1]} x {class_ids.shape[0]} pixels, "
-                f"the image of the frame {width} x {height}"
+                f"the image of the frame is {width} x {height}"
             )
-        if fault := foreign_ids(class_ids, self.classes):
-            raise DataError(f"{path}: {fault}")
+        if problem := describe_unexpected_ids(class_ids, self.classes):
+            raise DataError(f"{path}: {problem}")
         return SemanticMap(class_ids, self.classes)
 
     def _class_ids(self, path: Path, pixels: np.ndarray) -> np.ndarray:
-        """Return (h, w) uint8 class ids of what the file holds."""
+        """Return the (h, w) uint8 class ids of a decoded PNG."""
         if pixels.ndim == 2 and pixels.dtype == np.uint8:
             return pixels
         if pixels.ndim == 2 and pixels.dtype == np.uint16 and self.divisor is not None:
             class_ids = np.where(pixels < self.divisor, pixels, pixels // self.divisor)
-            if class_ids.max(initial=0) < _MOST_CLASSES:
+            if class_ids.max(initial=0) < _MAX_CLASSES:
                 return class_ids.astype(np.uint8)
-            raise DataError(f"{path}: class {class_ids.max()} with divisor {self.divisor}")
+            raise DataError(
+                f"{path}: class {class_ids.max()} with divisor {self.divisor}, expected 0 to "
+                f"{_MAX_CLASSES - 1}; check segmenter.options.divisor"
+            )
         raise DataError(
-            f"{path}: expected one channel of 8 bits, a class id per pixel; for 16 bits of class "
-            "and instance set segmenter.options.divisor"
+            f"{path}: expected one channel of 8 bits, a class id per pixel; for 16-bit maps of "
+            "class and instance, set segmenter.options.divisor"
         )

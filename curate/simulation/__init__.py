@@ -1,4 +1,4 @@
-"""A simulated LiDAR-camera data set in KITTI's format, ray-cast with Open3D."""
+"""Simulation of a LiDAR-camera data set in KITTI's format by ray casting with Open3D."""
 
 from curate.simulation.scene import SEMANTIC_CLASSES
 from curate.simulation.writer import SEMANTIC_FOLDER, simulate

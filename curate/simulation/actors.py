@@ -1,6 +1,6 @@
-"""Cars, pedestrians and cyclists: composed meshes in many sizes, shapes and poses.
+"""Meshes of cars, pedestrians and cyclists in many sizes, shapes and poses.
 
-All face along +x and stand on z = 0. Sizes follow the spread of KITTI's labels (a car is
+All face along +x and stand on z = 0. Sizes follow the distribution of KITTI's labels (a car is
 3.9 +- 0.4 m long, a pedestrian 1.75 +- 0.1 m tall, a cyclist 1.75 +- 0.15 m long).
 """
 
@@ -13,9 +13,10 @@ from curate.simulation.materials import Material
 from curate.simulation.meshes import Mesh, box, cylinder, ellipsoid, frustum, merge, ring
 
 VARIANTS = {"Car": 48, "Pedestrian": 64, "Cyclist": 48}
-"""How many different meshes there are of each category."""
+"""Number of different meshes of each category."""
 
-# length, width, height, bonnet share, boot share, cabin top / bottom length, belt line / height
+# length, width, height, bonnet / length, boot / length, cabin top / bottom length, belt line /
+# height
 _CAR_STYLES = np.array(
     [
         (4.35, 1.75, 1.46, 0.27, 0.17, 0.52, 0.58),  # saloon
@@ -31,13 +32,13 @@ _CAR_STYLES = np.array(
 
 @cache
 def actor_mesh(category: str, variant: int) -> Mesh:
-    """Return the mesh number `variant` of `category`, the same in every process."""
+    """Return mesh number `variant` of a category; it is the same in every process."""
     generator = np.random.default_rng([list(_BUILDERS).index(category), variant])
     return _BUILDERS[category](generator).standing_on_origin()
 
 
 def actor_colours(category: str, generator: np.random.Generator) -> dict[Material, np.ndarray]:
-    """Paint or clothes for one actor."""
+    """Return random colours of the paint or the clothes of one actor."""
     if category == "Car":
         return {Material.PAINT: _paint(generator), Material.TRIM: np.full(3, 0.1)}
     colours = {
@@ -54,7 +55,7 @@ def actor_colours(category: str, generator: np.random.Generator) -> dict[Materia
 
 
 def _paint(generator: np.random.Generator) -> np.ndarray:
-    """Return (3,) RGB: mostly black to white, else a saturated colour."""
+    """Return (3,) RGB: in most cases grey, otherwise a saturated colour."""
     if generator.random() < 0.65:
         return np.full(3, generator.choice([0.06, 0.12, 0.3, 0.5, 0.65, 0.85]))
     colours = [(0.55, 0.05, 0.06), (0.06, 0.13, 0.42), (0.1, 0.3, 0.5), (0.1, 0.25, 0.13)]
@@ -63,14 +64,14 @@ def _paint(generator: np.random.Generator) -> np.ndarray:
 
 
 def _cloth(generator: np.random.Generator) -> np.ndarray:
-    """Return (3,) RGB: grey to black, denim, or any colour."""
+    """Return (3,) RGB: a random grey, blended with a random colour."""
     grey = np.full(3, generator.uniform(0.08, 0.8))
     tint = generator.uniform(0.05, 0.85, size=3)
     return np.asarray(grey + (tint - grey) * generator.choice([0.05, 0.2, 0.8]))
 
 
 def _car(generator: np.random.Generator) -> Mesh:
-    """Body, cabin with windows, four wheels, lights and number plates."""
+    """Return a body, a cabin with windows, four wheels, lights and number plates."""
     style = _CAR_STYLES[generator.integers(len(_CAR_STYLES))]
     length, width, height = style[:3] * generator.normal(1.0, (0.04, 0.025, 0.025))
     bonnet, boot, top, belt = style[3:] * generator.uniform(0.92, 1.08, size=4)
@@ -105,7 +106,7 @@ def _car_cabin(
     boot: float,
     top: float,
 ) -> list[Mesh]:
-    """Return the glazed part from the belt line to the roof, and the roof."""
+    """Return the glass from the belt line to the roof, the roof, and the pillars."""
     front, rear = length * (0.5 - bonnet), length * (boot - 0.5)
     bottom = front - rear
     shift = -(bottom * (1 - top) * (0.14 if boot < 0.08 else 0.05))
@@ -123,7 +124,7 @@ def _car_cabin(
         (0.9, 0.9),
         Material.PAINT,
     )
-    # Pillars between the side windows, a little proud of the glass.
+    # Pillars between the side windows, slightly in front of the glass.
     pillars = [
         frustum(
             (centre + share * bottom, 0, (belt_z + roof_z) / 2),
@@ -138,7 +139,7 @@ def _car_cabin(
 
 
 def _car_lights(length: float, width: float, belt_z: float) -> list[Mesh]:
-    """Headlights, rear lights and number plates."""
+    """Return headlights, rear lights and number plates."""
     parts = []
     for side in (-0.38, 0.38):
         height = belt_z * 0.78
@@ -152,7 +153,7 @@ def _car_lights(length: float, width: float, belt_z: float) -> list[Mesh]:
 
 
 def _pedestrian(generator: np.random.Generator) -> Mesh:
-    """Two legs in stride, torso, swinging arms and head, some with a bag or a long coat."""
+    """Return a walking person, in some variants with a bag, a rucksack or a long coat."""
     height = float(np.clip(generator.normal(1.74, 0.10), 1.4, 2.0))
     if generator.random() < 0.08:
         height *= 0.72  # a child
@@ -188,7 +189,7 @@ def _arm(
     swing: float,
     height: float,
 ) -> list[Mesh]:
-    """Upper arm, forearm and hand."""
+    """Return the upper arm, forearm and hand of one side (-1 right, +1 left)."""
     bend = generator.uniform(0.0, 0.16)
     top = (0, side * girth * 1.05, shoulder - 0.02)
     elbow = (0.35 * swing, side * girth * 1.35, shoulder - 0.18 * height)
@@ -203,7 +204,7 @@ def _arm(
 def _outfit(
     generator: np.random.Generator, height: float, hip: float, shoulder: float, girth: float
 ) -> list[Mesh]:
-    """Nothing, a coat, a rucksack or a carried bag."""
+    """Return nothing, a coat, a rucksack or a carried bag."""
     kind = generator.choice(["none", "coat", "rucksack", "bag"], p=[0.45, 0.25, 0.15, 0.15])
     if kind == "coat":
         low, high = (0, 0, 0.3 * height), (0, 0, shoulder - 0.12)
@@ -228,7 +229,7 @@ def bicycle(generator: np.random.Generator) -> Mesh:
     tubes.append((rear, (-0.2, 0, 0.78)))
     parts = [cylinder(start, end, 0.022, Material.METAL, sides=5) for start, end in tubes]
     parts += [ring(hub, wheel, 0.045, 0.04, Material.RUBBER) for hub in (front, rear)]
-    for hub in (front, rear):  # spokes, as one thin disc would hide too much
+    for hub in (front, rear):  # spokes; a disc would occlude too much behind it
         for angle in np.arange(3) * np.pi / 3:
             reach = np.array([np.cos(angle), 0, np.sin(angle)]) * (wheel - 0.04)
             parts.append(
@@ -247,7 +248,7 @@ def bicycle(generator: np.random.Generator) -> Mesh:
 
 
 def _cyclist(generator: np.random.Generator) -> Mesh:
-    """Return a bicycle and a rider: bent legs, leaning torso, arms to the bar, head."""
+    """Return a bicycle and a rider: bent legs, leaning torso, arms to the handlebar, head."""
     lean = generator.uniform(0.1, 0.42)
     rise = generator.uniform(0.42, 0.52)
     hip = np.array([-0.24, 0.0, 1.0])

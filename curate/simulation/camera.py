@@ -1,4 +1,4 @@
-"""The camera's image and semantic map: one ray per pixel, shaded, textured and made noisy."""
+"""Rendering of the camera's image and semantic map: ray casting, shading, texture and noise."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -20,17 +20,18 @@ _LINE_PAINT = np.array([0.78, 0.78, 0.76])
 
 @dataclass(frozen=True)
 class View:
-    """What the camera sees.
+    """The image of a scene and its ground truth.
 
     Attributes:
         image: (height, width, 3) uint8 RGB.
         semantic: (height, width) uint8 class ids, see `SEMANTIC_CLASSES`.
-        things: (height, width) int32, the thing in each pixel, -1 for the sky.
+        instances: (height, width) int32 instance number of each pixel, as in `Scene.instances`; -1
+            is the sky.
     """
 
     image: np.ndarray
     semantic: np.ndarray
-    things: np.ndarray
+    instances: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,12 @@ class Light:
 
     Attributes:
         sun: (3,) unit vector towards the sun, LiDAR frame.
-        direct: strength of the sun.
-        ambient: strength of the sky.
+        direct: strength of the sunlight.
+        ambient: strength of the light from the sky.
         tint: (3,) colour balance.
-        sky: (2, 3) RGB at the horizon and overhead.
-        grain: noise of the pixels, grey levels.
-        grain_offset: where in the repeating noise the image begins.
+        sky: (2, 3) RGB of the sky at the horizon and overhead.
+        grain: strength of the pixel noise, in grey levels.
+        grain_offset: row and column of the noise tile at which the image begins.
     """
 
     sun: np.ndarray
@@ -57,7 +58,7 @@ class Light:
 
     @classmethod
     def draw(cls, generator: np.random.Generator) -> Self:
-        """From a bright to an overcast day, well or badly exposed."""
+        """Return the light of a random day, bright to overcast, with a random exposure."""
         azimuth, elevation = generator.uniform(-np.pi, np.pi), generator.uniform(0.35, 1.2)
         sun = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
         overcast, exposure = generator.random(), np.exp(generator.normal(0, 0.22))
@@ -74,14 +75,14 @@ class Light:
         )
 
     def shade(self, normals: np.ndarray, colours: np.ndarray) -> np.ndarray:
-        """Return (m, 3) float32 colours of lit surfaces."""
+        """Return the (m, 3) float32 colours of (m, 3) surface colours under this light."""
         facing = np.clip(normals @ self.sun, 0, None)
         upward = 0.75 + 0.25 * normals[:, 2]
         strength = self.ambient * upward + self.direct * facing
         return np.asarray(colours * strength[:, None] * self.tint, dtype=np.float32)
 
     def air(self) -> Air:
-        """Sky, windows and grain for the kernel."""
+        """Return sky, windows and grain in the form that the kernel needs."""
         window = _WINDOW * (0.6 + self.ambient)
         return Air(
             self.sky.astype(np.float32),
@@ -92,7 +93,7 @@ class Light:
 
 
 def render(scene: Scene, caster: Caster, rig: CameraRig, generator: np.random.Generator) -> View:
-    """Return the camera's view of a scene."""
+    """Render the camera's view of a scene, in light drawn from `generator`."""
     hits = cast_pixels(caster, rig)
     light = Light.draw(generator)
     surfaces = Surfaces(
@@ -114,15 +115,15 @@ def render(scene: Scene, caster: Caster, rig: CameraRig, generator: np.random.Ge
         _markings(scene.street, light),
         light.air(),
     )
-    # The sky has triangle -1, which is the last entry of these tables.
-    things = np.append(scene.things, np.int32(-1))[triangle]
-    semantic = np.append(scene.thing_classes(), np.uint8(0))[things]
-    image = cv2.GaussianBlur(sharp, (3, 3), 0.55)  # the lens
-    return View(image, semantic, things)
+    # The sky has triangle -1, which selects the last entry of these tables.
+    instances = np.append(scene.instances, np.int32(-1))[triangle]
+    semantic = np.append(scene.instance_classes(), np.uint8(0))[instances]
+    image = cv2.GaussianBlur(sharp, (3, 3), 0.55)  # the blur of the lens
+    return View(image, semantic, instances)
 
 
 def _markings(street: Street, light: Light) -> Markings:
-    """Return the lines of a street, interrupted where another crosses."""
+    """Return the road markings of a street, interrupted where another street crosses."""
     lines = street.axis_d + street.lane_m * np.arange(-street.lanes, street.lanes + 1)
     half = street.crossing_half_m + 1.5
     crossing = (
@@ -140,7 +141,7 @@ def _markings(street: Street, light: Light) -> Markings:
 
 @cache
 def _noise_tile() -> np.ndarray:
-    """(256, 256) float32 noise of mean 0 and deviation 1 that repeats without a seam."""
+    """Return (256, 256) float32 noise of mean 0 and standard deviation 1 that tiles seamlessly."""
     generator = np.random.default_rng(0)
     tile = np.zeros((TILE, TILE))
     for cells, weight in ((256, 1.0), (64, 0.6), (16, 0.5)):

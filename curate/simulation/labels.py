@@ -1,10 +1,13 @@
-"""The ground truth of one scene as KITTI defines it.
+"""The ground truth of one scene, as KITTI defines it.
 
-2D box: the tight box around the whole object's projection, hidden parts included, clipped to the
-image. Truncated: the share of the unclipped 2D box that lies outside the image. Occluded: 0 from
-80 percent visible, 1 from 45, else 2, by the share of the object's pixels within the image that
-nothing hides. Objects of which no pixel is seen are not labelled; tiny, very far or almost hidden
-ones become DontCare regions.
+- 2D box: the tight box around the projection of the whole object, including occluded parts, clipped
+  to the image.
+- Truncation: the fraction of the unclipped 2D box outside the image.
+- Occlusion: 0 if at least 80 percent of the object's pixels within the image are visible, 1 if at
+  least 45 percent, else 2.
+
+Objects without a visible pixel are not labeled. Tiny, very far or almost hidden objects become
+DontCare regions.
 """
 
 import numpy as np
@@ -17,45 +20,45 @@ from curate.simulation.rig import IMAGE_SIZE, CameraRig
 from curate.simulation.scene import Caster, Scene
 
 _NEAR_M = 0.2
-_PROBES = 400  # rays per object that measure its visible share
+_PROBES = 400  # approximate number of rays per object for its visible fraction
 _FAR_M = 70.0
 _MIN_HEIGHT_PX = 14.0
 _MIN_VISIBLE_PX = 20
-_MIN_VISIBLE_SHARE = 0.12
-_OCCLUSION_SHARES = (0.8, 0.45)
+_MIN_VISIBLE_FRACTION = 0.12
+_OCCLUSION_FRACTIONS = (0.8, 0.45)
 
 
 def annotate(scene: Scene, view: View, rig: CameraRig) -> Annotations:
-    """The labels of everything that the camera sees, nearest first, DontCare regions last."""
+    """Return the labels of all visible objects, nearest first, with DontCare regions last."""
     calibration = rig.calibration
-    seen = np.bincount(view.things[view.things > 0], minlength=len(scene.placements) + 1)
+    seen = np.bincount(view.instances[view.instances > 0], minlength=len(scene.placements) + 1)
     numbers = [number for number in scene.actors() if seen[number]]
     if not numbers:
         return Annotations.empty()
     outlines = [_outline(scene, number, calibration) for number in numbers]
     boxes_2d = np.array([inside for inside, _ in outlines])
     truncated = np.array([1 - _area(inside) / _area(whole) for inside, whole in outlines])
-    shares = _visible_shares(scene, view, rig, numbers, boxes_2d)
+    visible = _visible_fractions(scene, view, rig, numbers, boxes_2d)
     boxes = np.array([_box(scene, number) for number in numbers])
     categories = as_categories([scene.placements[number - 1].kind for number in numbers])
 
     distance = np.hypot(boxes[:, 0], boxes[:, 1])
     unclear = (distance > _FAR_M) | (boxes_2d[:, 3] - boxes_2d[:, 1] < _MIN_HEIGHT_PX)
-    unclear |= (seen[numbers] < _MIN_VISIBLE_PX) | (shares < _MIN_VISIBLE_SHARE)
+    unclear |= (seen[numbers] < _MIN_VISIBLE_PX) | (visible < _MIN_VISIBLE_FRACTION)
     boxes[unclear] = np.nan
-    found = Annotations(
+    annotations = Annotations(
         boxes,
         np.where(unclear, "DontCare", categories),
         np.where(unclear, -1.0, truncated),
-        np.where(unclear, -1, np.digitize(-shares, -np.array(_OCCLUSION_SHARES))),
+        np.where(unclear, -1, np.digitize(-visible, -np.array(_OCCLUSION_FRACTIONS))),
         np.where(unclear, -10.0, _alpha(boxes, calibration)),
         boxes_2d,
     )
-    return found.select(np.lexsort((distance, unclear)))
+    return annotations.select(np.lexsort((distance, unclear)))
 
 
 def _box(scene: Scene, number: int) -> np.ndarray:
-    """(7,) the tight box around an object, in the LiDAR frame."""
+    """Return the (7,) tight box around an object in the LiDAR frame."""
     placement = scene.placements[number - 1]
     size = placement.mesh.size * placement.scale
     centre = placement.position + np.array([0, 0, size[2] / 2])
@@ -63,7 +66,7 @@ def _box(scene: Scene, number: int) -> np.ndarray:
 
 
 def _alpha(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """(n,) observation angle: rotation_y less the direction in which the camera sees the box."""
+    """Return (n,) observation angles: rotation_y minus the angle of the ray to the box centre."""
     matrix = calibration.lidar_to_camera
     centres = boxes[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
     rotation_y = -boxes[:, 6] - np.pi / 2
@@ -74,11 +77,11 @@ def _alpha(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
 def _outline(scene: Scene, number: int, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
     """Return (4,) left, top, right, bottom of the object within the image, and of the whole object.
 
-    The edges of the mesh are clipped to the view as segments in homogeneous coordinates, so that
-    an object that reaches beside or behind the camera gets the box of the part within the image.
+    The edges of the mesh are clipped to the view as segments in homogeneous coordinates. An object
+    that extends beside or behind the camera thus gets the 2D box of its part within the image.
     """
     matrix = calibration.lidar_to_image
-    corners = scene.thing_vertices(number) @ matrix[:, :3].T + matrix[:, 3]
+    corners = scene.instance_vertices(number) @ matrix[:, :3].T + matrix[:, 3]
     last = np.array(IMAGE_SIZE) - 1.0
     if corners[:, 2].min() > _NEAR_M:
         whole = _bounds(corners)
@@ -93,14 +96,20 @@ def _outline(scene: Scene, number: int, calibration: Calibration) -> tuple[np.nd
 
 
 def _clip(edges: np.ndarray, planes: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return the parts of (n, 2, 3) segments where planes @ point >= offset, for every plane."""
+    """Return the parts of (n, 2, 3) segments where plane @ point >= offset for every plane.
+
+    Segments entirely outside a plane are dropped. If one end is outside, it is replaced by the
+    intersection with the plane. For example, x >= 0 clips the segment from (-1, 0, 1) to (3, 4, 1)
+    to the segment from (0, 1, 1) to (3, 4, 1).
+    """
     for plane, offset in zip(planes, offsets, strict=True):
-        side = edges @ plane - offset
-        edges, side = edges[(side >= 0).any(axis=1)], side[(side >= 0).any(axis=1)]
-        span = side[:, 0] - side[:, 1]
-        share = side[:, 0] / np.where(span == 0, 1, span)
-        cut = edges[:, 0] + share[:, None] * (edges[:, 1] - edges[:, 0])
-        edges = np.where((side < 0)[..., None], cut[:, None], edges)
+        distance = edges @ plane - offset
+        kept = (distance >= 0).any(axis=1)
+        edges, distance = edges[kept], distance[kept]
+        span = distance[:, 0] - distance[:, 1]
+        fraction = distance[:, 0] / np.where(span == 0, 1, span)
+        cut = edges[:, 0] + fraction[:, None] * (edges[:, 1] - edges[:, 0])
+        edges = np.where((distance < 0)[..., None], cut[:, None], edges)
     return edges
 
 
@@ -115,15 +124,15 @@ def _area(box_2d: np.ndarray) -> float:
     return float((box_2d[2] - box_2d[0]) * (box_2d[3] - box_2d[1]))
 
 
-def _visible_shares(
+def _visible_fractions(
     scene: Scene, view: View, rig: CameraRig, numbers: list[int], boxes_2d: np.ndarray
 ) -> np.ndarray:
-    """Return (n,) the share of each object's pixels in the image that nothing hides.
+    """Return (n,) the visible fraction of each object's pixels in the image.
 
-    Rays through some pixels of its 2D box, cast into a scene of the actors alone, tell which of
-    them the whole object would cover.
+    Rays through a grid of pixels in the object's 2D box are cast into a scene of the actors alone,
+    with all hits along each ray. An object covers the pixels with a hit on it, visible or not.
     """
-    actors = np.isin(scene.things, numbers)
+    actors = np.isin(scene.instances, numbers)
     rows = np.flatnonzero(actors)
     alone = Caster(scene.vertices, scene.triangles[rows])
     pixels = [_probe_pixels(box_2d) for box_2d in boxes_2d]
@@ -131,16 +140,16 @@ def _visible_shares(
     pixel = np.concatenate(pixels)
     ray, triangle = alone.all_hits(rig.rays(pixel))
     covered = np.zeros(len(pixel), dtype=bool)
-    covered[ray[scene.things[rows[triangle]] == owner[ray]]] = True
-    visible = view.things.ravel()[pixel] == owner
+    covered[ray[scene.instances[rows[triangle]] == owner[ray]]] = True
+    visible = view.instances.ravel()[pixel] == owner
     size = int(max(numbers)) + 1
-    whole = np.bincount(owner[covered | visible], minlength=size)
-    shown = np.bincount(owner[visible], minlength=size)
-    return np.asarray(shown[numbers] / np.maximum(whole[numbers], 1))
+    covered_count = np.bincount(owner[covered | visible], minlength=size)
+    visible_count = np.bincount(owner[visible], minlength=size)
+    return np.asarray(visible_count[numbers] / np.maximum(covered_count[numbers], 1))
 
 
 def _probe_pixels(box_2d: np.ndarray) -> np.ndarray:
-    """Indices of pixels on a grid over a 2D box."""
+    """Return the indices (row * width + column) of a grid of pixels in a 2D box."""
     left, top = np.ceil(box_2d[:2]).astype(int)
     right, bottom = np.floor(box_2d[2:]).astype(int)
     step = max(1, int(np.sqrt((right - left + 1) * (bottom - top + 1) / _PROBES)))

@@ -1,4 +1,4 @@
-"""What surfaces are made of: how they look to the LiDAR and, unless painted, to the camera."""
+"""Surface materials: their LiDAR properties, texture and default colour."""
 
 from collections.abc import Mapping
 from enum import IntEnum
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Material(IntEnum):
-    """The kinds of surface; the value is the row in the tables of this module."""
+    """The surface materials; the value is the row in the tables of this module."""
 
     ASPHALT = 0
     PAVEMENT = 1
@@ -33,8 +33,8 @@ class Material(IntEnum):
     WOOD = 21
 
 
-# (m, 4): LiDAR reflectivity 0 to 1, share of pulses lost at normal incidence, roughness of the
-# range in metres, share of the reflectivity that follows the brightness of the colour.
+# (m, 4): LiDAR reflectivity 0 to 1, fraction of pulses lost at normal incidence, additional range
+# noise in metres, fraction of the reflectivity that is proportional to the colour's brightness.
 _LIDAR = np.array(
     [
         (0.24, 0.02, 0.00, 0.2),  # ASPHALT
@@ -63,7 +63,7 @@ _LIDAR = np.array(
 )
 REFLECTIVITY, LOSS, ROUGHNESS_M, COLOUR_SHARE = _LIDAR.T.astype(np.float32)
 
-# (m, 2): strength of the texture in the image, and its pixels per metre.
+# (m, 2): contrast of the texture in the image, and its resolution in texels per metre.
 TEXTURE = np.array(
     [
         (0.10, 24),  # ASPHALT
@@ -123,7 +123,7 @@ _COLOURS = np.array(
 
 
 def palette(colours: Mapping[Material, np.ndarray] | None = None) -> np.ndarray:
-    """Return (m, 3) float32 RGB of every material: the usual colours, some of them replaced."""
+    """Return the (m, 3) float32 RGB of all materials: the defaults, replaced by `colours`."""
     table = _COLOURS.copy()
     for material, colour in (colours or {}).items():
         table[material] = colour

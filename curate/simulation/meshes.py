@@ -1,4 +1,4 @@
-"""Triangle meshes composed of boxes, cylinders, ellipsoids and rings."""
+"""Triangle meshes built from boxes, cylinders, ellipsoids and rings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,11 +13,11 @@ from curate.simulation.materials import Material
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles with a material each; their corners turn counter-clockwise seen from outside.
+    """Triangles with a material each; corners are counter-clockwise seen from outside.
 
     Attributes:
-        vertices: (n, 3) float32, metres.
-        triangles: (m, 3) int64, rows of `vertices`.
+        vertices: (n, 3) float32, in metres.
+        triangles: (m, 3) int64 rows of `vertices`.
         materials: (m,) uint8, see `Material`.
     """
 
@@ -32,24 +32,24 @@ class Mesh:
 
     @property
     def size(self) -> np.ndarray:
-        """(3,) extent along x, y and z."""
+        """The (3,) extent along x, y and z in metres."""
         low, high = self.bounds
         return np.asarray(high - low)
 
     def standing_on_origin(self) -> Self:
-        """Return the mesh moved so that its bounds are centred in x and y and begin at z = 0."""
+        """Return the mesh, moved so that its bounds are centred in x and y and start at z = 0."""
         low, high = self.bounds
         base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
         return replace(self, vertices=(self.vertices - base).astype(np.float32))
 
     def moved(self, rotation: np.ndarray, translation: ArrayLike) -> Self:
-        """Return the mesh turned by a (3, 3) rotation, then shifted."""
+        """Return the mesh, rotated by a (3, 3) matrix and then translated."""
         vertices = self.vertices @ rotation.T.astype(np.float32)
         return replace(self, vertices=vertices + np.asarray(translation, dtype=np.float32))
 
 
 def merge(parts: Sequence[Mesh]) -> Mesh:
-    """Return all parts as one mesh."""
+    """Join several meshes into one."""
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
@@ -61,13 +61,13 @@ def merge(parts: Sequence[Mesh]) -> Mesh:
 
 
 def rotation_z(angle_rad: float) -> np.ndarray:
-    """Return (3, 3) rotation about z, counter-clockwise."""
+    """Return the (3, 3) matrix of a counter-clockwise rotation about z."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
 def box(centre: ArrayLike, size: ArrayLike, material: Material) -> Mesh:
-    """Return an axis-aligned box."""
+    """Return an axis-aligned box; `size` is its extent along x, y and z in metres."""
     return frustum(centre, size, (1.0, 1.0), material)
 
 
@@ -79,7 +79,7 @@ def frustum(
     *,
     top_shift: float = 0.0,
 ) -> Mesh:
-    """Return a box whose top is scaled in x and y, and shifted along x by `top_shift` metres."""
+    """Return a box with its top scaled in x and y, and shifted along x by `top_shift` metres."""
     vertices, triangles = _unit_box()
     shaped = vertices.copy()
     top = shaped[:, 2] > 0
@@ -105,7 +105,7 @@ def cylinder(
     end_radius: float | None = None,
     sides: int = 8,
 ) -> Mesh:
-    """Return a cylinder, or a cone's frustum where `end_radius` differs, from `start` to `end`."""
+    """Return a cylinder from `start` to `end`, or a truncated cone if `end_radius` is given."""
     vertices, triangles = _unit_cylinder(sides)
     origin = np.asarray(start, dtype=np.float64)
     axis = np.asarray(end, dtype=np.float64) - origin
@@ -129,7 +129,7 @@ def ring(
     *,
     sides: int = 14,
 ) -> Mesh:
-    """Return a wheel rim in the x-z plane: outer `radius`, radial `thickness`, `width` along y."""
+    """Return a ring in the x-z plane with an outer `radius`, a radial `thickness` and a `width`."""
     angles = np.arange(sides) * 2 * np.pi / sides
     circle = np.stack([np.cos(angles), np.zeros(sides), np.sin(angles)], axis=1)
     side = np.array([0.0, width / 2, 0.0])
@@ -147,25 +147,25 @@ def ring(
 
 
 def _mesh(vertices: np.ndarray, triangles: np.ndarray, material: Material) -> Mesh:
-    """One part of a single material."""
+    """Return a mesh of a single material."""
     return Mesh(vertices, triangles, np.full(len(triangles), material, dtype=np.uint8))
 
 
 def _perpendicular(axis: np.ndarray) -> np.ndarray:
-    """Return a unit vector at right angles to `axis`."""
+    """Return a unit vector perpendicular to `axis`."""
     helper = np.eye(3)[np.argmin(np.abs(axis))]
     across = np.cross(axis, helper)
     return np.asarray(across / np.linalg.norm(across))
 
 
 def _split(quads: np.ndarray) -> np.ndarray:
-    """Return (n, 4) quadrilaterals as (2n, 3) triangles."""
+    """Split (n, 4) quadrilaterals into (2n, 3) triangles."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
 @cache
 def _unit_box() -> tuple[np.ndarray, np.ndarray]:
-    """Corners at +-0.5 and the 12 triangles."""
+    """Return the vertices and triangles of a box with corners at +-0.5."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     quads = np.array(
         [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
@@ -175,7 +175,7 @@ def _unit_box() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _unit_cylinder(sides: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radius 1 about the z axis from 0 to 1, with caps."""
+    """Return a closed cylinder of radius 1 about the z axis, from z = 0 to 1."""
     angles = np.arange(sides) * 2 * np.pi / sides
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     lower = np.column_stack([circle, np.zeros(sides)])
@@ -192,7 +192,7 @@ def _unit_cylinder(sides: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _unit_sphere(sides: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radius 1 about the origin, by longitude and latitude."""
+    """Return a sphere of radius 1 about the origin, divided by longitude and latitude."""
     bands = max(3, sides // 2)
     latitudes = np.linspace(-np.pi / 2, np.pi / 2, bands + 1)[1:-1]
     angles = np.arange(sides) * 2 * np.pi / sides

@@ -1,8 +1,9 @@
-"""The only module that imports open3d, and the system libraries that its wheel leaves out.
+"""Import of open3d, with the system libraries that its wheel does not contain.
 
-The wheel links against `libusb-1.0.so.0`, which a minimal Linux system lacks. The package
-`libusb-package` contains it; loaded with global visibility before the import, it satisfies the
-linker. The other libraries come from the system, see `system_libraries`.
+No other module imports open3d. Its wheel links against `libusb-1.0.so.0`, which a minimal Linux
+system does not have. The package `libusb-package` contains it; if it is loaded with global
+visibility before the import of open3d, the linker finds it. The other libraries must be installed
+on the system, see `system_libraries`.
 """
 
 import ctypes
@@ -16,7 +17,7 @@ _LIBUSB = "libusb-1.0.so.0"
 
 
 def load() -> ModuleType:
-    """Return the module `open3d`, imported.
+    """Import and return the module `open3d`.
 
     Raises:
         ConfigError: if open3d is not installed, or a system library that it needs is missing.
@@ -28,15 +29,15 @@ def load() -> ModuleType:
     except (ImportError, OSError) as error:
         raise ConfigError(
             f"simulation needs open3d, which cannot be loaded: {_remedy(error)}. "
-            "Everything on your own data works without it"
+            "Work on your own data does not need it"
         ) from error
     return open3d
 
 
 def _provide_libusb() -> None:
-    """Load `libusb-1.0.so.0`: the system's own if there is one, else the one of the package.
+    """Load `libusb-1.0.so.0` from the system, or else from `libusb-package`.
 
-    If neither can be loaded, the import of open3d that follows reports it.
+    If neither can be loaded, the import of open3d that follows reports the error.
     """
     try:
         ctypes.CDLL(_LIBUSB, mode=ctypes.RTLD_GLOBAL)
@@ -50,7 +51,7 @@ def _provide_libusb() -> None:
 
 
 def _remedy(error: ImportError | OSError) -> str:
-    """Return what is missing and the command that installs it, in one line."""
+    """Return one line that says what is missing and which command installs it."""
     if isinstance(error, ModuleNotFoundError) and error.name == "open3d":
         return "it is not installed; run `pip install open3d-cpu` (or `pip install open3d`)"
     missing = missing_libraries()

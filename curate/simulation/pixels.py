@@ -1,8 +1,15 @@
-"""What every pixel sees, at less than half of the rays: every second pixel, then where they differ.
+"""Ray casting of all pixels with less than half of the rays.
 
-Pixels with even row and column are cast first. One between them that lies among equals (the same
-triangle on all sides) needs no ray of its own. What is thinner than two pixels may so be
-missed in places, as in any image without anti-aliasing.
+Pixels with even row and column (A) are cast first. Another pixel (.) gets no ray of its own if its
+neighbours A hit the same triangle; it takes that triangle and their mean distance. The remaining
+pixels are cast in a second step:
+
+    A . A . A
+    . . . . .
+    A . A . A
+
+Parts of objects that are thinner than two pixels may be missed, as in any image without
+anti-aliasing.
 """
 
 import numpy as np
@@ -18,7 +25,7 @@ _GRID = (np.arange(0, _HEIGHT, _STEP)[:, None] * _WIDTH + np.arange(0, _WIDTH, _
 
 
 def cast_pixels(caster: Caster, rig: CameraRig) -> Hits:
-    """Return the first hit of each pixel's ray, row by row."""
+    """Return the first hit of each pixel's ray, in row-major order."""
     distance = np.empty(_WIDTH * _HEIGHT, dtype=np.float32)
     triangle = np.full(_WIDTH * _HEIGHT, _UNDECIDED, dtype=np.int32)
     coarse = caster.first_hits(rig.rays(_GRID))
@@ -32,7 +39,7 @@ def cast_pixels(caster: Caster, rig: CameraRig) -> Hits:
 
 @njit(cache=True, nogil=True)
 def _fill_between(distance: np.ndarray, triangle: np.ndarray) -> None:
-    """Return pixels between equal neighbours their triangle and their mean distance."""
+    """Fill each pixel between equal neighbours with their triangle and their mean distance."""
     height, width = triangle.shape
     for row in range(height):
         above, below = row - row % 2, row + row % 2

@@ -1,4 +1,4 @@
-"""Who and what stands along a street: traffic, parked rows, people, clutter, trees, buildings."""
+"""Random placement of objects along a street: traffic, parked cars, people, clutter, buildings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,11 +20,11 @@ class Placement:
 
     Attributes:
         kind: a category ("Car", ...) or a kind of scenery ("tree", ...).
-        mesh: facing +x, standing on z = 0.
-        position: (3,) where its origin stands in the LiDAR frame, metres.
-        yaw_rad: counter-clockwise from the LiDAR's x axis.
-        scale: (3,) along its own axes.
-        palette: (m, 3) RGB of its materials.
+        mesh: the mesh, which faces +x and stands on z = 0.
+        position: (3,) position of the mesh's origin in the LiDAR frame, in metres.
+        yaw_rad: yaw, counter-clockwise from the LiDAR's x axis.
+        scale: (3,) scale along the axes of the mesh.
+        palette: (m, 3) RGB of the materials.
     """
 
     kind: str
@@ -37,12 +37,12 @@ class Placement:
 
 @dataclass
 class Population:
-    """Fills a street, keeping things apart.
+    """Places objects on a street at random, without overlaps.
 
     Attributes:
-        street: to be filled.
-        generator: the source of all draws.
-        placements: what stands there so far.
+        street: the street to fill.
+        generator: the random generator.
+        placements: the objects placed so far.
     """
 
     street: Street
@@ -53,7 +53,7 @@ class Population:
     )
 
     def fill(self) -> Sequence[Placement]:
-        """Return all placements of a random scene."""
+        """Place all objects and return them."""
         self._traffic()
         self._crossing_traffic()
         self._people()
@@ -66,7 +66,7 @@ class Population:
         return self.placements
 
     def _traffic(self) -> None:
-        """Cars in the lanes, with their own spacing in each lane."""
+        """Place cars in the lanes, with a random density for each lane."""
         street, generator = self.street, self.generator
         for lane in range(2 * street.lanes):
             onward = lane < street.lanes
@@ -77,11 +77,11 @@ class Population:
                 turned = generator.random() < 0.05
                 swerve = generator.uniform(-0.9, 0.9) if turned else generator.normal(0, 0.03)
                 yaw = (0.0 if onward else np.pi) + swerve
-                self._stand("Car", s, d + generator.normal(0, 0.25), yaw)
+                self._place("Car", s, d + generator.normal(0, 0.25), yaw)
                 s += 5.5 + generator.exponential(gap)
 
     def _crossing_traffic(self) -> None:
-        """Cars, people and cyclists on the crossing street."""
+        """Place cars and cyclists on the crossing street, if there is one."""
         street, generator = self.street, self.generator
         if street.crossing_s is None:
             return
@@ -89,13 +89,13 @@ class Population:
             s = street.crossing_s - side * street.crossing_half_m / 2
             for _ in range(generator.poisson(0.8)):
                 d = generator.uniform(-30, 30)
-                self._stand("Car", s, d, side * np.pi / 2 + generator.normal(0, 0.05))
+                self._place("Car", s, d, side * np.pi / 2 + generator.normal(0, 0.05))
             for _ in range(generator.poisson(0.35)):
                 d = generator.uniform(-20, 20)
-                self._stand("Cyclist", s + side * 1.2, d, side * np.pi / 2)
+                self._place("Cyclist", s + side * 1.2, d, side * np.pi / 2)
 
     def _people(self) -> None:
-        """Pedestrians, alone or in groups, mostly on the pavements."""
+        """Place pedestrians, alone or in groups, mostly on the pavements."""
         street, generator = self.street, self.generator
         for _ in range(generator.poisson(generator.choice([1.5, 3.2, 5.6]))):
             s = 5 + 70 * generator.random() ** 1.4
@@ -113,10 +113,10 @@ class Population:
                 yaw = generator.uniform(-np.pi, np.pi)
             for member in range(generator.choice([1, 2, 3], p=[0.68, 0.24, 0.08])):
                 shift = generator.normal(0, 0.2), generator.uniform(0.6, 0.85) * member
-                self._stand("Pedestrian", s + shift[0], d + shift[1], yaw, margin=0.0)
+                self._place("Pedestrian", s + shift[0], d + shift[1], yaw, margin=0.0)
 
     def _riders(self) -> None:
-        """Cyclists along the edge of the lanes, on the pavements, or crossing."""
+        """Place cyclists at the edge of the lanes, on the pavements, or crossing the street."""
         street, generator = self.street, self.generator
         for _ in range(generator.poisson(generator.choice([1.0, 2.6, 4.2]))):
             s = 5 + 65 * generator.random() ** 1.3
@@ -132,10 +132,10 @@ class Population:
             else:
                 d = generator.uniform(street.right_d - 2, street.left_d + 2)
                 yaw = generator.choice([-1, 1]) * np.pi / 2 + generator.normal(0, 0.3)
-            self._stand("Cyclist", s, d, yaw)
+            self._place("Cyclist", s, d, yaw)
 
     def _parked(self, side: int) -> None:
-        """A row along the kerb: cars, clutter of their size, and gaps."""
+        """Place a row of parked cars, car-sized clutter and gaps along the kerb."""
         street, generator = self.street, self.generator
         if (street.parking_left_m if side > 0 else street.parking_right_m) == 0:
             return
@@ -149,13 +149,13 @@ class Population:
             draw = generator.random()
             if not street.in_crossing(s, 3.0):
                 if draw < full:
-                    self._stand("Car", s, d, yaw)
+                    self._place("Car", s, d, yaw)
                 elif draw < full + 0.09:
-                    self._stand(str(generator.choice(scenery.CAR_SIZED)), s, d, yaw)
+                    self._place(str(generator.choice(scenery.CAR_SIZED)), s, d, yaw)
             s += generator.uniform(5.2, 6.6)
 
     def _pavement_clutter(self, side: int) -> None:
-        """Things of the size of people and cyclists between the kerb and the yards."""
+        """Place person-sized and cyclist-sized clutter, trees and poles on the pavement."""
         street, generator = self.street, self.generator
         for kinds, rate in ((scenery.PERSON_SIZED, 2.6), (scenery.CYCLIST_SIZED, 0.7)):
             for _ in range(generator.poisson(rate)):
@@ -164,13 +164,13 @@ class Population:
                     continue
                 d = self._beside(side, generator.choice([0.35, 0.6, 0.9]) * street.pavement_m)
                 yaw = generator.choice([0.0, np.pi / 2, np.pi, -np.pi / 2])
-                self._stand(str(generator.choice(kinds)), s, d, yaw + generator.normal(0, 0.15))
+                self._place(str(generator.choice(kinds)), s, d, yaw + generator.normal(0, 0.15))
         if generator.random() < 0.7:
             self._row(side, "tree", 0.5, generator.uniform(9, 22))
         self._row(side, "pole", 0.4, generator.uniform(18, 40))
 
     def _yard(self, side: int) -> None:
-        """Between the pavement and the buildings: parked cars, hedges, walls, trees."""
+        """Place cars, clutter, walls and trees between the pavement and the buildings."""
         street, generator = self.street, self.generator
         for kinds, rate in (
             (("Car",), 0.8),
@@ -186,10 +186,10 @@ class Population:
                 kind = str(generator.choice(kinds))
                 quarter = 0 if kind == "wall" else generator.integers(4)
                 yaw = quarter * np.pi / 2 + generator.normal(0, 0.1)
-                self._stand(kind, s, self._beside(side, inward), yaw)
+                self._place(kind, s, self._beside(side, inward), yaw)
 
     def _buildings(self, side: int) -> None:
-        """A row of fronts with gaps."""
+        """Place a row of buildings with gaps."""
         street, generator = self.street, self.generator
         s = generator.uniform(-6, 6)
         d = self._beside(side, street.pavement_m + street.yard_m)
@@ -197,25 +197,25 @@ class Population:
             back = generator.uniform(0, 2.0)
             yaw = 0.0 if side > 0 else np.pi
             if generator.random() < 0.85 and not street.in_crossing(s, 9.0):
-                self._stand("building", s, d + side * back, yaw, apart=False)
+                self._place("building", s, d + side * back, yaw, apart=False)
             s += generator.uniform(14, 22)
 
     def _row(self, side: int, kind: str, inward: float, spacing: float) -> None:
-        """Evenly spaced trees or poles along the kerb."""
+        """Place evenly spaced trees or poles along the kerb."""
         s = self.generator.uniform(4, 4 + spacing)
         while s < _REACH_M:
             if not self.street.in_crossing(s, 1.0):
-                self._stand(kind, s, self._beside(side, inward), -side * np.pi / 2)
+                self._place(kind, s, self._beside(side, inward), -side * np.pi / 2)
             s += spacing
 
     def _beside(self, side: int, outward: float) -> float:
-        """Road coordinate d, `outward` metres beyond the kerb of a side (+1 left, -1 right)."""
+        """Return the road coordinate d at `outward` metres beyond a kerb (+1 left, -1 right)."""
         return self.street.left_d + outward if side > 0 else self.street.right_d - outward
 
-    def _stand(
+    def _place(
         self, kind: str, s: float, d: float, yaw: float, *, margin: float = 0.25, apart: bool = True
     ) -> None:
-        """Places a random mesh of the kind, unless it is out of view or in another's place."""
+        """Place a random mesh of a kind, unless it is out of view or overlaps another object."""
         generator = self.generator
         mesh = self._mesh(kind)
         scale = generator.uniform(0.93, 1.03) * generator.uniform(0.97, 1.03, size=3)
@@ -225,7 +225,7 @@ class Population:
         if not _in_view(position, float(extent.max())):
             return
         discs = _footprint(position, yaw_rad, extent, margin)
-        if apart and self._taken(discs):
+        if apart and self._overlaps(discs):
             return
         if apart and kind != "tree":
             self._discs = np.concatenate([self._discs, discs])
@@ -238,20 +238,20 @@ class Population:
             self.placements.append(_shadow(position, yaw_rad, extent))
 
     def _mesh(self, kind: str) -> Mesh:
-        """One of the meshes of a kind."""
+        """Return a random mesh of a kind."""
         if kind in actors.VARIANTS:
             variant = int(self.generator.integers(actors.VARIANTS[kind]))
             return actors.actor_mesh(kind, variant)
         return scenery.scenery_mesh(kind, int(self.generator.integers(scenery.VARIANTS)))
 
-    def _taken(self, discs: np.ndarray) -> bool:
-        """Return whether any (n, 3) disc overlaps one that is already there."""
-        apart = np.linalg.norm(self._discs[:, None, :2] - discs[None, :, :2], axis=2)
-        return bool((apart < self._discs[:, None, 2] + discs[None, :, 2]).any())
+    def _overlaps(self, discs: np.ndarray) -> bool:
+        """Return whether any of (n, 3) discs x, y, radius overlaps a disc of a placed object."""
+        distance = np.linalg.norm(self._discs[:, None, :2] - discs[None, :, :2], axis=2)
+        return bool((distance < self._discs[:, None, 2] + discs[None, :, 2]).any())
 
 
 def _shadow(position: np.ndarray, yaw_rad: float, extent: np.ndarray) -> Placement:
-    """Return the dark patch under a thing."""
+    """Return the dark patch on the ground under an object."""
     return Placement(
         "shadow",
         scenery.shadow_mesh(),
@@ -263,7 +263,7 @@ def _shadow(position: np.ndarray, yaw_rad: float, extent: np.ndarray) -> Placeme
 
 
 def _in_view(position: np.ndarray, extent: float) -> bool:
-    """Return whether a thing may be seen by the sensors' sector."""
+    """Return whether an object may be within the sensors' field of view."""
     distance = float(np.hypot(position[0], position[1]))
     if distance > _REACH_M + extent:
         return False
@@ -274,7 +274,11 @@ def _in_view(position: np.ndarray, extent: float) -> bool:
 def _footprint(
     position: np.ndarray, yaw_rad: float, extent: np.ndarray, margin: float
 ) -> np.ndarray:
-    """Return (n, 3) discs x, y, radius that cover a rectangle of `extent` (length, width)."""
+    """Return (n, 3) discs x, y, radius along the longer side of a rectangle (length, width).
+
+    They cover it approximately. For example, a car of 4 x 2 m gets two discs with a radius of 1 m
+    plus the margin, centred 1 m in front of and 1 m behind the centre of the car.
+    """
     long, short = float(extent.max()), float(extent.min())
     radius = short / 2 + margin
     reach = max(0.0, (long - short) / 2)

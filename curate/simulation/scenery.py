@@ -1,7 +1,8 @@
-"""What is no actor: trees, poles, buildings, and clutter of the size of cars and people.
+"""Meshes of scenery: trees, poles, buildings, and clutter of the size of cars and people.
 
-In the point cloud a container or a dense hedge resembles a car, a bin or a clipped shrub a
-pedestrian and a rack of bicycles a cyclist; the image tells them apart.
+The clutter makes detection realistic. In the point cloud, a container or a dense hedge resembles a
+car, a bin or a clipped shrub resembles a pedestrian, and a rack of bicycles resembles a cyclist.
+The image shows the difference.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from curate.simulation.meshes import (
 )
 
 VARIANTS = 24
-"""How many different meshes there are of each kind of scenery."""
+"""Number of different meshes of each kind of scenery."""
 
 CAR_SIZED = ("container", "hedge", "trailer", "stack")
 PERSON_SIZED = ("bin", "shrub", "column", "sign", "cabinet")
@@ -32,14 +33,14 @@ CLUTTER = CAR_SIZED + PERSON_SIZED + CYCLIST_SIZED
 
 @cache
 def scenery_mesh(kind: str, variant: int) -> Mesh:
-    """Return the mesh number `variant` of a kind of scenery, the same in every process."""
+    """Return mesh number `variant` of a kind of scenery; it is the same in every process."""
     stream = list(_BUILDERS).index(kind)
     return _BUILDERS[kind](np.random.default_rng([100 + stream, variant]))
 
 
 @cache
 def shadow_mesh() -> Mesh:
-    """Return a flat octagon of length and width 1."""
+    """Return a flat octagon of length and width 1, the shape of a shadow."""
     blunt = np.array([[0.5, 0.3], [0.3, 0.5], [-0.3, 0.5], [-0.5, 0.3]])
     outline = np.concatenate([blunt, -blunt])
     fan = np.arange(1, len(outline) - 1)
@@ -51,7 +52,7 @@ def shadow_mesh() -> Mesh:
 
 
 def scenery_colours(kind: str, generator: np.random.Generator) -> dict[Material, np.ndarray]:
-    """Colours for one piece of scenery."""
+    """Return random colours for one piece of scenery."""
     green = np.array([0.20, 0.33, 0.12]) * generator.uniform(0.6, 1.3, size=3)
     colours = {Material.FOLIAGE: green, Material.BARK: np.full(3, generator.uniform(0.15, 0.35))}
     if kind == "building":
@@ -108,7 +109,7 @@ def _pole(generator: np.random.Generator) -> Mesh:
 
 
 def _building(generator: np.random.Generator) -> Mesh:
-    """Return a block with a flat or a gabled roof; its front lies at y = 0, it extends to y > 0."""
+    """Return a building with a flat or gabled roof and its front at y = 0; it extends to y > 0."""
     length, depth = generator.uniform(8, 20), generator.uniform(7, 12)
     height = generator.uniform(4, 14)
     parts = [box((0, depth / 2, height / 2 - 0.5), (length, depth, height + 1), Material.WALL)]
@@ -117,7 +118,7 @@ def _building(generator: np.random.Generator) -> Mesh:
         roof_centre = (0, depth / 2, height + rise / 2 - 0.01)
         size = (length + 0.6, depth + 0.6, rise)
         parts.append(frustum(roof_centre, size, (1.0, 0.05), Material.ROOF))
-    for _ in range(generator.integers(0, 3)):  # bays and porches break the plane
+    for _ in range(generator.integers(0, 3)):  # bays and porches in front of the wall
         x = generator.uniform(-0.4, 0.4) * length
         tall = generator.uniform(2.2, max(2.3, height * 0.8))
         wide = generator.uniform(1.2, 3)
@@ -144,7 +145,7 @@ def _container(generator: np.random.Generator) -> Mesh:
 
 
 def _hedge(generator: np.random.Generator) -> Mesh:
-    """Return a dense, clipped hedge of the outline of a car."""
+    """Return a dense, clipped hedge with the outline of a car."""
     length, width, height = generator.normal((3.9, 1.65, 1.5), (0.5, 0.15, 0.15))
     parts = [
         frustum(
@@ -162,7 +163,7 @@ def _hedge(generator: np.random.Generator) -> Mesh:
 
 
 def _trailer(generator: np.random.Generator) -> Mesh:
-    """Return a covered cart: a body on a dark base, with a canvas cover set back like a cabin."""
+    """Return a trailer: a body on wheels with a canvas cover that is shaped like a cabin."""
     length, width, height = generator.normal((3.7, 1.7, 1.55), (0.35, 0.1, 0.12))
     return merge(
         [
@@ -183,7 +184,7 @@ def _trailer(generator: np.random.Generator) -> Mesh:
 
 
 def _stack(generator: np.random.Generator) -> Mesh:
-    """Stacked crates and boards."""
+    """Return a stack of crates and boards."""
     parts, level = [], 0.0
     footprint = generator.normal((3.6, 1.6), (0.4, 0.15))
     for _ in range(generator.integers(2, 5)):
@@ -210,7 +211,7 @@ def _bin(generator: np.random.Generator) -> Mesh:
 
 
 def _shrub(generator: np.random.Generator) -> Mesh:
-    """Return a clipped shrub or a young tree in a sleeve: a slim body with a round top."""
+    """Return a clipped shrub or a small tree: a slim body with a round top."""
     height, radius = generator.normal((1.7, 0.3), (0.15, 0.05))
     radii = np.array([radius, radius, 0.34 * height])
     parts = [
@@ -247,7 +248,7 @@ def _sign(generator: np.random.Generator) -> Mesh:
 
 
 def _cabinet(generator: np.random.Generator) -> Mesh:
-    """Return a meter, a parcel box or a cable cabinet."""
+    """Return a meter, parcel or cable cabinet."""
     size = generator.normal((0.45, 0.6, 1.45), (0.08, 0.12, 0.2))
     return merge(
         [
@@ -263,7 +264,7 @@ def _cabinet(generator: np.random.Generator) -> Mesh:
 
 
 def _rack(generator: np.random.Generator) -> Mesh:
-    """Bicycles without riders, one to four side by side, some with a cover or a box."""
+    """Return one to four bicycles side by side without riders, in some variants with a shrub."""
     parts = []
     for index in range(generator.integers(1, 5)):
         tilt = rotation_z(generator.normal(0, 0.08))
@@ -274,7 +275,7 @@ def _rack(generator: np.random.Generator) -> Mesh:
 
 
 def _scooter(generator: np.random.Generator) -> Mesh:
-    """Return a motor scooter under a canvas."""
+    """Return a motor scooter under a canvas cover."""
     height = generator.normal(1.4, 0.15)
     return merge(
         [

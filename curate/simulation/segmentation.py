@@ -1,12 +1,12 @@
-"""Trains the small segmentation model that the project ships for simulated images.
+"""Training of the small segmentation model that ships with curate, for simulated images.
 
     python -m curate.simulation.segmentation --out curate/segmenters/models/simulated.onnx
 
-It simulates frames under seeds of its own, which no other part of the project uses, trains an
-encoder-decoder with skip connections (after U-Net, Ronneberger et al., MICCAI 2015) on their images
-at half resolution, measures the intersection over union on frames of another seed, and exports to
-ONNX: uint8 RGB [1, 188, 621, 3] in, class ids [1, 188, 621] out (0 background, 1 car,
-2 pedestrian, 3 cyclist).
+It simulates frames with seeds that no other part of the project uses, and trains an encoder-decoder
+with skip connections (after U-Net, Ronneberger et al., MICCAI 2015) on the images at half
+resolution. It then measures the intersection over union on frames of another seed and exports the
+model to ONNX. Input: uint8 RGB [1, 188, 621, 3]. Output: class ids [1, 188, 621] (0 background,
+1 car, 2 pedestrian, 3 cyclist).
 """
 
 import argparse
@@ -30,27 +30,27 @@ from curate.simulation.segmentation_graph import build_graph
 _log = logging.getLogger(__name__)
 
 TRAIN_SEED, TEST_SEED = 730_001, 730_002
-"""Seeds of the simulations that the model learns from and is measured on."""
+"""Seeds of the simulated frames for training and for testing."""
 
 INPUT_SIZE = (621, 188)
 _CLASSES = len(SEMANTIC_CLASSES) + 1
 _CROP_COLUMNS = 320
-# Pedestrians and cyclists cover few pixels: background, car, pedestrian, cyclist.
+# Background, car, pedestrian, cyclist. Pedestrians and cyclists cover few pixels.
 _CLASS_WEIGHTS = (0.7, 1.0, 1.6, 1.6)
 
 
 @dataclass(frozen=True)
 class SegmentationSettings:
-    """How the shipped model was trained.
+    """Settings of the training; the defaults are those of the shipped model.
 
     Attributes:
-        frames: simulated images to learn from.
-        test_frames: images to measure on.
-        steps: of the optimiser.
+        frames: number of simulated images for training.
+        test_frames: number of simulated images for testing.
+        steps: optimiser steps.
         batch_size: crops per step.
-        learning_rate: the peak of a one-cycle schedule.
-        threads: of torch, and processes of the simulation.
-        seed: of the weights, the crops and the augmentation.
+        learning_rate: peak of the one-cycle schedule.
+        threads: number of torch threads, and of simulation processes.
+        seed: seed of the weights, the crops and the augmentation.
     """
 
     frames: int = 320
@@ -63,7 +63,10 @@ class SegmentationSettings:
 
 
 class SegmentationNet(nn.Module):
-    """Four levels at 1/1, 1/2, 1/4 and 1/8 of the input, the deepest dilated; 0.2 M parameters."""
+    """A U-Net of four levels (1/1, 1/2, 1/4 and 1/8 of the input) with 0.2 M parameters.
+
+    The deepest level has dilated convolutions.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -79,7 +82,7 @@ class SegmentationNet(nn.Module):
         self.mix_fine = _convolution(16, 16)
         self.fine_to_sharp = nn.Conv2d(16, 8, 1)
         self.mix_sharp = _convolution(8, 8)
-        self.answer = nn.Conv2d(8, _CLASSES, 1)
+        self.head = nn.Conv2d(8, _CLASSES, 1)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Return (b, 4, h, w) logits of (b, h, w, 3) uint8 RGB images."""
@@ -90,12 +93,12 @@ class SegmentationNet(nn.Module):
         middle = self.mix_middle(middle + _upsample(deep, middle.shape[2:]))
         fine = self.mix_fine(fine + _upsample(self.middle_to_fine(middle), fine.shape[2:]))
         sharp = self.mix_sharp(sharp + _upsample(self.fine_to_sharp(fine), sharp.shape[2:]))
-        logits: torch.Tensor = self.answer(sharp)
+        logits: torch.Tensor = self.head(sharp)
         return logits
 
 
 class _Residual(nn.Module):
-    """Two convolutions around which the input is carried."""
+    """A residual block of two convolutions."""
 
     def __init__(self, channels: int, dilation: int) -> None:
         super().__init__()
@@ -104,22 +107,22 @@ class _Residual(nn.Module):
         )
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Features of the same shape."""
+        """Return features of the same shape."""
         out: torch.Tensor = features + self.body(features)
         return out
 
 
 def train_segmentation(out: Path, settings: SegmentationSettings) -> dict[str, float]:
-    """Train the model, writes it to `out`, and returns its intersection over union by class."""
+    """Train the model, write it to `out`, and return its intersection over union by class."""
     torch.manual_seed(settings.seed)
     torch.set_num_threads(settings.threads)
     start = time.perf_counter()
-    images, truth, _ = _simulated(TRAIN_SEED, settings.frames, settings.threads)
+    images, truth, _ = _simulate_images(TRAIN_SEED, settings.frames, settings.threads)
     _log.info("simulated %d images in %.0f s", len(images), time.perf_counter() - start)
     net = _fit(images, truth, settings)
-    _log.info("trained for %d steps, %.0f s in all", settings.steps, time.perf_counter() - start)
-    replace_file(out, _exported(net))
-    images, _, full_truth = _simulated(TEST_SEED, settings.test_frames, settings.threads)
+    _log.info("trained for %d steps, %.0f s in total", settings.steps, time.perf_counter() - start)
+    replace_file(out, _export(net))
+    images, _, full_truth = _simulate_images(TEST_SEED, settings.test_frames, settings.threads)
     scores = _intersection_over_union(net, images, full_truth)
     for name, score in scores.items():
         _log.info("IoU of %s: %.3f", name, score)
@@ -128,7 +131,7 @@ def train_segmentation(out: Path, settings: SegmentationSettings) -> dict[str, f
 
 
 def _convolution(inputs: int, outputs: int, *, stride: int = 1, dilation: int = 1) -> nn.Module:
-    """3 x 3 convolution, normalisation, rectification."""
+    """Return a 3 x 3 convolution with batch norm and ReLU."""
     return nn.Sequential(
         nn.Conv2d(
             inputs, outputs, 3, stride=stride, padding=dilation, dilation=dilation, bias=False
@@ -139,14 +142,17 @@ def _convolution(inputs: int, outputs: int, *, stride: int = 1, dilation: int = 
 
 
 def _upsample(features: torch.Tensor, size: torch.Size) -> torch.Tensor:
-    """Bilinear interpolation to (height, width)."""
+    """Interpolate features bilinearly to (height, width)."""
     return functional.interpolate(features, size=tuple(size), mode="bilinear", align_corners=False)
 
 
-def _simulated(
+def _simulate_images(
     seed: int, frames: int, workers: int
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Images (n, h, w, 3) and classes (n, h, w) in the model's size, and classes in full size."""
+    """Return (n, h, w, 3) images and (n, h, w) class ids in the model's size.
+
+    Also return the class ids in full size.
+    """
     with tempfile.TemporaryDirectory() as folder:
         simulate(Path(folder), frames, seed, val_frames=0, workers=workers)
         images, truth, full = [], [], []
@@ -182,15 +188,15 @@ def _fit(images: np.ndarray, truth: np.ndarray, settings: SegmentationSettings) 
 
 
 def _dice_loss(logits: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
-    """1 - the soft Dice coefficient, mean over the classes but the background.
+    """Return 1 minus the soft Dice coefficient, averaged over the classes except background.
 
-    Source: Milletari et al., "V-Net", 3DV 2016. It weighs each class by its overlap, however few
-    pixels it covers.
+    Source: Milletari et al., "V-Net", 3DV 2016. Classes count equally, even if they cover few
+    pixels.
     """
-    found = logits.softmax(dim=1)[:, 1:]
+    predicted = logits.softmax(dim=1)[:, 1:]
     truth = functional.one_hot(targets, _CLASSES).permute(0, 3, 1, 2)[:, 1:].float()
-    common = (found * truth).sum(dim=(0, 2, 3))
-    total = found.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3))
+    common = (predicted * truth).sum(dim=(0, 2, 3))
+    total = predicted.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3))
     dice: torch.Tensor = (2 * common + 1) / (total + 1)
     return (1 - dice).mean()
 
@@ -198,7 +204,7 @@ def _dice_loss(logits: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
 def _batch(
     images: np.ndarray, truth: np.ndarray, size: int, generator: np.random.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Random crops, mirrored and with other brightness, contrast and colour balance."""
+    """Return random crops and their classes, with random mirroring, brightness and colour gain."""
     crops, targets = [], []
     for index in generator.integers(len(images), size=size):
         left = generator.integers(images.shape[2] - _CROP_COLUMNS + 1)
@@ -214,29 +220,29 @@ def _batch(
 def _intersection_over_union(
     net: SegmentationNet, images: np.ndarray, truth: list[np.ndarray]
 ) -> dict[str, float]:
-    """By class, over all pixels of all images in full size; NaN for a class that has none."""
+    """Return the IoU by class over all pixels of all images in full size; NaN without pixels."""
     counts = np.zeros((_CLASSES, _CLASSES))
     for image, expected in zip(images, truth, strict=True):
         with torch.no_grad():
             logits = net(torch.from_numpy(image[None]))
-        answer = logits[0].argmax(dim=0).numpy().astype(np.uint8)
-        found = cv2.resize(answer, expected.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        pairs = expected.ravel().astype(np.int64) * _CLASSES + found.ravel()
+        small = logits[0].argmax(dim=0).numpy().astype(np.uint8)
+        predicted = cv2.resize(small, expected.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        pairs = expected.ravel().astype(np.int64) * _CLASSES + predicted.ravel()
         counts += np.bincount(pairs, minlength=_CLASSES**2).reshape(_CLASSES, _CLASSES)
     union = counts.sum(axis=0) + counts.sum(axis=1) - np.diag(counts)
     names = ("background", *SEMANTIC_CLASSES)
-    shares = np.divide(np.diag(counts), union, out=np.full(_CLASSES, np.nan), where=union > 0)
-    return dict(zip(names, shares.tolist(), strict=True))
+    ious = np.divide(np.diag(counts), union, out=np.full(_CLASSES, np.nan), where=union > 0)
+    return dict(zip(names, ious.tolist(), strict=True))
 
 
-def _exported(net: SegmentationNet) -> bytes:
-    """Return the ONNX model."""
+def _export(net: SegmentationNet) -> bytes:
+    """Return the serialized ONNX model."""
     weights = {name: tensor.detach().numpy() for name, tensor in net.state_dict().items()}
     return bytes(build_graph(weights, *INPUT_SIZE).SerializeToString())
 
 
 def main() -> None:
-    """Read the command line and trains."""
+    """Parse the command line and train the model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="the .onnx file to write")
     defaults = SegmentationSettings()

@@ -1,7 +1,7 @@
-"""The trained segmentation network as an ONNX graph, written node by node from its tensors.
+"""Export of the trained segmentation network to an ONNX graph, node by node.
 
-Batch norms are folded into the convolutions before them. The general exporter of torch would need
-two more packages for this one network.
+Batch norms are folded into the preceding convolutions. The general exporter of torch would need two
+more packages for this one network.
 """
 
 from collections.abc import Mapping
@@ -13,9 +13,15 @@ from curate.files.onnx_graph import EPSILON, GraphBuilder
 
 
 def build_graph(weights: Mapping[str, np.ndarray], width: int, height: int) -> ModelProto:
-    """Return the graph of `segmentation.SegmentationNet` with its state `weights`.
+    """Return the ONNX model of a `segmentation.SegmentationNet`.
 
-    Input `image` (1, height, width, 3) uint8 RGB, output `class_ids` (1, height, width) uint8.
+    Its input is `image` (1, height, width, 3) uint8 RGB; its output is `class_ids` (1, height,
+    width) uint8.
+
+    Args:
+        weights: the state dict of the network.
+        width: width of the input in pixels.
+        height: height of the input in pixels.
     """
     graph = _Graph(weights)
     sharp = graph.convolution(graph.image("image"), "sharp")
@@ -26,24 +32,24 @@ def build_graph(weights: Mapping[str, np.ndarray], width: int, height: int) -> M
     for below, above, level in (
         ("deep", middle, "middle"), ("middle", fine, "fine"), ("fine", sharp, "sharp"),
     ):  # fmt: skip
-        deep = graph.enlarged(graph.pointwise(deep, f"{below}_to_{level}"), above)
+        deep = graph.upsampled(graph.pointwise(deep, f"{below}_to_{level}"), above)
         deep = graph.convolution(graph.node("Add", above, deep), f"mix_{level}")
-    graph.class_ids(graph.pointwise(deep, "answer"), "class_ids")
+    graph.class_ids(graph.pointwise(deep, "head"), "class_ids")
     return graph.model((1, height, width))
 
 
 class _Graph(GraphBuilder):
-    """The parts of the network."""
+    """Builds the parts of the network; methods return the name of the value that they add."""
 
     def image(self, name: str) -> str:
-        """Return the input as maps (1, 3, height, width) from -1 to 1."""
+        """Add the conversion of the input to (1, 3, height, width) values from -1 to 1."""
         pixels = self.node("Cast", name, to=TensorProto.FLOAT)
         maps = self.node("Transpose", pixels, perm=[0, 3, 1, 2])
         half, one = (self.constant(np.array(value, np.float32)) for value in (127.5, 1.0))
         return self.node("Sub", self.node("Div", maps, half), one)
 
     def convolution(self, maps: str, name: str, *, stride: int = 1, dilation: int = 1) -> str:
-        """ReLU of a normalised 3 x 3 convolution."""
+        """Add a 3 x 3 convolution with its folded batch norm, and a ReLU."""
         mean, variance = (self._weights[f"{name}.1.running_{part}"] for part in ("mean", "var"))
         scale = self._weights[f"{name}.1.weight"] / np.sqrt(variance + EPSILON)
         kernel = self.constant(self._weights[f"{name}.0.weight"] * scale[:, None, None, None])
@@ -52,17 +58,17 @@ class _Graph(GraphBuilder):
         return self.node("Relu", self.node("Conv", maps, kernel, shift, **attributes))
 
     def residual(self, maps: str, name: str, dilation: int) -> str:
-        """Two convolutions around which the input is carried."""
+        """Add a residual block of two convolutions."""
         body = self.convolution(maps, f"{name}.body.0")
         return self.node("Add", maps, self.convolution(body, f"{name}.body.1", dilation=dilation))
 
     def pointwise(self, maps: str, name: str) -> str:
-        """Return a 1 x 1 convolution with bias and nothing after it."""
+        """Add a 1 x 1 convolution with a bias, without activation."""
         parts = (self._weights[f"{name}.{part}"] for part in ("weight", "bias"))
         return self.node("Conv", maps, *map(self.constant, parts))
 
-    def enlarged(self, maps: str, like: str) -> str:
-        """Map in the height and width of others, interpolated."""
+    def upsampled(self, maps: str, like: str) -> str:
+        """Add a bilinear interpolation of `maps` to the height and width of `like`."""
         size = self.node("Shape", like, start=2)
         channels = self.node("Shape", maps, end=2)
         sizes = self.node("Concat", channels, size, axis=0)
@@ -70,13 +76,13 @@ class _Graph(GraphBuilder):
         return self.node("Resize", maps, "", "", sizes, **modes)
 
     def class_ids(self, logits: str, name: str) -> None:
-        """Name the classes of the highest logits an output."""
+        """Add an output with that name: the class of the highest logit of each pixel."""
         best = self.node("ArgMax", logits, axis=1, keepdims=0)
         self._nodes.append(helper.make_node("Cast", [best], [name], to=TensorProto.UINT8))
 
     def model(self, shape: tuple[int, ...]) -> ModelProto:
-        """Return the finished and checked model."""
+        """Return the complete model, checked by ONNX."""
         describe = helper.make_tensor_value_info
         image = describe("image", TensorProto.UINT8, (*shape, 3))
-        answer = describe("class_ids", TensorProto.UINT8, shape)
-        return self.finish("segmentation", [image], [answer], full_check=True)
+        class_ids = describe("class_ids", TensorProto.UINT8, shape)
+        return self.finish("segmentation", [image], [class_ids], full_check=True)

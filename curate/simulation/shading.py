@@ -1,4 +1,4 @@
-"""Compiled kernels of the camera: the rays of its pixels, and the colour of what they hit."""
+"""Compiled kernels of the camera: the rays of the pixels, and the colours of what they hit."""
 
 from typing import NamedTuple
 
@@ -16,14 +16,14 @@ _ASPHALT, _WALL = int(Material.ASPHALT), int(Material.WALL)
 
 
 class Surfaces(NamedTuple):
-    """What the kernel needs of the scene's m triangles.
+    """The properties of the scene's m triangles that the kernel needs.
 
     Attributes:
         lit: (m, 3) float32 RGB of the lit surface.
-        normals: (m, 3) float32.
-        materials: (m,) uint8.
-        texture: (k, 2) float32 strength and pixels per metre by material.
-        tile: (256, 256) float32 noise of mean 0 and deviation 1.
+        normals: (m, 3) float32 unit normals.
+        materials: (m,) uint8, see `Material`.
+        texture: (k, 2) float32 contrast and texels per metre of each material.
+        tile: (256, 256) float32 noise of mean 0 and standard deviation 1.
     """
 
     lit: np.ndarray
@@ -34,14 +34,16 @@ class Surfaces(NamedTuple):
 
 
 class Markings(NamedTuple):
-    """Where the road is painted, in road coordinates.
+    """The road markings, in road coordinates (see `street`).
 
     Attributes:
-        cos: of the street's heading.
-        sin: of the street's heading.
-        lines_d: (n,) float32 d of the lines, from right to left; the inner ones are dashed.
-        crossing_s: (2,) float32 where a crossing street begins and ends; equal for none.
-        colour: (3,) float32 of the paint, lit.
+        cos: cosine of the street's heading.
+        sin: sine of the street's heading.
+        lines_d: (n,) float32 coordinates d of the lines, from right to left; inner lines are
+            dashed.
+        crossing_s: (2,) float32 coordinates s at which a crossing street begins and ends; equal if
+            there is none.
+        colour: (3,) float32 RGB of the lit paint.
     """
 
     cos: np.float32
@@ -55,10 +57,10 @@ class Air(NamedTuple):
     """Sky, haze, windows and the sensor's grain.
 
     Attributes:
-        sky: (2, 3) float32 RGB at the horizon and overhead.
+        sky: (2, 3) float32 RGB of the sky at the horizon and overhead.
         window: (3,) float32 RGB of window panes.
-        grain: strength of the noise, grey levels.
-        grain_offset: rows and columns by which the grain is shifted.
+        grain: strength of the pixel noise, in grey levels.
+        grain_offset: row and column of the noise tile at which the image begins.
     """
 
     sky: np.ndarray
@@ -71,16 +73,16 @@ class Air(NamedTuple):
 def pixel_rays(
     inverse: np.ndarray, origin: np.ndarray, pixels: np.ndarray, width: int
 ) -> np.ndarray:
-    """Rays through pixel centres.
+    """Return the rays through pixel centres.
 
     Args:
-        inverse: (3, 3) from homogeneous pixels to directions.
-        origin: (3,) the camera's centre.
-        pixels: (n,) row * width + column; integers are centres.
-        width: of the image.
+        inverse: (3, 3) matrix from homogeneous pixels to directions.
+        origin: (3,) camera centre.
+        pixels: (n,) row * width + column; integer coordinates are pixel centres.
+        width: width of the image in pixels.
 
     Returns:
-        (n, 6) float32 origin and unit direction.
+        (n, 6) float32: origin and unit direction.
     """
     rays = np.empty((len(pixels), 6), dtype=np.float32)
     for i in range(len(pixels)):
@@ -110,24 +112,25 @@ def shade(
     markings: Markings,
     air: Air,
 ) -> np.ndarray:
-    """Return the image.
+    """Return the shaded image.
 
     Args:
-        inverse: (3, 3) float32 from homogeneous pixels to directions.
-        origin: (3,) float32 the camera's centre.
-        distance: (height, width) float32 metres along each pixel's ray.
-        triangle: (height, width) int32 what it hits, -1 for the sky.
-        surfaces: of the scene.
-        markings: of the road.
-        air: and the sensor.
+        inverse: (3, 3) float32 matrix from homogeneous pixels to directions.
+        origin: (3,) float32 camera centre.
+        distance: (height, width) float32 distance along each pixel's ray, in metres.
+        triangle: (height, width) int32 triangle that each ray hits, -1 for the sky.
+        surfaces: surfaces of the scene.
+        markings: markings of the road.
+        air: sky, haze, windows and sensor noise.
 
     Returns:
         (height, width, 3) uint8 RGB.
     """
     height, width = triangle.shape
     image = np.empty((height, width, 3), dtype=np.uint8)
-    fading = np.exp(-np.arange(_FAR_M) / np.float32(_TEXTURE_M)).astype(np.float32)
-    clearness = np.exp(-np.arange(_FAR_M) / np.float32(_HAZE_M)).astype(np.float32)
+    # Tables by whole metres of distance: contrast of textures, and transmission of the haze.
+    texture_contrast = np.exp(-np.arange(_FAR_M) / np.float32(_TEXTURE_M)).astype(np.float32)
+    transmission = np.exp(-np.arange(_FAR_M) / np.float32(_HAZE_M)).astype(np.float32)
     for row in range(height):
         for column in range(width):
             hit, reach = triangle[row, column], distance[row, column]
@@ -146,14 +149,14 @@ def shade(
             kind, across, along = _paint(x, y, z, hit, surfaces, markings)
             texel = _texel(across, along, surfaces.materials[hit], surfaces)
             metre = min(int(reach), _FAR_M - 1)
-            contrast = 1 + fading[metre] * texel
+            contrast = 1 + texture_contrast[metre] * texel
             for k in range(3):
                 colour = surfaces.lit[hit, k]
                 if kind == _LINE:
                     colour = markings.colour[k]
                 elif kind == _WINDOW:
                     colour = air.window[k]
-                clear = clearness[metre]
+                clear = transmission[metre]
                 level = air.sky[0, k] * (1 - clear) + colour * contrast * clear
                 image[row, column, k] = _grey_level(level, grain)
     return image
@@ -161,7 +164,7 @@ def shade(
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _grey_level(colour: _Real, grain: _Real) -> np.uint8:
-    """Linear light with gamma 2, noise and rounding."""
+    """Convert linear light to a grey level: gamma 2, added noise, clipped to 0 to 255."""
     clipped = min(max(np.float32(colour), np.float32(0)), np.float32(1))
     level = np.float32(255) * np.sqrt(clipped) + grain
     return np.uint8(min(max(level, np.float32(0)), np.float32(255)))
@@ -169,9 +172,9 @@ def _grey_level(colour: _Real, grain: _Real) -> np.uint8:
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _texel(across: _Real, along: _Real, material: int, surfaces: Surfaces) -> _Real:
-    """Return the texture of a material at a place on a surface, by metres across and along it."""
+    """Return the texture of a material at a point on a surface; `across` and `along` in metres."""
     scale = surfaces.texture[material, 1]
-    # The offset keeps the numbers positive, where truncation is rounding down.
+    # The offset makes the numbers positive, so that truncation rounds down.
     column = int((across + np.float32(1024)) * scale) & (TILE - 1)
     row = int((along + np.float32(1024)) * scale) & (TILE - 1)
     texel: _Real = surfaces.texture[material, 0] * surfaces.tile[row, column]
@@ -182,7 +185,10 @@ def _texel(across: _Real, along: _Real, material: int, surfaces: Surfaces) -> _R
 def _paint(
     x: _Real, y: _Real, z: _Real, hit: int, surfaces: Surfaces, markings: Markings
 ) -> tuple[int, _Real, _Real]:
-    """What covers a surface (line, window or nothing), and where on it the place lies."""
+    """Return what covers a point of a surface (line, window or nothing), and its texture position.
+
+    Windows repeat on walls every 2.7 m horizontally and 2.9 m vertically.
+    """
     flat = abs(surfaces.normals[hit, 2]) > np.float32(0.7)
     if flat:
         if surfaces.materials[hit] == _ASPHALT and _is_painted(x, y, markings):
@@ -199,14 +205,14 @@ def _paint(
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _fraction(value: _Real) -> _Real:
-    """Return the part after the decimal point, 0 to 1; the remainder operator is slow."""
+    """Return the fractional part, 0 to 1; the modulo operator is slower."""
     whole: _Real = np.floor(value)
     return value - whole
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _is_painted(x: _Real, y: _Real, markings: Markings) -> bool:
-    """Return whether a place on the asphalt carries a line."""
+    """Return whether a point on the asphalt is on a line."""
     d = markings.cos * y - markings.sin * x
     last = len(markings.lines_d) - 1
     for line in range(last + 1):

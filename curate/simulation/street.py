@@ -1,7 +1,7 @@
-"""The lie of the land of one scene: a street, its lanes, kerbs and pavements, and their heights.
+"""The ground of one scene: a street with lanes, kerbs and pavements, and its height profile.
 
-Road coordinates are s along the street and d to its left, in metres; the sensors stand at
-s = d = 0, 1.73 m above the road, and the street runs within a few degrees of the LiDAR's x axis.
+Road coordinates are s along the street and d to its left, in metres. The sensors are at s = d = 0,
+1.73 m above the road. The street's heading is within a few degrees of the LiDAR's x axis.
 """
 
 from dataclasses import dataclass
@@ -23,16 +23,16 @@ class Street:
 
     Attributes:
         heading_rad: direction of the street in the LiDAR frame.
-        lanes: per direction.
+        lanes: number of lanes per direction.
         lane_m: width of a lane.
-        parking_left_m: width of the parking strip on the left, 0 for none.
-        parking_right_m: the same on the right.
+        parking_left_m: width of the parking strip on the left; 0 if there is none.
+        parking_right_m: width of the parking strip on the right; 0 if there is none.
         pavement_m: width of each pavement.
-        yard_m: from the pavement to the buildings.
-        crossing_s: where the crossing street's axis lies, None for none.
-        crossing_half_m: half of its width.
+        yard_m: distance from the pavement to the buildings.
+        crossing_s: coordinate s of the crossing street's axis; None if there is none.
+        crossing_half_m: half the width of the crossing street.
         slope: rise per metre along s and along d.
-        wave: amplitude in metres, wave length in metres and phase of the road's undulation.
+        wave: amplitude in metres, wavelength in metres and phase of the height profile.
     """
 
     heading_rad: float
@@ -71,7 +71,7 @@ class Street:
 
     @property
     def axis_d(self) -> float:
-        """Coordinate d of the line between the directions; the sensors ride rightmost."""
+        """Coordinate d of the line between the directions; the sensors are in the right lane."""
         return (self.lanes - 0.5) * self.lane_m
 
     @property
@@ -85,20 +85,20 @@ class Street:
         return self.axis_d - self.lanes * self.lane_m - self.parking_right_m
 
     def in_crossing(self, s: np.ndarray | float, margin: float = 0.0) -> np.ndarray:
-        """Return whether s lies in the crossing street."""
+        """Return whether s is within the crossing street, extended by a margin in metres."""
         if self.crossing_s is None:
             return np.zeros(np.shape(s), dtype=bool)
         return np.abs(np.asarray(s) - self.crossing_s) < self.crossing_half_m + margin
 
     def to_lidar(self, s: float, d: float) -> np.ndarray:
-        """Return (3,) x, y, z of a place on the ground in the LiDAR frame."""
+        """Return the (3,) x, y, z of a point on the ground in the LiDAR frame."""
         cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
         kerb = 0.0 if self.right_d < d < self.left_d else self._kerb_m
         height = np.interp(s, self._knots_s, self._profile) + self.slope[1] * d + kerb
         return np.array([cos * s - sin * d, sin * s + cos * d, height])
 
     def ground(self) -> Mesh:
-        """Return the ground as a mesh: asphalt, pavements, yards."""
+        """Return the mesh of the ground: asphalt, pavements and yards."""
         s, d = np.meshgrid(self._knots_s, self._knots_d, indexing="ij")
         outside = (d < self.right_d - 1e-6) | (d > self.left_d + 1e-6)
         z = np.interp(s, self._knots_s, self._profile) + self.slope[1] * d
@@ -119,7 +119,7 @@ class Street:
         )
 
     def _surface(self, s: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """Return the ground's material at places in road coordinates, uint8."""
+        """Return the uint8 material of the ground at points in road coordinates."""
         road = ((d > self.right_d) & (d < self.left_d)) | self.in_crossing(s)
         beside = (d > self.right_d - self.pavement_m) & (d < self.left_d + self.pavement_m)
         surface = np.where(beside, Material.PAVEMENT, Material.GRASS)
@@ -127,12 +127,12 @@ class Street:
 
     @property
     def _kerb_m(self) -> float:
-        """Height of the pavement; level where a street crosses."""
+        """Height of the pavement above the road; 0 in a scene with a crossing street."""
         return 0.11 if self.crossing_s is None else 0.0
 
     @cached_property
     def _knots_s(self) -> np.ndarray:
-        """Where the ground bends along the street."""
+        """Coordinates s of the mesh vertices along the street."""
         knots = np.concatenate([np.arange(-20, 112, 4.0), [140, 200, _FAR_M]])
         if self.crossing_s is not None:
             edges = self.crossing_s + self.crossing_half_m * np.array([-1, 1])
@@ -141,7 +141,7 @@ class Street:
 
     @cached_property
     def _knots_d(self) -> np.ndarray:
-        """Where the ground bends or changes across the street; a kerb takes two knots."""
+        """Coordinates d of the mesh vertices across the street; each kerb has two."""
         outer = self.pavement_m
         left = [self.left_d, self.left_d + 0.02, self.left_d + outer, 40, 90, _FAR_M]
         right = [self.right_d, self.right_d - 0.02, self.right_d - outer, -40, -90, -_FAR_M]

@@ -1,6 +1,7 @@
-"""The system libraries that open3d links against, and which of them this machine lacks.
+"""The system libraries that open3d links against, and a check for missing ones.
 
-Standard library only: `.ci/check_system.py` runs this file before anything is installed.
+This module uses only the standard library: `.ci/check_system.py` runs it before anything is
+installed.
 """
 
 import ctypes
@@ -15,14 +16,14 @@ DEBIAN_PACKAGES = {
     "libstdc++.so.6": "libstdc++6",
     "libudev.so.1": "libudev1",
 }
-"""The package with each library in Debian 12 and 13; Ubuntu 22.04 and 24.04 have the same names.
+"""The package of each library in Debian 12 and 13; Ubuntu 22.04 and 24.04 use the same names.
 
-libusb-1.0 is not in the table, since the package `libusb-package` from PyPI contains it.
+libusb-1.0 is not in the table, because `libusb-package` from PyPI contains it.
 """
 
 
 def missing_libraries() -> list[str]:
-    """Return the libraries that cannot be loaded here; none on systems other than Linux."""
+    """Return the libraries that cannot be loaded; none on systems other than Linux."""
     return [name for name in DEBIAN_PACKAGES if sys.platform == "linux" and not loads(name)]
 
 

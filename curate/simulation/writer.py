@@ -1,7 +1,8 @@
-"""Simulates a LiDAR-camera data set in KITTI's layout, with all cores, resumable at any moment.
+"""Writer of simulated LiDAR-camera data sets in KITTI's layout.
 
-Frame i depends on (seed, i) alone. Its files are renamed into place one by one, the label last: a
-frame with a label is whole, and a run that was killed goes on with the others.
+Frame i depends only on (seed, i), so frames are simulated in parallel. Each file is written
+atomically, and the label last. A frame with all files is complete; after a kill, the next run
+resumes with the missing frames.
 """
 
 import json
@@ -36,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 SETTINGS_FILE = "simulation.json"
 SEMANTIC_FOLDER = "semantic_2"
-_FORMAT = 1  # raised whenever the same seed gives other frames
+_FORMAT = 1  # incremented whenever the same seed gives different frames
 _FOLDERS = {
     "velodyne": ".bin",
     "image_2": ".png",
@@ -48,7 +49,7 @@ _FOLDERS = {
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """What decides the content of a simulated data set; stored in simulation.json."""
+    """The settings that determine a simulated data set; stored in simulation.json."""
 
     format: int
     seed: int
@@ -65,94 +66,96 @@ def simulate(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write a simulated data set in KITTI's layout; frames that are already there are kept.
+    """Write a simulated data set in KITTI's layout; existing frames are kept.
+
+    A script that calls this function with more than one worker must do so below
+    `if __name__ == "__main__":`, because each worker process imports the script.
 
     Args:
-        directory: the root; gets training/{velodyne,image_2,semantic_2,calib,label_2} and
-            ImageSets/{train,val,trainval}.txt.
-        frames: how many.
-        seed: decides every frame, whatever the number of workers.
-        val_frames: how many of them, the last, are the split val; default a quarter.
-        workers: processes; default one per core.
+        directory: the root folder, where training/{velodyne,image_2,semantic_2,calib,label_2} and
+            ImageSets/{train,val,trainval}.txt are written.
+        frames: number of frames.
+        seed: seed of all frames; the number of workers does not change them.
+        val_frames: number of frames at the end that form the split val; a quarter by default.
+        workers: number of processes; one per core by default.
         progress: called with (frames done, frames).
 
-    Scripts that call it with more than one worker do so below `if __name__ == "__main__":`, since
-    each worker runs the script's other lines.
-
     Raises:
-        CurateError: if a worker was killed, or the script lacks that line.
-        ConfigError: if a number is out of range, or the directory holds another simulation.
-        DataError: if the directory holds other data or cannot be written, or its simulation.json is
-            damaged.
+        CurateError: if a worker was killed, or the script has no main guard.
+        ConfigError: if a number is out of range, or the directory contains another simulation.
+        DataError: if the directory contains other data or cannot be written, or its simulation.json
+            is damaged.
     """
     directory = Path(directory)
     settings = _settings(frames, seed, val_frames)
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, not {workers}")
     try:
-        _claim(directory, settings)
-        _complete(directory / "training", settings, workers or os.cpu_count() or 1, progress)
+        _check_settings_file(directory, settings)
+        _simulate_missing(
+            directory / "training", settings, workers or os.cpu_count() or 1, progress
+        )
         _write_splits(directory, settings)
     except OSError as error:
         reason = error.strerror or error
         raise DataError(f"{directory}: cannot be written: {reason}") from error
 
 
-def _complete(
+def _simulate_missing(
     home: Path,
     settings: SimulationSettings,
     workers: int,
     progress: Callable[[int, int], None] | None,
 ) -> None:
-    """Make the frames that are not there yet."""
-    for leftover in home.glob("*/.*.partial"):  # of a run that was killed
+    """Simulate the frames that are not complete."""
+    for leftover in home.glob("*/.*.partial"):  # from a run that was killed
         leftover.unlink()
-    missing = [index for index in range(settings.frames) if not _is_whole(home, index)]
+    missing = [index for index in range(settings.frames) if not _is_complete(home, index)]
     done = settings.frames - len(missing)
     if progress:
         progress(done, settings.frames)
     task = partial(_simulate_frame, home, settings.seed)
-    with _mapped(task, missing, workers) as finished:
-        for _ in finished:
+    with _parallel_map(task, missing, workers) as results:
+        for _ in results:
             done += 1
             if progress:
                 progress(done, settings.frames)
-    _log.info("%s: %d simulated frames, %d made now", home, settings.frames, len(missing))
+    _log.info("%s: %d simulated frames, %d of them new", home, settings.frames, len(missing))
 
 
 def _settings(frames: int, seed: int, val_frames: int | None) -> SimulationSettings:
-    """Return the settings, checked."""
+    """Return the settings after checking them."""
     val = frames // 4 if val_frames is None else val_frames
     if not 1 <= frames <= 999_999:
         raise ConfigError(f"frames must be 1 to 999999, not {frames}")
     if seed < 0:
-        raise ConfigError(f"seed must not be negative, is {seed}")
+        raise ConfigError(f"seed must be at least 0, not {seed}")
     if not 0 <= val < frames:
         raise ConfigError(f"val_frames must be 0 to {frames - 1} of {frames} frames, not {val}")
     return SimulationSettings(_FORMAT, seed, frames, val)
 
 
-def _claim(directory: Path, settings: SimulationSettings) -> None:
-    """Mark the directory with the settings, or makes sure that it is marked with the same."""
-    marker = directory / SETTINGS_FILE
-    if not marker.exists():
+def _check_settings_file(directory: Path, settings: SimulationSettings) -> None:
+    """Write simulation.json, or check that an existing one has the same settings."""
+    path = directory / SETTINGS_FILE
+    if not path.exists():
         if (directory / "training").exists():
             raise DataError(
-                f"{directory}: holds a data set that was not simulated (no {SETTINGS_FILE}); "
-                "name another directory"
+                f"{directory}: contains a data set that was not simulated (no {SETTINGS_FILE}); "
+                "choose another directory"
             )
-        replace_file(marker, (json.dumps(asdict(settings), indent=2) + "\n").encode())
+        replace_file(path, (json.dumps(asdict(settings), indent=2) + "\n").encode())
         return
     try:
-        stored = SimulationSettings(**json.loads(marker.read_text(encoding="utf-8")))
+        stored = SimulationSettings(**json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
-        raise DataError(f"{marker}: is damaged ({error}); delete the directory") from error
+        raise DataError(f"{path}: damaged ({error}); delete the directory and rerun") from error
     if stored != settings:
         raise ConfigError(
-            f"{directory}: holds another simulation (frames={stored.frames} seed={stored.seed} "
-            f"val_frames={stored.val_frames} format={stored.format}, asked for "
+            f"{directory}: contains another simulation (frames={stored.frames} seed={stored.seed} "
+            f"val_frames={stored.val_frames} format={stored.format}, requested "
             f"frames={settings.frames} seed={settings.seed} val_frames={settings.val_frames} "
-            f"format={settings.format}); name another directory or delete this one"
+            f"format={settings.format}); choose another directory or delete this one"
         )
 
 
@@ -160,13 +163,13 @@ def _frame_file(home: Path, folder: str, index: int) -> Path:
     return home / folder / f"{index:06d}{_FOLDERS[folder]}"
 
 
-def _is_whole(home: Path, index: int) -> bool:
-    """Return whether all files of a frame are there."""
+def _is_complete(home: Path, index: int) -> bool:
+    """Return whether all files of a frame exist."""
     return all(_frame_file(home, folder, index).exists() for folder in _FOLDERS)
 
 
 def _simulate_frame(home: Path, seed: int, index: int) -> None:
-    """Make one frame and writes its files, the label last."""
+    """Simulate one frame and write its files, the label last."""
     layout, laser, lens = (np.random.default_rng([seed, index, part]) for part in range(3))
     scene = Scene.draw(layout)
     rig = CameraRig.draw(lens)
@@ -184,23 +187,23 @@ def _simulate_frame(home: Path, seed: int, index: int) -> None:
 
 
 def _png(pixels: np.ndarray) -> bytes:
-    """Return a PNG file of grey or BGR pixels; OpenCV's default compression is its fast one."""
+    """Encode grey or BGR pixels as PNG; OpenCV's default compression level is the fast one."""
     _, encoded = cv2.imencode(".png", pixels)
     return bytes(encoded)
 
 
 @contextmanager
-def _mapped(
+def _parallel_map(
     task: Callable[[int], None], indices: Sequence[int], workers: int
 ) -> Iterator[Iterator[None]]:
-    """The results of a task over all indices, in this process or in several."""
+    """Yield the iterator of a task's results for all indices, in this process or in several."""
     workers = min(workers, len(indices))
     if workers <= 1:
         yield map(task, indices)
         return
     if getattr(multiprocessing.current_process(), "_inheriting", False):
-        # A worker that runs its parent's script, which calls without a main guard. The parent says
-        # so, in one line; what multiprocessing would raise here is a page per worker.
+        # This is a worker that imports its parent's script, which has no main guard. The parent
+        # reports that in one line; multiprocessing would print a long traceback per worker.
         sys.exit(1)
     with ProcessPoolExecutor(
         workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start_worker
@@ -209,15 +212,16 @@ def _mapped(
             yield pool.map(task, indices)
         except BrokenProcessPool:
             raise CurateError(
-                "a simulation process was killed, or it ran a script that calls `simulate` outside "
-                'of `if __name__ == "__main__":`; mend that, or run the same again: it goes on'
+                "a simulation process was killed, or the script calls `simulate` outside of "
+                '`if __name__ == "__main__":`; fix the script if necessary and rerun; finished '
+                "frames are kept"
             ) from None
         finally:
             pool.shutdown(cancel_futures=True)
 
 
 def _start_worker() -> None:
-    """One thread per process, and no process that outlives a killed parent."""
+    """Use one OpenCV thread per process, and exit when the parent process ends."""
     cv2.setNumThreads(1)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
 
@@ -230,7 +234,7 @@ def _exit_with_parent() -> None:
 
 
 def _write_splits(directory: Path, settings: SimulationSettings) -> None:
-    """The lists of frames; written last, so that they never name a frame that is not there."""
+    """Write the frame lists; this is done last, so they never contain a missing frame."""
     names = [f"{index:06d}\n" for index in range(settings.frames)]
     train = settings.frames - settings.val_frames
     for split, part in (("train", names[:train]), ("val", names[train:]), ("trainval", names)):

@@ -133,7 +133,7 @@ def _read_labels(path: Path) -> None:
 
 
 def _read_results(path: Path) -> None:
-    to_detections(read_objects(path, scored=True, known=None), toy_calibration())
+    to_detections(read_objects(path, scored=True, categories=None), toy_calibration())
 
 
 def _raw_calibration(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Point clouds from files of several formats: x, y, z in metres and intensity in [0, 1]."""
+"""Reader of point clouds in several file formats: x, y, z in metres and intensity in [0, 1]."""
 
 import tokenize
 import warnings
@@ -10,8 +10,8 @@ from curate.datasets.formats.cloud_formats import read_pcd, read_ply
 from curate.datasets.kitti.dataset import check_point_range, read_bytes
 from curate.errors import DataError, one_line
 
-# What a damaged header makes numpy raise.
-_NPY_DAMAGES = (
+# The errors that numpy raises for a damaged .npy header.
+_NPY_ERRORS = (
     EOFError,
     MemoryError,
     OSError,
@@ -26,12 +26,14 @@ CLOUD_SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 
 
 def read_cloud(path: Path, columns: int = 4, intensity_scale: float = 1.0) -> np.ndarray:
-    """Return the (n, 4) float32 points of a file; points that are not finite are left out.
+    """Return the (n, 4) float32 points of a file; points that are not finite are dropped.
 
     Args:
         path: .bin of float32, .npy of (n, columns), .pcd or .ply.
-        columns: of .bin and .npy: x, y, z, intensity (0 where there are three), others.
-        intensity_scale: what full intensity is in the file, e.g. 255; it is clipped there.
+        columns: number of columns of .bin and .npy files: x, y, z, intensity (0 if there are only
+            three columns), others (ignored).
+        intensity_scale: the value of full intensity in the file, e.g. 255; intensities are divided
+            by it and clipped to [0, 1].
 
     Raises:
         DataError: if the file is missing, damaged or of another format.
@@ -45,9 +47,9 @@ def read_cloud(path: Path, columns: int = 4, intensity_scale: float = 1.0) -> np
         read = read_pcd if suffix == ".pcd" else read_ply
         table = read(path, read_bytes(path, "point"))
     else:
-        raise DataError(f"{path}: no point file; known are {', '.join(CLOUD_SUFFIXES)}")
+        raise DataError(f"{path}: not a point file; supported are {', '.join(CLOUD_SUFFIXES)}")
     points = np.zeros((len(table), 4), dtype=np.float32)
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is left out
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite and are dropped below
         points[:, : min(table.shape[1], 4)] = table[:, :4]
     points = points[np.isfinite(points).all(axis=1)]
     check_point_range(path, points)
@@ -59,23 +61,24 @@ def _read_bin(path: Path, columns: int) -> np.ndarray:
     content = read_bytes(path, "point")
     if len(content) % (4 * columns):
         raise DataError(
-            f"{path}: {len(content)} bytes are no rows of {columns} float32; set columns"
+            f"{path}: {len(content)} bytes are not a multiple of {4 * columns} (rows of {columns} "
+            "float32); set columns"
         )
     return np.frombuffer(content, dtype="<f4").reshape(-1, columns)
 
 
 def _read_npy(path: Path, columns: int) -> np.ndarray:
     try:
-        # Mapped, not read: a header that claims more than the file holds costs no memory, and
-        # neither pickles nor archives are taken for arrays.
+        # A memory map: a header that claims more than the file contains allocates no memory, and
+        # pickles and archives are rejected.
         with warnings.catch_warnings():
-            # Python's of the header's literals, or numpy's that Python 2 wrote them.
+            # Python warns about odd literals in the header, numpy about files written by Python 2.
             warnings.simplefilter("ignore")
             table = np.lib.format.open_memmap(path, mode="r")
     except FileNotFoundError:
         raise DataError(f"{path}: no such point file") from None
-    except _NPY_DAMAGES as error:
-        raise DataError(f"{path}: no readable .npy array: {one_line(error, 200)}") from None
+    except _NPY_ERRORS as error:
+        raise DataError(f"{path}: not a readable .npy array: {one_line(error, 200)}") from None
     if table.ndim != 2 or table.shape[1] != columns or table.dtype.kind not in "fiu":
         raise DataError(
             f"{path}: {table.dtype} {list(table.shape)}, expected [n, {columns}]; set columns"

@@ -1,8 +1,8 @@
-"""Paths of a data set stay inside it: names lead nowhere else, and neither do links, unless wished.
+"""Checks that the paths of a data set stay inside its folder, unless `follow_links` is set.
 
-A data set that was fetched from somewhere is foreign data. A frame name with a separator, or a link
-that its archive has brought along, would make curate read files that nobody meant to show it; a
-named pipe would make it wait for ever.
+A downloaded data set is untrusted data. A frame name with a path separator, or a symbolic link in
+its archive, could make curate read files outside the data set. A named pipe would make it wait
+forever.
 """
 
 import errno
@@ -14,23 +14,23 @@ from curate.errors import DataError
 
 
 def check_frame_id(frame_id: str) -> None:
-    """Raise DataError if the id could lead out of the data set's folders, or garble a message."""
-    harmless = frame_id.isprintable() and not {"/", "\\"} & set(frame_id)
-    if not frame_id or frame_id.startswith(".") or not harmless:
+    """Raise DataError if the id is not a plain file name that can be printed in a message."""
+    plain = frame_id.isprintable() and not {"/", "\\"} & set(frame_id)
+    if not frame_id or frame_id.startswith(".") or not plain:
         raise DataError(
-            f"{frame_id[:80]!r} is no frame id: it must be a plain file name such as 000008"
+            f"{frame_id[:80]!r} is not a frame id: it must be a plain file name such as 000008"
         )
 
 
 class Boundary:
-    """The folder of a data set, which no path of it leads out of.
+    """The folder of a data set; `check` rejects paths that lead out of it.
 
-    Where folders really lie is looked up once each: who can exchange them meanwhile can exchange
-    the files as well.
+    The real path of each folder is resolved once and cached. This is safe: whoever can replace a
+    folder after the check can also replace the files in it.
 
     Args:
         root: the folder.
-        follow_links: whether links and names may lead out of it after all.
+        follow_links: whether links and paths may lead out of the folder.
     """
 
     def __init__(self, root: Path, *, follow_links: bool = False) -> None:
@@ -39,29 +39,32 @@ class Boundary:
         self._folders: dict[str, str] = {}
 
     def check(self, *paths: Path) -> None:
-        """Raise DataError if a path leads out, by a link or by its name, or is a pipe or a device.
+        """Check paths, which need not exist.
 
-        Or where no file could have that name. It need not be there.
+        Raises:
+            DataError: if a path leads out of the folder (by a link or by its name), is a pipe or a
+                device, or is not a valid path.
         """
         if self._open:
             for path in paths:
                 _mode(os.fspath(path))
             return
-        home = self._real_folder(self._root)
+        root = self._real_folder(self._root)
         for path in paths:
             real, mode = self._real(path)
-            if real != home and not real.startswith(home.rstrip(os.sep) + os.sep):
+            if real != root and not real.startswith(root.rstrip(os.sep) + os.sep):
                 raise DataError(
-                    f"{path}: leads out of the data set, to {real}; if you made that link "
+                    f"{path}: leads out of the data set, to {real}; if you created that link "
                     "yourself, set dataset.follow_links = true (curate init --follow-links)"
                 )
             if mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-                raise DataError(f"{path}: is a pipe or a device, no file; remove it")
+                raise DataError(f"{path}: is a pipe or a device, not a file; remove it")
 
     def _real(self, path: Path) -> tuple[str, int]:
-        """`os.path.realpath`, which would ask the system about every folder on the way.
+        """Return the real path and its mode, 0 if it does not exist.
 
-        With the mode of what lies there, 0 where nothing does.
+        `os.path.realpath` makes a system call for every parent folder. Here the folder's real path
+        is cached, so a path that is not a link needs one call.
         """
         folder, name = os.path.split(path)
         plain = name not in ("", os.curdir, os.pardir) and "\0" not in name
@@ -78,12 +81,16 @@ class Boundary:
 
 
 def _mode(path: str) -> int:
-    """0 where nothing is there; DataError where nothing could be."""
+    """Return the mode of a path without following links, 0 if it does not exist.
+
+    Raises:
+        DataError: if no file could have that path.
+    """
     try:
         return os.lstat(path).st_mode
-    except ValueError:  # a zero byte
-        raise DataError(f"{path!r} is no path") from None
+    except ValueError:  # a null byte
+        raise DataError(f"{path!r} is not a valid path") from None
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
-            raise DataError(f"{path[:80]!r}...: is no path, its name is too long") from None
+            raise DataError(f"{path[:80]!r}... is not a valid path: the name is too long") from None
         return 0

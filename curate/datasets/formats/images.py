@@ -1,4 +1,4 @@
-"""Images from files: pixels, or only the size, without trusting a damaged file."""
+"""Reader of PNG and JPEG images, or only of their size, that rejects damaged files."""
 
 import struct
 from pathlib import Path
@@ -10,21 +10,21 @@ from curate.errors import DataError
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_START = PNG_SIGNATURE + b"\0\0\0\rIHDR"
 PNG_HEADER_BYTES = 24  # PNG_START, width, height
-_PNG_CHUNK = struct.Struct(">I4s")  # length and kind, before the content and its checksum
-_PNG_CHECK_BYTES = 4
+_PNG_CHUNK = struct.Struct(">I4s")  # length and type; then follow the content and its checksum
+_PNG_CHECKSUM_BYTES = 4
 JPEG_START = b"\xff\xd8"
-# Markers of JPEG that tell the size: start of frame, without the three that mean other things.
+# JPEG's start-of-frame markers, which contain the size: C0 to CF without three other markers.
 _SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})
-# A header may claim any size, and decoders believe it.
-MOST_PIXELS = 1 << 25
+_MARKERS_WITHOUT_CONTENT = frozenset({0x01, *range(0xD0, 0xD9)})
+# A header may claim any size, and decoders allocate that much memory.
+MAX_PIXELS = 1 << 25
 
 
 def read_image(path: Path) -> np.ndarray:
     """Return the (height, width, 3) uint8 RGB pixels of an image file.
 
     Raises:
-        DataError: if the file is missing, truncated or no image.
+        DataError: if the file is missing, truncated or not an image.
     """
     import cv2
 
@@ -32,10 +32,10 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def read_image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) in pixels; of a PNG only the header is read.
+    """Return (width, height) in pixels; only the header of a PNG is read.
 
     Raises:
-        DataError: if the file is missing or no image.
+        DataError: if the file is missing or not an image.
     """
     header = _read_bytes(path, PNG_HEADER_BYTES)
     if not header.startswith(PNG_START):
@@ -44,10 +44,10 @@ def read_image_size(path: Path) -> tuple[int, int]:
 
 
 def read_sized_image(path: Path, *, pixels: bool) -> tuple[tuple[int, int], np.ndarray | None]:
-    """(width, height) of an image file, and as `read_image` its pixels where they are wanted.
+    """Return (width, height) of an image file, and its pixels as in `read_image` if requested.
 
     Raises:
-        DataError: if the file is missing, truncated or no image.
+        DataError: if the file is missing, truncated or not an image.
     """
     if not pixels:
         return read_image_size(path), None
@@ -57,17 +57,18 @@ def read_sized_image(path: Path, *, pixels: bool) -> tuple[tuple[int, int], np.n
 
 
 def decode_image(path: Path, mode: int) -> np.ndarray:
-    """Return the pixels of an image file as OpenCV decodes them under `mode` (cv2.IMREAD_...).
+    """Return the pixels of an image file, decoded by OpenCV with `mode` (cv2.IMREAD_...).
 
     Raises:
-        DataError: if the file is missing, truncated, no PNG or JPEG, or larger than `MOST_PIXELS`.
+        DataError: if the file is missing, truncated, not a PNG or JPEG, or has more than
+            `MAX_PIXELS` pixels.
     """
     import cv2
 
     content = _read_bytes(path)
     _claimed_size(content, path)
     if content.startswith(PNG_SIGNATURE) and not _has_end(content):
-        raise DataError(f"{path}: the PNG ends before its end mark; fetch the file again")
+        raise DataError(f"{path}: the PNG is truncated (no end chunk); fetch the file again")
     try:
         pixels = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
     except cv2.error:
@@ -78,7 +79,11 @@ def decode_image(path: Path, mode: int) -> np.ndarray:
 
 
 def _claimed_size(content: bytes, path: Path) -> tuple[int, int]:
-    """(width, height) by the header of a PNG or JPEG; DataError where it is none, or absurd."""
+    """Return (width, height) according to the header of a PNG or JPEG.
+
+    Raises:
+        DataError: if the content is neither, or the size is 0 or above `MAX_PIXELS`.
+    """
     size = None
     if content.startswith(PNG_START) and len(content) >= PNG_HEADER_BYTES:
         size = struct.unpack(">II", content[16:PNG_HEADER_BYTES])
@@ -87,46 +92,49 @@ def _claimed_size(content: bytes, path: Path) -> tuple[int, int]:
     if size is None:
         raise _unreadable(content, path)
     width, height = map(int, size)
-    if not 0 < width * height <= MOST_PIXELS:
+    if not 0 < width * height <= MAX_PIXELS:
         raise DataError(
-            f"{path}: claims {width} x {height} pixels; images of up to {MOST_PIXELS} are read"
+            f"{path}: the header claims {width} x {height} pixels, supported are 1 to {MAX_PIXELS}"
         )
     return width, height
 
 
 def _has_end(content: bytes) -> bool:
-    """Return whether a PNG's chunks lead to its end mark within the file.
+    """Return whether the chunks of a PNG reach the end chunk IEND within the file.
 
-    A decoder takes memory for as many bytes as a chunk claims before it reads the first.
+    This is checked first because decoders allocate the length that a chunk claims before they read
+    it. A file is a signature and chunks of length, type, content and checksum:
+
+        89 50 4E 47 0D 0A 1A 0A | 0000000D IHDR ... | 00001F40 IDAT ... | 00000000 IEND ...
     """
-    at = len(PNG_SIGNATURE)
-    kind = b""
-    while kind != b"IEND" and at + _PNG_CHUNK.size <= len(content):
-        length, kind = _PNG_CHUNK.unpack_from(content, at)
-        at += _PNG_CHUNK.size + length + _PNG_CHECK_BYTES
-    return kind == b"IEND" and at <= len(content)
+    offset = len(PNG_SIGNATURE)
+    chunk_type = b""
+    while chunk_type != b"IEND" and offset + _PNG_CHUNK.size <= len(content):
+        length, chunk_type = _PNG_CHUNK.unpack_from(content, offset)
+        offset += _PNG_CHUNK.size + length + _PNG_CHECKSUM_BYTES
+    return chunk_type == b"IEND" and offset <= len(content)
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """Return (width, height) by the first start of a frame; None where there is none."""
-    at = len(JPEG_START)
-    while at + 9 <= len(content) and content[at] == 0xFF:
-        marker = content[at + 1]
+    """Return (width, height) from the first start-of-frame segment; None if there is none."""
+    offset = len(JPEG_START)
+    while offset + 9 <= len(content) and content[offset] == 0xFF:
+        marker = content[offset + 1]
         if marker in _SIZE_MARKERS:
-            height, width = struct.unpack(">HH", content[at + 5 : at + 9])
+            height, width = struct.unpack(">HH", content[offset + 5 : offset + 9])
             return width, height
         if marker == 0xFF:
-            at += 1
-        elif marker in _BARE_MARKERS:
-            at += 2
+            offset += 1
+        elif marker in _MARKERS_WITHOUT_CONTENT:
+            offset += 2
         else:
-            at += 2 + int(struct.unpack(">H", content[at + 2 : at + 4])[0])
+            offset += 2 + int(struct.unpack(">H", content[offset + 2 : offset + 4])[0])
     return None
 
 
 def _unreadable(content: bytes, path: Path) -> DataError:
     return DataError(
-        f"{path}: no readable image (PNG or JPEG, {len(content)} bytes); fetch the file again"
+        f"{path}: not a readable PNG or JPEG image ({len(content)} bytes); fetch the file again"
     )
 
 

@@ -1,7 +1,14 @@
-"""LZF, the compression of PCD files.
+"""Decompression of LZF, which PCD files use.
 
-Source: Lehmann, LibLZF. A byte below 32 announces that many literal bytes and one more; any other
-byte a repetition of bytes already made, by its length (three bits, or a further byte) and distance.
+Source: Lehmann, LibLZF. The data are a series of two kinds of blocks:
+
+- A control byte c below 32 is followed by c + 1 literal bytes.
+- Any other control byte repeats earlier output. Its upper three bits are the length minus 2; the
+  value 7 means that a further byte is added to it. Its lower five bits and the next byte are the
+  distance minus 1, high bits first.
+
+Example: 02 'a' 'b' 'c' 20 02 is "abc" and then a repetition of length 1 + 2 = 3 at distance 2 + 1 =
+3 before the end, so "abcabc".
 """
 
 import numpy as np
@@ -10,37 +17,37 @@ from numba import njit
 
 @njit(cache=True)
 def unpack(source: np.ndarray, target: np.ndarray) -> int:
-    """Undo the compression of (n,) bytes into (m,) bytes.
+    """Decompress (n,) bytes into a target of (m,) bytes.
 
     Returns:
-        How many bytes it made; -1 where the source is damaged or makes more than m.
+        The number of bytes written; -1 if the source is damaged or needs more than m bytes.
     """
-    at, made = 0, 0
-    while at < len(source):
-        control = int(source[at])
-        at += 1
+    offset, written = 0, 0
+    while offset < len(source):
+        control = int(source[offset])
+        offset += 1
         if control < 32:
             length = control + 1
-            if at + length > len(source) or made + length > len(target):
+            if offset + length > len(source) or written + length > len(target):
                 return -1
             for i in range(length):
-                target[made + i] = source[at + i]
-            at += length
+                target[written + i] = source[offset + i]
+            offset += length
         else:
             length = control >> 5
             if length == 7:
-                if at >= len(source):
+                if offset >= len(source):
                     return -1
-                length += int(source[at])
-                at += 1
-            if at >= len(source):
+                length += int(source[offset])
+                offset += 1
+            if offset >= len(source):
                 return -1
-            reference = made - ((control & 31) << 8) - int(source[at]) - 1
-            at += 1
+            reference = written - ((control & 31) << 8) - int(source[offset]) - 1
+            offset += 1
             length += 2
-            if reference < 0 or made + length > len(target):
+            if reference < 0 or written + length > len(target):
                 return -1
             for i in range(length):
-                target[made + i] = target[reference + i]
-        made += length
-    return made
+                target[written + i] = target[reference + i]
+        written += length
+    return written

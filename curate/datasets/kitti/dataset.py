@@ -1,8 +1,9 @@
-"""The KITTI object data set, or any data in its layout.
+"""Reader of the KITTI object data set, and of other data in its layout.
 
 Source: Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the readme of its
-object development kit. Two layouts are read: ROOT/training/{velodyne,image_2,calib,label_2} and the
-flat ROOT/{velodyne,image_2,calib,label_2}; label_2 and ROOT/ImageSets/*.txt are optional.
+object development kit. Two layouts are supported:
+ROOT/training/{velodyne,image_2,calib,label_2} and ROOT/{velodyne,image_2,calib,label_2}. label_2
+and ROOT/ImageSets/*.txt are optional.
 """
 
 import io
@@ -30,25 +31,25 @@ _log = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 POINT_BYTES = 16  # x, y, z, intensity, float32 each
-# No LiDAR sees farther; maps over the points would fill the memory.
-FARTHEST_METRES = 2000.0
-# KITTI's own development kit says which drive each frame of training/ was taken from.
+# Beyond the range of any LiDAR. Farther points would make grids over the points too large.
+MAX_RANGE_METRES = 2000.0
+# The folder of KITTI's development kit that says which drive each frame of training/ is from.
 _MAPPINGS = ("mapping", "devkit_object/mapping", "devkit/mapping")
 _MAPPING_FILES = ("train_mapping.txt", "train_rand.txt")
-# Focal lengths are thousands of pixels, P2's last column a million at most.
-_LARGEST_ENTRY = 1e9
+# Focal lengths are thousands of pixels; the last column of P2 is at most a million.
+_MAX_ENTRY = 1e9
 CALIBRATION_SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
 class KittiDataset:
-    """A `Dataset` in KITTI's layout; its frames are the ones that have a velodyne file.
+    """A `Dataset` in KITTI's layout; every velodyne file is a frame.
 
     Args:
-        root: the folder that holds training/, or velodyne/ itself.
-        follow_links: whether links may lead out of it.
+        root: the folder that contains training/velodyne or velodyne.
+        follow_links: whether links may lead out of the root.
 
     Raises:
-        DataError: neither is there.
+        DataError: if the root contains neither.
     """
 
     name = "kitti"
@@ -60,14 +61,14 @@ class KittiDataset:
         home = next((home for home in homes if (home / "velodyne").is_dir()), None)
         if home is None:
             raise DataError(
-                f"{self.root}: holds neither training/velodyne nor velodyne; "
-                "name the root of a data set in KITTI's layout"
+                f"{self.root}: contains neither training/velodyne nor velodyne; "
+                "set the root to a data set in KITTI's layout"
             )
         self._home = home
         self._folders = [home / name for name in ("velodyne", "image_2", "calib", "label_2")]
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return all frames with a velodyne file, in sorted order."""
+        """Return the ids of all frames with a velodyne file, sorted."""
         return self._frame_ids
 
     @cached_property
@@ -75,46 +76,46 @@ class KittiDataset:
         return tuple(sorted(path.stem for path in visible_files(self._home / "velodyne", "*.bin")))
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
-        """The lists of ROOT/ImageSets, by file name; they may name frames that are not there.
+        """Return the lists in ROOT/ImageSets by file name; they may contain missing frames.
 
-        KITTI's own test.txt names frames of ROOT/testing, whose numbers are those of other frames
-        of ROOT/training. It is therefore left out where ROOT/training is read.
+        KITTI's test.txt lists frames of ROOT/testing. Their ids are also ids of other frames in
+        ROOT/training, so this list is dropped when ROOT/training is read.
 
         Raises:
-            DataError: if a list names something that is no frame id.
+            DataError: if a list contains an invalid frame id.
         """
         lists = {
             path.stem: path for path in sorted(visible_files(self.root / "ImageSets", "*.txt"))
         }
         if self._home != self.root and "test" in lists:
-            _log.info("%s: left out, it names frames of testing/", lists.pop("test"))
+            _log.info("%s: skipped, it lists frames of testing/", lists.pop("test"))
         self._boundary.check(*lists.values())
         return {name: read_frame_list(path) for name, path in lists.items()}
 
     def files(self, frame_id: str) -> FrameFiles:
-        """Where the frame's files lie; `label` is None where there is no label file.
+        """Return the paths of the frame's files; `label` is None if there is no label file.
 
         Raises:
-            DataError: if the name or a link would lead out of the data set.
+            DataError: if the frame id is invalid, or a link leads out of the data set.
         """
         check_frame_id(frame_id)
-        velodyne, pictures, calib, labels = self._folders
-        images = [pictures / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
-        label = labels / f"{frame_id}.txt"
-        found = FrameFiles(
+        velodyne, image_2, calib, label_2 = self._folders
+        images = [image_2 / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
+        label = label_2 / f"{frame_id}.txt"
+        files = FrameFiles(
             points=velodyne / f"{frame_id}.bin",
             image=next((image for image in images if image.exists()), images[0]),
             calibration=calib / f"{frame_id}.txt",
             label=label if label.exists() else None,
         )
-        self._boundary.check(*found.paths())
-        return found
+        self._boundary.check(*files.paths())
+        return files
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """The drive of a frame, where the mapping of KITTI's development kit lies in the root.
+        """Return the drive of a frame if the root contains the mapping of KITTI's development kit.
 
         Raises:
-            DataError: if the mapping is malformed, or lies elsewhere.
+            DataError: if the mapping is malformed, or a link to it leads out of the data set.
         """
         return self._drives.get(frame_id)
 
@@ -124,12 +125,12 @@ class KittiDataset:
         home = next((home for home in homes if (home / _MAPPING_FILES[0]).is_file()), None)
         if home is None:
             return {}
-        # Before they are read: messages repeat a piece of what is no number.
+        # Checked before reading, because error messages quote content of the files.
         self._boundary.check(*(home / name for name in _MAPPING_FILES))
         return read_drives(home)
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
-        """The frame's calibration, its points unless unwanted, and its image where asked for.
+        """Read the frame's calibration and image size, and its points and image if requested.
 
         Raises:
             DataError: if a file is missing, damaged or malformed.
@@ -153,22 +154,25 @@ class KittiDataset:
 
 
 def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:
-    """The (n, 4) float32 points of a velodyne file: x, y, z in metres, intensity. May be empty.
+    """Return the (n, 4) float32 points of a velodyne file: x, y, z in metres, intensity.
+
+    An empty file has no points.
 
     Raises:
-        DataError: if the file is missing or truncated, or holds NaN or infinite numbers.
+        DataError: if the file is missing or truncated, or contains NaN, infinite numbers, or points
+            beyond `MAX_RANGE_METRES`.
     """
-    with opened(path, "velodyne") as file:
+    with open_unbuffered(path, "velodyne") as file:
         size = os.fstat(file.fileno()).st_size
         points = np.empty((size // POINT_BYTES, 4), dtype="<f4")
         if size % POINT_BYTES or file.readinto(points.reshape(-1).view(np.uint8).data) != size:
             raise DataError(
-                f"{path}: {size} bytes are no multiple of {POINT_BYTES} "
+                f"{path}: {size} bytes are not a multiple of {POINT_BYTES} "
                 "(x, y, z, intensity as float32); the file is truncated, fetch it again"
             )
-    # NaN and infinite numbers show in the extremes, and all columns at once are read fastest.
+    # Fast path: the minimum and maximum over all columns reveal NaN and infinite numbers as well.
     low, high = points.min(initial=0), points.max(initial=0)
-    if low >= -FARTHEST_METRES and high <= FARTHEST_METRES:
+    if low >= -MAX_RANGE_METRES and high <= MAX_RANGE_METRES:
         return points
     finite = np.isfinite(points)
     if not finite.all():
@@ -182,13 +186,13 @@ def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:
 
 
 def check_point_range(path: Path, points: Float[np.ndarray, "n _"]) -> None:
-    """Raise DataError if a finite point of (n, >=3) is farther than any LiDAR sees."""
+    """Raise DataError if a point of (n, >=3) has a coordinate beyond `MAX_RANGE_METRES`."""
     far = np.abs(points[:, :3]).max(initial=0)
-    if far > FARTHEST_METRES:
+    if far > MAX_RANGE_METRES:
         k = int(np.abs(points[:, :3]).max(axis=1).argmax())
         raise DataError(
-            f"{path}: point {k} is {far:.4g} m away; points are in metres from the LiDAR, remove "
-            f"those beyond {FARTHEST_METRES:g} m"
+            f"{path}: point {k} is {far:.4g} m away; points must be in metres from the LiDAR, "
+            f"remove those beyond {MAX_RANGE_METRES:g} m"
         )
 
 
@@ -196,8 +200,8 @@ def read_calibration(path: Path) -> Calibration:
     """Return the calibration of the left colour camera (P2, R0_rect, Tr_velo_to_cam).
 
     Raises:
-        DataError: if the file is missing, or one of the three is missing, has a wrong number of
-            entries, or is not finite.
+        DataError: if the file or one of the three matrices is missing, or a matrix has a wrong
+            number of entries, entries that are not finite, or no inverse.
     """
     matrices: dict[str, np.ndarray] = {}
     text = read_bytes(path, "calibration").decode("utf-8", errors="replace")
@@ -213,15 +217,15 @@ def read_calibration(path: Path) -> Calibration:
     extrinsic[:3] = matrices["Tr_velo_to_cam"]
     lidar_to_camera = rectify @ extrinsic
     if abs(np.linalg.det(lidar_to_camera)) < 1e-6:
-        raise DataError(f"{path}: R0_rect times Tr_velo_to_cam cannot be inverted")
+        raise DataError(f"{path}: the product of R0_rect and Tr_velo_to_cam cannot be inverted")
     return Calibration(matrices["P2"], lidar_to_camera)
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
     """Write a calibration file that `read_calibration` reads back exactly.
 
-    The whole way from the LiDAR to the rectified camera is in Tr_velo_to_cam, R0_rect is the
-    identity. P0, P1 and P3 repeat P2, for readers that take lines by number.
+    Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera, and R0_rect is
+    the identity. P0, P1 and P3 repeat P2, for readers that expect P2 on the third line.
     """
     matrices = dict.fromkeys(("P0", "P1", "P2", "P3"), calibration.projection)
     matrices["R0_rect"] = np.eye(3)
@@ -234,26 +238,36 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     replace_file(path, "".join(lines).encode())
 
 
-def parse_matrix(entries: str, shape: tuple[int, int], place: str) -> np.ndarray:
-    """A matrix from the numbers of a calibration line; DataError at `place` where it is none."""
+def parse_matrix(entries: str, shape: tuple[int, int], location: str) -> np.ndarray:
+    """Parse the numbers of a calibration line as a matrix.
+
+    Args:
+        entries: the part of the line after the key.
+        shape: rows and columns of the matrix.
+        location: file and line, for error messages.
+
+    Raises:
+        DataError: if an entry is not a finite number of sane size, or their count is wrong.
+    """
     try:
         numbers = np.array([float(entry) for entry in entries.split()])
     except ValueError as error:
-        raise DataError(f"{place}: {error}; a calibration line holds only numbers") from None
+        raise DataError(f"{location}: {error}; a calibration line holds only numbers") from None
     if len(numbers) != shape[0] * shape[1]:
-        raise DataError(f"{place}: {len(numbers)} numbers, expected {shape[0]} x {shape[1]}")
+        raise DataError(f"{location}: {len(numbers)} numbers, expected {shape[0]} x {shape[1]}")
     if not np.isfinite(numbers).all():
-        raise DataError(f"{place}: holds NaN or infinite numbers")
-    if np.abs(numbers).max() > _LARGEST_ENTRY:
-        raise DataError(f"{place}: holds numbers beyond {_LARGEST_ENTRY:g}")
+        raise DataError(f"{location}: contains NaN or infinite numbers")
+    if np.abs(numbers).max() > _MAX_ENTRY:
+        raise DataError(f"{location}: contains numbers beyond {_MAX_ENTRY:g}")
     return numbers.reshape(shape)
 
 
 def read_drives(folder: Path) -> Mapping[str, str]:
-    """The drive of each frame of KITTI's training/ from train_mapping.txt and train_rand.txt.
+    """Return the drive of each frame of KITTI's training/.
 
-    The first has a line "date drive frame" per frame, the second for each frame the number of its
-    line, from 1.
+    train_mapping.txt has a line "date drive frame" for each recorded frame. train_rand.txt has one
+    number for each frame of training/: the number of its line in train_mapping.txt, from 1. For
+    example, if train_rand.txt begins with 7, frame 000000 is from the drive on line 7.
 
     Raises:
         DataError: if a file is missing or malformed.
@@ -265,31 +279,31 @@ def read_drives(folder: Path) -> Mapping[str, str]:
         text = read_bytes(path, "mapping").decode("utf-8", "replace")
         numbers = [int(number) for number in text.replace(",", " ").split()]
     except ValueError as error:
-        raise DataError(f"{path}: {error}; it holds only numbers of lines") from None
+        raise DataError(f"{path}: {error}; the file must contain only line numbers") from None
     if not all(1 <= number <= len(drives) for number in numbers):
-        raise DataError(f"{path}: names a line that train_mapping.txt does not have")
+        raise DataError(f"{path}: contains a line number that train_mapping.txt does not have")
     return {f"{i:06d}": drives[number - 1] for i, number in enumerate(numbers)}
 
 
 def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
-    """Yield the files of a folder without hidden ones: macOS strews ._ files over foreign disks."""
+    """Yield the files of a folder that match a pattern, without hidden ones such as macOS' ._*."""
     if not folder.is_dir():
         return
-    with os.scandir(folder) as entries:  # `glob` would hold an object per file
+    with os.scandir(folder) as entries:  # `glob` would keep an object per file in memory
         for entry in entries:
             if not entry.name.startswith(".") and fnmatchcase(entry.name, pattern):
                 yield folder / entry.name
 
 
 def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str, ...]]:
-    """Return the frame lists of a folder by file name; none where it is not there.
+    """Return the frame lists of a folder by file name; empty if the folder does not exist.
 
     Args:
-        folder: of the lists.
-        boundary: that links must not lead out of.
+        folder: the folder of the lists.
+        boundary: the boundary of the data set.
 
     Raises:
-        DataError: if a list names something that is no frame id, or lies elsewhere.
+        DataError: if a list contains an invalid frame id, or is a link out of the data set.
     """
     paths = sorted(visible_files(folder, "*.txt"))
     boundary.check(*paths)
@@ -297,12 +311,16 @@ def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str
 
 
 def read_frame_list(path: Path) -> tuple[str, ...]:
-    """Return the frame ids of a text file, one per line; DataError for what is no frame id."""
+    """Return the frame ids of a text file, one per line.
+
+    Raises:
+        DataError: if the file is missing or not text, or a line is not a valid frame id.
+    """
     names: list[str] = []
     try:
         text = read_bytes(path, "frame list").decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is no UTF-8 text: {error.reason} at {error.start}") from None
+        raise DataError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from None
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip():
             try:
@@ -314,14 +332,22 @@ def read_frame_list(path: Path) -> tuple[str, ...]:
 
 
 def read_bytes(path: Path, kind: str) -> bytes:
-    """Return the content of a file; DataError with its kind where it is missing."""
-    with opened(path, kind) as file:
+    """Return the content of a file; `kind` is e.g. "velodyne", for error messages.
+
+    Raises:
+        DataError: if the file is missing or cannot be read.
+    """
+    with open_unbuffered(path, kind) as file:
         return file.read()
 
 
 @contextmanager
-def opened(path: Path, kind: str) -> Iterator[io.FileIO]:
-    """A file that is read at once, so without a buffer; DataError with its kind where missing."""
+def open_unbuffered(path: Path, kind: str) -> Iterator[io.FileIO]:
+    """Open a file for one large read, which needs no buffer.
+
+    Raises:
+        DataError: if the file is missing or cannot be read.
+    """
     try:
         with path.open("rb", buffering=0) as file:
             yield file

@@ -5,9 +5,12 @@ line: category, truncated, occluded, alpha, left, top, right, bottom (pixels), h
 (metres), x, y, z of the bottom centre in the rectified camera frame (metres), rotation_y (radians),
 and in result files a 16th field, the score.
 
-The yaw about the LiDAR's z and the rotation_y about the camera's y are taken for opposite turns
-about the same axis, as is usual with KITTI: yaw = -rotation_y - pi/2. The two axes are less than
-one degree apart.
+The LiDAR's z axis and the camera's y axis point in opposite directions and differ by less than one
+degree. As is usual with KITTI, they are treated as the same axis: yaw = -rotation_y - pi/2. The
+bottom centre is raised by half the height along the camera's y axis (which points down), and then
+transformed to the LiDAR frame. Example: a car 1.5 m high at (2, 1.7, 20) in the camera frame, which
+drives away from the camera, has rotation_y = -pi/2. Its centre is (2, 0.95, 20) in the camera
+frame, about (20, -2, -0.95) in the frame of a LiDAR at the camera, and its yaw is 0.
 """
 
 from collections.abc import Collection, Sequence
@@ -30,11 +33,11 @@ DONT_CARE = "DontCare"
 KITTI_CATEGORIES = frozenset(
     {"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", DONT_CARE}
 )
-"""Every category that KITTI's own label files name."""
+"""All categories in the label files of KITTI."""
 
 LABEL_FIELDS, RESULT_FIELDS = 15, 16
-# Of a field; KITTI's own placeholders reach -1000.
-_LARGEST = 1e6
+# Largest accepted absolute value of a field; KITTI's placeholders go down to -1000.
+_MAX_VALUE = 1e6
 
 
 @dataclass(frozen=True)
@@ -43,14 +46,14 @@ class KittiObjects(Columns):
 
     Attributes:
         categories: (n,) str; "DontCare" marks regions that have only a 2D box.
-        truncated: (n,) float64, share of the object outside the image, 0 to 1; -1 unknown.
-        occluded: (n,) int64, KITTI's levels 0 to 3; -1 unknown.
+        truncated: (n,) float64, fraction of the object outside the image, 0 to 1; -1 if unknown.
+        occluded: (n,) int64, KITTI's occlusion levels 0 to 3; -1 if unknown.
         alpha: (n,) float64, observation angle in radians.
-        boxes_2d: (n, 4) float64 left, top, right, bottom in pixels.
-        dimensions: (n, 3) float64 height, width, length in metres.
-        locations: (n, 3) float64 bottom centre in the rectified camera frame, metres.
-        rotations_y: (n,) float64 about the camera's y axis, radians.
-        scores: (n,) float64, NaN where the file has none.
+        boxes_2d: (n, 4) float64: left, top, right, bottom in pixels.
+        dimensions: (n, 3) float64: height, width, length in metres.
+        locations: (n, 3) float64: bottom centre in the rectified camera frame, in metres.
+        rotations_y: (n,) float64: rotation about the camera's y axis, in radians.
+        scores: (n,) float64; NaN if the file has no scores.
     """
 
     categories: Shaped[np.ndarray, " n"]
@@ -65,54 +68,55 @@ class KittiObjects(Columns):
 
     @classmethod
     def empty(cls) -> Self:
-        """No objects."""
+        """Return zero objects."""
         return cls(as_categories([]), *_columns(np.zeros((0, RESULT_FIELDS - 1))))
 
 
 def read_objects(
-    path: StrPath, *, scored: bool = False, known: Collection[str] | None = KITTI_CATEGORIES
+    path: StrPath, *, scored: bool = False, categories: Collection[str] | None = KITTI_CATEGORIES
 ) -> KittiObjects:
     """Return the objects of a KITTI label file, or of a result file if `scored`.
 
-    Label files have 15 fields per line, result files 16.
-    Empty lines are skipped; an empty file holds no objects.
+    Label files have 15 fields per line, result files 16. Empty lines are skipped. An empty file
+    contains no objects.
 
     Args:
         path: the text file.
         scored: whether each line ends with a score.
-        known: the category names that may occur; None accepts any.
+        categories: the allowed category names; None allows any.
 
     Raises:
-        DataError: if the file is missing or not text, or a line has too few or too many fields, a
-            field that is not a finite number, an unknown category, or a negative dimension of an
-            object that is not DontCare.
+        DataError: if the file is missing or not text, or if a line has a wrong number of fields, a
+            field that is not a finite number, an unknown category, or a negative dimension (unless
+            it is a DontCare region).
     """
     fields = RESULT_FIELDS if scored else LABEL_FIELDS
     path = Path(path)
     lines = _read_lines(path)
     rows = [row for row in map(str.split, lines) if row]
-    categories = [row[0] for row in rows]
+    names = [row[0] for row in rows]
+    # All lines are parsed and checked at once for speed; the bad line is searched only on failure.
     try:
         values = np.array([float(field) for row in rows for field in row[1:]])
         values = values.reshape(len(rows), fields - 1)
-    except ValueError:  # not a number, or too many or too few
-        raise _first_fault(path, lines, fields, known) from None
+    except ValueError:  # a field that is not a number, or a wrong number of fields
+        raise _first_error(path, lines, fields, categories) from None
     if (
         any(len(row) != fields for row in rows)
-        or not (np.abs(values) <= _LARGEST).all()
-        or (known is not None and not frozenset(known).issuperset(categories))
-        or _has_negative_side(categories, values[:, 7:10])
+        or not (np.abs(values) <= _MAX_VALUE).all()
+        or (categories is not None and not frozenset(categories).issuperset(names))
+        or _has_negative_dimension(names, values[:, 7:10])
     ):
-        raise _first_fault(path, lines, fields, known)
-    return KittiObjects(as_categories(categories), *_columns(values))
+        raise _first_error(path, lines, fields, categories)
+    return KittiObjects(as_categories(names), *_columns(values))
 
 
 def write_objects(path: StrPath, objects: KittiObjects) -> None:
-    """Write a label file, or a result file where the objects have scores, whole or not at all.
+    """Write a label file atomically, or a result file if the objects have scores.
 
-    KITTI's own files have two decimals. Here alpha, dimensions, location and rotation_y have four,
-    so that a box comes back within 0.1 mm per coordinate, and the score has six; truncation and
-    the 2D box have two.
+    The files of KITTI have two decimals. This function writes four decimals for alpha, dimensions,
+    location and rotation_y, so that a box is read back within 0.1 mm per coordinate; six for the
+    score; and two for truncation and the 2D box.
 
     Raises:
         DataError: if a number is not finite, or only some objects have scores.
@@ -127,9 +131,7 @@ def write_objects(path: StrPath, objects: KittiObjects) -> None:
     ]
     for number, line in enumerate(lines, start=1):
         if "nan" in line or "inf" in line:
-            raise DataError(
-                f"{path}:{number}: refuses to write numbers that are not finite: {line}"
-            )
+            raise DataError(f"{path}:{number}: cannot write numbers that are not finite: {line}")
     replace_file(path, "".join(f"{line}\n" for line in lines).encode())
 
 
@@ -149,12 +151,15 @@ def to_annotations(objects: KittiObjects, calibration: Calibration) -> Annotatio
 
 def to_detections(objects: KittiObjects, calibration: Calibration) -> Detections:
     """Return the objects as detections in the LiDAR frame, without DontCare regions."""
-    found = objects.select(objects.categories != DONT_CARE)
-    return Detections(_boxes_lidar(found, calibration), found.scores, found.categories)
+    kept = objects.select(objects.categories != DONT_CARE)
+    return Detections(_boxes_lidar(kept, calibration), kept.scores, kept.categories)
 
 
 def from_annotations(annotations: Annotations, calibration: Calibration) -> KittiObjects:
-    """Inverse of `to_annotations`; DontCare regions get KITTI's placeholders (-1, -1000, -10)."""
+    """Return ground truth as KITTI objects, the inverse of `to_annotations`.
+
+    DontCare regions get KITTI's placeholders: dimensions -1, location -1000, rotation_y -10.
+    """
     dimensions, locations, rotations_y = _boxes_camera(annotations.boxes, calibration)
     region = annotations.categories == DONT_CARE
     dimensions[region], locations[region], rotations_y[region] = -1, -1000, -10
@@ -174,16 +179,16 @@ def from_annotations(annotations: Annotations, calibration: Calibration) -> Kitt
 def from_detections(
     detections: Detections, calibration: Calibration, image_size: tuple[int, int]
 ) -> KittiObjects:
-    """Return the detections in KITTI's form, in the same order.
+    """Return detections as KITTI objects, in the same order.
 
-    The 2D box is the projected 3D box clipped to the image; a box that does not reach the image
-    gets (-1, -1, -1, -1), which has no height, so that KITTI's evaluation ignores it. Truncation
-    and occlusion are unknown (-1).
+    The 2D box is the projected 3D box, clipped to the image. A box outside the image gets (-1, -1,
+    -1, -1); its height is 0, so KITTI's evaluation ignores it. Truncation and occlusion are unknown
+    (-1).
 
     Args:
         detections: boxes in the LiDAR frame.
-        calibration: of the frame.
-        image_size: (width, height) in pixels.
+        calibration: calibration of the frame.
+        image_size: (width, height) of the image in pixels.
     """
     dimensions, locations, rotations_y = _boxes_camera(detections.boxes, calibration)
     boxes_2d = image_rectangles(detections.boxes, calibration, image_size)
@@ -202,7 +207,7 @@ def from_detections(
 
 
 def _boxes_lidar(objects: KittiObjects, calibration: Calibration) -> np.ndarray:
-    """Return (n, 7) centre boxes in the LiDAR frame."""
+    """Return the (n, 7) boxes in the LiDAR frame."""
     height, width, length = objects.dimensions.T
     centres = objects.locations.copy()
     centres[:, 1] -= height / 2  # the camera's y points down
@@ -221,7 +226,7 @@ def _boxes_lidar(objects: KittiObjects, calibration: Calibration) -> np.ndarray:
 def _boxes_camera(
     boxes: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (n, 3) height, width, length; (n, 3) bottom centres; (n,) rotation_y."""
+    """Return (n, 3) height, width, length; (n, 3) bottom centres; (n,) rotation_y, as in KITTI."""
     to_camera = calibration.lidar_to_camera
     locations = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
     locations[:, 1] += boxes[:, 5] / 2
@@ -244,7 +249,7 @@ def _columns(values: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _format(objects: KittiObjects, index: int) -> str:
-    """One label line without the score."""
+    """Return the label line of one object, without the score."""
     category = objects.categories[index]
     box_2d = " ".join(f"{pixel:.2f}" for pixel in objects.boxes_2d[index])
     if category == DONT_CARE:
@@ -257,7 +262,6 @@ def _format(objects: KittiObjects, index: int) -> str:
 
 
 def _read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file; DataError where there is none."""
     try:
         return path.read_bytes().decode("utf-8-sig").splitlines()
     except FileNotFoundError:
@@ -265,50 +269,52 @@ def _read_lines(path: Path) -> list[str]:
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is not a text file (byte {error.start})") from error
+        raise DataError(f"{path}: not a text file (byte {error.start})") from error
 
 
-def _has_negative_side(categories: Sequence[str], dimensions: np.ndarray) -> bool:
-    """Return whether an object that is not DontCare has a negative dimension."""
+def _has_negative_dimension(categories: Sequence[str], dimensions: np.ndarray) -> bool:
+    """Return whether an object other than a DontCare region has a negative dimension."""
     if dimensions.min(initial=0) >= 0:
         return False
     rows = np.flatnonzero((dimensions < 0).any(axis=1)).tolist()
     return any(categories[row] != DONT_CARE for row in rows)
 
 
-def _first_fault(
-    path: Path, lines: Sequence[str], fields: int, known: Collection[str] | None
+def _first_error(
+    path: Path, lines: Sequence[str], fields: int, categories: Collection[str] | None
 ) -> DataError:
-    """Return the error for the first bad line of a file that has one."""
+    """Return the error for the first invalid line of a file with at least one."""
     rows = [(number, line.split()) for number, line in enumerate(lines, start=1)]
-    faults = ((number, _fault(row, fields, known)) for number, row in rows if row)
-    number, fault = next((number, fault) for number, fault in faults if fault)
-    return DataError(f"{path}:{number}: {fault}")
+    problems = ((number, _line_problem(row, fields, categories)) for number, row in rows if row)
+    number, problem = next((number, problem) for number, problem in problems if problem)
+    return DataError(f"{path}:{number}: {problem}")
 
 
-def _fault(row: Sequence[str], fields: int, known: Collection[str] | None) -> str | None:
-    """What is wrong with one line, if anything."""
+def _line_problem(
+    row: Sequence[str], fields: int, categories: Collection[str] | None
+) -> str | None:
+    """Return what is wrong with one line, or None."""
     if len(row) != fields:
-        kind = "a result line ends with a score and" if fields == RESULT_FIELDS else "a label line"
-        return f"{len(row)} fields, but {kind} has {fields}"
-    if known is not None and row[0] not in known:
-        return f"unknown category {row[0][:40]!r}; known are {', '.join(sorted(known))}"
-    wrong = next(filter(None, map(_wrong_number, row[1:])), None)
-    if wrong:
-        return wrong
+        kind = "result lines (which end with a score)" if fields == RESULT_FIELDS else "label lines"
+        return f"{len(row)} fields, but {kind} have {fields}"
+    if categories is not None and row[0] not in categories:
+        return f"unknown category {row[0][:40]!r}; use one of {', '.join(sorted(categories))}"
+    problem = next(filter(None, map(_number_problem, row[1:])), None)
+    if problem:
+        return problem
     if row[0] != DONT_CARE and min(map(float, row[8:11])) < 0:
         return f"negative height, width or length ({' '.join(row[8:11])}) of a {row[0]}"
     return None
 
 
-def _wrong_number(field: str) -> str | None:
-    """What is wrong with a field that should be a number, if anything."""
+def _number_problem(field: str) -> str | None:
+    """Return what is wrong with a field that must be a number, or None."""
     try:
         number = float(field)
     except ValueError:
         return f"{field[:40]!r} is not a number"
     if not np.isfinite(number):
         return f"{field[:40]!r} is not a finite number"
-    if abs(number) > _LARGEST:
-        return f"{field[:40]!r} is beyond {_LARGEST:g}, which nothing in a label can be"
+    if abs(number) > _MAX_VALUE:
+        return f"{field[:40]!r} is beyond {_MAX_VALUE:g}, the largest valid number in a label"
     return None

@@ -1,9 +1,9 @@
-"""KITTI's raw recordings, synced and rectified.
+"""Reader of KITTI's raw recordings, synced and rectified.
 
-Source: Geiger et al., "Vision meets robotics: the KITTI dataset", IJRR 2013. A date folder holds
-calib_velo_to_cam.txt, calib_cam_to_cam.txt and drives with velodyne_points/data and image_02/data.
-A frame is named by its drive and number, 2011_09_26_drive_0001_sync_0000000005. Labels in the
-format of KITTI object may lie in DRIVE/label_2.
+Source: Geiger et al., "Vision meets robotics: the KITTI dataset", IJRR 2013. A date folder contains
+calib_velo_to_cam.txt, calib_cam_to_cam.txt, and drives with velodyne_points/data and image_02/data.
+A frame id is the drive and the number: 2011_09_26_drive_0001_sync_0000000005. DRIVE/label_2 may
+contain labels in the format of the KITTI object data set.
 """
 
 from collections.abc import Mapping
@@ -29,19 +29,19 @@ from curate.frames import Calibration, Frame, FrameFiles
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
 _TO_CAMERA, _CAMERAS = "calib_velo_to_cam.txt", "calib_cam_to_cam.txt"
-# Drives lie in the date folder, or dates below the root.
+# The root is a date folder with drives, or a folder of date folders.
 _DRIVES = ("*", "*/*")
 
 
 class KittiRawDataset:
-    """A `Dataset` of synced drives; frames without an image are left out.
+    """A `Dataset` of synced drives; frames without an image are skipped.
 
     Args:
-        root: a date folder with drives, or a folder of dates.
-        follow_links: whether links may lead out of it.
+        root: a date folder with drives, or a folder of date folders.
+        follow_links: whether links may lead out of the root.
 
     Raises:
-        DataError: there is no drive.
+        DataError: if there is no drive.
     """
 
     name = "kitti-raw"
@@ -49,59 +49,63 @@ class KittiRawDataset:
     def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
-        found = (path.parent.parent for at in _DRIVES for path in self.root.glob(f"{at}/{_POINTS}"))
-        self._drives = {path.name: path for path in sorted(found)}
+        drives = (
+            path.parent.parent
+            for pattern in _DRIVES
+            for path in self.root.glob(f"{pattern}/{_POINTS}")
+        )
+        self._drives = {path.name: path for path in sorted(drives)}
         if not self._drives:
             raise DataError(
-                f"{self.root}: holds no DRIVE/{_POINTS}; name the date folder, which also holds "
-                f"{_TO_CAMERA}, or the folder of all dates"
+                f"{self.root}: contains no DRIVE/{_POINTS}; set the root to the date folder, which "
+                f"also contains {_TO_CAMERA}, or to the folder of all dates"
             )
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return all frames with points and image, in sorted order."""
-        return tuple(self._homes)
+        """Return the ids of all frames with points and image, sorted."""
+        return tuple(self._frames)
 
     @cached_property
-    def _homes(self) -> Mapping[str, tuple[Path, str]]:
-        """Drive and number of each frame."""
-        found = {
-            f"{drive}_{points.stem}": (home, points.stem)
-            for drive, home in self._drives.items()
-            for points in visible_files(home / _POINTS, "*.bin")
-            if (home / _IMAGES / f"{points.stem}.png").exists()
+    def _frames(self) -> Mapping[str, tuple[Path, str]]:
+        """The folder of the drive and the number of each frame."""
+        frames = {
+            f"{drive}_{points.stem}": (folder, points.stem)
+            for drive, folder in self._drives.items()
+            for points in visible_files(folder / _POINTS, "*.bin")
+            if (folder / _IMAGES / f"{points.stem}.png").exists()
         }
-        return dict(sorted(found.items()))
+        return dict(sorted(frames.items()))
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
-        """Return the lists of ROOT/ImageSets, by file name."""
+        """Return the frame lists in ROOT/ImageSets by file name."""
         return read_frame_lists(self.root / "ImageSets", self._boundary)
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """Return the drive of a frame."""
-        return self._homes[frame_id][0].name if frame_id in self._homes else None
+        """Return the drive of a frame, or None if there is no such frame."""
+        return self._frames[frame_id][0].name if frame_id in self._frames else None
 
     def files(self, frame_id: str) -> FrameFiles:
-        """Where the frame's files lie; the calibration is the drive's.
+        """Return the paths of the frame's files; all frames of a date share the calibration.
 
         Raises:
             DataError: if there is no such frame.
         """
         check_frame_id(frame_id)
-        if frame_id not in self._homes:
-            raise DataError(f"{self.root}: no frame {frame_id}; frames are named DRIVE_NUMBER")
-        home, number = self._homes[frame_id]
-        label = home / "label_2" / f"{number}.txt"
-        found = FrameFiles(
-            points=home / _POINTS / f"{number}.bin",
-            image=home / _IMAGES / f"{number}.png",
-            calibration=home.parent / _TO_CAMERA,
+        if frame_id not in self._frames:
+            raise DataError(f"{self.root}: no frame {frame_id}; frame ids are DRIVE_NUMBER")
+        drive, number = self._frames[frame_id]
+        label = drive / "label_2" / f"{number}.txt"
+        files = FrameFiles(
+            points=drive / _POINTS / f"{number}.bin",
+            image=drive / _IMAGES / f"{number}.png",
+            calibration=drive.parent / _TO_CAMERA,
             label=label if label.exists() else None,
         )
-        self._boundary.check(*found.paths(), home.parent / _CAMERAS)
-        return found
+        self._boundary.check(*files.paths(), drive.parent / _CAMERAS)
+        return files
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
-        """The frame's calibration, its points unless unwanted, and its image where asked for.
+        """Read the frame's calibration and image size, and its points and image if requested.
 
         Raises:
             DataError: if a file is missing, damaged or malformed.
@@ -120,14 +124,17 @@ class KittiRawDataset:
         """
         files = self.files(frame_id)
         if files.label is None:
-            home, number = self._homes[frame_id]
-            raise DataError(f"{home / 'label_2' / number}.txt: no such label file")
+            drive, number = self._frames[frame_id]
+            raise DataError(f"{drive / 'label_2' / number}.txt: no such label file")
         calibration = read_raw_calibration(files.calibration.parent)
         return to_annotations(read_objects(files.label), calibration)
 
 
 def read_raw_calibration(folder: Path) -> Calibration:
-    """The calibration of the left colour camera (P_rect_02, R_rect_00, R and T of the LiDAR).
+    """Return the calibration of the left colour camera (P_rect_02, R_rect_00, R and T).
+
+    Args:
+        folder: the date folder.
 
     Raises:
         DataError: if a file or an entry is missing or malformed.

@@ -1,4 +1,4 @@
-"""nuScenes: key frames of its LiDAR and one camera, read from its tables."""
+"""Reader of nuScenes: the key frames of the LiDAR and one camera, from nuScenes' tables."""
 
 from curate.datasets.nuscenes.dataset import NuScenesDataset
 

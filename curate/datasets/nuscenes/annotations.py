@@ -1,6 +1,6 @@
-"""Ground truth of nuScenes, brought from the map into the LiDAR's frame of reference.
+"""Ground truth of nuScenes, transformed from the map frame to the LiDAR frame.
 
-Only the records of the frame that is asked for are decoded: those of other frames stay text.
+Only the records of the requested frame are parsed as JSON; the table is indexed by byte offsets.
 """
 
 import re
@@ -28,21 +28,22 @@ from curate.geometry.poses import boxes_in_frame
 from curate.geometry.projection import image_rectangles
 from curate.geometry.similarity import wrap_angle
 
-# KITTI's occlusion by nuScenes' visibility in all cameras: up to 40, 60, 80, 100 percent.
-_OCCLUDED = {"1": 2, "2": 1, "3": 1, "4": 0}
+# KITTI's occlusion level for nuScenes' visibility token (up to 40, 60, 80, 100 percent visible).
+_OCCLUSION = {"1": 2, "2": 1, "3": 1, "4": 0}
 _UNKNOWN = 3
-# Beyond so many widths and heights of the image, what is cut off does not count as more.
-_AROUND = 10
+# Margin around the image for truncation, in image widths and heights. It bounds the 2D box of an
+# object that is partly behind the camera.
+_MARGIN = 10
 _SAMPLE = re.compile(rb'"sample_token"\s*:\s*"([^"]*)"')
 
 
 class AnnotationTable:
-    """The table sample_annotation, from which single frames are read.
+    """Reads the objects of single frames from the table sample_annotation.
 
     Args:
-        tables: its folder.
-        rename: categories by name of the detection task's class.
-        minimum_points: objects in which fewer LiDAR points were counted are left out.
+        tables: folder of the tables.
+        rename: the category for each class of the detection task.
+        minimum_points: objects with fewer LiDAR points (num_lidar_pts) are dropped.
     """
 
     def __init__(self, tables: Path, rename: Mapping[str, str], minimum_points: int) -> None:
@@ -54,17 +55,23 @@ class AnnotationTable:
     def read(
         self, token: str, calibration: Calibration, image_size: tuple[int, int]
     ) -> Annotations:
-        """Return the objects of a frame that the camera sees, in the order of the table.
+        """Return the objects of a frame in the camera's view, in the order of the table.
+
+        Args:
+            token: sample token of the frame.
+            calibration: calibration of the frame, with the pose of the LiDAR.
+            image_size: (width, height) in pixels.
 
         Raises:
-            DataError: if a table is missing or damaged, or a record cannot be.
+            DataError: if a table is missing or damaged, or a record is invalid.
         """
-        records = [one for one in self._records(token) if self._counted(one)]
+        records = [record for record in self._records(token) if self._has_enough_points(record)]
         boxes = self._boxes(records, calibration)
-        categories = as_categories([self._category(one) for one in records])
-        levels = [_OCCLUDED.get(str(one.get("visibility_token")), _UNKNOWN) for one in records]
+        categories = as_categories([self._category(record) for record in records])
+        visibilities = [str(record.get("visibility_token")) for record in records]
+        levels = [_OCCLUSION.get(visibility, _UNKNOWN) for visibility in visibilities]
         rectangles = image_rectangles(boxes, calibration, image_size)
-        found = Annotations(
+        objects = Annotations(
             boxes,
             categories,
             _truncation(boxes, rectangles, calibration, image_size),
@@ -72,40 +79,44 @@ class AnnotationTable:
             _observation_angles(boxes, calibration),
             rectangles,
         )
-        return found.select(~np.isnan(rectangles).any(axis=1))
+        return objects.select(~np.isnan(rectangles).any(axis=1))
 
     def _records(self, token: str) -> list[Record]:
         with self.path.open("rb") as file:
-            found = []
-            for start, length in self._places.get(token, ()):
+            records = []
+            for start, length in self._index.get(token, ()):
                 file.seek(start)
-                found.append(parse_record(self.path, file.read(length)))
-        return found
+                records.append(parse_record(self.path, file.read(length)))
+        return records
 
     @cached_property
-    def _places(self) -> Mapping[str, list[tuple[int, int]]]:
-        """Where the records of each sample are in the file: first byte and length."""
-        places: dict[str, list[tuple[int, int]]] = {}
+    def _index(self) -> Mapping[str, list[tuple[int, int]]]:
+        """The byte offset and length of each record in the file, by sample token."""
+        index: dict[str, list[tuple[int, int]]] = {}
         for start, content in scan_table(self.path):
             sample = _SAMPLE.search(content)
             if sample is None:
                 raise DataError(f"{self.path}: the record at byte {start} has no sample_token")
             token = sample.group(1).decode(errors="replace")
-            places.setdefault(token, []).append((start, len(content)))
-        return places
+            index.setdefault(token, []).append((start, len(content)))
+        return index
 
-    def _counted(self, record: Record) -> bool:
+    def _has_enough_points(self, record: Record) -> bool:
         return count(self.path, record, "num_lidar_pts") >= self.minimum_points
 
     def _boxes(self, records: list[Record], calibration: Calibration) -> np.ndarray:
-        centres = [numbers(self.path, one, "translation", (3,)) for one in records]
-        sizes = np.reshape([numbers(self.path, one, "size", (3,)) for one in records], (-1, 3))
-        if (sizes <= 0).any():
-            raise DataError(f"{self.path}: a size of {sizes.min():g} m; they are above 0")
-        turns = [quaternion(self.path, one) for one in records]
-        lengths_first = sizes[:, [1, 0, 2]]
-        places = np.reshape(centres, (-1, 3)), lengths_first, np.reshape(turns, (-1, 4))
-        return boxes_in_frame(*places, calibration.pose_in_map())
+        centres = [numbers(self.path, record, "translation", (3,)) for record in records]
+        sizes = [numbers(self.path, record, "size", (3,)) for record in records]
+        widths_first = np.reshape(sizes, (-1, 3))
+        if (widths_first <= 0).any():
+            raise DataError(f"{self.path}: a size of {widths_first.min():g} m; it must be above 0")
+        rotations = [quaternion(self.path, record) for record in records]
+        return boxes_in_frame(
+            np.reshape(centres, (-1, 3)),
+            widths_first[:, [1, 0, 2]],
+            np.reshape(rotations, (-1, 4)),
+            calibration.pose_in_map(),
+        )
 
     def _category(self, record: Record) -> str:
         token = text(self.path, record, "instance_token")
@@ -115,44 +126,55 @@ class AnnotationTable:
 
     @cached_property
     def _names(self) -> Mapping[str, str]:
-        """General class of each instance."""
+        """The general class of each instance, such as vehicle.car."""
         path = self.tables / "category.json"
-        names = {token: text(path, one, "name") for token, one in read_table(path).items()}
+        names = {token: text(path, record, "name") for token, record in read_table(path).items()}
         path = self.tables / "instance.json"
-        kinds = {
-            token: text(path, one, "category_token") for token, one in read_table(path).items()
+        categories = {
+            token: text(path, record, "category_token")
+            for token, record in read_table(path).items()
         }
-        return {token: names[kind] for token, kind in kinds.items() if kind in names}
+        return {token: names[of] for token, of in categories.items() if of in names}
 
 
 def _truncation(
     boxes: np.ndarray, rectangles: np.ndarray, calibration: Calibration, size: tuple[int, int]
 ) -> np.ndarray:
-    """(n,) share of each projected box that lies outside the image; 1 where all of it does."""
-    around = np.array(size) * _AROUND
-    moved = np.eye(3)
-    moved[:2, 2] = around
-    wider = Calibration(moved @ calibration.projection, calibration.lidar_to_camera)
-    width, height = (np.array(size) + 2 * around).tolist()
-    whole = image_rectangles(boxes, wider, (width, height))
-    share = _areas(rectangles) / np.maximum(_areas(whole), 1e-9)
-    outside: np.ndarray = np.clip(1 - np.nan_to_num(share), 0, 1)
+    """Return (n,) the fraction of each projected box outside the image; 1 if nothing is inside.
+
+    The full 2D box is the projection into a larger image, with a margin on all sides. For example,
+    a 2D box of 100 x 50 pixels of which 40 x 50 lie in the image has truncation 0.6.
+
+    Args:
+        boxes: (n, 7) in the LiDAR frame.
+        rectangles: (n, 4) projected boxes, clipped to the image.
+        calibration: calibration of the frame.
+        size: (width, height) of the image in pixels.
+    """
+    margin = np.array(size) * _MARGIN
+    shift = np.eye(3)
+    shift[:2, 2] = margin
+    wider = Calibration(shift @ calibration.projection, calibration.lidar_to_camera)
+    width, height = (np.array(size) + 2 * margin).tolist()
+    full = image_rectangles(boxes, wider, (width, height))
+    inside = _areas(rectangles) / np.maximum(_areas(full), 1e-9)
+    outside: np.ndarray = np.clip(1 - np.nan_to_num(inside), 0, 1)
     return outside
 
 
 def _areas(rectangles: np.ndarray) -> np.ndarray:
-    """Return (n,) pixels."""
+    """Return (n,) areas in pixels of left, top, right, bottom."""
     areas: np.ndarray = np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)
     return areas
 
 
 def _observation_angles(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """Return (n,) KITTI's alpha: the heading against the ray from the camera, radians."""
+    """Return (n,) KITTI's alpha in radians: rotation_y minus the angle of the ray to the centre."""
     to_camera = calibration.lidar_to_camera
     centres = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
-    level = np.zeros(len(boxes))
-    ahead = np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), level])
-    ahead = ahead @ to_camera[:3, :3].T
-    rotation_y = np.arctan2(-ahead[:, 2], ahead[:, 0])
+    zeros = np.zeros(len(boxes))
+    headings = np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), zeros])
+    headings = headings @ to_camera[:3, :3].T
+    rotation_y = np.arctan2(-headings[:, 2], headings[:, 0])
     angles: np.ndarray = wrap_angle(rotation_y - np.arctan2(centres[:, 0], centres[:, 2]))
     return angles

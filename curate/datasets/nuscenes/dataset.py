@@ -1,9 +1,9 @@
-"""nuScenes' key frames as a data set: LIDAR_TOP, one camera, and the objects that it sees.
+"""The key frames of nuScenes as a data set: LIDAR_TOP, one camera, and the objects in its view.
 
 Source: Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 2020. ROOT
-holds samples/ and the tables of a version, such as v1.0-mini/. A frame is named by its sample
-token, as in nuScenes' results. Point files have five float32 per point, of which the fifth, the
-number of the ring, is left out; intensities are 0 to 255.
+contains samples/ and the tables of a version, such as v1.0-mini/. A frame id is a sample token, as
+in nuScenes' result files. Point files have five float32 per point; the fifth, the ring number, is
+dropped. Intensities are 0 to 255.
 """
 
 import logging
@@ -31,19 +31,19 @@ _COLUMNS, _FULL_INTENSITY = 5, 255.0
 
 
 class NuScenesDataset:
-    """A `Dataset` and `Sequenced` of nuScenes' key frames; those whose files are not there are out.
+    """A `Dataset` and `Sequenced` of nuScenes' key frames; frames with missing files are skipped.
 
     Args:
         root: the folder with samples/ and v1.0-*/.
-        version: name of the folder of tables; needless where there is one.
+        version: name of the folder of tables; only needed if there are several.
         camera: channel of the camera.
-        rename: categories by name of the detection task's class, in place of `names.CATEGORIES`.
-        minimum_points: annotated objects with fewer LiDAR points (num_lidar_pts) are left out.
-        follow_links: whether links and names in the tables may lead out of the root.
+        rename: the category for each class of the detection task, in place of `names.CATEGORIES`.
+        minimum_points: annotated objects with fewer LiDAR points (num_lidar_pts) are dropped.
+        follow_links: whether links and paths in the tables may lead out of the root.
 
     Raises:
-        DataError: there are no tables.
-        ConfigError: there is no such version, or there are several and none is named.
+        DataError: if there are no tables.
+        ConfigError: if the version does not exist, or there are several and none is specified.
     """
 
     name = "nuscenes"
@@ -65,10 +65,10 @@ class NuScenesDataset:
         self._tables = self.root / self.version
         self._boundary.check(*self._tables.glob("*.json"))
         names = CATEGORIES if rename is None else rename
-        self._annotated = AnnotationTable(self._tables, names, minimum_points)
+        self._annotations = AnnotationTable(self._tables, names, minimum_points)
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return the sample tokens of all key frames with sweep and image, in sorted order."""
+        """Return the sample tokens of all key frames with sweep and image, sorted."""
         return self._present
 
     @cached_property
@@ -77,59 +77,67 @@ class NuScenesDataset:
 
     @cached_property
     def _present(self) -> tuple[str, ...]:
-        """The frames whose files are there: the data set comes in ten parts, not all at once."""
+        """The frames with both files; the data set is often downloaded in part (of ten)."""
         frames = self._keyframes
-        wanted = {file for one in frames.values() for file in (one.points, one.image)}
-        folders = {str(Path(file).parent) for file in wanted}
-        there = {
+        needed = {file for frame in frames.values() for file in (frame.points, frame.image)}
+        folders = {str(Path(file).parent) for file in needed}
+        existing = {
             f"{folder}/{path.name}"
             for folder in folders
             if (self.root / folder).is_dir()
             for path in (self.root / folder).iterdir()
         }
-        present = tuple(token for token, one in frames.items() if {one.points, one.image} <= there)
+        present = tuple(
+            token for token, frame in frames.items() if {frame.points, frame.image} <= existing
+        )
         if len(present) < len(frames):
-            told = f"{len(frames) - len(present)} of {len(frames)} key frames have no files"
+            missing = f"the files of {len(frames) - len(present)} of {len(frames)} key frames"
             if not present:
                 first = next(iter(frames.values())).points
-                raise DataError(f"{self.root}: {told}, such as {first}; is this the whole folder?")
-            _log.info("%s: %s; they are left out", self.root, told)
+                raise DataError(
+                    f"{self.root}: {missing} are missing, such as {first}; set the root to the "
+                    "folder with samples/"
+                )
+            _log.info("%s: %s are missing; these frames are skipped", self.root, missing)
         return present
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
-        """Return the official train and val of v1.0-trainval and v1.0-mini, by scene; else none."""
+        """Return the official lists train and val of v1.0-trainval and v1.0-mini.
+
+        The split is by scene. For other versions there are no lists.
+        """
         scenes = {self._keyframes[token].scene for token in self._present}
-        held_out = validation_scenes(self.version, scenes)
-        if not held_out:
+        val_scenes = validation_scenes(self.version, scenes)
+        if not val_scenes:
             return {}
         lists: dict[str, list[str]] = {"train": [], "val": []}
         for token in self._present:
-            lists["val" if self.sequence_of(token) in held_out else "train"].append(token)
+            lists["val" if self.sequence_of(token) in val_scenes else "train"].append(token)
         return {name: tuple(tokens) for name, tokens in lists.items()}
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """Return the scene of a frame: 20 seconds of one drive."""
+        """Return the scene of a frame, 20 seconds of a drive, or None for an unknown frame."""
         return self._keyframes[frame_id].scene if frame_id in self._keyframes else None
 
     def files(self, frame_id: str) -> FrameFiles:
-        """Where the frame's files lie; calibration and labels are tables of all frames.
+        """Return the paths of the frame's files; calibration and labels are tables of all frames.
 
         Raises:
-            DataError: if there is no such frame, or its files lie elsewhere.
+            DataError: if there is no such frame, or its files are outside the data set.
         """
         frame = self._frame(frame_id)
-        labels = self._annotated.path
-        found = FrameFiles(
+        labels = self._annotations.path
+        files = FrameFiles(
             points=self.root / frame.points,
             image=self.root / frame.image,
             calibration=self._tables / "calibrated_sensor.json",
             label=labels if labels.exists() else None,
         )
-        self._boundary.check(*found.paths())
-        return found
+        self._boundary.check(*files.paths())
+        return files
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
-        """The frame's calibration, its points unless unwanted, and its image where asked for.
+        """Read the frame's calibration and image size, and its points and image if requested.
 
         Raises:
             DataError: if a file is missing, damaged or malformed.
@@ -138,46 +146,49 @@ class NuScenesDataset:
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
             sweep = read_cloud(files.points, _COLUMNS, _FULL_INTENSITY)
-            # Rows times a rotation are its inverse on each: from the sensor's axes to ours.
+            # For row vectors, p @ R applies the inverse of R: from the sensor's axes to ours.
             sweep[:, :3] = sweep[:, :3] @ TO_SENSOR_AXES[:3, :3].astype(np.float32)
         pixels = read_image(files.image) if image else None
         size = frame.image_size
         if pixels is not None and pixels.shape[1::-1] != size:
-            raise DataError(f"{files.image}: {pixels.shape[1::-1]} pixels, its table says {size}")
+            raise DataError(
+                f"{files.image}: {pixels.shape[1::-1]} pixels, but {size} in sample_data.json"
+            )
         return Frame(frame_id, sweep, frame.calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
-        """Return the objects that the camera sees, in the LiDAR frame.
+        """Return the objects in the camera's view, in the LiDAR frame.
 
         Raises:
             DataError: if the version has no annotations, or they are malformed.
         """
         if self.files(frame_id).label is None:
-            raise DataError(f"{self._annotated.path}: no such table; {self.version} has no labels")
+            raise DataError(
+                f"{self._annotations.path}: no such table; {self.version} has no labels"
+            )
         frame = self._frame(frame_id)
-        return self._annotated.read(frame_id, frame.calibration, frame.image_size)
+        return self._annotations.read(frame_id, frame.calibration, frame.image_size)
 
     def _frame(self, frame_id: str) -> Keyframe:
         check_frame_id(frame_id)
         if frame_id not in self._keyframes:
-            raise DataError(
-                f"{self._tables}: no key frame {frame_id}; frames are named by their sample token"
-            )
+            raise DataError(f"{self._tables}: no key frame {frame_id}; frame ids are sample tokens")
         return self._keyframes[frame_id]
 
 
 def _version(root: Path, version: str | None) -> str:
-    """Return the folder of tables below a root."""
-    found = sorted(path.parent.name for path in root.glob("*/sample_data.json"))
-    if not found:
+    """Return the name of the folder of tables."""
+    versions = sorted(path.parent.name for path in root.glob("*/sample_data.json"))
+    if not versions:
         raise DataError(
-            f"{root}: holds no v1.0-*/sample_data.json; name the folder with samples/ and v1.0-*/"
+            f"{root}: contains no v1.0-*/sample_data.json; set the root to the folder with "
+            "samples/ and v1.0-*/"
         )
-    if version is None and len(found) == 1:
-        return found[0]
-    if version not in found:
-        asked = f"no version {version}" if version else "several versions"
+    if version is None and len(versions) == 1:
+        return versions[0]
+    if version not in versions:
+        problem = f"no version {version}" if version else "several versions"
         raise ConfigError(
-            f"{root}: {asked}; set dataset.options.version to one of {', '.join(found)}"
+            f"{root}: {problem}; set dataset.options.version to one of {', '.join(versions)}"
         )
     return version

@@ -1,7 +1,7 @@
-"""Names of nuScenes' classes, and what they are called here.
+"""The class names of nuScenes and their categories in curate.
 
-Source: nuScenes' detection task (nuscenes.org): 23 general classes of annotations, of which 14 make
-up the ten classes of the task; results name the ten.
+Source: nuScenes' detection task (nuscenes.org). Annotations have 23 general classes. 14 of them
+form the ten classes of the detection task, which result files use.
 """
 
 from collections.abc import Mapping
@@ -25,28 +25,28 @@ DETECTION_NAMES: Mapping[str, str] = MappingProxyType(
         "vehicle.truck": "truck",
     }
 )
-"""The class of the task behind a general class; the other nine have none."""
+"""The class of the detection task for each general class; the other nine have none."""
 
 CATEGORIES: Mapping[str, str] = MappingProxyType(
     {"car": "Car", "pedestrian": "Pedestrian", "bicycle": "Cyclist"}
 )
-"""What segmenters, priors and the evaluation here know by another name; a bicycle's box holds its
-rider. The other classes keep their names."""
+"""The category for each class of the task; other classes keep their names. A bicycle is a Cyclist
+because its box includes the rider."""
 
 
 def category_of(general_name: str, rename: Mapping[str, str]) -> str:
     """Return the category of an annotation; classes outside the task keep their general name.
 
     Args:
-        general_name: such as vehicle.car.
-        rename: categories by name of the task's class.
+        general_name: general class, such as vehicle.car.
+        rename: the category for each class of the task, as in `CATEGORIES`.
     """
     name = DETECTION_NAMES.get(general_name, general_name)
     return rename.get(name, name)
 
 
 def detection_name(category: str) -> str | None:
-    """Return the task's class of a category under `CATEGORIES`, or None where it has none."""
-    ours = {name: detected for detected, name in CATEGORIES.items()}
-    name = ours.get(category, category)
+    """Return the task's class for a category (the inverse of `CATEGORIES`), or None."""
+    class_of = {name: task_class for task_class, name in CATEGORIES.items()}
+    name = class_of.get(category, category)
     return name if name in DETECTION_NAMES.values() else None

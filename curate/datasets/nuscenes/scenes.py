@@ -1,11 +1,11 @@
-"""Which scenes of nuScenes are for validation, so that no scene is on both sides.
+"""The official validation scenes of nuScenes; no scene is in both train and val.
 
 Source: the official splits of nuScenes (Caesar et al., "nuScenes", CVPR 2020; nuscenes.org).
 """
 
 from collections.abc import Iterable, Mapping
 
-# Numbers of v1.0-trainval's 150 validation scenes, first and last of each run.
+# The 150 validation scenes of v1.0-trainval as ranges: first and last scene number.
 _VAL = (
     (3, 3), (12, 18), (35, 36), (38, 39), (92, 110), (221, 221), (268, 278), (329, 332),
     (344, 346), (519, 524), (552, 565), (625, 627), (629, 630), (632, 638), (770, 771),
@@ -13,19 +13,19 @@ _VAL = (
     (962, 963), (966, 969), (971, 972), (1059, 1073),
 )  # fmt: skip
 _MINI_VAL = ((103, 103), (916, 916))
-_RUNS: Mapping[str, tuple[tuple[int, int], ...]] = {"v1.0-trainval": _VAL, "v1.0-mini": _MINI_VAL}
+_RANGES: Mapping[str, tuple[tuple[int, int], ...]] = {"v1.0-trainval": _VAL, "v1.0-mini": _MINI_VAL}
 
 
 def validation_scenes(version: str, scenes: Iterable[str]) -> frozenset[str]:
-    """The official validation scenes among those of a version; none where there is no such split.
+    """Return the official validation scenes among `scenes`; none if the version has no split.
 
     Args:
-        version: v1.0-trainval, v1.0-mini or another.
-        scenes: names such as scene-0103.
+        version: name of the version; v1.0-trainval and v1.0-mini have a split.
+        scenes: scene names, such as scene-0103.
     """
     names = {
         f"scene-{number:04d}"
-        for first, last in _RUNS.get(version, ())
+        for first, last in _RANGES.get(version, ())
         for number in range(first, last + 1)
     }
     return frozenset(names & set(scenes))

@@ -1,11 +1,14 @@
-"""nuScenes' tables: JSON files with an array of records each, read without its development kit.
+"""Reader of nuScenes' tables: JSON files that each contain an array of records.
 
 Source: nuScenes' schema (nuscenes.org, docs/schema_nuscenes.md of its development kit). The kit
-itself requires numpy < 2, so it cannot be installed beside this project.
+itself requires numpy < 2, so it cannot be installed together with curate.
 
-`sample_data`, `ego_pose` and `sample_annotation` of the whole data set are hundreds of megabytes
-each, and of their records one in thirty is needed: they are walked through in pieces, and only
-records that are wanted are decoded. Their values hold no braces.
+`sample_data`, `ego_pose` and `sample_annotation` of the whole data set have hundreds of megabytes
+each, and only about one in thirty of their records is needed. They are therefore scanned in chunks,
+and only the needed records are parsed. A regular expression finds the records, since their values
+contain no braces:
+
+    [{"token": "a1", ...}, {"token": "b2", ...}]   ->   (1, b'{"token": "a1", ...}'), ...
 """
 
 import json
@@ -21,19 +24,19 @@ from curate.geometry.poses import pose_matrix
 
 Record = Mapping[str, Any]
 
-PIECE_BYTES = 8 << 20  # of a table that are text at a time
+CHUNK_BYTES = 8 << 20
 _RECORD = re.compile(rb"\{[^{}]*\}")
-# How far the length of a quaternion may be from one; they are written with many digits.
-_UNIT_SLACK = 0.01
-# Metres and pixels; letters of tokens and of file names.
-_LARGEST, _LONGEST = 1e7, 200
+# Allowed difference between the length of a quaternion and one.
+_UNIT_TOLERANCE = 0.01
+# Largest accepted number (metres or pixels), and longest accepted text (tokens and file names).
+_MAX_NUMBER, _MAX_LENGTH = 1e7, 200
 
 
 def read_table(path: Path) -> dict[str, Record]:
-    """Return the records of a small table by their token.
+    """Return the records of a small table by token.
 
     Raises:
-        DataError: if the file is missing or no table.
+        DataError: if the file is missing or not a table.
     """
     try:
         records = json.loads(path.read_bytes())
@@ -41,34 +44,38 @@ def read_table(path: Path) -> dict[str, Record]:
         raise _unreadable(path, error) from None
     except (RecursionError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None
-    if not isinstance(records, list) or not all(isinstance(one, dict) for one in records):
-        raise DataError(f"{path}: no table of records with a token")
+    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
+        raise DataError(f"{path}: not a table: expected a list of records with a token")
     return {text(path, record, "token"): record for record in records}
 
 
 def scan_table(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Where each record of a large table begins, and its text.
+    """Yield the byte offset and the text of each record in a large table.
 
     Raises:
         DataError: if the file is missing, or ends within a record.
     """
-    rest, place = b"", 0
+    rest, offset = b"", 0
     try:
         with path.open("rb") as file:
-            while piece := file.read(PIECE_BYTES):
-                text, end = rest + piece, 0
+            while chunk := file.read(CHUNK_BYTES):
+                text, end = rest + chunk, 0
                 for match in _RECORD.finditer(text):
-                    yield place + match.start(), match.group()
+                    yield offset + match.start(), match.group()
                     end = match.end()
-                rest, place = text[end:], place + end
+                rest, offset = text[end:], offset + end
     except OSError as error:
         raise _unreadable(path, error) from None
     if rest.strip() not in {b"]", b"[]"}:
-        raise DataError(f"{path}: no table, or one that ends within a record; fetch it again")
+        raise DataError(f"{path}: not a table, or truncated within a record; fetch it again")
 
 
 def parse_record(path: Path, content: bytes) -> Record:
-    """Return a record of a large table from its text; DataError where it is none."""
+    """Return a record of a large table, parsed from its text.
+
+    Raises:
+        DataError: if the text is not valid JSON.
+    """
     try:
         record: Record = json.loads(content)
     except (RecursionError, ValueError) as error:
@@ -77,69 +84,95 @@ def parse_record(path: Path, content: bytes) -> Record:
 
 
 def field(path: Path, record: Record, name: str) -> Any:
-    """Return a value of a record; DataError where there is none."""
+    """Return a value of a record.
+
+    Raises:
+        DataError: if the record has no such field.
+    """
     if name not in record:
-        raise DataError(f"{path}: record {_named(record)} has no {name}")
+        raise DataError(f"{path}: record {_shown_token(record)} has no {name}")
     return record[name]
 
 
 def text(path: Path, record: Record, name: str) -> str:
-    """A token or a name of a record; DataError where it is none that a message can repeat."""
-    found = field(path, record, name)
-    if not isinstance(found, str) or not found.isprintable() or len(found) > _LONGEST:
+    """Return a token or a name of a record.
+
+    Raises:
+        DataError: if it is missing or not a short printable string.
+    """
+    value = field(path, record, name)
+    if not isinstance(value, str) or not value.isprintable() or len(value) > _MAX_LENGTH:
         raise DataError(
-            f"{path}: record {_named(record)}: {name} is no text of up to {_LONGEST} letters"
+            f"{path}: record {_shown_token(record)}: {name} is not a printable text of up to "
+            f"{_MAX_LENGTH} characters"
         )
-    return found
+    return value
 
 
 def count(path: Path, record: Record, name: str) -> int:
-    """Return a whole number of a record, from 0 on; DataError where it is none."""
-    found = field(path, record, name)
-    if not isinstance(found, int) or not 0 <= found <= _LARGEST:
-        raise DataError(f"{path}: record {_named(record)}: {name} is no whole number from 0 on")
-    return found
+    """Return a count of a record.
+
+    Raises:
+        DataError: if it is missing or not an integer from 0.
+    """
+    value = field(path, record, name)
+    if not isinstance(value, int) or not 0 <= value <= _MAX_NUMBER:
+        raise DataError(
+            f"{path}: record {_shown_token(record)}: {name} is not an integer from 0 to "
+            f"{_MAX_NUMBER:g}"
+        )
+    return value
 
 
 def numbers(path: Path, record: Record, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Numbers of a record; DataError where they are absurd or of another shape."""
+    """Return an array of numbers of a record.
+
+    Raises:
+        DataError: if it is missing, of another shape, or not of finite numbers of sane size.
+    """
     try:
-        found = np.array(field(path, record, name), dtype=np.float64)
+        values = np.array(field(path, record, name), dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
-        found = np.full(shape, np.nan)
-    if found.shape != shape or not (np.abs(found) <= _LARGEST).all():
-        wanted = " x ".join(map(str, shape))
+        values = np.full(shape, np.nan)
+    if values.shape != shape or not (np.abs(values) <= _MAX_NUMBER).all():
+        expected = " x ".join(map(str, shape))
         raise DataError(
-            f"{path}: record {_named(record)}: {name} is not {wanted} finite numbers up to "
-            f"{_LARGEST:g}"
+            f"{path}: record {_shown_token(record)}: {name} is not {expected} finite numbers up to "
+            f"{_MAX_NUMBER:g}"
         )
-    return found
+    return values
 
 
 def quaternion(path: Path, record: Record) -> np.ndarray:
-    """(4,) the rotation of a record, w, x, y, z of unit length; DataError where it is none."""
+    """Return the (4,) rotation of a record as a unit quaternion w, x, y, z.
+
+    Raises:
+        DataError: if it is missing, malformed, or its length is not about one.
+    """
     rotation = numbers(path, record, "rotation", (4,))
     length = float(np.linalg.norm(rotation))
-    if abs(length - 1) > _UNIT_SLACK:
+    if abs(length - 1) > _UNIT_TOLERANCE:
         raise DataError(
-            f"{path}: record {_named(record)}: rotation {rotation.tolist()} is no unit quaternion "
-            f"(w, x, y, z), its length is {length:.3f}"
+            f"{path}: record {_shown_token(record)}: rotation {rotation.tolist()} is not a unit "
+            f"quaternion (w, x, y, z), its length is {length:.3f}"
         )
     return rotation / length
 
 
 def pose(path: Path, record: Record) -> np.ndarray:
-    """Return (4, 4) pose of a record of ego_pose or calibrated_sensor."""
+    """Return the (4, 4) pose in a record of ego_pose or calibrated_sensor."""
     return pose_matrix(numbers(path, record, "translation", (3,)), quaternion(path, record))
 
 
-def _named(record: Record) -> str:
-    """Return the token of a record as a message may repeat it."""
+def _shown_token(record: Record) -> str:
+    """Return the token of a record in a form that is safe to print in a message."""
     token = record.get("token")
     return token[:80] if isinstance(token, str) and token.isprintable() else "without a token"
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:
     if isinstance(error, FileNotFoundError):
-        return DataError(f"{path}: no such table; is ROOT the folder with samples/ and v1.0-*/?")
+        return DataError(
+            f"{path}: no such table; set the root to the folder with samples/ and v1.0-*/"
+        )
     return DataError(f"{path}: cannot be read: {error.strerror}")

@@ -28,7 +28,7 @@ class KittiResults(Mapping[str, KittiObjects]):
 
     def __getitem__(self, frame_id: str) -> KittiObjects:
         """Return the objects of a frame; DataError where its file is malformed."""
-        return read_objects(self._paths[frame_id], scored=True, known=None)
+        return read_objects(self._paths[frame_id], scored=True, categories=None)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._paths)

@@ -68,7 +68,7 @@ def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[Edited
     ]
     scored = bool(lines) and all(len(line.split()) == RESULT_FIELDS for _, line in lines)
     known = {*sheet.categories, DONT_CARE}
-    objects = read_objects(path, scored=scored, known=known)
+    objects = read_objects(path, scored=scored, categories=known)
     places = [number for number, line in lines if line.split()[0] != DONT_CARE]
     found = to_detections(objects, read(name).calibration)
     return [

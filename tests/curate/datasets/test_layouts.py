@@ -64,15 +64,19 @@ def test_raw_calibration_is_named_where_it_is_wrong(tmp_path):
 @pytest.mark.parametrize(
     ("line", "other", "message"),
     [
-        ('images = "camera"\n', "", "no key images; data sets without a camera are not read"),
-        ('images = "camera"\n', "image_size = [120]\n", "image_size cannot be"),
-        ('images = "camera"\n', "image_size = [120, 0.5]\n", "image_size cannot be"),
-        ('images = "camera"\n', 'images = "camera"\nimage_size = [120, 40]\n', "leave one"),
+        ('images = "camera"\n', "", "no key images; data sets without a camera are not supported"),
+        ('images = "camera"\n', "image_size = [120]\n", "invalid value of image_size"),
+        ('images = "camera"\n', "image_size = [120, 0.5]\n", "invalid value of image_size"),
+        ('images = "camera"\n', 'images = "camera"\nimage_size = [120, 40]\n', "remove one"),
         ('points = "lidar"\n', "", "no key points"),
-        ("intensity_scale = 255\n", "intensity_scale = 0\n", "intensity_scale cannot be"),
-        ("intensity_scale = 255\n", "columns = 2\n", "columns cannot be"),
-        ("intensity_scale = 255\n", f"intensity_scale = 1{'0' * 400}\n", "scale cannot be"),
-        ("intensity_scale = 255\n", "rings = 64\n", "unknown key rings; known are points"),
+        ("intensity_scale = 255\n", "intensity_scale = 0\n", "invalid value of intensity_scale"),
+        ("intensity_scale = 255\n", "columns = 2\n", "invalid value of calibration or columns"),
+        (
+            "intensity_scale = 255\n",
+            f"intensity_scale = 1{'0' * 400}\n",
+            "invalid value of intensity_scale",
+        ),
+        ("intensity_scale = 255\n", "rings = 64\n", "unknown key rings; use one of points"),
         ("projection = [[60.0,", "projection = [[", r"calibration\.projection must be 3 x 4"),
         ("projection = [[60.0,", f"projection = [[1{'0' * 400},", "projection must be 3 x 4"),
         ("[calibration]\n", "[calibration\n", "not TOML"),
@@ -95,7 +99,7 @@ def test_a_folder_of_lists_that_holds_none_is_named(tmp_path):
     write_toy_folder(tmp_path)
     description = tmp_path / "dataset.toml"
     description.write_text('splits = "lists"\n' + description.read_text())
-    with pytest.raises(DataError, match="holds no list such as train"):
+    with pytest.raises(DataError, match="contains no frame list such as train"):
         FolderDataset(tmp_path).splits()
     (tmp_path / "lists").mkdir()
     (tmp_path / "lists" / "train.txt").write_text("a\n")
@@ -114,7 +118,9 @@ def test_frames_without_images_have_a_size(tmp_path):
     assert (found.image_size, found.image) == (expected.image_size, None)
     np.testing.assert_array_equal(found.points, expected.points)
     assert len(bare.annotations("000001")) == 3
-    with pytest.raises(DataError, match=r"no key images, but the pixels of 000001 are needed"):
+    with pytest.raises(
+        DataError, match=r"image of frame 000001 is needed, but there is no key images"
+    ):
         bare.read("000001", image=True)
 
 

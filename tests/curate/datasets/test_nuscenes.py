@@ -153,7 +153,7 @@ def test_key_frames_without_files_are_left_out(root):
     assert len(NuScenesDataset(root).frame_ids()) == 3
     for path in (root / "samples" / "LIDAR_TOP").iterdir():
         path.unlink()
-    with pytest.raises(DataError, match="4 of 4 key frames have no files, such as samples/LIDAR"):
+    with pytest.raises(DataError, match="4 of 4 key frames are missing, such as samples/LIDAR"):
         NuScenesDataset(root).frame_ids()
 
 
@@ -168,19 +168,19 @@ def test_the_version_and_the_camera_are_asked_for(root):
     with pytest.raises(ConfigError, match=r"several versions; .* one of v1\.0-mini, v1\.0-test"):
         NuScenesDataset(root)
     assert len(NuScenesDataset(root, version="v1.0-mini").frame_ids()) == 4
-    with pytest.raises(DataError, match=r"name the folder with samples/ and v1\.0"):
+    with pytest.raises(DataError, match=r"set the root to the folder with samples/ and v1\.0"):
         NuScenesDataset(root / "v1.0-mini")
 
 
 @pytest.mark.parametrize(
     ("table", "edit", "message"),
     [
-        ("ego_pose", {"rotation": [1, 1, 0, 0]}, "is no unit quaternion"),
+        ("ego_pose", {"rotation": [1, 1, 0, 0]}, "is not a unit quaternion"),
         ("ego_pose", {"translation": [1, None, 0]}, "translation is not 3 finite numbers"),
         ("ego_pose", {"token": "other"}, "no record .* which sample_data.json refers to"),
         ("calibrated_sensor", {"rotation": [1, 0, 0]}, "rotation is not 4 finite numbers"),
         ("calibrated_sensor", {"camera_intrinsic": []}, "camera_intrinsic is not 3 x 3 finite"),
-        ("sample", {"scene_token": "none"}, "or none with a scene"),
+        ("sample", {"scene_token": "none"}, "is missing or has no valid scene"),
     ],
 )
 def test_a_record_that_cannot_be_is_named(root, table, edit, message):
@@ -219,7 +219,7 @@ def test_an_instance_without_category_is_named(root):
 
 def test_a_frame_that_does_not_exist_is_named(kept):
     """Frames go by sample tokens, not by those of sample_data."""
-    with pytest.raises(DataError, match="no key frame 000001; frames are named by their sample"):
+    with pytest.raises(DataError, match="no key frame 000001; frame ids are sample"):
         NuScenesDataset(kept).read("000001")
 
 
@@ -245,7 +245,7 @@ def test_tables_may_be_larger_than_a_piece(kept, monkeypatch):
 
     whole = NuScenesDataset(kept)
     name = sample_token(SCENES[1], 1)
-    monkeypatch.setattr(tables, "PIECE_BYTES", 97)
+    monkeypatch.setattr(tables, "CHUNK_BYTES", 97)
     pieces = NuScenesDataset(kept)
     assert pieces.frame_ids() == whole.frame_ids()
     np.testing.assert_array_equal(pieces.annotations(name).boxes, whole.annotations(name).boxes)

@@ -41,7 +41,7 @@ def test_an_unknown_table_is_named_with_the_known_ones():
 @pytest.mark.parametrize("one", [-1, 256, 1.5, "7"])
 def test_ids_that_no_map_can_hold_are_refused(one):
     """A semantic map has 8 bits per pixel."""
-    with pytest.raises(ConfigError, match="of Car: an id is 0 to 255"):
+    with pytest.raises(ConfigError, match="of Car: an id is an integer from 0 to 255"):
         checked_classes({"Car": [one]})
 
 

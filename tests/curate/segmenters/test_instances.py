@@ -114,14 +114,14 @@ def test_a_frame_without_objects_is_not_a_frame_without_masks(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("held", "message"),
     [
-        ({"annotations": 3}, "no list of instance masks"),
-        ([3], "no list of instance masks"),
+        ({"annotations": 3}, "expected a list of instance masks"),
+        ([3], "expected a list of instance masks"),
         ([{"category_id": 3}], "no image_id"),
         ({"images": [{"id": 1}], "annotations": []}, "no file_name"),
         ([{"image_id": 7, "category_id": 3}], "object 0 has no segmentation"),
-        ([{**CAR, "score": "high"}], "the score is no number from 0 to 1"),
+        ([{**CAR, "score": "high"}], "the score is not a number from 0 to 1"),
         ([CAR, {**CAR, "segmentation": {"size": [20, 60], "counts": [1200]}}],
-         "object 1: the mask is 60 x 20 pixels, the image 120 x 40"),
+         "object 1: the mask is 60 x 20 pixels, the image is 120 x 40"),
     ],
 )  # fmt: skip
 def test_malformed_masks_are_named(tmp_path: Path, held: object, message: str) -> None:

@@ -83,13 +83,16 @@ def test_neighbours_share_no_pixel_and_polygons_unite() -> None:
 @pytest.mark.parametrize(
     ("segmentation", "message"),
     [
-        ({"size": [6, 8], "counts": [48]}, "the mask is 8 x 6 pixels, the image 9 x 6"),
-        ({"counts": [54]}, "the mask is without a size"),
-        ({"size": [6, 9], "counts": [50]}, "the run lengths are 50, not 54 pixels"),
-        ({"size": [6, 9], "counts": [60, -6]}, "no whole numbers"),
-        ({"size": [6, 9], "counts": None}, "no whole numbers"),
-        ({"size": [6, 9], "counts": "é"}, "no character of compressed run lengths"),
-        ({"size": [6, 9], "counts": "f"}, "cut off"),
+        ({"size": [6, 8], "counts": [48]}, "the mask is 8 x 6 pixels, the image is 9 x 6"),
+        ({"counts": [54]}, "the mask has no valid size"),
+        (
+            {"size": [6, 9], "counts": [50]},
+            "the run lengths add up to 50; an image of 9 x 6 has 54 pixels",
+        ),
+        ({"size": [6, 9], "counts": [60, -6]}, "the run lengths are not valid integers"),
+        ({"size": [6, 9], "counts": None}, "the run lengths are not valid integers"),
+        ({"size": [6, 9], "counts": "é"}, "not a character of compressed run lengths"),
+        ({"size": [6, 9], "counts": "f"}, "the compressed run lengths are truncated"),
         ([[0, 0, 1, 1]], "at least three corners"),
         ([["a"] * 6], "at least three corners"),
         ([[0, 0, 1, 1, float("nan"), 2]], "at least three corners"),

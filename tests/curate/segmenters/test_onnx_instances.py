@@ -173,17 +173,17 @@ def test_no_objects_in_any_input(tmp_path, shape):
 
 GOOD = answers([[0, 0, 4, 4]], [3], [0.9], np.ones((1, 28, 28)))
 BAD = {
-    "boxes of three numbers": ({"boxes": np.zeros((1, 3), np.float32)}, "answers boxes [1, 3], "),
+    "boxes of three numbers": ({"boxes": np.zeros((1, 3), np.float32)}, "returns boxes [1, 3], "),
     "one mask too few": (
         {"masks": np.ones((0, 28, 28), np.float32)},
         "masks [0, 28, 28]; expected",
     ),
     "a mask per class": ({"masks": np.ones((1, 3, 28, 28), np.float32)}, "masks [1, 3, 28, 28]; "),
-    "a bare number": ({"boxes": np.float32(1).reshape(())}, "answers boxes [], "),
+    "a bare number": ({"boxes": np.float32(1).reshape(())}, "returns boxes [], "),
     "no number": ({"boxes": np.full((1, 4), np.nan, np.float32)}, "NaN, infinite or beyond"),
-    "half a label": ({"labels": np.float32([0.5])}, "label 0.5, which is no whole number"),
+    "half a label": ({"labels": np.float32([0.5])}, "label 0.5, which is not an integer"),
     "masks without cells": ({"masks": np.ones((1, 0, 28), np.float32)}, "28 x 0 cells"),
-    "a mask of no numbers": ({"masks": np.full((1, 28, 28), np.nan, np.float32)}, "holds NaN"),
+    "a mask of no numbers": ({"masks": np.full((1, 28, 28), np.nan, np.float32)}, "contains NaN"),
     "an endless mask": ({"masks": np.ones((1, 1, 9000), np.float32)}, "9000 x 1 cells"),
 }
 
@@ -205,7 +205,7 @@ def test_prototypes_that_are_nan_are_refused(tmp_path):
     found = {"predictions": np.full((1, 6, 1), 0.9, np.float32)}
     found["prototypes"] = np.full((1, 1, 4, 4), np.nan, np.float32)
     path = constant_model(tmp_path / "a.onnx", found)
-    with pytest.raises(ModelError, match=r"a\.onnx: answers a mask that holds NaN"):
+    with pytest.raises(ModelError, match=r"a\.onnx: returns a mask that contains NaN"):
         asked(path, {"Car": (0,)}, outputs={name: name for name in found})
 
 
@@ -225,7 +225,7 @@ def test_wrong_prototypes_are_refused(tmp_path):
         ({"outputs": {"boxes": "boxes"}}, "segmenter outputs boxes: declare boxes, labels, masks"),
         (
             {"outputs": dict.fromkeys(GOOD, "b")},
-            "has no output b.* but boxes, labels, scores, masks",
+            "has no output b.* are boxes, labels, scores, masks",
         ),
         ({"scaling": "caffe"}, "use one of imagenet, unit, none"),
         ({"minimum_score": 2}, "0 to 1"),

@@ -33,7 +33,7 @@ def test_reads_the_map_of_a_frame(tmp_path):
 @pytest.mark.parametrize(
     ("class_ids", "message"),
     [
-        (np.zeros((5, 11), np.uint8), "the map is 11 x 5 pixels, the image of the frame 12 x 5"),
+        (np.zeros((5, 11), np.uint8), "the map is 11 x 5 pixels, the image of the frame is 12 x 5"),
         (np.zeros((5, 12, 3), np.uint8), "expected one channel of 8 bits"),
         (np.zeros((5, 12), np.uint16), "expected one channel of 8 bits"),
     ],
@@ -56,16 +56,24 @@ def test_instances_are_told_by_the_divisor(tmp_path):
     assert found.class_ids[0, :6].tolist() == [26, 26, 24, 7, 255, 33]
     with pytest.raises(DataError, match="class 330 with divisor 100"):
         SavedSegmenter(tmp_path, classes, divisor=100).segment(FRAME)
-    with pytest.raises(ConfigError, match="divisor 1: a whole number above 1"):
+    with pytest.raises(ConfigError, match="divisor 1: expected an integer above 1"):
         SavedSegmenter(tmp_path, classes, divisor=1)
 
 
 @pytest.mark.parametrize(
     ("declared", "present", "message"),
     [
-        ("cityscapes", 26, "class 26, .* cityscapes are 0 to 18; are they cityscapes-label-ids"),
-        ("voc", 33, "class 33, .* voc are 0 to 20; are they cityscapes-label-ids"),
-        ("simulated", 13, "class 13, .* simulated are 0 to 3; are they voc or cityscapes or"),
+        (
+            "cityscapes",
+            26,
+            "class 26, .* cityscapes are 0 to 18; .* uses cityscapes-label-ids",
+        ),
+        ("voc", 33, "class 33, .* voc are 0 to 20; .* uses cityscapes-label-ids"),
+        (
+            "simulated",
+            13,
+            "class 13, .* simulated are 0 to 3; .* uses voc or cityscapes or",
+        ),
         ("cityscapes-label-ids", 90, "class 90, .* cityscapes-label-ids are 0 to 33$"),
     ],
 )
@@ -85,9 +93,9 @@ def test_missing_and_unreadable_maps_are_named(tmp_path):
     with pytest.raises(DataError, match=r"000001\.png: no such image file"):
         segmenter.segment(FRAME)
     (tmp_path / "000001.png").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"000001\.png: no readable image"):
+    with pytest.raises(DataError, match=r"000001\.png: not a readable PNG or JPEG image"):
         segmenter.segment(FRAME)
     with pytest.raises(DataError, match="no such folder of semantic maps"):
         SavedSegmenter(tmp_path / "missing", CLASSES)
-    with pytest.raises(ConfigError, match="an id is 0 to 255"):
+    with pytest.raises(ConfigError, match="an id is an integer from 0 to 255"):
         SavedSegmenter(tmp_path, {"Car": (300,)})

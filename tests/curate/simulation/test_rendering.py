@@ -83,13 +83,13 @@ def test_pixels_show_what_projects_into_them(scene_of, rig):
     middle = np.array([[15.0, 3.0, -SENSOR_HEIGHT_M + 0.6]])
     (column, row), _ = project_points(middle, rig.calibration)[0][0], None
     assert view.semantic[round(row), round(column)] == 1
-    pixels, _ = project_points(scene.thing_vertices(1), rig.calibration)
+    pixels, _ = project_points(scene.instance_vertices(1), rig.calibration)
     rows, columns = np.nonzero(view.semantic)
     assert columns.min() >= pixels[:, 0].min() - 1
     assert columns.max() <= pixels[:, 0].max() + 1
     assert rows.min() >= pixels[:, 1].min() - 1
     assert rows.max() <= pixels[:, 1].max() + 1
-    assert (view.things[view.semantic == 1] == 1).all()
+    assert (view.instances[view.semantic == 1] == 1).all()
 
 
 def test_light_and_grain_differ_between_frames(scene_of, rig):

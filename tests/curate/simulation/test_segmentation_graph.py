@@ -22,7 +22,7 @@ def lively() -> SegmentationNet:
             elif isinstance(module, torch.nn.Conv2d):
                 shape = module.weight[0].numel()
                 module.weight.normal_(0, (2 / shape) ** 0.5, generator=generator)
-        net.answer.bias.zero_()
+        net.head.bias.zero_()
     return net
 
 

@@ -151,7 +151,7 @@ def test_a_place_that_cannot_be_written_is_reported(tmp_path):
 def test_a_damaged_settings_file_is_reported(tmp_path, text):
     """One line that names the file."""
     (tmp_path / "simulation.json").write_text(text)
-    with pytest.raises(DataError, match=r"simulation\.json: is damaged"):
+    with pytest.raises(DataError, match=r"simulation\.json: damaged"):
         simulate(tmp_path, 1, 0, workers=1)
 
 
@@ -159,7 +159,7 @@ def test_a_damaged_settings_file_is_reported(tmp_path, text):
     ("arguments", "message"),
     [
         ({"frames": 0}, "frames must be"),
-        ({"seed": -1}, "seed must not"),
+        ({"seed": -1}, "seed must be at least 0"),
         ({"val_frames": 4}, "val_frames must be"),
         ({"workers": 0}, "workers must be"),
     ],

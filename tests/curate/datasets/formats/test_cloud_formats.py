@@ -148,6 +148,6 @@ def test_a_damaged_header_is_one_error_and_no_warning(tmp_path: Path) -> None:
     path = write_npy(tmp_path / "a.npy", "(1and 40, 4)")
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        with pytest.raises(DataError, match=r"a\.npy: no readable"):
+        with pytest.raises(DataError, match=r"a\.npy: not a readable"):
             read_cloud(path)
     assert not told

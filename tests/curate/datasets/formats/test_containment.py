@@ -43,7 +43,7 @@ def test_no_name_leads_out(tmp_path: Path, layout: str, name: str) -> None:
     """Neither asked for nor in a list."""
     write, kind = LAYOUTS[layout]
     write(tmp_path)
-    with pytest.raises(DataError, match="no frame id"):
+    with pytest.raises(DataError, match="not a frame id"):
         kind(tmp_path).files(name)
 
 
@@ -52,7 +52,7 @@ def test_a_list_of_frames_names_frames(tmp_path: Path, line: str) -> None:
     """A split list with a path in it is refused by its line."""
     write_toy_kitti(tmp_path, 4)
     (tmp_path / "ImageSets" / "train.txt").write_text(f"000000\n{line}\n")
-    with pytest.raises(DataError, match=r"train\.txt:2: .* no frame id"):
+    with pytest.raises(DataError, match=r"train\.txt:2: .* not a frame id"):
         KittiDataset(tmp_path).splits()
 
 
@@ -106,7 +106,7 @@ def test_a_name_that_no_file_could_have_is_refused(
         told = {"points": "lidar", "images": "camera", "calibration": "calib.txt", key: where}
         lines = [f'{name} = "{value}"' for name, value in told.items()]
         (tmp_path / "dataset.toml").write_text("\n".join(lines))
-        with pytest.raises(DataError, match="is no path") as raised:
+        with pytest.raises(DataError, match="is not a valid path") as raised:
             FolderDataset(tmp_path, follow_links=follow_links)
         assert len(str(raised.value)) < 500
 

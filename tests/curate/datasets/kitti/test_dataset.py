@@ -95,7 +95,7 @@ def test_a_flat_folder_without_labels(flat_kitti):
 
 def test_a_root_without_points_is_refused(tmp_path):
     """The error names the root and what should be in it."""
-    with pytest.raises(DataError, match="holds neither training/velodyne nor velodyne"):
+    with pytest.raises(DataError, match="contains neither training/velodyne nor velodyne"):
         KittiDataset(tmp_path)
 
 
@@ -123,14 +123,14 @@ def test_a_listed_frame_that_is_not_there_fails_when_read(toy_kitti):
 @pytest.mark.parametrize("name", ["", ".", "..", "../000001", "a/b", "/etc/passwd", "a\\b", "a\0b"])
 def test_a_frame_id_cannot_leave_the_data_set(toy_kitti, name):
     """Only plain file names are frame ids."""
-    with pytest.raises(DataError, match="is no frame id"):
+    with pytest.raises(DataError, match="is not a frame id"):
         KittiDataset(toy_kitti).read(name)
 
 
 def test_a_list_with_a_path_in_it_is_refused_with_its_place(toy_kitti):
     """The error names the list and the line."""
     (toy_kitti / "ImageSets" / "train.txt").write_text("000001\n../../secret\n")
-    with pytest.raises(DataError, match=r"train\.txt:2: '\.\./\.\./secret' is no frame id"):
+    with pytest.raises(DataError, match=r"train\.txt:2: '\.\./\.\./secret' is not a frame id"):
         KittiDataset(toy_kitti).splits()
 
 
@@ -139,7 +139,7 @@ def test_a_list_is_text(toy_kitti):
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"\xef\xbb\xbf000001\n")
     assert KittiDataset(toy_kitti).splits()["train"] == ("000001",)
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"000001\n\xff\xfe\n")
-    with pytest.raises(DataError, match=r"train\.txt: is no UTF-8 text"):
+    with pytest.raises(DataError, match=r"train\.txt: not UTF-8 text"):
         KittiDataset(toy_kitti).splits()
 
 
@@ -176,7 +176,7 @@ def test_truncated_points_are_refused(tmp_path, size):
     path.write_bytes(bytes(size))
     with pytest.raises(DataError) as caught:
         read_points(path)
-    assert one_line(caught).startswith(f"{path}: {size} bytes are no multiple of 16")
+    assert one_line(caught).startswith(f"{path}: {size} bytes are not a multiple of 16")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -211,7 +211,7 @@ def test_calibration_is_read_by_name(tmp_path):
         ("Tr_velo_to_cam:", "", "no line Tr_velo_to_cam:"),
         ("P2: 60", "P2:", r":2: 11 numbers, expected 3 x 4"),
         ("R0_rect: 1", "R0_rect: 1 1", r":3: 10 numbers, expected 3 x 3"),
-        ("0.3\n", "inf\n", r":4: holds NaN or infinite numbers"),
+        ("0.3\n", "inf\n", r":4: contains NaN or infinite numbers"),
         ("0.3\n", "zero\n", r":4: could not convert string to float: 'zero'"),
         ("R0_rect: 1 0 0", "R0_rect: 0 0 0", "cannot be inverted"),
     ],
@@ -261,7 +261,7 @@ def test_a_truncated_png_is_refused(toy_kitti):
     """Its header is whole, but not its pixels."""
     path = toy_kitti / "training" / "image_2" / "000000.png"
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(DataError, match="the PNG ends before its end mark"):
+    with pytest.raises(DataError, match="the PNG is truncated"):
         KittiDataset(toy_kitti).read("000000", image=True)
 
 

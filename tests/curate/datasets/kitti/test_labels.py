@@ -121,12 +121,12 @@ def test_an_empty_file_holds_no_objects(tmp_path, text):
 @pytest.mark.parametrize(
     ("line", "scored", "message"),
     [
-        (CAR.rsplit(" ", 1)[0], False, "14 fields, but a label line has 15"),
-        (f"{CAR} 0.5", False, "16 fields, but a label line has 15"),
-        (CAR, True, "15 fields, but a result line ends with a score and has 16"),
-        (f"{CAR} 0.5 0.5", True, "17 fields, but a result line"),
+        (CAR.rsplit(" ", 1)[0], False, "14 fields, but label lines have 15"),
+        (f"{CAR} 0.5", False, "16 fields, but label lines have 15"),
+        (CAR, True, "15 fields, but result lines (which end with a score) have 16"),
+        (f"{CAR} 0.5 0.5", True, "17 fields, but result lines"),
         ("Car", False, "1 fields"),
-        (CAR.replace("Car", "car"), False, "unknown category 'car'; known are Car, Cyclist,"),
+        (CAR.replace("Car", "car"), False, "unknown category 'car'; use one of Car, Cyclist,"),
         (CAR.replace("14.44", "far"), False, "'far' is not a number"),
         (CAR.replace("14.44", "nan"), False, "'nan' is not a finite number"),
         (f"{CAR} NaN", True, "'NaN' is not a finite number"),
@@ -153,12 +153,12 @@ def test_the_first_of_several_bad_lines_is_named(tmp_path):
 
 
 def test_categories_may_be_narrowed_and_opened(tmp_path):
-    """`known` replaces KITTI's own categories; None accepts any."""
+    """`categories` replaces KITTI's own categories; None accepts any."""
     path = write(tmp_path / "a.txt", CAR.replace("Car", "Dog"))
-    assert read_objects(path, known=None).categories.tolist() == ["Dog"]
-    assert read_objects(path, known={"Dog"}).categories.tolist() == ["Dog"]
-    with pytest.raises(DataError, match="known are Cat"):
-        read_objects(path, known=["Cat"])
+    assert read_objects(path, categories=None).categories.tolist() == ["Dog"]
+    assert read_objects(path, categories={"Dog"}).categories.tolist() == ["Dog"]
+    with pytest.raises(DataError, match="use one of Cat"):
+        read_objects(path, categories=["Cat"])
 
 
 @pytest.mark.parametrize("scored", [False, True])
@@ -169,7 +169,7 @@ def test_a_missing_or_binary_file_is_named(tmp_path, scored):
     with pytest.raises(DataError, match="cannot be read"):
         read_objects(tmp_path, scored=scored)
     (tmp_path / "binary.txt").write_bytes(b"Car \xff\xfe")
-    with pytest.raises(DataError, match=r"binary\.txt: is not a text file \(byte 4\)"):
+    with pytest.raises(DataError, match=r"binary\.txt: not a text file \(byte 4\)"):
         read_objects(tmp_path / "binary.txt", scored=scored)
 
 
@@ -261,8 +261,8 @@ def test_detections_get_a_rectangle_and_an_observation_angle():
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("locations", np.array([[np.nan, 0, 1]]), r"a\.txt:1: refuses to write"),
-        ("scores", np.array([np.inf]), r"a\.txt:1: refuses to write"),
+        ("locations", np.array([[np.nan, 0, 1]]), r"a\.txt:1: cannot write"),
+        ("scores", np.array([np.inf]), r"a\.txt:1: cannot write"),
     ],
 )
 def test_numbers_that_are_not_finite_are_not_written(tmp_path, field, value, message):
