@@ -15,9 +15,9 @@ from curate.detections import Detections
 from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.audit import Audit, audit
 from curate.evaluation.audit_summary import summary_sentences
-from curate.evaluation.judged_labels import AuditedFrame, JudgedLabels, judge_frames
+from curate.evaluation.evaluated_labels import AuditedFrame, EvaluatedLabels, evaluate_frames
 from curate.evaluation.kitti_rules import MIN_OVERLAPS
-from curate.evaluation.reliability import JudgeSettings, Overlap
+from curate.evaluation.reliability import MatchSettings, Overlap
 from curate.geometry.projection import image_rectangles
 from curate.weighting.base import Evidence
 from db import bulk
@@ -126,7 +126,7 @@ def run_audit(
         failed = _run_stages(plan, split, progress, done)
         parts.append(_judge(plan, split, request, failed))
         contexts.append(plan.context)
-    judged = JudgedLabels.joined([part for part, _ in parts])
+    judged = EvaluatedLabels.joined([part for part, _ in parts])
     weights = {
         name: np.concatenate([weights[name] for _, weights in parts]) for name in request.names
     }
@@ -211,7 +211,7 @@ def _run_stages(plan: Plan, split: str, progress: Progress, done: Tell) -> set[s
 
 def _judge(
     plan: Plan, split: str, request: AuditRequest, failed: set[str]
-) -> tuple[JudgedLabels, dict[str, np.ndarray]]:
+) -> tuple[EvaluatedLabels, dict[str, np.ndarray]]:
     """Return the labels of a split with what the truth says of them, and their weights."""
     workspace, context = plan.workspace, plan.context
     # By key, as the evidence is ordered.
@@ -220,9 +220,9 @@ def _judge(
     )
     complete = plan.complete_frames(plan.graph.of_rounds("solve"), split)
     _, evidence = read_evidence(workspace, context.number, complete)
-    judged = judge_frames(
+    judged = evaluate_frames(
         _frames(workspace, context, split, frames, complete),
-        judge_settings(workspace.config, request.overlap),
+        match_settings(workspace.config, request.overlap),
     )
     return judged, {
         name: EVIDENCE[name](evidence)
@@ -232,10 +232,10 @@ def _judge(
     }
 
 
-def judge_settings(config: Config, overlap: Overlap) -> JudgeSettings:
+def match_settings(config: Config, overlap: Overlap) -> MatchSettings:
     """When a label is right: KITTI's overlaps for the configured categories."""
     categories = config.dataset.categories
-    return JudgeSettings(
+    return MatchSettings(
         overlap=overlap,
         minimum_iou={name: MIN_OVERLAPS.get(name, OTHER_IOU) for name in categories},
     )

@@ -8,7 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from sqlalchemy import select
 
-from curate.evaluation.reliability import auroc, judge, weighted_precision, weighted_recall
+from curate.evaluation.reliability import (
+    auroc,
+    match_to_ground_truth,
+    weighted_precision,
+    weighted_recall,
+)
 from curate.geometry.projection import image_rectangles
 from db import bulk
 from pipelines.workspace.workspace import Workspace
@@ -25,10 +30,12 @@ def label_quality(
     for name, key in keys.items():
         frame = workspace.dataset.read(name, points=False)
         rectangles = image_rectangles(found[key].boxes, frame.calibration, frame.image_size)
-        verdict = judge(found[key], workspace.dataset.annotations(name), rectangles=rectangles)
+        verdict = match_to_ground_truth(
+            found[key], workspace.dataset.annotations(name), rectangles=rectangles
+        )
         objects += sum(verdict.ground_truths.values())
         for k in np.flatnonzero(verdict.counted):
-            right[key, int(k)] = bool(verdict.right[k])
+            right[key, int(k)] = bool(verdict.correct[k])
     rows = []
     for policy in policies:
         weights = _weights(workspace, round_number, policy)

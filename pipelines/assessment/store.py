@@ -9,7 +9,7 @@ from sqlalchemy import Connection
 
 from curate.detections import Detections
 from curate.evaluation.audit import Estimate, Figures
-from curate.evaluation.judged_labels import WHOLE
+from curate.evaluation.evaluated_labels import WHOLE
 from curate.evaluation.kitti_ap import KittiEvaluation
 from curate.evaluation.kitti_outcomes import Outcomes, object_outcomes
 from curate.evaluation.kitti_rules import DIFFICULTIES

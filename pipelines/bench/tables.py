@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from curate.evaluation.comparison import PairedDifference, Spread, paired_difference, spread
-from curate.evaluation.kitti_rules import DIFFICULTIES, LOOSE_OVERLAPS, MIN_OVERLAPS
+from curate.evaluation.kitti_rules import DIFFICULTIES, MIN_OVERLAPS, RELAXED_OVERLAPS
 from pipelines.bench.grid import Job
 from pipelines.bench.results import JobResult, Levels
 from pipelines.stages.methods import METHODS
 
 BASELINE = "baseline"
 TEACHER = "teacher"
-RULES = {"kitti": MIN_OVERLAPS, "loose": LOOSE_OVERLAPS}
+RULES = {"kitti": MIN_OVERLAPS, "loose": RELAXED_OVERLAPS}
 NAMES = {"3d": "3D AP", "bev": "BEV AP", "recall": "recall, 3D"}
 # What is tabulated per ratio: overlaps and figure.
 PER_RATIO = (
