@@ -122,8 +122,8 @@ def test_the_labeled_frames_can_be_audited_with_a_detector_that_never_saw_them(
 @pytest.mark.parametrize(
     ("request_of", "error", "message"),
     [
-        ({"split": "unlabeled"}, ConfigError, "only val and labeled"),
-        ({"folds": 3}, ConfigError, "--folds 3: the 2 labeled frames make 2 to 2 folds"),
+        ({"split": "unlabeled"}, ConfigError, "use val or labeled"),
+        ({"folds": 3}, ConfigError, "--folds 3: 2 labeled frames allow 2 to 2 folds"),
         ({"folds": 2, "round_number": 2}, ConfigError, "first round"),
         ({"names": ("nonsense",)}, ConfigError, "unknown policy 'nonsense'"),
     ],

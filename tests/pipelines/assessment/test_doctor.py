@@ -56,7 +56,7 @@ def test_a_wrong_convention_fails(curate: Curate, tmp_path: Path, toy_kitti: Pat
     assert found["convention"] == "wrong"
     code, _, err = curate("doctor", "999999", "-w", tmp_path / "w")
     assert code == 2
-    assert "no frame 999999" in err
+    assert "frame 999999 is not in the workspace" in err
 
 
 def test_what_cannot_be_opened_is_a_finding(
