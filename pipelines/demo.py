@@ -18,7 +18,7 @@ import typer
 from curate.detections import CATEGORIES
 from curate.errors import CurateError, WorkspaceError
 from curate.evaluation import kitti_ap
-from curate.evaluation.kitti_rules import LOOSE_OVERLAPS
+from curate.evaluation.kitti_rules import RELAXED_OVERLAPS
 from pipelines.assessment.evaluation import detect_val, val_objects
 from pipelines.assessment.label_quality import label_quality
 from pipelines.engine.progress import Bar, as_total
@@ -187,13 +187,13 @@ def _print_detectors(workspace: Workspace) -> None:
     for name, path in _detectors(workspace):
         objects = val_objects(workspace, detect_val(workspace, path, Bar()))
         strict = kitti_ap.evaluate(*objects).ap_r40[:, :, 1]
-        loose = kitti_ap.evaluate(*objects, min_overlaps=LOOSE_OVERLAPS).ap_r40[:, :, 1]
+        loose = kitti_ap.evaluate(*objects, min_overlaps=RELAXED_OVERLAPS).ap_r40[:, :, 1]
         bev, box = kitti_ap.FIGURES.index("bev"), kitti_ap.FIGURES.index("3d")
         means = (loose[:, box], loose[:, bev], strict[:, box], strict[:, bev])
         rows.append((name, *map(float, loose[:, box]), *(float(mean.mean()) for mean in means)))
     columns = ("detector", *CATEGORIES, "3D mean", "BEV mean", "3D strict", "BEV strict")
     print_table(columns, rows, title="AP R40, moderate, percent")
-    overlaps = ", ".join(f"{name} {overlap}" for name, overlap in LOOSE_OVERLAPS.items())
+    overlaps = ", ".join(f"{name} {overlap}" for name, overlap in RELAXED_OVERLAPS.items())
     typer.echo(f"   IoU above {overlaps}; strict is KITTI's own 0.7, 0.5, 0.5.")
 
 

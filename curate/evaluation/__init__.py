@@ -1,1 +1,1 @@
-"""How good detections and weights are."""
+"""Evaluation of detections and of label weights against ground truth."""

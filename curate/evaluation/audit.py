@@ -1,9 +1,10 @@
-"""What pseudo-labels and their weights are worth, on frames whose ground truth is known.
+"""Evaluate pseudo-labels and their weights on frames with ground truth.
 
-The labels of such frames are made and weighed as if the frames were unlabeled. Then the truth is
-asked how many are right, and how well each policy's weight tells right from wrong: over all, by
-category, by distance from the LiDAR, and by LiDAR points in the box. Intervals come from a
-bootstrap over frames, the unit that was sampled; policies are compared within the same draws.
+The labels of these frames are made and weighted as if the frames were unlabeled. The ground truth
+then shows how many are correct, and how well the weights of each policy separate correct labels
+from wrong ones: overall, by category, by distance from the LiDAR, and by LiDAR points in the box.
+Intervals come from a bootstrap over frames, because frames are what was sampled. Policies are
+compared on the same draws.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Self
 
 import numpy as np
 
-from curate.evaluation.judged_labels import ALL, WHOLE, JudgedLabels, Slice, slices
+from curate.evaluation.evaluated_labels import ALL, WHOLE, EvaluatedLabels, Slice, slices
 from curate.evaluation.reliability import (
     ReliabilityBins,
     auroc,
@@ -28,7 +29,7 @@ from curate.shapes import Float
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with its interval; NaN where it is undefined."""
+    """A figure with its confidence interval; NaN where it is undefined."""
 
     value: float
     low: float
@@ -36,9 +37,13 @@ class Estimate:
 
     @classmethod
     def of(cls, value: float, replicates: Float[np.ndarray, " r"], level: float) -> Self:
-        """Return the figure, and the interval that holds the share `level` of its (r,) replicates.
+        """Return the figure with the interval that contains a share `level` of its replicates.
 
-        Undefined replicates are left out; the interval is NaN where all of them are.
+        Args:
+            value: the figure.
+            replicates: (r,) bootstrap replicates; NaN is skipped. If all are NaN, so is the
+                interval.
+            level: coverage of the interval.
         """
         defined = replicates[~np.isnan(replicates)]
         if not len(defined):
@@ -49,22 +54,22 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Figures:
-    """How good the labels of a category in a slice are, and how well a policy's weight judges them.
+    """The quality of the labels of a category in a slice, and of a policy's weights for them.
 
     Attributes:
-        policy: whose weight.
-        category: or `ALL`.
+        policy: the policy that gave the weights.
+        category: the category, or `ALL`.
         slice: see `Slice`.
-        labels: that are right or wrong.
-        neutral: further labels that are neither.
-        right: of the labels.
-        objects: to be found; None where it is not known which belong to the slice.
+        labels: number of labels that are correct or wrong.
+        neutral: number of further labels that are neither.
+        right: number of correct labels.
+        objects: number of ground truth objects; None if it is unknown which are in the slice.
         share_right: right / labels.
-        auroc: chance that a right label weighs more than a wrong one.
-        average_precision: of the labels ranked by weight.
-        weighted_precision: share of the weight that lies on right labels.
-        weighted_recall: weight on right labels per object.
-        calibration_error: expected distance of the weight and the share of right labels.
+        auroc: probability that a correct label weighs more than a wrong one.
+        average_precision: average precision of the labels ranked by weight.
+        weighted_precision: share of the weight that is on correct labels.
+        weighted_recall: weight on correct labels per object.
+        calibration_error: expected difference between the weight and the share of correct labels.
         bins: labels, precision and recall by weight.
     """
 
@@ -86,7 +91,7 @@ class Figures:
 
 @dataclass(frozen=True)
 class Comparison:
-    """By how much the AUROC of one policy exceeds that of another, over the same frames."""
+    """The difference between the AUROC of two policies on the same frames: policy - other."""
 
     category: str
     policy: str
@@ -95,7 +100,7 @@ class Comparison:
 
     @property
     def beyond_chance(self) -> bool:
-        """Whether the interval of the difference leaves 0 out."""
+        """Whether the interval of the difference excludes 0."""
         return self.difference.low > 0 or self.difference.high < 0
 
 
@@ -104,10 +109,10 @@ class Audit:
     """All figures of an audit.
 
     Attributes:
-        frames: that were audited.
+        frames: number of audited frames.
         level: coverage of the intervals.
-        figures: by category, slice and policy.
-        comparisons: of every two policies, by category.
+        figures: the figures by category, slice and policy.
+        comparisons: the comparison of every two policies, by category.
     """
 
     frames: int
@@ -116,7 +121,7 @@ class Audit:
     comparisons: tuple[Comparison, ...]
 
     def whole(self, category: str = ALL) -> dict[str, Figures]:
-        """Return the figures of all distances and point counts, by policy."""
+        """Return the figures over all distances and point counts, by policy."""
         return {
             found.policy: found
             for found in self.figures
@@ -124,17 +129,17 @@ class Audit:
         }
 
     def compare(self, policy: str, other: str, category: str = ALL) -> Comparison:
-        """Return the comparison of two policies, in this order."""
+        """Return the comparison of two policies, as policy - other."""
         for found in self.comparisons:
             if (found.category, found.policy, found.other) == (category, policy, other):
                 return found
         found = self.compare(other, policy, category)
-        turned = Estimate(-found.difference.value, -found.difference.high, -found.difference.low)
-        return Comparison(category, policy, other, turned)
+        negated = Estimate(-found.difference.value, -found.difference.high, -found.difference.low)
+        return Comparison(category, policy, other, negated)
 
 
 def audit(
-    labels: JudgedLabels,
+    labels: EvaluatedLabels,
     weights: Mapping[str, Float[np.ndarray, " n"]],
     categories: Sequence[str],
     generator: np.random.Generator,
@@ -143,16 +148,16 @@ def audit(
     level: float = 0.95,
     bins: int = 10,
 ) -> Audit:
-    """Return all figures, with intervals.
+    """Return all figures with their intervals.
 
     Args:
-        labels: see `JudgedLabels`.
-        weights: (n,) in [0, 1] by policy.
-        categories: to be looked at one by one, and all together.
-        generator: source of the draws.
-        replicates: number of draws.
+        labels: see `EvaluatedLabels`.
+        weights: (n,) weights in [0, 1], by policy.
+        categories: the categories to audit, each by itself and all together.
+        generator: random generator for the bootstrap.
+        replicates: number of bootstrap draws.
         level: coverage of the intervals.
-        bins: of the weight.
+        bins: number of bins of the weight.
     """
     draws = draw_frames(generator, labels.frames, replicates)
     figures: list[Figures] = []
@@ -161,8 +166,8 @@ def audit(
         for part in (WHOLE, *slices(labels)):
             sample = _sample(labels, category, part)
             aurocs: dict[str, np.ndarray] = {}
-            for policy, of_all in weights.items():
-                found, aurocs[policy] = _figures(policy, of_all, sample, draws, level, bins)
+            for policy, policy_weights in weights.items():
+                found, aurocs[policy] = _figures(policy, policy_weights, sample, draws, level, bins)
                 figures.append(found)
             if part == WHOLE:
                 comparisons += _comparisons(figures[-len(weights) :], aurocs, level)
@@ -171,18 +176,18 @@ def audit(
 
 @dataclass(frozen=True)
 class _Sample:
-    """The counted labels of a category and slice; `objects` is (f,), None where unknown."""
+    """The counted labels of a category and slice; `objects` is (f,) per frame, or None."""
 
     category: str
     part: Slice
     index: np.ndarray
     frame_index: np.ndarray
-    right: np.ndarray
+    correct: np.ndarray
     neutral: int
     objects: np.ndarray | None
 
 
-def _sample(labels: JudgedLabels, category: str, part: Slice) -> _Sample:
+def _sample(labels: EvaluatedLabels, category: str, part: Slice) -> _Sample:
     of_category = np.full(len(labels), True) if category == ALL else labels.category == category
     objects = np.full(len(labels.object_frame), True)
     if category != ALL:
@@ -196,9 +201,9 @@ def _sample(labels: JudgedLabels, category: str, part: Slice) -> _Sample:
         part,
         index,
         labels.frame_index[index],
-        labels.right[index],
+        labels.correct[index],
         int((of_category & ~labels.counted).sum()),
-        # Points are counted in labels only, so nobody knows how many objects have few of them.
+        # Points are counted inside labels only, so the point counts of objects are unknown.
         None
         if part.by == "points"
         else np.bincount(labels.object_frame[objects], minlength=labels.frames),
@@ -207,20 +212,20 @@ def _sample(labels: JudgedLabels, category: str, part: Slice) -> _Sample:
 
 def _figures(
     policy: str,
-    of_all: np.ndarray,
+    weights: np.ndarray,
     sample: _Sample,
     draws: np.ndarray,
     level: float,
     bins: int,
 ) -> tuple[Figures, np.ndarray]:
     """Return the figures of one policy, and the replicates of its AUROC."""
-    v, right = of_all[sample.index], sample.right
+    v, correct = weights[sample.index], sample.correct
     frames = draws.shape[1]
     objects = 0 if sample.objects is None else int(sample.objects.sum())
-    ranked = ranked_replicates(v, right, sample.frame_index, draws)
+    ranked = ranked_replicates(v, correct, sample.frame_index, draws)
     counts, found, weight, trusted = (
         draws @ np.bincount(sample.frame_index, column, minlength=frames)
-        for column in (np.ones(len(v)), right, v, v * right)
+        for column in (np.ones(len(v)), correct, v, v * correct)
     )
     of_objects = draws @ (np.zeros(frames) if sample.objects is None else sample.objects)
     error = _calibration_replicates(v, sample, draws, bins) / np.where(counts, counts, np.nan)
@@ -234,33 +239,36 @@ def _figures(
         slice=sample.part,
         labels=len(v),
         neutral=sample.neutral,
-        right=int(right.sum()),
+        right=int(correct.sum()),
         objects=None if sample.objects is None else objects,
-        share_right=estimate(_mean(right), _ratio(found, counts)),
-        auroc=estimate(auroc(v, right), ranked[0]),
-        average_precision=estimate(average_precision(v, right), ranked[1]),
-        weighted_precision=estimate(weighted_precision(v, right), _ratio(trusted, weight)),
-        weighted_recall=estimate(weighted_recall(v, right, objects), _ratio(trusted, of_objects)),
-        calibration_error=estimate(expected_calibration_error(v, right, bins), error),
-        bins=reliability_bins(v, right, objects, bins),
+        share_right=estimate(_mean(correct), _ratio(found, counts)),
+        auroc=estimate(auroc(v, correct), ranked[0]),
+        average_precision=estimate(average_precision(v, correct), ranked[1]),
+        weighted_precision=estimate(weighted_precision(v, correct), _ratio(trusted, weight)),
+        weighted_recall=estimate(weighted_recall(v, correct, objects), _ratio(trusted, of_objects)),
+        calibration_error=estimate(expected_calibration_error(v, correct, bins), error),
+        bins=reliability_bins(v, correct, objects, bins),
     ), ranked[0]
 
 
 def _calibration_replicates(
     v: np.ndarray, sample: _Sample, draws: np.ndarray, bins: int
 ) -> np.ndarray:
-    """(r,) sum over the bins of |right labels - weight|: the calibration error times the labels."""
+    """Return (r,) the calibration error times the number of labels.
+
+    This is the sum over the bins of |correct labels - sum of weights|.
+    """
     edges = np.arange(bins + 1) / bins
     member = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, bins - 1)
     cell = sample.frame_index * bins + member
-    gap = np.bincount(cell, sample.right - v, minlength=draws.shape[1] * bins)
+    gap = np.bincount(cell, sample.correct - v, minlength=draws.shape[1] * bins)
     return np.asarray(np.abs(draws @ gap.reshape(-1, bins)).sum(axis=1))
 
 
 def _comparisons(
     figures: Sequence[Figures], aurocs: Mapping[str, np.ndarray], level: float
 ) -> list[Comparison]:
-    """Return every policy with each that follows it."""
+    """Compare every policy with each policy after it."""
     return [
         Comparison(
             one.category,
@@ -278,9 +286,9 @@ def _comparisons(
 
 
 def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Return (r,) part / whole, NaN where the whole is 0."""
+    """Return (r,) part / whole, NaN if the whole is 0."""
     return np.asarray(part / np.where(whole > 0, whole, np.nan))
 
 
-def _mean(right: np.ndarray) -> float:
-    return float(right.mean()) if len(right) else float("nan")
+def _mean(correct: np.ndarray) -> float:
+    return float(correct.mean()) if len(correct) else float("nan")

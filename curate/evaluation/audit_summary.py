@@ -1,4 +1,4 @@
-"""What an audit means, in plain words, and as plain numbers."""
+"""Summarise an audit in sentences, or as plain numbers."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -8,34 +8,34 @@ from typing import Any
 import numpy as np
 
 from curate.evaluation.audit import Audit, Comparison, Estimate, Figures
-from curate.evaluation.judged_labels import ALL
+from curate.evaluation.evaluated_labels import ALL
 
 FEW_FRAMES = 30
 
 
 def summary_sentences(audit: Audit, policies: Sequence[str], evidence: Sequence[str]) -> list[str]:
-    """Sentences: how much is right, who judges best, and whether that is more than chance.
+    """Return sentences: share of correct labels, best policy, and whether the lead is significant.
 
     Args:
         audit: see `Audit`.
-        policies: the audited policies that weigh labels for a training.
-        evidence: the audited pieces of evidence, judges that no training uses by themselves.
+        policies: the audited policies, which weight labels for training.
+        evidence: the audited columns of evidence, which no training uses as weights directly.
     """
     if not policies:
         policies, evidence = evidence, ()
     by_policy = audit.whole()
     some = next(iter(by_policy.values()))
-    sentences = [_share_correct(audit, some), *_left_out(audit, some)]
+    sentences = [_share_correct(audit, some), *_caveats(audit, some)]
     ranked = _by_auroc(by_policy, policies)
     if not ranked:
-        return [*sentences, *_missing_policies(some)]
+        return [*sentences, *_undefined_auroc(some)]
     sentences += _best_policy(audit, ranked)
     sentences += _effect_of_evidence(audit, ranked[0], _by_auroc(by_policy, evidence))
     return [*sentences, *_weight_by_correctness([by_policy[name] for name in policies])]
 
 
 def as_numbers(audit: Audit) -> dict[str, Any]:
-    """Plain numbers for JSON; None where a figure is undefined or an edge is open."""
+    """Return plain numbers for JSON; None for an undefined figure or an open upper edge."""
     return {
         "frames": audit.frames,
         "level": audit.level,
@@ -48,7 +48,7 @@ def as_numbers(audit: Audit) -> dict[str, Any]:
 
 
 def _flat(found: Figures) -> dict[str, Any]:
-    """Return the figures, their bins as rows."""
+    """Return the figures as a dictionary, with one row per bin."""
     bins = found.bins
     rows = [
         {
@@ -69,7 +69,7 @@ def _flat(found: Figures) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers of numpy as Python's; what is not finite as None."""
+    """Convert numpy numbers to Python's, and NaN and infinity to None."""
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -82,45 +82,49 @@ def _plain(value: Any) -> Any:
 def _share_correct(audit: Audit, some: Figures) -> str:
     place = f"{audit.frames} frames with {some.objects} objects"
     if not some.labels:
-        return f"There is no label on {place}, so there is nothing to audit."
+        return f"There are no labels on {place}, so there is nothing to audit."
     shares = [
         f"{category} {100 * next(iter(whole.values())).share_right.value:.1f} %"
         for category in _categories(audit)
         if next(iter((whole := audit.whole(category)).values())).labels
     ]
     return (
-        f"{some.right} of {some.labels} labels are right, {_percent(some.share_right)}, on {place}"
+        f"{some.right} of {some.labels} labels are correct, "
+        f"{_percent(some.share_right)}, on {place}"
         + (f" ({', '.join(shares)})." if len(shares) > 1 else ".")
     )
 
 
-def _left_out(audit: Audit, some: Figures) -> Iterator[str]:
+def _caveats(audit: Audit, some: Figures) -> Iterator[str]:
     if some.neutral:
         yield (
-            f"{some.neutral} more are neither right nor wrong, as they lie on a neighbouring "
-            "category (a van, a sitting person) or in a DontCare region."
+            f"{some.neutral} more are neither correct nor wrong, because they lie on an object of "
+            "a neighbour category (van, sitting person) or in a DontCare region."
         )
     if some.labels and audit.frames < FEW_FRAMES:
         yield (
-            f"With {audit.frames} frames the intervals are rough themselves; "
-            f"{FEW_FRAMES} frames or more would tell more."
+            f"With {audit.frames} frames the intervals are only approximate; "
+            f"use {FEW_FRAMES} frames or more."
         )
 
 
-def _missing_policies(some: Figures) -> Iterator[str]:
+def _undefined_auroc(some: Figures) -> Iterator[str]:
     if some.labels and some.right in (0, some.labels):
-        every = "right" if some.right else "wrong"
-        yield f"All labels are {every}, so no weight can tell right from wrong here."
+        every = "correct" if some.right else "wrong"
+        yield f"All labels are {every}, so the AUROC is undefined here."
 
 
 def _best_policy(audit: Audit, ranked: Sequence[Figures]) -> Iterator[str]:
     best = ranked[0]
-    first = f"Of the policies, {best.policy} judges best: AUROC {_figure(best.auroc)}"
     if len(ranked) == 1:
-        yield f"{first.replace('Of the policies, ', '').replace(' judges best', '')}."
+        yield f"{best.policy}: AUROC {_figure(best.auroc)}."
         return
-    found = audit.compare(best.policy, ranked[1].policy)
-    yield f"{first}, before {ranked[1].policy} with {ranked[1].auroc.value:.3f}; {_verdict(found)}."
+    second = ranked[1]
+    yield (
+        f"Of the policies, {best.policy} ranks the labels best: AUROC {_figure(best.auroc)}. "
+        f"Next is {second.policy} with {second.auroc.value:.3f}; "
+        f"{_significance(audit.compare(best.policy, second.policy))}."
+    )
 
 
 def _effect_of_evidence(audit: Audit, best: Figures, evidence: Sequence[Figures]) -> Iterator[str]:
@@ -129,7 +133,7 @@ def _effect_of_evidence(audit: Audit, best: Figures, evidence: Sequence[Figures]
         found = audit.compare(better[0].policy, best.policy)
         yield (
             f"{better[0].policy} alone, without a policy, ranks the labels better than "
-            f"{best.policy}: AUROC {_figure(better[0].auroc)}; {_verdict(found)}."
+            f"{best.policy}: AUROC {_figure(better[0].auroc)}; {_significance(found)}."
         )
 
 
@@ -142,24 +146,23 @@ def _weight_by_correctness(policies: Sequence[Figures]) -> Iterator[str]:
         f"{found.policy} {100 * found.weighted_precision.value:.1f} %" for found in order[1:]
     )
     yield (
-        f"Of all the weight that a training would see from {order[0].policy}, "
-        f"{_percent(order[0].weighted_precision)} lies on right labels"
+        f"Of the total weight that {order[0].policy} gives, "
+        f"{_percent(order[0].weighted_precision)} is on correct labels"
         + (f"; {shares}." if shares else ".")
     )
 
 
-def _verdict(found: Comparison) -> str:
-    """Return whether a difference is more than chance."""
+def _significance(found: Comparison) -> str:
     interval = (
         f"{found.difference.value:.3f} ({found.difference.low:.3f} to {found.difference.high:.3f})"
     )
     if found.beyond_chance:
-        return f"the difference of {interval} is more than chance"
-    return f"the difference of {interval} may be chance, these frames do not tell the two apart"
+        return f"the difference of {interval} is significant"
+    return f"the difference of {interval} is not significant on these frames"
 
 
 def _by_auroc(by_policy: dict[str, Figures], names: Sequence[str]) -> list[Figures]:
-    """Return the figures of those whose AUROC is defined, the best first."""
+    """Return the figures with a defined AUROC, the best first."""
     defined = [by_policy[name] for name in names if not math.isnan(by_policy[name].auroc.value)]
     return sorted(defined, key=lambda found: -found.auroc.value)
 

@@ -1,7 +1,8 @@
-"""Figures of repeated experiments: their mean and spread, and their paired difference to others.
+"""Figures of repeated experiments: their mean, their spread, and the difference between pairs.
 
 The interval of a paired difference is Student's t interval over the pairs (Student, "The Probable
-Error of a Mean", Biometrika 1908): the pairs share a seed, so what the seed does to both drops out.
+Error of a Mean", Biometrika 1908). Both experiments of a pair use the same seed, so the effect that
+the seed has on both cancels out.
 """
 
 from dataclasses import dataclass
@@ -13,12 +14,12 @@ from curate.shapes import Float
 
 @dataclass(frozen=True)
 class Spread:
-    """Repeated measurements of one figure.
+    """Mean and spread of repeated measurements of one figure.
 
     Attributes:
-        mean: NaN without any.
-        std: sample standard deviation (n - 1); NaN with fewer than two.
-        count: n.
+        mean: NaN without measurements.
+        std: sample standard deviation (n - 1); NaN with fewer than two measurements.
+        count: number of measurements, n.
     """
 
     mean: float
@@ -28,13 +29,13 @@ class Spread:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """How much greater a figure is than another one that was measured with it.
+    """The mean difference of two figures over pairs of experiments, with its interval.
 
     Attributes:
-        mean: of the differences; NaN without any.
+        mean: mean of the differences; NaN without pairs.
         low: lower bound of its interval; NaN with fewer than two pairs.
-        high: upper bound.
-        count: pairs.
+        high: upper bound of its interval; NaN with fewer than two pairs.
+        count: number of pairs.
     """
 
     mean: float
@@ -44,7 +45,7 @@ class PairedDifference:
 
 
 def spread(values: Float[np.ndarray, " n"]) -> Spread:
-    """Mean and standard deviation of (n,) values; NaN values are left out."""
+    """Return the mean and standard deviation of (n,) values; NaN values are skipped."""
     values = values[~np.isnan(values)]
     count = len(values)
     mean = float(values.mean()) if count else np.nan
@@ -58,15 +59,15 @@ def paired_difference(
     """Return the mean of values - others with its t interval.
 
     Args:
-        values: (n,), NaN where it was not measured.
-        others: (n,) of the same experiments, NaN likewise; such pairs are left out.
+        values: (n,), NaN where it was not measured; such pairs are skipped.
+        others: (n,) values to compare with, in the same order of experiments; NaN likewise.
         level: coverage of the interval.
     """
     from scipy.stats import t
 
-    found = spread(values - others)
-    reach = np.nan
-    if found.count > 1:
-        quantile = t.ppf((1 + level) / 2, found.count - 1)
-        reach = float(quantile) * found.std / np.sqrt(found.count)
-    return PairedDifference(found.mean, found.mean - reach, found.mean + reach, found.count)
+    difference = spread(values - others)
+    mean, count, half_width = difference.mean, difference.count, np.nan
+    if count > 1:
+        quantile = t.ppf((1 + level) / 2, count - 1)
+        half_width = float(quantile) * difference.std / np.sqrt(count)
+    return PairedDifference(mean, mean - half_width, mean + half_width, count)

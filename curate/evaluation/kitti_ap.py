@@ -1,14 +1,15 @@
 """Average precision of KITTI's object benchmark on the CPU: image, orientation, BEV and 3D.
 
-Sources: Geiger et al., "Are we ready for Autonomous Driving?", CVPR 2012, and its development kit,
-whose figures this reproduces; Simonelli et al., "Disentangling Monocular 3D Object Detection", ICCV
-2019, for the 40 recall positions (R40) beside the original 11 (R11).
+Sources: Geiger et al., "Are we ready for Autonomous Driving?", CVPR 2012, and its development kit
+(the figures here equal the kit's); Simonelli et al., "Disentangling Monocular 3D Object Detection",
+ICCV 2019, for the 40 recall positions (R40) in addition to the original 11 (R11).
 
-The kit samples precision at 41 scores, one per 1/40 of recall. With fewer than 41 objects there are
-not that many scores, and it leaves the positions behind the last one at 0: a perfect detector gets
-2.5 per object. Here those few scores are read at their true recall, so that perfection is 100 from
-the first object on; `kit_sampling=True` gives the kit's own figure. From 41 objects on both agree.
-Without objects the average precision is 0, as in the kit; `objects` tells the two cases apart.
+The kit samples the precision at 41 scores, one for each 1/40 of recall. With fewer than 41 objects
+there are fewer scores, and the kit sets the precision at the remaining positions to 0: a perfect
+detector then gets only 2.5 per object. Here the scores are placed at their true recall instead, and
+a perfect detector gets 100 with any number of objects. `kit_sampling=True` gives the kit's figure.
+Both are the same from 41 objects on. Without objects the average precision is 0, as in the kit;
+check `objects` to see whether there were any.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,13 +22,13 @@ from curate.datasets.kitti.labels import KittiObjects
 from curate.errors import DataError
 from curate.evaluation.kitti_matching import (
     Candidates,
-    Contest,
+    MatchInputs,
     PooledFrames,
     candidates_by_metric,
+    count_at_thresholds,
     dont_care_shares,
     match_results,
-    scores_of_found,
-    tally,
+    true_positive_scores,
 )
 from curate.evaluation.kitti_rules import (
     COUNTED,
@@ -39,7 +40,7 @@ from curate.evaluation.kitti_rules import (
 from curate.shapes import Float, Int
 
 FIGURES = ("image", "aos", "bev", "3d")
-"""What is averaged: precision by 2D, BEV and 3D overlap; "aos", orientation similarity by 2D."""
+"""The averaged figures: precision by 2D, BEV and 3D overlap; aos: orientation similarity by 2D."""
 
 _POSITIONS = 41  # recall 0, 1/40, ..., 1
 _UNKNOWN_ALPHA = -10.0
@@ -47,16 +48,16 @@ _UNKNOWN_ALPHA = -10.0
 
 @dataclass(frozen=True)
 class KittiEvaluation:
-    """Detections compared with labels; c categories, 3 difficulties.
+    """The result of evaluating detections against labels; c categories, 3 difficulties.
 
     Attributes:
-        min_overlaps: the evaluated categories and the overlap that finds one.
+        min_overlaps: the evaluated categories and the overlap that a true positive must exceed.
         curves: (c, 4, 3, 41) precision in [0, 1] by category, figure of `FIGURES`, difficulty, and
-            recall 0, 1/40, ..., 1; at each recall the best precision from there on.
+            recall 0, 1/40, ..., 1. Each value is the best precision at this or a higher recall.
         objects: (c, 3) int64 counted objects.
         recall_overlaps: (r,) 3D overlaps of `recall_3d`.
-        recall_3d: (c, r, 3) share of the objects that any detection finds, whatever its score.
-        has_orientation: whether all detections have an observation angle; if not, no aos.
+        recall_3d: (c, r, 3) share of the counted objects that a detection of any score matches.
+        has_orientation: whether all detections have an observation angle; aos needs it.
     """
 
     min_overlaps: Mapping[str, float]
@@ -68,18 +69,18 @@ class KittiEvaluation:
 
     @property
     def ap_r11(self) -> Float[np.ndarray, "c 4 3"]:
-        """(c, 4, 3) mean over recall 0, 0.1, ..., 1, in percent."""
+        """(c, 4, 3) mean precision at recall 0, 0.1, ..., 1, in percent."""
         return _percent(self.curves[..., ::4])
 
     @property
     def ap_r40(self) -> Float[np.ndarray, "c 4 3"]:
-        """(c, 4, 3) mean over recall 1/40, 2/40, ..., 1, in percent."""
+        """(c, 4, 3) mean precision at recall 1/40, 2/40, ..., 1, in percent."""
         return _percent(self.curves[..., 1:])
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON, in percent: `AP_R40` and `AP_R11` by category and figure.
+        """Return plain numbers for JSON, in percent: `AP_R40` and `AP_R11` by category and figure.
 
-        Each is a list over the difficulties; "aos" is None where there is no orientation.
+        Each value is a list over the difficulties; "aos" is None without orientations.
         """
         recalls = [f"{overlap:g}" for overlap in self.recall_overlaps]
         return {
@@ -119,10 +120,10 @@ def evaluate(
 
     Args:
         labels: the objects of each frame.
-        results: the detections of each frame, in the same order; they need scores and 2D boxes.
-        min_overlaps: the categories to evaluate, and the overlap that a detection must exceed.
-        recall_overlaps: 3D overlaps at which the recall is given.
-        kit_sampling: for fewer than 41 objects, sample recall as KITTI's program does.
+        results: the detections of each frame, in the same order, with scores and 2D boxes.
+        min_overlaps: the categories to evaluate, and the overlap that a true positive must exceed.
+        recall_overlaps: 3D overlaps at which to compute the recall.
+        kit_sampling: with fewer than 41 objects, sample the recall as KITTI's program does.
 
     Raises:
         DataError: if the numbers of frames differ, or a detection has no score.
@@ -154,11 +155,15 @@ def evaluate(
 
 
 def check_frames(labels: Sequence[KittiObjects], results: Sequence[KittiObjects]) -> None:
-    """Raise `DataError` unless there are as many results as labels and all have scores."""
+    """Check that labels and results have the same number of frames and all results have scores.
+
+    Raises:
+        DataError: if the numbers of frames differ, or a detection has no score.
+    """
     if len(labels) != len(results):
         raise DataError(
-            f"labels of {len(labels)} frames cannot be compared with results of {len(results)}: "
-            f"give one of each per frame, empty ones included"
+            f"{len(labels)} frames of labels, but {len(results)} frames of results: "
+            f"pass one of each per frame, also for frames without objects"
         )
     for index, frame in enumerate(results):
         if np.isnan(frame.scores).any():
@@ -169,7 +174,7 @@ def check_frames(labels: Sequence[KittiObjects], results: Sequence[KittiObjects]
 
 
 class _Match:
-    """The overlapping pairs of all frames, and what is counted from them."""
+    """The overlapping pairs of all frames, and the counts over them."""
 
     def __init__(self, labels: PooledFrames, results: PooledFrames) -> None:
         self.candidates = candidates_by_metric(labels, results)
@@ -181,7 +186,7 @@ class _Match:
         }
 
     def states(self, category: str, difficulty: int) -> tuple[np.ndarray, np.ndarray]:
-        """States of the labels and of the results."""
+        """Return the states of the labels and of the results."""
         return (
             label_states(self._labels, category, difficulty),
             result_states(self._results, category, difficulty),
@@ -190,23 +195,25 @@ class _Match:
     def curves(
         self, metric: str, of_labels: np.ndarray, of_results: np.ndarray, min_overlap: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(41,) precision and (41,) orientation similarity at the kit's score thresholds."""
+        """Return (41,) precision and (41,) orientation similarity at the kit's thresholds."""
         candidates = self.candidates[metric]
-        contest = Contest(of_labels, of_results, self._results.scores, min_overlap)
-        found = scores_of_found(candidates, contest)
+        inputs = MatchInputs(of_labels, of_results, self._results.scores, min_overlap)
+        found = true_positive_scores(candidates, inputs)
         thresholds = score_thresholds(found, int(np.sum(of_labels == COUNTED)))
-        # DontCare regions are 2D boxes: only the image metric knows them.
+        # DontCare regions are 2D boxes, so they apply to the image metric only.
         in_dont_care = (self._dont_care > min_overlap) & (metric == "image")
-        totals = tally(candidates, contest, thresholds, in_dont_care, self._gains[metric])
+        totals = count_at_thresholds(
+            candidates, inputs, thresholds, in_dont_care, self._gains[metric]
+        )
         positives = np.maximum(totals[:, 0] + totals[:, 1], 1)
         return _running_maximum(totals[:, 0] / positives), _running_maximum(
             totals[:, 2] / positives
         )
 
     def recall_3d(self, of_labels: np.ndarray, of_results: np.ndarray, min_overlap: float) -> float:
-        """Share of the counted objects that a detection of any score finds."""
-        contest = Contest(of_labels, of_results, self._results.scores, min_overlap)
-        matches = match_results(self.candidates["3d"], contest, -np.inf)
+        """Return the share of the counted objects that a detection of any score matches."""
+        inputs = MatchInputs(of_labels, of_results, self._results.scores, min_overlap)
+        matches = match_results(self.candidates["3d"], inputs, -np.inf)
         counted = of_labels == COUNTED
         found = counted & (matches >= 0)
         found[found] = of_results[matches[found]] == COUNTED
@@ -215,17 +222,17 @@ class _Match:
     def _orientation_gains(self, pairs: Candidates) -> np.ndarray:
         """Return (pairs,) (1 + cos of the difference of the observation angles) / 2."""
         rows = np.repeat(np.arange(len(self._labels)), np.diff(pairs.starts))
-        apart = self._labels.alpha[rows] - self._results.alpha[pairs.results]
-        gains: np.ndarray = (1 + np.cos(apart)) / 2
+        difference = self._labels.alpha[rows] - self._results.alpha[pairs.results]
+        gains: np.ndarray = (1 + np.cos(difference)) / 2
         return gains
 
 
 def score_thresholds(scores: Float[np.ndarray, " n"], count: int) -> Float[np.ndarray, " t"]:
-    """Return the kit's score thresholds: at most 41, each the nearest to the next 1/40 of recall.
+    """Return the kit's score thresholds, at most 41: the score nearest to each 1/40 of recall.
 
     Args:
-        scores: (n,) of the detections that found an object.
-        count: number of objects.
+        scores: (n,) scores of the true positives.
+        count: number of counted objects.
 
     Returns:
         (t,) descending.
@@ -244,20 +251,24 @@ def score_thresholds(scores: Float[np.ndarray, " n"], count: int) -> Float[np.nd
 
 
 def _percent(precision: np.ndarray) -> np.ndarray:
-    """Mean over the last axis, in percent; exactly 100 where all are 1."""
+    """Return the mean over the last axis in percent."""
+    # The sum is multiplied before the division: a row of ones gives exactly 100.
     means: np.ndarray = 100 * np.sum(precision, axis=-1) / precision.shape[-1]
     return means
 
 
 def _running_maximum(values: np.ndarray) -> np.ndarray:
-    """(41,) running maximum from the end of (t,) values, 0 after the last."""
+    """Return (41,) the running maximum of (t,) values from the end, 0 after the last value."""
     curve = np.zeros(_POSITIONS)
     curve[: len(values)] = np.maximum.accumulate(values[::-1])[::-1]
     return curve
 
 
 def _at_true_recall(curve: np.ndarray, count: int) -> np.ndarray:
-    """Return the curve of fewer than 41 objects, whose positions are objects, by recall."""
+    """Return the curve with its values at their true recall, if there are fewer than 41 objects.
+
+    With so few objects, position k of the curve belongs to object k, not to recall k / 40.
+    """
     if count >= _POSITIONS or count == 0:
         return curve
     # Position k of 40 needs ceil(k * count / 40) objects; the first of them is at index 0.

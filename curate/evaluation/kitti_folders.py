@@ -1,4 +1,4 @@
-"""Folders of KITTI text files as the frames of an evaluation."""
+"""Evaluate folders of KITTI label and result files."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,13 +14,14 @@ def evaluate_folders(
 ) -> KittiEvaluation:
     """Return KITTI's average precision of a folder of result files: image, aos, BEV and 3D.
 
-    At KITTI's overlaps (Car 0.7, Pedestrian and Cyclist 0.5), for R11 and R40, on the CPU.
-    Source: see `evaluate`, which takes other overlaps.
+    Uses KITTI's IoU thresholds (Car 0.7, Pedestrian and Cyclist 0.5), R11 and R40, on the CPU.
+    For other thresholds, and for the sources, see `evaluate`.
 
     Args:
-        labels: folder with one `FRAME.txt` of 15 fields per line for each frame.
-        results: folder with one `FRAME.txt` of 16 fields per line, the last a score.
-        frame_ids: the frames to compare; by default all frames of the label folder.
+        labels: folder with one `FRAME.txt` for each frame, 15 fields per line.
+        results: folder with one `FRAME.txt` for each frame, 16 fields per line; the last is the
+            score.
+        frame_ids: the frames to evaluate; by default all frames of the label folder.
 
     Raises:
         DataError: if a folder or file is missing, damaged or malformed.
@@ -34,29 +35,30 @@ def read_folders(
 ) -> tuple[tuple[str, ...], list[KittiObjects], list[KittiObjects]]:
     """Return the frame ids of two folders, and the labels and results of each frame.
 
-    A frame without a result file is an error, never silently left out: a partial run must not be
-    scored as a whole one. A frame without detections has an empty result file.
+    A frame without a result file is an error: otherwise a partial run would be scored like a
+    complete one. A frame without detections needs an empty result file.
 
     Args:
-        labels: folder with one `FRAME.txt` of 15 fields per line for each frame.
-        results: folder with one `FRAME.txt` of 16 fields per line, the last a score.
-        frame_ids: the frames to read; None is all frames of the label folder, and then result
-            files for other frames are an error too.
+        labels: folder with one `FRAME.txt` for each frame, 15 fields per line.
+        results: folder with one `FRAME.txt` for each frame, 16 fields per line; the last is the
+            score.
+        frame_ids: the frames to read; None reads all frames of the label folder, and then result
+            files of other frames are an error too.
 
     Returns:
-        The frame ids in sorted order, the labels and the results of each.
+        The sorted frame ids, the labels of each frame, and the results of each frame.
 
     Raises:
         DataError: if a folder or file is missing, damaged or malformed.
     """
     labels, results = Path(labels), Path(results)
-    labelled, answered = _frame_ids(labels), _frame_ids(results)
-    wanted = labelled if frame_ids is None else set(frame_ids)
-    _require_files(wanted - labelled, labels, "label")
+    with_labels, with_results = _frame_ids(labels), _frame_ids(results)
+    selected = with_labels if frame_ids is None else set(frame_ids)
+    _require_files(selected - with_labels, labels, "label")
     if frame_ids is None:
-        _require_files(answered - labelled, labels, "label")
-    _require_files(wanted - answered, results, "result")
-    ordered = tuple(sorted(wanted))
+        _require_files(with_results - with_labels, labels, "label")
+    _require_files(selected - with_results, results, "result")
+    ordered = tuple(sorted(selected))
     return (
         ordered,
         [read_objects(labels / f"{frame_id}.txt") for frame_id in ordered],
@@ -67,19 +69,19 @@ def read_folders(
 def _frame_ids(folder: Path) -> set[str]:
     """Return the names of the text files in a folder."""
     if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; name one with a text file per frame")
-    # macOS strews hidden ._ files over foreign disks.
+        raise DataError(f"{folder}: no such folder; use a folder with one text file per frame")
+    # macOS creates hidden ._ files on disks of other systems.
     found = {path.stem for path in folder.glob("*.txt") if not path.name.startswith(".")}
     if not found:
-        raise DataError(f"{folder}: holds no .txt files; name a folder with one per frame")
+        raise DataError(f"{folder}: no .txt files; use a folder with one text file per frame")
     return found
 
 
 def _require_files(missing: set[str], folder: Path, kind: str) -> None:
-    """Raise `DataError` where frames have no file."""
+    """Raise `DataError` if files are missing."""
     if not missing:
         return
     first = min(missing)
     others = f" and {len(missing) - 1} other frames" if len(missing) > 1 else ""
-    remedy = "write an empty one for a frame without objects, or name the frames with --frames"
+    remedy = "write an empty file for a frame without objects, or list the frames with --frames"
     raise DataError(f"{folder / first}.txt: no {kind} file for frame {first}{others}; {remedy}")

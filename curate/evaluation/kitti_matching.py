@@ -1,7 +1,21 @@
-"""Matching of detections to labelled objects by KITTI's rules, over all frames at once.
+"""Match detections ("results") to labeled objects ("labels") by KITTI's rules, for all frames.
 
-Only pairs that overlap are ever looked at: they are found once, and every category, difficulty and
-score threshold visits the same list. Source: the KITTI object development kit's evaluation program.
+The overlapping pairs are computed once. Every category, difficulty and score threshold then walks
+through the same list of pairs. Source: the evaluation program of KITTI's object development kit.
+
+Example: Car, IoU above 0.7, score threshold 0.5. One frame has the labels A (Car), B (Car) and
+C (Van, a neighbour category) and the results 0 to 3, all of them Car.
+
+    label  state    overlaps with                               takes   outcome
+    A      COUNTED  0 (IoU 0.75, score 0.9), 1 (0.80, 0.8)      1       true positive
+    B      COUNTED  3 (IoU 0.85, score 0.4)                     none    missed: 3 is below 0.5
+    C      IGNORED  2 (IoU 0.90, score 0.6)                     2       2 is ignored
+
+The pairs are stored by label: starts [0, 2, 3, 4], results [0, 1, 3, 2], overlaps [0.75, 0.80,
+0.85, 0.90]. `match_results` returns [1, -1, 2]: A takes 1, which has the greatest IoU, although 0
+has a higher score. Result 0 then has no label left: it is a false positive. Result 3 takes no part.
+`count_at_thresholds` counts 1 TP and 1 FP at 0.5, and 2 TP and 1 FP at 0.4, where B takes 3.
+`true_positive_scores` returns [0.9, 0.4]: there A takes 0, which has the highest score.
 """
 
 from collections.abc import Sequence
@@ -20,11 +34,11 @@ METRICS = ("image", "bev", "3d")
 
 @dataclass(frozen=True)
 class PooledFrames:
-    """The objects of many frames in one array each.
+    """The objects of many frames, concatenated.
 
     Attributes:
         objects: all objects, frame by frame.
-        starts: (frames + 1,) int64; frame f is objects starts[f] to starts[f + 1].
+        starts: (frames + 1,) int64; frame f has the objects starts[f] to starts[f + 1] - 1.
     """
 
     objects: KittiObjects
@@ -32,12 +46,12 @@ class PooledFrames:
 
     @classmethod
     def of(cls, frames: Sequence[KittiObjects]) -> Self:
-        """Return the frames, in their order."""
+        """Concatenate the objects of the frames, in the given order."""
         starts = np.zeros(len(frames) + 1, dtype=np.int64)
         np.cumsum([len(frame) for frame in frames], out=starts[1:])
-        whole = [KittiObjects.empty(), *frames]
+        parts = [KittiObjects.empty(), *frames]
         columns = (
-            np.concatenate([getattr(frame, field.name) for frame in whole])
+            np.concatenate([getattr(part, field.name) for part in parts])
             for field in fields(KittiObjects)
         )
         return cls(KittiObjects(*columns), starts)
@@ -49,11 +63,11 @@ class PooledFrames:
 
 
 class Candidates(NamedTuple):
-    """Overlapping pairs: those of label i are starts[i] to starts[i + 1], ascending by result.
+    """Overlapping pairs; label i has the pairs starts[i] to starts[i + 1] - 1, by ascending result.
 
     Attributes:
         starts: (labels + 1,) int64.
-        results: (pairs,) int64 row of the result.
+        results: (pairs,) int64 row of the result of each pair.
         overlaps: (pairs,) float64 in (0, 1].
     """
 
@@ -62,14 +76,14 @@ class Candidates(NamedTuple):
     overlaps: np.ndarray
 
 
-class Contest(NamedTuple):
-    """What decides the matching for one category, difficulty and metric.
+class MatchInputs(NamedTuple):
+    """The inputs of the matching for one category and difficulty.
 
     Attributes:
-        label_states: (labels,) int8, see `kitti_rules`.
-        result_states: (results,) int8.
+        label_states: (labels,) int8 COUNTED, IGNORED or ABSENT, see `kitti_rules`.
+        result_states: (results,) int8, as for the labels.
         scores: (results,) float64.
-        min_overlap: a pair must overlap more than this.
+        min_overlap: only pairs with an overlap above this can match.
     """
 
     label_states: np.ndarray
@@ -79,7 +93,7 @@ class Contest(NamedTuple):
 
 
 def candidates_by_metric(labels: PooledFrames, results: PooledFrames) -> dict[str, Candidates]:
-    """Return the overlapping pairs within frames, per metric."""
+    """Return the pairs that overlap within a frame, for each metric of `METRICS`."""
     count = len(labels.objects)
     on_image = _image_pairs(
         labels.objects.boxes_2d, labels.starts, results.objects.boxes_2d, results.starts
@@ -95,7 +109,7 @@ def candidates_by_metric(labels: PooledFrames, results: PooledFrames) -> dict[st
 
 
 def dont_care_shares(labels: PooledFrames, results: PooledFrames) -> Float[np.ndarray, " results"]:
-    """(results,) largest share of each detection's 2D box that lies in one DontCare region."""
+    """Return (results,) the largest share of each 2D box that lies in one DontCare region."""
     regions = labels.select(labels.objects.categories == DONT_CARE)
     return _covered_shares(
         regions.objects.boxes_2d, regions.starts, results.objects.boxes_2d, results.starts
@@ -103,10 +117,10 @@ def dont_care_shares(labels: PooledFrames, results: PooledFrames) -> Float[np.nd
 
 
 def camera_boxes(objects: KittiObjects) -> Float[np.ndarray, "n 7"]:
-    """Return (n, 7) centre boxes in a frame with x to the right, y forward and z up, in metres.
+    """Return (n, 7) boxes at their centre in a frame with x right, y forward and z up, in metres.
 
-    The camera's frame turned by 90 degrees, not the LiDAR frame: overlaps need no calibration.
-    Seen from above, rotation_y turns clockwise.
+    This is the camera frame turned by 90 degrees, not the LiDAR frame, because overlaps need no
+    calibration. The yaw is -rotation_y: seen from above, rotation_y turns clockwise.
     """
     x, y, z = objects.locations.T
     height, width, length = objects.dimensions.T
@@ -116,15 +130,15 @@ def camera_boxes(objects: KittiObjects) -> Float[np.ndarray, "n 7"]:
 def _by_label(
     count: int, rows: np.ndarray, columns: np.ndarray, overlaps: np.ndarray
 ) -> Candidates:
-    """Pairs that ascend by row, as `Candidates`; pairs without overlap are left out."""
-    real = overlaps > 0
-    starts = np.searchsorted(rows[real], np.arange(count + 1))
-    return Candidates(starts, columns[real], overlaps[real])
+    """Return pairs sorted by row as `Candidates`, without those that do not overlap."""
+    overlapping = overlaps > 0
+    starts = np.searchsorted(rows[overlapping], np.arange(count + 1))
+    return Candidates(starts, columns[overlapping], overlaps[overlapping])
 
 
 @njit(cache=True, nogil=True)
 def _common_pixels(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
-    """Area that two 2D boxes (left, top, right, bottom) share."""
+    """Return the intersection area of two 2D boxes (left, top, right, bottom)."""
     width = min(a[i, 2], b[j, 2]) - max(a[i, 0], b[j, 0])
     height = min(a[i, 3], b[j, 3]) - max(a[i, 1], b[j, 1])
     return width * height if width > 0 and height > 0 else 0.0
@@ -132,7 +146,7 @@ def _common_pixels(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _pixels(boxes: np.ndarray, i: int) -> float:
-    """Area of a 2D box."""
+    """Return the area of a 2D box."""
     return float((boxes[i, 2] - boxes[i, 0]) * (boxes[i, 3] - boxes[i, 1]))
 
 
@@ -140,8 +154,9 @@ def _pixels(boxes: np.ndarray, i: int) -> float:
 def _image_pairs(
     a: np.ndarray, starts_a: np.ndarray, b: np.ndarray, starts_b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Row in a, row in b and IoU of the 2D boxes that overlap within a frame, ascending."""
-    rows_a, rows_b = [0 for _ in range(0)], [0 for _ in range(0)]  # typed by their elements
+    """Return row in a, row in b and IoU of the 2D boxes that overlap in a frame, in this order."""
+    # numba infers the type of an empty list from the elements of the comprehension.
+    rows_a, rows_b = [0 for _ in range(0)], [0 for _ in range(0)]
     overlaps = [0.0 for _ in range(0)]
     for frame in range(len(starts_a) - 1):
         for i in range(starts_a[frame], starts_a[frame + 1]):
@@ -158,7 +173,7 @@ def _image_pairs(
 def _covered_shares(
     regions: np.ndarray, region_starts: np.ndarray, boxes: np.ndarray, starts: np.ndarray
 ) -> np.ndarray:
-    """Return the kernel of `dont_care_shares`."""
+    """Return the largest share of each box that lies in one region of its frame."""
     shares = np.zeros(len(boxes))
     for frame in range(len(starts) - 1):
         for j in range(starts[frame], starts[frame + 1]):
@@ -170,56 +185,57 @@ def _covered_shares(
 
 
 @njit(cache=True, nogil=True)
-def scores_of_found(candidates: Candidates, contest: Contest) -> np.ndarray:
-    """Scores of the counted detections that find a counted object, in the order of the objects.
+def true_positive_scores(candidates: Candidates, inputs: MatchInputs) -> np.ndarray:
+    """Return the scores of the true positives, in the order of the labels.
 
-    Here each object takes the free detection with the highest score: KITTI's way of choosing the
-    score thresholds, not of counting.
+    Here each label takes the free result with the highest score. KITTI uses this matching to choose
+    the score thresholds; it counts with `match_results`.
     """
-    taken = np.zeros(len(contest.scores), np.bool_)
-    found = np.empty(len(contest.label_states))
+    taken = np.zeros(len(inputs.scores), np.bool_)
+    found = np.empty(len(inputs.label_states))
     number = 0
-    for label in range(len(contest.label_states)):
-        if contest.label_states[label] < 0:
+    for label in range(len(inputs.label_states)):
+        if inputs.label_states[label] < 0:
             continue
         best = -1
         for pair in range(candidates.starts[label], candidates.starts[label + 1]):
             row = candidates.results[pair]
             if (
-                candidates.overlaps[pair] > contest.min_overlap
-                and contest.result_states[row] >= 0
+                candidates.overlaps[pair] > inputs.min_overlap
+                and inputs.result_states[row] >= 0
                 and not taken[row]
-                and (best < 0 or contest.scores[row] > contest.scores[best])
+                and (best < 0 or inputs.scores[row] > inputs.scores[best])
             ):
                 best = row
         if best >= 0:
             taken[best] = True
-            if contest.label_states[label] == 0 and contest.result_states[best] == 0:
-                found[number] = contest.scores[best]
+            if inputs.label_states[label] == 0 and inputs.result_states[best] == 0:
+                found[number] = inputs.scores[best]
                 number += 1
     return found[:number]
 
 
 @njit(cache=True, nogil=True)
-def match_results(candidates: Candidates, contest: Contest, threshold: float) -> np.ndarray:
-    """Return (labels,) int64 row of the detection that each object takes, -1 where none.
+def match_results(candidates: Candidates, inputs: MatchInputs, threshold: float) -> np.ndarray:
+    """Return (labels,) int64 row of the result that each label takes, -1 for none.
 
-    Objects choose in the order of the labels, among the free detections with a score of at least
-    `threshold`: the counted one with the greatest overlap, else the first ignored one.
+    The labels choose one after the other among the results that are still free and have a score of
+    at least `threshold`. A label takes the counted result with the greatest overlap, or the first
+    ignored result if no counted one overlaps enough.
     """
-    taken = np.zeros(len(contest.scores), np.bool_)
-    matches = np.full(len(contest.label_states), -1)
-    for label in range(len(contest.label_states)):
-        if contest.label_states[label] < 0:
+    taken = np.zeros(len(inputs.scores), np.bool_)
+    matches = np.full(len(inputs.label_states), -1)
+    for label in range(len(inputs.label_states)):
+        if inputs.label_states[label] < 0:
             continue
         best, best_overlap = -1, 0.0
         for pair in range(candidates.starts[label], candidates.starts[label + 1]):
             row, overlap = candidates.results[pair], candidates.overlaps[pair]
-            if overlap <= contest.min_overlap or taken[row] or contest.scores[row] < threshold:
+            if overlap <= inputs.min_overlap or taken[row] or inputs.scores[row] < threshold:
                 continue
-            if contest.result_states[row] == 0 and overlap > best_overlap:
+            if inputs.result_states[row] == 0 and overlap > best_overlap:
                 best, best_overlap = row, overlap
-            elif contest.result_states[row] == 1 and best < 0:
+            elif inputs.result_states[row] == 1 and best < 0:
                 best = row
         if best >= 0:
             taken[best] = True
@@ -228,20 +244,20 @@ def match_results(candidates: Candidates, contest: Contest, threshold: float) ->
 
 
 @njit(cache=True, nogil=True)
-def tally(
+def count_at_thresholds(
     candidates: Candidates,
-    contest: Contest,
+    inputs: MatchInputs,
     thresholds: np.ndarray,
     in_dont_care: np.ndarray,
     orientation_gains: np.ndarray,
 ) -> np.ndarray:
-    """Count at each score threshold.
+    """Count true and false positives at each score threshold.
 
     Args:
         candidates: overlapping pairs.
-        contest: who takes part.
+        inputs: states, scores and minimum overlap.
         thresholds: (t,) scores.
-        in_dont_care: (results,) bool; such a detection is no false positive.
+        in_dont_care: (results,) bool; these results are not false positives.
         orientation_gains: (pairs,) what a true positive adds to the orientation similarity.
 
     Returns:
@@ -249,21 +265,21 @@ def tally(
     """
     totals = np.zeros((len(thresholds), 3))
     for position in range(len(thresholds)):
-        matches = match_results(candidates, contest, thresholds[position])
-        for row in range(len(contest.scores)):
+        matches = match_results(candidates, inputs, thresholds[position])
+        for row in range(len(inputs.scores)):
             if (
-                contest.result_states[row] == 0
+                inputs.result_states[row] == 0
                 and not in_dont_care[row]
-                and contest.scores[row] >= thresholds[position]
+                and inputs.scores[row] >= thresholds[position]
             ):
                 totals[position, 1] += 1
         for label in range(len(matches)):
             row = matches[label]
-            if row < 0 or contest.result_states[row] != 0:
+            if row < 0 or inputs.result_states[row] != 0:
                 continue
             if not in_dont_care[row]:
                 totals[position, 1] -= 1
-            if contest.label_states[label] == 0:
+            if inputs.label_states[label] == 0:
                 totals[position, 0] += 1
                 for pair in range(candidates.starts[label], candidates.starts[label + 1]):
                     if candidates.results[pair] == row:

@@ -1,4 +1,4 @@
-"""What became of every single object and detection under KITTI's rules: found, missed, false."""
+"""The outcome of each single object and detection by KITTI's rules: tp, fp, fn or ignored."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -13,7 +13,7 @@ from curate.evaluation.kitti_ap import check_frames
 from curate.evaluation.kitti_matching import (
     METRICS,
     Candidates,
-    Contest,
+    MatchInputs,
     PooledFrames,
     candidates_by_metric,
     dont_care_shares,
@@ -34,19 +34,20 @@ TRUE_POSITIVE, FALSE_POSITIVE, FALSE_NEGATIVE, LEFT_OUT = "tp", "fp", "fn", "ign
 
 @dataclass(frozen=True)
 class Outcomes(Columns):
-    """One row per object of a category under evaluation, in the order of category, frame, object.
+    """One row per object of an evaluated category, sorted by category, frame and object.
 
-    A neighbouring category's objects (Van for Car) are rows of that evaluation too, as ignored.
+    The objects of a neighbour category (Van for Car) have rows too, with the outcome "ignored".
 
     Attributes:
-        categories: (n,) str, the category under evaluation.
-        frames: (n,) int64, position of the frame in what was given.
-        indices: (n,) int64, position of the object in its frame.
+        categories: (n,) str, the evaluated category.
+        frames: (n,) int64, index of the frame in the input.
+        indices: (n,) int64, index of the object in its frame.
         outcomes: (n,) str: labels "tp", "fn" or "ignored"; detections "tp", "fp" or "ignored".
-        matches: (n,) int64, position in the same frame of the detection that found the object, or
-            of the object that the detection found; -1 where none.
-        overlaps: (n,) float64 overlap with the match, else the greatest with any that took part.
-        scores: (n,) float64 of the detection, of the matched one for labels; NaN where none.
+        matches: (n,) int64, index in the frame of the matched detection (rows of labels) or of the
+            matched object (rows of detections); -1 for none.
+        overlaps: (n,) float64 overlap with the match; without a match the greatest overlap with
+            any object that takes part.
+        scores: (n,) float64 score of the detection, or of the matched one; NaN without a match.
     """
 
     categories: Shaped[np.ndarray, " n"]
@@ -59,7 +60,7 @@ class Outcomes(Columns):
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the rows of all parts."""
+        """Concatenate the rows of all parts."""
         return cls(
             *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls))
         )
@@ -74,24 +75,25 @@ def object_outcomes(
     score_threshold: float = -np.inf,
     min_overlaps: Mapping[str, float] = MIN_OVERLAPS,
 ) -> tuple[Outcomes, Outcomes]:
-    """Outcomes of the labels and of the results.
+    """Return the outcomes of the labels and of the results.
 
     Args:
         labels: the objects of each frame.
         results: the detections of each frame, in the same order.
-        metric: overlap that decides, "image", "bev" or "3d".
-        difficulty: "easy", "moderate" or "hard"; objects beyond it are ignored.
-        score_threshold: detections below it do not take part.
-        min_overlaps: the categories to evaluate, and the overlap that a detection must exceed.
+        metric: the overlap to match by, "image", "bev" or "3d".
+        difficulty: "easy", "moderate" or "hard"; harder objects are ignored.
+        score_threshold: detections with a lower score take no part.
+        min_overlaps: the categories to evaluate, and the overlap that a true positive must exceed.
 
     Raises:
-        ConfigError: if there is no such metric or difficulty.
+        ConfigError: if the metric or the difficulty is unknown.
         DataError: if the numbers of frames differ, or a detection has no score.
     """
     if metric not in METRICS or difficulty not in DIFFICULTIES:
         raise ConfigError(
-            f"no metric {metric!r} or no difficulty {difficulty!r}: "
-            f"choose of {', '.join(METRICS)} and of {', '.join(DIFFICULTIES)}"
+            f"unknown metric {metric!r} or difficulty {difficulty!r}: "
+            f"choose a metric from {', '.join(METRICS)}, a difficulty from "
+            f"{', '.join(DIFFICULTIES)}"
         )
     check_frames(labels, results)
     pooled = PooledFrames.of(labels), PooledFrames.of(results)
@@ -100,14 +102,14 @@ def object_outcomes(
     level = DIFFICULTIES.index(difficulty)
     pairs = []
     for category, min_overlap in min_overlaps.items():
-        contest = Contest(
+        inputs = MatchInputs(
             label_states(pooled[0].objects, category, level),
             result_states(pooled[1].objects, category, level),
             pooled[1].objects.scores,
             min_overlap,
         )
-        contest.result_states[contest.scores < score_threshold] = ABSENT
-        pairs.append(_outcomes(category, pooled, contest, candidates, shares > min_overlap))
+        inputs.result_states[inputs.scores < score_threshold] = ABSENT
+        pairs.append(_outcomes(category, pooled, inputs, candidates, shares > min_overlap))
     of_labels, of_results = zip(*pairs, strict=True)
     return Outcomes.joined(of_labels), Outcomes.joined(of_results)
 
@@ -115,30 +117,28 @@ def object_outcomes(
 def _outcomes(
     category: str,
     pooled: tuple[PooledFrames, PooledFrames],
-    contest: Contest,
+    inputs: MatchInputs,
     candidates: Candidates,
     in_dont_care: np.ndarray,
 ) -> tuple[Outcomes, Outcomes]:
-    """Outcomes of one category; `in_dont_care` is (results,) bool."""
-    finders = match_results(candidates, contest, -np.inf)
-    found = _inverse(finders, len(contest.scores))
+    """Return the outcomes of one category; `in_dont_care` is (results,) bool."""
+    finders = match_results(candidates, inputs, -np.inf)
+    found = _inverse(finders, len(inputs.scores))
     of_labels = np.full(len(finders), FALSE_NEGATIVE, dtype="<U7")
     of_labels[finders >= 0] = TRUE_POSITIVE
     of_results = np.full(len(found), FALSE_POSITIVE, dtype="<U7")
     of_results[found >= 0] = TRUE_POSITIVE
-    of_labels[_with_ignored(contest.label_states, finders, contest.result_states)] = LEFT_OUT
-    of_results[_with_ignored(contest.result_states, found, contest.label_states)] = LEFT_OUT
+    of_labels[_with_ignored(inputs.label_states, finders, inputs.result_states)] = LEFT_OUT
+    of_results[_with_ignored(inputs.result_states, found, inputs.label_states)] = LEFT_OUT
     of_results[in_dont_care & (found < 0)] = LEFT_OUT
-    overlaps = _overlaps(candidates, contest, finders)
-    scores = np.where(finders >= 0, np.append(contest.scores, np.nan)[finders], np.nan)
-    label_rows = np.flatnonzero(contest.label_states != ABSENT)
-    takes_part = contest.result_states != ABSENT
+    overlaps = _overlaps(candidates, inputs, finders)
+    scores = np.where(finders >= 0, np.append(inputs.scores, np.nan)[finders], np.nan)
+    label_rows = np.flatnonzero(inputs.label_states != ABSENT)
+    takes_part = inputs.result_states != ABSENT
     result_rows = np.flatnonzero(takes_part & (pooled[1].objects.categories == category))
     return (
         _rows(category, pooled, label_rows, (of_labels, finders, overlaps[0], scores)),
-        _rows(
-            category, pooled[::-1], result_rows, (of_results, found, overlaps[1], contest.scores)
-        ),
+        _rows(category, pooled[::-1], result_rows, (of_results, found, overlaps[1], inputs.scores)),
     )
 
 
@@ -148,21 +148,21 @@ def _rows(
     rows: np.ndarray,
     columns: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> Outcomes:
-    """`Outcomes` of some rows.
+    """Return the `Outcomes` of selected objects.
 
     Args:
-        category: under evaluation.
-        pooled: the objects that have the outcomes, and the others.
-        rows: (n,) which of the objects.
-        columns: outcomes, matches (as rows of the others), overlaps, scores of all objects.
+        category: the evaluated category.
+        pooled: the objects with these outcomes, and the objects that they are matched with.
+        rows: (n,) rows of the selected objects.
+        columns: outcomes, matches (rows of the other objects), overlaps and scores of all objects.
     """
     outcomes, matches, overlaps, scores = (column[rows] for column in columns)
-    own_starts, other_starts = pooled[0].starts, pooled[1].starts
-    frames = np.searchsorted(own_starts, rows, side="right") - 1
+    starts, other_starts = pooled[0].starts, pooled[1].starts
+    frames = np.searchsorted(starts, rows, side="right") - 1
     return Outcomes(
         np.full(len(rows), category),
         frames,
-        rows - own_starts[frames],
+        rows - starts[frames],
         outcomes,
         np.where(matches >= 0, matches - other_starts[frames], -1),
         overlaps,
@@ -171,7 +171,7 @@ def _rows(
 
 
 def _inverse(matches: np.ndarray, count: int) -> np.ndarray:
-    """Return (count,) row whose match each is, -1 where none."""
+    """Return (count,) the row that has each index as its match, -1 for none."""
     inverse = np.full(count, -1)
     rows = np.flatnonzero(matches >= 0)
     inverse[matches[rows]] = rows
@@ -181,7 +181,7 @@ def _inverse(matches: np.ndarray, count: int) -> np.ndarray:
 def _with_ignored(
     states: np.ndarray, matches: np.ndarray, states_of_others: np.ndarray
 ) -> np.ndarray:
-    """Return (n,) bool, whether a row or its match is ignored."""
+    """Return (n,) bool, True if a row or its match is ignored."""
     matched = matches >= 0
     ignored: np.ndarray = states == IGNORED
     ignored[matched] |= states_of_others[matches[matched]] == IGNORED
@@ -189,15 +189,15 @@ def _with_ignored(
 
 
 def _overlaps(
-    candidates: Candidates, contest: Contest, finders: np.ndarray
+    candidates: Candidates, inputs: MatchInputs, finders: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (labels,) and (results,) overlap with the match, else the greatest that took part."""
+    """Return (labels,) and (results,) overlap with the match, else the greatest overlap."""
     rows = np.repeat(np.arange(len(finders)), np.diff(candidates.starts))
-    takes_part = contest.label_states[rows] != ABSENT
-    takes_part &= contest.result_states[candidates.results] != ABSENT
+    takes_part = inputs.label_states[rows] != ABSENT
+    takes_part &= inputs.result_states[candidates.results] != ABSENT
     rows, columns = rows[takes_part], candidates.results[takes_part]
     overlaps = candidates.overlaps[takes_part]
-    of_labels, of_results = np.zeros(len(finders)), np.zeros(len(contest.scores))
+    of_labels, of_results = np.zeros(len(finders)), np.zeros(len(inputs.scores))
     np.maximum.at(of_labels, rows, overlaps)
     np.maximum.at(of_results, columns, overlaps)
     is_match = finders[rows] == columns

@@ -1,8 +1,7 @@
-"""KITTI's rules on which objects count: categories, difficulties, and what is left out.
+"""KITTI's rules on which objects count: categories, difficulties and ignored objects.
 
-Source: the KITTI object development kit (Geiger et al., CVPR 2012), readme.txt and its evaluation
-program. An object that is left out ("ignored") may be found without reward and missed without
-penalty.
+Source: the KITTI object development kit (Geiger et al., CVPR 2012), readme.txt and evaluation
+program. An ignored object is neither a true positive if it is found nor a miss if it is not.
 """
 
 from types import MappingProxyType
@@ -14,29 +13,29 @@ from curate.shapes import Int
 
 DIFFICULTIES = ("easy", "moderate", "hard")
 MIN_HEIGHTS = (40.0, 25.0, 25.0)
-"""Height of the 2D box in pixels, per difficulty: labels must exceed it, results reach it."""
+"""2D box heights in pixels, per difficulty: labels must be higher, results at least as high."""
 MAX_OCCLUSIONS = (0, 1, 2)
 MAX_TRUNCATIONS = (0.15, 0.3, 0.5)
 
 MIN_OVERLAPS = MappingProxyType({"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5})
-"""Overlap that a detection must exceed to find an object; the same in image, BEV and 3D."""
+"""KITTI's IoU thresholds: the overlap that a true positive must exceed, in image, BEV and 3D."""
 
-LOOSE_OVERLAPS = MappingProxyType({"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25})
-"""For detectors of few labels, which find objects before they measure them to KITTI's overlaps."""
+RELAXED_OVERLAPS = MappingProxyType({"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25})
+"""Relaxed IoU thresholds, for detectors trained on few labels with boxes that are not precise."""
 
 NEIGHBOURS = MappingProxyType({"Car": "Van", "Pedestrian": "Person_sitting"})
-"""Categories that are alike: their objects are ignored, not counted as background."""
+"""The neighbour category of a category: its objects look alike and are ignored."""
 
 COUNTED, IGNORED, ABSENT = 0, 1, -1
-"""States of an object in the evaluation of one category at one difficulty."""
+"""States of an object in the evaluation of one category and difficulty; ABSENT takes no part."""
 
 
 def label_states(labels: KittiObjects, category: str, difficulty: int) -> Int[np.ndarray, " n"]:
-    """Return (n,) int8 state of each labelled object.
+    """Return (n,) int8 state of each labeled object.
 
     Args:
         labels: n objects.
-        category: that is being evaluated.
+        category: the evaluated category.
         difficulty: index into `DIFFICULTIES`.
     """
     heights = labels.boxes_2d[:, 3] - labels.boxes_2d[:, 1]
@@ -55,12 +54,12 @@ def label_states(labels: KittiObjects, category: str, difficulty: int) -> Int[np
 def result_states(results: KittiObjects, category: str, difficulty: int) -> Int[np.ndarray, " n"]:
     """Return (n,) int8 state of each detection.
 
-    A detection that is too low in the image is ignored whatever its category, so that a low
-    detection of another category can take an object out of the count; this is KITTI's own rule.
+    A detection with a 2D box that is too low is ignored, whatever its category. It can therefore
+    match an object of another category, which is then not counted. KITTI's program does the same.
 
     Args:
         results: n detections.
-        category: that is being evaluated.
+        category: the evaluated category.
         difficulty: index into `DIFFICULTIES`.
     """
     heights = np.abs(results.boxes_2d[:, 3] - results.boxes_2d[:, 1])

@@ -1,7 +1,7 @@
-"""What became of labels from one round to the next: matched one to one by BEV IoU.
+"""Changes of the labels from one round to the next: labels are matched one to one by BEV IoU.
 
-Source: SQL joins rounds by key, but label k of one round is not label k of the next; like MS3D's
-and ST3D's memory, labels are the same where their boxes overlap.
+Rounds cannot be joined by key, because label k of one round is not label k of the next. As in the
+label memories of MS3D and ST3D, two labels are the same object if their boxes overlap.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ class RoundLabels(Columns):
     """The n labels of a round with the weights of one policy.
 
     Attributes:
-        frames: (n,) integer, the same frame has the same number in both rounds.
-        categories: (n,) integer, likewise.
+        frames: (n,) integer; a frame has the same number in both rounds.
+        categories: (n,) integer; a category has the same number in both rounds.
         boxes: (n, 7) in the LiDAR frame.
         weights: (n,) in [0, 1].
     """
@@ -34,12 +34,12 @@ class RoundLabels(Columns):
 
 @dataclass(frozen=True)
 class LabelChanges:
-    """Labels before and after.
+    """The labels of two rounds and the pairs that are the same object.
 
     Attributes:
-        before: n labels.
-        after: m labels.
-        pairs: (p, 2) rows before and after that mean the same object.
+        before: n labels of the earlier round.
+        after: m labels of the later round.
+        pairs: (p, 2) rows in `before` and in `after` of the same object.
         iou: (p,) BEV IoU of each pair.
     """
 
@@ -50,34 +50,35 @@ class LabelChanges:
 
     @cached_property
     def lost(self) -> Int[np.ndarray, " lost"]:
-        """Rows before without a match, ascending."""
+        """Rows of `before` without a match, ascending."""
         return np.setdiff1d(np.arange(len(self.before)), self.pairs[:, 0])
 
     @cached_property
     def gained(self) -> Int[np.ndarray, " gained"]:
-        """Rows after without a match, ascending."""
+        """Rows of `after` without a match, ascending."""
         return np.setdiff1d(np.arange(len(self.after)), self.pairs[:, 1])
 
     @cached_property
     def weight_change(self) -> Float[np.ndarray, " p"]:
-        """(p,) weight after less weight before of each pair."""
+        """(p,) weight after minus weight before of each pair."""
         change: np.ndarray = (
             self.after.weights[self.pairs[:, 1]] - self.before.weights[self.pairs[:, 0]]
         )
         return change
 
     def largest(self, count: int) -> tuple[Int[np.ndarray, "c 2"], Float[np.ndarray, " c"]]:
-        """Return the labels whose weight changed most; a lost or gained one changes from or to 0.
+        """Return up to `count` labels with the largest change of weight.
+
+        The weight of a lost label changes to 0, that of a gained label from 0.
 
         Returns:
-            (c, 2) rows before and after, -1 for none, and (c,) changes, the largest first; labels
-            whose weight did not change are not among them.
+            (c, 2) rows in `before` and `after`, -1 for none, and (c,) changes, the largest first.
+            Labels without a change are not included.
         """
-        nobody = np.full(len(self.lost), -1), np.full(len(self.gained), -1)
         rows = np.concatenate([
             self.pairs,
-            np.stack([self.lost, nobody[0]], axis=1),
-            np.stack([nobody[1], self.gained], axis=1),
+            np.stack([self.lost, np.full(len(self.lost), -1)], axis=1),
+            np.stack([np.full(len(self.gained), -1), self.gained], axis=1),
         ])  # fmt: skip
         change = np.concatenate([
             self.weight_change, -self.before.weights[self.lost], self.after.weights[self.gained]
@@ -90,7 +91,7 @@ class LabelChanges:
 def compare_labels(
     before: RoundLabels, after: RoundLabels, minimum_iou: float = 0.1
 ) -> LabelChanges:
-    """Match labels of the same frame and category, the largest BEV IoU first.
+    """Match labels of the same frame and category, the pair with the largest BEV IoU first.
 
     Args:
         before: labels of the earlier round.
@@ -98,10 +99,10 @@ def compare_labels(
         minimum_iou: pairs with a BEV IoU at or below this are different objects.
 
     Raises:
-        ConfigError: minimum_iou is not in [0, 1).
+        ConfigError: if minimum_iou is not in [0, 1).
     """
     if not 0 <= minimum_iou < 1:
-        raise ConfigError(f"diff: the least overlap must be in [0, 1), not {minimum_iou}")
+        raise ConfigError(f"diff: the minimum IoU must be in [0, 1), not {minimum_iou}")
     groups = np.concatenate([_groups(before), _groups(after)])
     names, group = np.unique(groups, return_inverse=True)
     of_before, of_after = group[: len(before)], group[len(before) :]
@@ -120,19 +121,19 @@ def compare_labels(
 
 
 def _groups(labels: RoundLabels) -> np.ndarray:
-    """Return (n,) a number per frame and category."""
+    """Return (n,) one number per frame and category: the frame in the high bits."""
     number: np.ndarray = labels.frames.astype(np.int64) * 2**20 + labels.categories
     return number
 
 
 def _by_group(group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows ordered by their group, and where each group starts."""
+    """Return the rows sorted by group, and the start of each group."""
     starts = np.concatenate([[0], np.cumsum(np.bincount(group, minlength=groups))])
     return np.argsort(group, kind="stable"), starts
 
 
 def _take(rows: np.ndarray, columns: np.ndarray, n: int, m: int) -> np.ndarray:
-    """Indices of pairs in their order, without those of which one label is taken already."""
+    """Return the indices of the pairs that get both their row and their column, in their order."""
     free_row, free_column = [True] * n, [True] * m
     taken = []
     for index, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):

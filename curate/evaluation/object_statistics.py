@@ -1,4 +1,4 @@
-"""How hard the objects of a data set are: by difficulty, occlusion, truncation and distance."""
+"""Statistics of the labeled objects of a data set: difficulty, occlusion, truncation, distance."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,16 +13,16 @@ QUANTILES = (0.1, 0.5, 0.9)
 
 @dataclass(frozen=True)
 class ObjectStatistics:
-    """The objects of one category.
+    """Statistics of the objects of one category.
 
     Attributes:
-        objects: all that are labelled.
-        per_frame: their number per frame.
-        counted: number per frame that counts at each difficulty of `DIFFICULTIES`; those of one
-            are among those of the next.
+        objects: number of labeled objects.
+        per_frame: objects per frame.
+        counted: objects per frame that count at each difficulty of `DIFFICULTIES`; each difficulty
+            includes the easier ones.
         occluded: share with occlusion level 1 or more.
-        mostly_occluded: share with level 2 or more.
-        truncated: share of which too much lies outside the image for KITTI to call them easy.
+        mostly_occluded: share with occlusion level 2 or more.
+        truncated: share that is truncated more than KITTI allows for "easy".
         distances: quantiles of the distance from the camera in metres, see `QUANTILES`.
     """
 
@@ -38,21 +38,21 @@ class ObjectStatistics:
 def object_statistics(
     frames: Sequence[KittiObjects], categories: Sequence[str]
 ) -> Mapping[str, ObjectStatistics]:
-    """The statistics of each category; shares and distances are NaN where there is no object."""
+    """Return the statistics of each category; shares and distances are NaN without objects."""
     return {category: _of_category(frames, category) for category in categories}
 
 
 def _of_category(frames: Sequence[KittiObjects], category: str) -> ObjectStatistics:
-    own = [frame.select(frame.categories == category) for frame in frames]
+    selected = [frame.select(frame.categories == category) for frame in frames]
     empty = KittiObjects.empty()
-    occluded = np.concatenate([each.occluded for each in (empty, *own)])
-    truncated = np.concatenate([each.truncated for each in (empty, *own)])
-    locations = np.concatenate([each.locations for each in (empty, *own)])
+    occluded = np.concatenate([each.occluded for each in (empty, *selected)])
+    truncated = np.concatenate([each.truncated for each in (empty, *selected)])
+    locations = np.concatenate([each.locations for each in (empty, *selected)])
     distances = np.hypot(locations[:, 0], locations[:, 2])
     count = len(occluded)
     frame_count = max(len(frames), 1)
     counted = [
-        sum(int((label_states(each, category, level) == COUNTED).sum()) for each in own)
+        sum(int((label_states(each, category, level) == COUNTED).sum()) for each in selected)
         for level in range(len(DIFFICULTIES))
     ]
     return ObjectStatistics(
@@ -68,5 +68,5 @@ def _of_category(frames: Sequence[KittiObjects], category: str) -> ObjectStatist
     )
 
 
-def _share(chosen: np.ndarray) -> float:
-    return float(chosen.mean()) if len(chosen) else np.nan
+def _share(flags: np.ndarray) -> float:
+    return float(flags.mean()) if len(flags) else np.nan

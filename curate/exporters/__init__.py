@@ -1,1 +1,1 @@
-"""Labels as files that other tools read, one file per format."""
+"""Exporters: write labels in the formats of other tools, one module per format."""

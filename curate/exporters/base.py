@@ -1,4 +1,4 @@
-"""What every exporter offers: the labels of a round as files for trainers."""
+"""The interface of exporters, and the label set that they write."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,28 +18,28 @@ BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 WEIGHTED_LABEL_COLUMNS = tuple(column.name for column in WEIGHTED_LABELS)
 GROUND_TRUTH_COLUMNS = ("frame", "k", "category", *BOX_COLUMNS, "truncated", "occluded")
 
-# How many frames an error names.
-_NAMED_FRAMES = 5
+# How many frames an error message lists.
+_LISTED_FRAMES = 5
 
 Block = Mapping[str, Sequence[Any] | np.ndarray]
-"""Rows as named columns, all of one length; None, or NaN in an array, is unknown."""
+"""Rows as named columns of the same length; None, or NaN in an array, means unknown."""
 Columns = Mapping[str, list[Any]]
-"""A block in plain Python values."""
+"""A block as plain Python values."""
 
 
 @dataclass(frozen=True)
 class LabelFileDescription:
-    """What the labels are about.
+    """The origin of the labels: data set, round and policy.
 
     Attributes:
         dataset: name of the data set, as in the registry.
         root: folder that the paths of the frames are relative to.
-        categories: the categories to be learned, in the detector's order.
-        round: round that made the labels.
-        policy: policy that weighted them.
-        code_version: of curate.
-        zero_weight: what a label of weight 0 is, see `ZeroWeight`. What a person rejected is
-            background in any case.
+        categories: the categories to learn, in the detector's order.
+        round: the round that made the labels.
+        policy: the policy that weighted them.
+        code_version: the version of curate.
+        zero_weight: the meaning of weight 0, see `ZeroWeight`. A label that a person rejected is
+            always background.
     """
 
     dataset: str
@@ -53,7 +53,7 @@ class LabelFileDescription:
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """A frame to learn from, and where its files lie below the root of the data set."""
+    """A frame to learn from, with the paths of its files relative to the root of the data set."""
 
     frame: str
     split: str
@@ -64,23 +64,25 @@ class FrameFiles:
 
 @dataclass(frozen=True)
 class LabelSet:
-    """All that a student may learn from: X_l with its ground truth, X_u with weighted labels.
+    """Everything that a student may learn from: X_l with ground truth, X_u with weighted labels.
 
-    A labeled frame without objects belongs to it and teaches background. An unlabeled frame without
-    labels does not: no weight vouches for its emptiness.
+    A labeled frame without objects is included, because it teaches background. An unlabeled frame
+    without labels is not included, because no weight says how reliable its emptiness is.
 
     Attributes:
         description: see `LabelFileDescription`.
         frames: the labeled and unlabeled frames, in their order.
-        ground_truth: the columns `GROUND_TRUTH_COLUMNS` of objects of labeled frames.
-        labels: blocks with the columns `columns` of labels of unlabeled frames, in the order of
-            frames and k; a frame may continue in the next block. Walked anew by each export.
-        read: calibration and image size of a frame, for formats in the camera's frame.
-        read_points: the same with the frame's points, for formats that carry objects' points.
-        columns: of the labels: the core ones first, further evidence behind them.
+        ground_truth: the columns `GROUND_TRUTH_COLUMNS` for the objects of labeled frames.
+        labels: blocks with the columns `columns` for the labels of unlabeled frames, sorted by
+            frame and k; a frame may continue in the next block. Each export iterates over them
+            once.
+        read: returns calibration and image size of a frame, for formats in the camera frame.
+        read_points: like `read`, with the points, for formats that contain the points of objects.
+        columns: columns of the labels: the core columns first, then further evidence.
 
     Raises:
-        LeakageError: ground truth of a frame that is not labeled, or a frame of another split.
+        LeakageError: if there is ground truth of a frame that is not labeled, or a frame of another
+            split.
     """
 
     description: LabelFileDescription
@@ -96,43 +98,43 @@ class LabelSet:
         for each in self.frames:
             if each.split not in ("labeled", "unlabeled"):
                 raise LeakageError(
-                    f"frame {each.frame} is of split {each.split!r}; export labeled and unlabeled "
-                    "frames only"
+                    f"frame {each.frame} is in the split {each.split!r}; export labeled and "
+                    "unlabeled frames only"
                 )
         leaked = set(self.ground_truth["frame"]) - self._of_split("labeled")
         if leaked:
             raise LeakageError(
-                f"labels to export hold ground truth of frames outside the labeled split: "
-                f"{named(leaked)}; only labeled frames may bring ground truth into a training"
+                f"the labels to export contain ground truth of frames outside the labeled split: "
+                f"{named(leaked)}; export ground truth of labeled frames only"
             )
 
     @property
     def column_names(self) -> tuple[str, ...]:
-        """The names of the columns of the labels."""
+        """The names of the label columns."""
         return tuple(column.name for column in self.columns)
 
     def truth(self) -> Columns:
-        """Return the ground truth in plain Python values."""
+        """Return the ground truth as plain Python values."""
         return _plain(self.ground_truth, GROUND_TRUTH_COLUMNS)
 
     def blocks(self) -> Iterator[Columns]:
-        """Walk through the labels once, and check them on the way.
+        """Iterate over the blocks of labels and check each of them.
 
         Raises:
-            DataError: if a weight is not a number in [0, 1], a label is of a frame outside the
+            DataError: if a weight is not a number in [0, 1], a label belongs to a frame outside the
                 unlabeled split, or a block has other columns.
         """
         unlabeled = self._of_split("unlabeled")
-        for given in self.labels:
-            block = _plain(given, self.column_names)
-            for place, weight in enumerate(block["weight"]):
+        for labels in self.labels:
+            block = _plain(labels, self.column_names)
+            for row, weight in enumerate(block["weight"]):
                 if not (isinstance(weight, int | float) and 0 <= weight <= 1):
-                    raise bad_weight(block["frame"][place], block["k"][place], weight)
-            strays = set(block["frame"]) - unlabeled
-            if strays:
+                    raise bad_weight(block["frame"][row], block["k"][row], weight)
+            unexpected = set(block["frame"]) - unlabeled
+            if unexpected:
                 raise DataError(
-                    f"labels of frames outside the unlabeled split: {named(strays)}; export labels "
-                    "of unlabeled frames only"
+                    f"labels of frames outside the unlabeled split: {named(unexpected)}; "
+                    "export labels of unlabeled frames only"
                 )
             yield block
 
@@ -143,40 +145,41 @@ class LabelSet:
 class Exporter(Protocol):
     """Writes a label set in one format.
 
-    An export is whole or not there: what fails or is killed on the way leaves the former one as it
-    was. Only former exports are replaced; `ConfigError` where something else is in the place.
+    An export is atomic: if it fails or is killed, the previous export stays as it was. It only
+    replaces a previous export; if anything else is at the path, it raises `ConfigError`.
 
-    A trainer that reads no weights never takes a label of weight 0 for an object. The format says
-    what such labels are, see `LabelFileDescription.zero_weight`: those to ignore are in the form
-    that its readers ignore; background ones are where its readers do not look, or left out.
+    A trainer that does not read weights must never learn a label of weight 0 as an object. The
+    format therefore depends on `LabelFileDescription.zero_weight`: labels to ignore are written in
+    a form that the format's readers ignore; background labels are written where its readers do not
+    look, or are omitted.
     """
 
     name: ClassVar[str]
     suffix: ClassVar[str]
-    """Of the file, such as ".sqlite"; "" for a format that is a folder."""
+    """The suffix of the file, such as ".sqlite"; "" for a format that is a folder."""
 
     def write(self, path: Path, labels: LabelSet) -> int:
-        """Write the file or folder `path`; returns how many labels are in it.
+        """Write the file or folder `path` and return how many labels it contains.
 
         Raises:
-            ConfigError: if something else is in the place.
-            DataError: if a label cannot be, such as one with a weight that is not in [0, 1].
+            ConfigError: if something other than a previous export is at the path.
+            DataError: if a label is invalid, for example its weight is not in [0, 1].
         """
         ...
 
 
 def by_frame(blocks: Iterable[Columns]) -> Iterator[tuple[str, Columns]]:
-    """Walk through blocks frame by frame; a frame may continue in the next block."""
+    """Iterate over blocks frame by frame; a frame may continue in the next block."""
     for frame, parts in groupby(chain.from_iterable(map(_parts, blocks)), key=_frame_of):
-        own: dict[str, list[Any]] = {}
+        columns: dict[str, list[Any]] = {}
         for part in parts:
             for name, values in part.items():
-                own.setdefault(name, []).extend(values)
-        yield frame, own
+                columns.setdefault(name, []).extend(values)
+        yield frame, columns
 
 
 def _parts(block: Columns) -> Iterator[Columns]:
-    """Cut a block where the frame changes."""
+    """Split a block where the frame changes."""
     start = 0
     for _, group in groupby(block["frame"]):
         stop = start + sum(1 for _ in group)
@@ -189,11 +192,11 @@ def _frame_of(part: Columns) -> str:
 
 
 def _plain(block: Block, names: Sequence[str]) -> Columns:
-    """Return the columns by name and in order, in plain Python values."""
+    """Return the columns in the order of `names`, as plain Python values."""
     if set(block) != set(names) or len({len(values) for values in block.values()}) != 1:
         raise DataError(
             f"a block of labels has the columns {', '.join(block)}; it needs {', '.join(names)}, "
-            "all of one length"
+            "all of the same length"
         )
     return {name: _as_list(block[name]) for name in names}
 
@@ -206,15 +209,15 @@ def _as_list(values: Sequence[Any] | np.ndarray) -> list[Any]:
 
 
 def bad_weight(frame: str, k: int, weight: object) -> DataError:
-    """Return what is wrong with a label with an impossible weight."""
+    """Return the error for a label with an invalid weight."""
     return DataError(
-        f"frame {frame}: label {k} has weight {weight!r}; weights are in [0, 1], something else "
-        "has written this one: restore a backup"
+        f"frame {frame}: label {k} has weight {weight!r}, expected a number in [0, 1]; curate did "
+        "not write it: restore a backup"
     )
 
 
 def named(frames: Iterable[str]) -> str:
-    """Some of the frames, as text."""
+    """Return the first few frames as text, and the number of the others."""
     names = sorted(frames)
-    more = f" and {len(names) - _NAMED_FRAMES} more" if len(names) > _NAMED_FRAMES else ""
-    return ", ".join(names[:_NAMED_FRAMES]) + more
+    more = f" and {len(names) - _LISTED_FRAMES} more" if len(names) > _LISTED_FRAMES else ""
+    return ", ".join(names[:_LISTED_FRAMES]) + more

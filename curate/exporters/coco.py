@@ -1,12 +1,13 @@
-"""Labels as COCO object detection annotations: the 3D boxes projected into the image.
+"""Export labels as COCO object detection annotations: the 3D boxes projected into the image.
 
 Source: the COCO data format (Lin et al., "Microsoft COCO", ECCV 2014): `bbox` is left, top, width,
-height in pixels. Each annotation has these keys besides: `weight`, v; `score`, of pseudo-labels;
-`box_3d`, the box in the LiDAR frame; `frame` and `k`. A label of weight 0 that is to be ignored has
-`iscrowd` 1, which COCO's readers take for a region to be ignored. One that is background is not
-among the `annotations` but, in the same form, in `background`, which they do not read. The info's
-`zero_weight` says what a weight of 0 means. A box that the camera does not see has a `bbox` of no
-size, which they leave out. Images of X_l carry their ground truth with weight 1.
+height in pixels. Each annotation has additional keys: `weight` (v), `score` (pseudo-labels only),
+`box_3d` (the box in the LiDAR frame), `frame` and `k`. Images of X_l have their ground truth with
+weight 1.
+
+`zero_weight` in `info` gives the meaning of weight 0. A label to ignore has `iscrowd` 1, which COCO
+readers ignore. A background label is not in `annotations` but in `background`, in the same form,
+which COCO readers do not read. A box outside the image has a `bbox` of size 0, which they skip.
 """
 
 import json
@@ -18,7 +19,7 @@ import numpy as np
 
 from curate.exporters.base import LabelFileDescription, LabelSet
 from curate.exporters.objects import FrameObjects, categories_of, count_labels, frame_objects
-from curate.exporters.place import check_place, says
+from curate.exporters.place import check_place, has_description
 from curate.files.atomic import replace_file
 from curate.frames import Frame
 from curate.geometry.projection import image_rectangles
@@ -38,7 +39,7 @@ class CocoExporter:
         Raises:
             DataError: if the calibration or the image of a frame cannot be read.
         """
-        check_place(path, says("info", _FORMAT))
+        check_place(path, has_description("info", _FORMAT))
         frames = list(frame_objects(labels))
         document = _document(labels.description, frames, labels.read)
         replace_file(path, json.dumps(document, allow_nan=False).encode())
@@ -57,9 +58,9 @@ def _document(
         frame = read(objects.frame_id)
         images.append(_image(number, objects, frame))
         made = _annotations(objects, frame, ids)
-        for annotation, nothing in zip(made, objects.background, strict=True):
-            kept = background if nothing else annotations
-            kept.append({"id": len(kept) + 1, "image_id": number} | annotation)
+        for annotation, is_background in zip(made, objects.background, strict=True):
+            target = background if is_background else annotations
+            target.append({"id": len(target) + 1, "image_id": number} | annotation)
     return {
         "info": {
             "description": _FORMAT,
@@ -91,16 +92,16 @@ def _image(number: int, objects: FrameObjects, frame: Frame) -> dict[str, Any]:
 def _annotations(
     objects: FrameObjects, frame: Frame, ids: dict[str, int]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the objects of a frame without their places in the file."""
+    """Yield the annotations of a frame without the ids of annotation and image."""
     found = objects.detections
-    seen = np.nan_to_num(image_rectangles(found.boxes, frame.calibration, frame.image_size))
-    sizes = seen[:, 2:] - seen[:, :2]
+    rectangles = np.nan_to_num(image_rectangles(found.boxes, frame.calibration, frame.image_size))
+    sizes = rectangles[:, 2:] - rectangles[:, :2]
     for k in range(len(found)):
         annotation = {
             "category_id": ids[str(found.categories[k])],
-            "bbox": [*seen[k, :2].tolist(), *sizes[k].tolist()],
+            "bbox": [*rectangles[k, :2].tolist(), *sizes[k].tolist()],
             "area": float(sizes[k].prod()),
-            # Its readers never match what has no area, so nobody should be asked to find it.
+            # COCO readers never match a box without area: it must not count as a missed object.
             "iscrowd": int(objects.ignored[k] or not sizes[k].all()),
             "weight": float(objects.weights[k]),
             "box_3d": found.boxes[k].tolist(),

@@ -1,4 +1,4 @@
-"""What an exported weighted label says of itself: its columns, their units and their meanings."""
+"""The columns of an exported weighted label, with their units and meanings."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from curate.priors.semantic import SemanticPrior
 
 
 def as_optional(columns: tuple[Column, ...]) -> tuple[Column, ...]:
-    """Return columns of evidence as a label has them: null where there is no such evidence."""
+    """Return evidence columns for labels: a label may lack the evidence, then they are null."""
     return tuple(replace(column, optional=True) for column in columns)
 
 
@@ -16,10 +16,10 @@ WEIGHTED_LABELS = (
     Column("round", "int32", "", "round that made the label"),
     Column("frame", "name", "", "frame id"),
     Column("k", "int32", "", "number of the label within its frame, by falling score"),
-    Column("category", "name", "", "of the object"),
+    Column("category", "name", "", "category of the object"),
     Column("x", "float64", "m", "box centre, forward of the LiDAR"),
-    Column("y", "float64", "m", "box centre, to its left"),
-    Column("z", "float64", "m", "box centre, above it"),
+    Column("y", "float64", "m", "box centre, left of the LiDAR"),
+    Column("z", "float64", "m", "box centre, above the LiDAR"),
     Column("length", "float64", "m", "along the heading"),
     Column("width", "float64", "m", "across the heading"),
     Column("height", "float64", "m", "upward"),
@@ -30,8 +30,8 @@ WEIGHTED_LABELS = (
     *as_optional(SemanticPrior.columns),
     Column("rho_det", "float64", "1", "product of the priors' rho", True),
     Column("lambda_u", "float64", "1", "age parameter, Eq. 4: losses above it weigh 0", True),
-    Column("provenance", "name", "", "detector, or human where a person decided"),
-    Column("policy", "name", "", "that weighted the label"),
-    Column("weight", "float64", "1", "v, reliability in [0, 1]; what 0 means, the policy says"),
+    Column("provenance", "name", "", "detector, or human if a person decided"),
+    Column("policy", "name", "", "policy that weighted the label"),
+    Column("weight", "float64", "1", "v, reliability in [0, 1]; the policy defines what 0 means"),
 )
-"""The core columns, in the order in which every format has them."""
+"""The core columns, in the order of every format."""

@@ -1,8 +1,8 @@
-"""Weighted labels as one CSV file (RFC 4180), for spreadsheets and scripts.
+"""Export weighted labels as one CSV file (RFC 4180), for spreadsheets and scripts.
 
-The columns are those of `weighted_labels`; what is unknown is an empty field. Numbers are written
-so that they come back to the last bit. The format has no place to say what a weight of 0 means: the
-policy, a column, does.
+The columns are those of `weighted_labels`; an unknown value is an empty field. Numbers are written
+with all their digits and read back exactly. The file cannot state the meaning of weight 0: it
+depends on the policy, which is a column.
 """
 
 import csv
@@ -17,14 +17,14 @@ _HEADER = ",".join(WEIGHTED_LABEL_COLUMNS)
 
 
 class CsvExporter:
-    """An `Exporter` that writes the weighted labels of X_u as CSV; ground truth is not in it."""
+    """An `Exporter` that writes the weighted labels of X_u as CSV, without ground truth."""
 
     name: ClassVar[str] = "csv"
     suffix: ClassVar[str] = ".csv"
 
     def write(self, path: Path, labels: LabelSet) -> int:
         """See `curate.exporters.base.Exporter`."""
-        check_place(path, _is_former)
+        check_place(path, _is_export)
         count = 0
         with atomic_path(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -35,7 +35,7 @@ class CsvExporter:
         return count
 
 
-def _is_former(path: Path) -> bool:
-    with path.open(encoding="utf-8") as former:
-        start = former.readline(len(_HEADER) + 1)
+def _is_export(path: Path) -> bool:
+    with path.open(encoding="utf-8") as file:
+        start = file.readline(len(_HEADER) + 1)
     return start.rstrip(",\n") == _HEADER

@@ -1,8 +1,8 @@
-"""Exported labels as a pandas or polars DataFrame: `read_labels("labels.sqlite")`.
+"""Read exported labels as a pandas or polars DataFrame: `read_labels("labels.sqlite")`.
 
-The three exports that hold every label with its weight are read: SQLite, CSV and Parquet. All give
-the same columns with the same types, those of `weighted_labels`. A table reader that guesses types
-would turn the frame id "000001" into the number 1; here the declared columns decide.
+SQLite, CSV and Parquet exports can be read, because they contain every label with its weight. All
+give the columns of `weighted_labels` with the same types. The types come from the declared columns:
+a reader that guesses types would turn the frame id "000001" into the number 1.
 """
 
 import csv
@@ -44,21 +44,21 @@ def read_labels(path: StrPath, as_: Literal["polars"]) -> "pl.DataFrame": ...
 @overload
 def read_labels(path: StrPath, as_: None = None) -> Any: ...
 def read_labels(path: StrPath, as_: Library | None = None) -> Any:
-    """Return exported labels as a DataFrame, a row per label, in the order of the file.
+    """Return exported labels as a DataFrame with one row per label, in the order of the file.
 
     The columns are those of `weighted_labels`: round, frame, k, category, the box (x, y, z, length,
     width, height in metres, yaw in radians; box centre, LiDAR frame), score, loss, the evidence,
-    policy and weight. Frame ids are text: "000001" stays "000001". What is unknown is missing: NaN,
-    NA or null. Ground truth of labeled frames is not in the table. What a weight of 0 means depends
-    on the policy; see docs/training.md.
+    policy and weight. Frame ids are text: "000001" stays "000001". Unknown values are NaN, NA or
+    null. The table does not contain the ground truth of labeled frames. The meaning of weight 0
+    depends on the policy; see docs/training.md.
 
     Args:
-        path: an export in the format sqlite, csv or parquet; the content decides which.
-        as_: "pandas" or "polars"; by default pandas, or polars where only that is installed.
+        path: an export in the format sqlite, csv or parquet; the format is detected.
+        as_: "pandas" or "polars"; by default pandas, or polars if only polars is installed.
 
     Raises:
         ConfigError: if the library is unknown or not installed, or pyarrow is missing for Parquet.
-        DataError: if the file is missing, damaged, or not an export that holds weights.
+        DataError: if the file is missing, damaged, or not an export with weights.
     """
     path = Path(path)
     library = _choose(as_)
@@ -86,7 +86,7 @@ def _choose(as_: str | None) -> Library:
 
 
 def _start(path: Path) -> bytes:
-    """As many bytes as it takes to tell the formats apart."""
+    """Return the first bytes, enough to detect the format."""
     try:
         with path.open("rb") as file:
             return file.read(len(",".join(WEIGHTED_LABEL_COLUMNS)))
@@ -95,10 +95,10 @@ def _start(path: Path) -> bytes:
 
 
 def _read_csv(path: Path, library: Library) -> Any:
-    """Read the declared columns by their type, and further ones as numbers where all of them are.
+    """Read a CSV export; columns beyond the core columns are numbers if all their values are.
 
     Raises:
-        DataError: if a row is too short or too long, or a value is not of its column's type.
+        DataError: if a row is too short or too long, or a value does not have its column's type.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -125,9 +125,9 @@ def _parse(path: Path, lines: Iterable[Sequence[str]], kinds: Kinds) -> Iterator
 
 
 def _kind_of_texts(path: Path, place: int) -> Kind:
-    """Return int or float where every value of a column is what such a number is written as.
+    """Return int or float if every value of a column is written as such a number, else str.
 
-    So "7" is a number, and "007" is text.
+    "7" is an int, but "007" is text, because an int would be written as "7".
     """
     fitting: list[Kind] = [int, float]
     with path.open(newline="", encoding="utf-8") as file:
@@ -145,11 +145,11 @@ def _is_written_as(kind: Kind, text: str) -> bool:
 
 
 def _read_parquet(path: Path, library: Library) -> Any:
-    """Read all columns, and give names, integers and floats the types of the other formats."""
+    """Read all columns and convert them to the types that the other formats give."""
     arrow, parquet = load_parquet()
     try:
         if (parquet.read_schema(path).metadata or {}).get(b"curate.format") != FORMAT.encode():
-            raise DataError(f"{path}: a Parquet file, but not one that curate exported")
+            raise DataError(f"{path}: this Parquet file is not an export of curate")
         table = parquet.read_table(path)
         types = [(field.name, _plain(arrow, field.type)) for field in table.schema]
         table = table.cast(arrow.schema(types))
@@ -166,14 +166,14 @@ def _read_parquet(path: Path, library: Library) -> Any:
 
 
 def _plain(arrow: Any, kind: Any) -> Any:
-    """Return the one Arrow type for integers, for floats, and for names."""
+    """Return the Arrow type that all formats use: int64, float64 or string."""
     if arrow.types.is_integer(kind):
         return arrow.int64()
     return arrow.float64() if arrow.types.is_floating(kind) else arrow.string()
 
 
 def _as_data_frame(library: Library, kinds: Kinds, rows: Iterator[Row]) -> Any:
-    """Build the table block by block: only one block is held as Python objects at a time."""
+    """Build the table block by block, to have only one block as Python objects in memory."""
     blocks = _blocks(rows)
     if library == "polars":
         import polars as pl
@@ -203,7 +203,7 @@ def _polars_types() -> Mapping[Kind, Any]:
 
 
 def _blocks(rows: Iterator[Row]) -> Iterator[list[Row]]:
-    """Yield the rows in blocks; an empty one where there are no rows."""
+    """Yield the rows in blocks; a single empty block if there are no rows."""
     yield list(islice(rows, BLOCK_ROWS))
     while block := list(islice(rows, BLOCK_ROWS)):
         yield block

@@ -1,6 +1,6 @@
-"""Exports that are a folder: whole or not there, and nothing replaced but a former export.
+"""Write exports that are a folder: atomically, and replacing nothing but a previous export.
 
-DIRECTORY/export.json marks the folder as an export and says in which format.
+DIRECTORY/export.json marks the folder as an export and contains the name of its format.
 """
 
 import glob
@@ -18,28 +18,28 @@ import numpy as np
 from curate.exporters.place import check_place
 
 _MARKER = "export.json"
-# Read by every Python 3 that a training framework still runs on.
+# Every Python 3 that training frameworks still use can read this version.
 _PICKLE_PROTOCOL = 4
 
 
 def write_folder(
     directory: Path, format_name: str, fill: Callable[[Path], Mapping[str, Any]]
 ) -> Mapping[str, Any]:
-    """Write an export folder, whole or not at all; a former export in its place is replaced.
+    """Write an export folder atomically; a previous export at the same path is replaced.
 
     Args:
-        directory: absent, empty, or a former export of the same format.
-        format_name: what the marker says.
-        fill: writes the content into an existing folder; what it returns goes into the marker.
+        directory: absent, empty, or a previous export of the same format.
+        format_name: name of the format, written to the marker file.
+        fill: writes the content into an existing folder; its result goes into the marker file.
 
     Returns:
-        What `fill` returned.
+        The result of `fill`.
 
     Raises:
-        ConfigError: if the directory holds something else.
+        ConfigError: if the directory contains something else.
     """
-    check_place(directory, lambda former: _is_former(former, format_name))
-    partial = _own_partial(directory)
+    check_place(directory, lambda former: _is_export(former, format_name))
+    partial = _partial_folder(directory)
     try:
         partial.mkdir(parents=True)
         facts = fill(partial)
@@ -52,48 +52,48 @@ def write_folder(
 
 
 def write_pickle(path: Path, value: Any) -> None:
-    """Write plain containers of numpy arrays so that any numpy reads them.
+    """Write plain containers of numpy arrays in a form that any numpy version reads.
 
-    numpy 2 names a module in its own pickles that releases before 1.26 do not have, and these are
-    what the frameworks that read such files run on.
+    Pickles of numpy 2 refer to a module that numpy before 1.26 does not have. The frameworks that
+    read these files often use such an old numpy.
     """
     with path.open("wb") as stream:
         _ArrayPickler(stream, protocol=_PICKLE_PROTOCOL).dump(value)
 
 
 class _ArrayPickler(pickle.Pickler):
-    """Arrays as calls of `numpy.ndarray` with shape, type and content."""
+    """Pickle arrays as calls of `numpy.ndarray` with shape, type and content."""
 
     def reducer_override(self, value: Any) -> Any:
         if type(value) is not np.ndarray:
             return NotImplemented
-        # Over a bytearray, which unlike bytes leaves the array writable.
+        # An array over bytes would be read-only; over a bytearray it is writable.
         return np.ndarray, (value.shape, value.dtype.str, bytearray(value.tobytes()))
 
 
-def _is_former(directory: Path, format_name: str) -> bool:
-    """Return whether a folder is empty, or an export of that format."""
+def _is_export(directory: Path, format_name: str) -> bool:
+    """Return whether a folder is empty or an export of this format."""
     if directory.is_dir() and not any(directory.iterdir()):
         return True
     marker = json.loads((directory / _MARKER).read_text(encoding="utf-8"))
     return bool(marker["format"] == format_name)
 
 
-def _own_partial(directory: Path) -> Path:
-    """A place beside an export that no other process writes to; those of killed ones are removed.
+def _partial_folder(directory: Path) -> Path:
+    """Return a folder next to an export for this process only; remove those of dead processes.
 
-    Two processes that shared one would mix their files, or end with half an export.
+    Two processes that write to the same folder would mix their files.
     """
-    own = f".{directory.name}.{socket.gethostname()}-"
-    for left in directory.parent.glob(f"{glob.escape(own)}*.partial"):
-        process = left.stem.removeprefix(own)
+    prefix = f".{directory.name}.{socket.gethostname()}-"
+    for leftover in directory.parent.glob(f"{glob.escape(prefix)}*.partial"):
+        process = leftover.stem.removeprefix(prefix)
         if process.isdecimal() and not _runs(int(process)):
-            shutil.rmtree(left, ignore_errors=True)
-    return directory.with_name(f"{own}{os.getpid()}.partial")
+            shutil.rmtree(leftover, ignore_errors=True)
+    return directory.with_name(f"{prefix}{os.getpid()}.partial")
 
 
 def _runs(process: int) -> bool:
-    """Return whether a process of this machine has that number, and is not this one."""
+    """Return whether another process of this machine has this id."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -104,7 +104,7 @@ def _runs(process: int) -> bool:
 
 
 def _take_place(partial: Path, directory: Path) -> None:
-    """Move a finished folder to its place, and what was there out of the way first."""
+    """Move a finished folder to its final path; a previous export is moved away and removed."""
     former = partial.with_suffix(".former")
     shutil.rmtree(former, ignore_errors=True)
     if directory.exists():

@@ -1,17 +1,17 @@
-"""Weighted labels as KITTI label files, for trainers that read that format.
+"""Export weighted labels as KITTI label files, for trainers that read this format.
 
-DIRECTORY/label_2/FRAME.txt holds one line per label in KITTI's format; by choice a 16th field holds
-the weight or the score. Labels of weight 0 are no objects there. Where they are to be ignored, the
-line is a DontCare region with the label's 2D box, so that KITTI's readers take it for neither
-object nor background; where they are background, there is no line.
+DIRECTORY/label_2/FRAME.txt has one line per label in KITTI's format. An optional 16th field is the
+weight or the score. Labels of weight 0 are not objects there. A label to ignore is a DontCare
+region with the label's 2D box, which KITTI readers treat neither as an object nor as background. A
+background label has no line.
 
-DIRECTORY/weight/FRAME.txt holds a line for each label, in the same order, also for those without
-one in label_2, with what that format has no place for: category, weight, score, and the box in the
-LiDAR frame (x, y, z of its centre, length, width, height in metres, yaw in radians). Only there do
-labels of weight 0 keep their category and their 3D box.
+DIRECTORY/weight/FRAME.txt has one line for every label, in the same order, including the labels
+that have no line in label_2. The line contains category, weight, score, and the box in the LiDAR
+frame (x, y, z of its centre, length, width, height in metres, yaw in radians). Labels of weight 0
+have their category and 3D box only in this file.
 
-DIRECTORY/export.json marks the folder as an export, and its `zero_weight` says what a label of
-weight 0 is; nothing but a former export is overwritten.
+DIRECTORY/export.json marks the folder as an export; its `zero_weight` gives the meaning of weight
+0. Only a previous export is overwritten.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -38,15 +38,15 @@ _FORMAT = "curate weighted labels, KITTI"
 
 @dataclass(frozen=True)
 class WeightedFrame:
-    """The weighted labels of one frame, with what it takes to write them in the camera's frame.
+    """The weighted labels of one frame, with its calibration and image size.
 
     Attributes:
         frame_id: name of the frame.
         labels: boxes in the LiDAR frame, scores, categories.
         weights: (n,) in [0, 1].
-        ignored: (n,) bool, which labels of weight 0 are regions to ignore; the others are
-            background.
-        calibration: of the frame.
+        ignored: (n,) bool, True for labels of weight 0 that are regions to ignore; the others of
+            weight 0 are background.
+        calibration: calibration of the frame.
         image_size: (width, height) in pixels.
     """
 
@@ -81,19 +81,19 @@ def export_kitti(
     last_field: LastField = "weight",
     zero_weight: ZeroWeight = "background",
 ) -> int:
-    """Write an export folder, whole or not at all; a former export in its place is replaced.
+    """Write an export folder atomically; a previous export at the same path is replaced.
 
     Args:
-        directory: absent, empty, or a former export.
-        frames: those without labels get empty files.
-        last_field: what stands in the 16th field of each label line.
-        zero_weight: what the marker says that a label of weight 0 is.
+        directory: absent, empty, or a previous export.
+        frames: the frames to write; a frame without labels gets empty files.
+        last_field: content of the 16th field of each label line.
+        zero_weight: the meaning of weight 0, written to the marker file.
 
     Returns:
-        How many labels were written.
+        The number of labels.
 
     Raises:
-        ConfigError: if the directory holds something else, or `last_field` is unknown.
+        ConfigError: if the directory contains something else, or `last_field` is unknown.
         DataError: if a weight is not in [0, 1], or a frame occurs twice.
     """
     if last_field not in get_args(LastField):
@@ -136,16 +136,16 @@ def _write_frames(
 
 def _write_frame(folder: Path, frame: WeightedFrame, last_field: str) -> None:
     weights, labels = frame.weights, frame.labels
-    possible = (weights >= 0) & (weights <= 1)
-    if weights.shape != (len(labels),) or not possible.all():
+    valid = (weights >= 0) & (weights <= 1)
+    if weights.shape != (len(labels),) or not valid.all():
         raise DataError(
             f"frame {frame.frame_id}: needs one weight in [0, 1] for each of {len(labels)} labels"
         )
     name = f"{frame.frame_id}.txt"
     objects = from_detections(labels, frame.calibration, frame.image_size)
-    shown = np.where(frame.ignored, DONT_CARE, objects.categories)
+    categories = np.where(frame.ignored, DONT_CARE, objects.categories)
     last = {"weight": weights, "score": labels.scores, "none": np.full(len(labels), np.nan)}
-    objects = replace(objects, categories=shown, scores=last[last_field])
+    objects = replace(objects, categories=categories, scores=last[last_field])
     kept = (weights > 0) | frame.ignored
     write_objects(folder / "label_2" / name, objects.select(kept))
     lines = [

@@ -1,9 +1,9 @@
-"""Reading an exported label file that anyone may have written or changed.
+"""Read an exported label file safely: it may come from an untrusted source.
 
-A SQLite file is more than rows: a table may be a view that never ends, or a column an expression
-that fills the memory. Only the very tables that `curate.exporters.sqlite` makes are read, so what
-is read is bounded by the size of the file. Files of version 1 and 2 are read; what the latter has
-of further evidence may only be plain columns.
+A SQLite file can contain more than rows, for example a view that returns rows without end, or a
+column with an expression that fills the memory. Therefore only tables with exactly the definition
+in `curate.exporters.sqlite` are read, and the amount of data is bounded by the size of the file.
+Versions 1 and 2 are supported; the further evidence of version 2 must be plain columns.
 """
 
 import json
@@ -22,22 +22,22 @@ from curate.weighting.base import ZeroWeight
 
 _VERSIONS = ("1", "2")
 _KEYS = ("categories", "round", "policy", "root")
-# Behind the core columns of `label`, in a file of version 2.
+# The columns after the core columns of `label`, in a file of version 2.
 _FURTHER_COLUMNS = r"(?: [a-z]\w* (?:INTEGER|REAL|TEXT)(?: NOT NULL)?,)*"
 _PYTHON_TYPES: Final = {"INTEGER": int, "REAL": float, "TEXT": str}
-# No cell of a label file is longer; SQLite's own limit is a gigabyte.
+# No cell of a label file is longer. SQLite's own limit is a gigabyte.
 _LONGEST_CELL = 1 << 24
 
 
 @dataclass(frozen=True)
 class LabelFileFrames:
-    """Which frames a label file speaks of.
+    """The frames of a label file, and the numbers of its rows.
 
     Attributes:
-        splits: the split that the file gives each frame.
-        truth: the frames that have rows of ground truth.
-        objects: rows of ground truth.
-        labels: rows of labels.
+        splits: the split of each frame in the file.
+        truth: the frames with ground truth.
+        objects: number of ground truth rows.
+        labels: number of label rows.
     """
 
     splits: Mapping[str, str]
@@ -48,10 +48,10 @@ class LabelFileFrames:
 
 @contextmanager
 def open_label_file(path: Path) -> Iterator[sqlite3.Connection]:
-    """A connection that can only read the file, whose tables are what an export makes.
+    """Open a label file read-only and check that its tables have the definition of an export.
 
     Raises:
-        DataError: if the file is missing or damaged, or of another version or kind.
+        DataError: if the file is missing or damaged, or its tables are different.
     """
     if not path.is_file():
         raise DataError(f"{path}: no such label file; export the labels first")
@@ -70,41 +70,45 @@ def open_label_file(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def read_meta(rows: sqlite3.Connection, path: Path) -> Mapping[str, str]:
-    """What the file says about itself.
+    """Return the rows of the table `meta`.
 
     Raises:
-        DataError: if it is of another version, or says too little.
+        DataError: if the file has another version, or a key is missing.
     """
     meta = dict(rows.execute("SELECT key, value FROM meta"))
     version = meta.get("format_version")
     if version not in _VERSIONS:
         raise DataError(
-            f"{path}: label format {version!r}, this version reads {' and '.join(_VERSIONS)}; "
-            "export again"
+            f"{path}: label format {version!r}, expected {' or '.join(_VERSIONS)}; "
+            "export it again with this version"
         )
     missing = [key for key in _KEYS if key not in meta]
     if missing:
         raise DataError(
-            f"{path}: meta names no {', '.join(missing)}; delete it and export it again"
+            f"{path}: meta lacks {', '.join(missing)}; delete the file and export it again"
         )
     return meta
 
 
 def read_categories(meta: Mapping[str, str], path: Path) -> tuple[str, ...]:
-    """Return the categories to learn; DataError where they are no list of names."""
+    """Return the categories to learn.
+
+    Raises:
+        DataError: if they are not a list of names.
+    """
     try:
         names = json.loads(meta["categories"])
     except (ValueError, RecursionError):
         names = None
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise DataError(
-            f"{path}: meta.categories is no list of names; delete it and export it again"
+            f"{path}: meta.categories is not a list of names; delete the file and export it again"
         )
     return tuple(names)
 
 
 def read_zero_weight(meta: Mapping[str, str], path: Path) -> ZeroWeight:
-    """Return what a label of weight 0 is; "ignore" where an older file does not say.
+    """Return the meaning of weight 0; "ignore" for an older file without this row.
 
     Raises:
         DataError: if it is neither "background" nor "ignore".
@@ -130,16 +134,16 @@ def check_leakage(rows: sqlite3.Connection, path: Path) -> None:
     if leaked:
         raise LeakageError(
             f"{path}: ground truth of frames outside the labeled split: "
-            f"{named(frame for (frame,) in leaked)}; only labeled frames may bring ground truth "
-            "into a training"
+            f"{named(frame for (frame,) in leaked)}; training may use ground truth of "
+            "labeled frames only: export the labels again"
         )
 
 
 def read_frames(path: Path) -> LabelFileFrames:
-    """Which frames a label file speaks of.
+    """Return the frames of a label file.
 
     Raises:
-        DataError: if the file is missing or damaged, or of another version or kind.
+        DataError: if the file is missing or damaged, has another version, or is not a label file.
     """
     with open_label_file(path) as rows:
         read_meta(rows, path)
@@ -153,10 +157,10 @@ def read_frames(path: Path) -> LabelFileFrames:
 def read_label_rows(
     path: Path,
 ) -> Iterator[tuple[Mapping[str, type[int] | type[float] | type[str]], Iterator[Sequence[Any]]]]:
-    """Open a label file for its labels: the Python type of each column, and the rows.
+    """Open a label file and yield the Python type of each label column, and the rows.
 
     Raises:
-        DataError: if the file is missing or damaged, or of another version or kind.
+        DataError: if the file is missing or damaged, has another version, or is not a label file.
     """
     with open_label_file(path) as rows:
         read_meta(rows, path)
@@ -166,28 +170,28 @@ def read_label_rows(
 
 
 def _check_tables(rows: sqlite3.Connection, path: Path) -> None:
-    """Raise DataError if a table is not the one that an export makes."""
+    """Raise DataError if a table is missing or differs from that of an export."""
     found = dict(rows.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     for name, statement in _statements().items():
         if name not in found:
             raise DataError(
                 f"{path}: not a label file: no table {name}; delete it and export it again"
             )
-        if not re.fullmatch(statement, _bare(str(found[name])), re.ASCII):
+        if not re.fullmatch(statement, _normalized(str(found[name])), re.ASCII):
             raise DataError(
-                f"{path}: table {name} is not the one that an export makes; delete it and "
+                f"{path}: table {name} differs from that of an export; delete the file and "
                 "export it again"
             )
 
 
 def _statements() -> Mapping[str, str]:
-    """Return a pattern of the bare CREATE TABLE statement of each table."""
-    parts = [part.strip() for part in _bare(tables()).split(";") if part.strip()]
+    """Return a pattern for the normalized CREATE TABLE statement of each table."""
+    parts = [part.strip() for part in _normalized(tables()).split(";") if part.strip()]
     patterns = {part.split()[2]: re.escape(part) for part in parts}
     core, generated, rest = patterns["label"].partition(re.escape(" split TEXT GENERATED"))
     return patterns | {"label": core + _FURTHER_COLUMNS + generated + rest}
 
 
-def _bare(statement: str) -> str:
-    """Return an SQL statement without comments, its spaces made one."""
+def _normalized(statement: str) -> str:
+    """Return an SQL statement without comments and with single spaces."""
     return " ".join(re.sub(r"--[^\n]*", " ", statement).split())

@@ -1,17 +1,18 @@
-"""Labels as mmdetection3d infos of version 2, each instance with its weight.
+"""Export labels as mmdetection3d infos of version 2, each instance with its weight.
 
 Source: mmdetection3d's page on the KITTI data set (docs/en/advanced_guides/datasets/kitti.md).
-DIRECTORY/kitti_infos_train.pkl, for `KittiDataset` and its `ann_file`, is a dict: `metainfo` with
-`categories`, and `data_list` with a dict per frame of X_l and X_u. `bbox_3d` of an instance is x,
-y, z of the bottom centre in the rectified camera frame, length, height, width, and the yaw about
-the camera's y; `bbox_label_3d` is the category's number, -1 for a label of weight 0, which is
-mmdetection3d's way to leave it out: to a trainer that reads no more, it is background. Three keys
-are more than its own: `weight` (v; 1 for ground truth), `category`, and `ignored`, whether a label
-of weight 0 is a region to ignore; otherwise it is background. `zero_weight` of `metainfo` says what
-a weight of 0 means.
+DIRECTORY/kitti_infos_train.pkl, to be used as `ann_file` of `KittiDataset`, is a dict: `metainfo`
+with `categories`, and `data_list` with one dict per frame of X_l and X_u.
 
-The numbers of KITTI's categories are those of `KittiDataset`; further categories follow.
-R0_rect is the identity, Tr_velo_to_cam the whole way from the LiDAR to the rectified camera.
+`bbox_3d` of an instance is x, y, z of the bottom centre in the rectified camera frame, length,
+height, width, and the yaw about the camera's y axis. `bbox_label_3d` is the number of the category.
+For a label of weight 0 it is -1: mmdetection3d skips such instances, so a trainer that does not
+read the additional keys treats them as background. The additional keys are `weight` (v; 1 for
+ground truth), `category` and `ignored` (True if a label of weight 0 is a region to ignore, False if
+it is background). `zero_weight` in `metainfo` gives the meaning of weight 0.
+
+KITTI's categories have the numbers of `KittiDataset`; other categories follow. R0_rect is the
+identity, and Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera.
 """
 
 from collections.abc import Mapping
@@ -38,7 +39,7 @@ _FORMAT = "curate weighted labels, mmdetection3d"
 _KITTI_ORDER = (
     "Pedestrian", "Cyclist", "Car", "Van", "Truck", "Person_sitting", "Tram", "Misc",
 )  # fmt: skip
-_LEFT_OUT = -1
+_SKIPPED_LABEL = -1
 
 
 class MMDet3DExporter:
@@ -58,9 +59,9 @@ class MMDet3DExporter:
 
 def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
     about, frames = labels.description, list(frame_objects(labels))
-    own = [name for name in about.categories if name not in _KITTI_ORDER]
-    rest = sorted(categories_of(frames) - {*_KITTI_ORDER, *own})
-    numbers = {name: number for number, name in enumerate((*_KITTI_ORDER, *own, *rest))}
+    configured = [name for name in about.categories if name not in _KITTI_ORDER]
+    rest = sorted(categories_of(frames) - {*_KITTI_ORDER, *configured})
+    numbers = {name: number for number, name in enumerate((*_KITTI_ORDER, *configured, *rest))}
     infos = []
     for position, objects in enumerate(frames):
         name = objects.frame_id
@@ -117,18 +118,18 @@ def _instances(
     numbers: Mapping[str, int],
 ) -> list[dict[str, Any]]:
     found = objects.detections
-    shown = from_detections(found, calibration, image_size)
+    in_camera = from_detections(found, calibration, image_size)
     centres, depths = project_points(found.boxes, calibration)
-    levels = difficulties(shown.boxes_2d, objects.truncated, objects.occluded)
-    lengths_first = shown.dimensions[:, [2, 0, 1]]
+    levels = difficulties(in_camera.boxes_2d, objects.truncated, objects.occluded)
+    lengths_first = in_camera.dimensions[:, [2, 0, 1]]
     instances = []
     for k in range(len(found)):
         category, weight = str(found.categories[k]), float(objects.weights[k])
-        label = _LEFT_OUT if weight == 0 else numbers[category]
-        box = (*shown.locations[k], *lengths_first[k], shown.rotations_y[k])
+        label = _SKIPPED_LABEL if weight == 0 else numbers[category]
+        box = (*in_camera.locations[k], *lengths_first[k], in_camera.rotations_y[k])
         instances.append(
             {
-                "bbox": shown.boxes_2d[k].tolist(),
+                "bbox": in_camera.boxes_2d[k].tolist(),
                 "bbox_label": label,
                 "bbox_3d": [float(number) for number in box],
                 "bbox_label_3d": label,
@@ -138,7 +139,7 @@ def _instances(
                 "difficulty": int(levels[k]),
                 "truncated": float(objects.truncated[k]),
                 "occluded": int(objects.occluded[k]),
-                "alpha": float(shown.alpha[k]),
+                "alpha": float(in_camera.alpha[k]),
                 "score": float(found.scores[k]),
                 "index": k,
                 "group_id": k,

@@ -1,11 +1,12 @@
-"""Weighted labels as nuScenes' results of the detection task, where the data set is nuScenes.
+"""Export weighted labels of a nuScenes data set as results of nuScenes' detection task.
 
-Source: nuScenes' detection task (nuscenes.org). A JSON object with `meta` and `results`: by sample
-token a list of boxes in the frame of the map, size as width, length, height, rotation as w, x, y,
-z. Beside nuScenes' own keys a box has `weight`, v, and `k`. Labels of weight 0 are not among the
-results but, in the same form, in `ignored` or in `background`, by what they are; nuScenes' tools
-read neither. The meta's `zero_weight` says what a weight of 0 means. Velocities are not known and
-written as 0.
+Source: nuScenes' detection task (nuscenes.org). The file is a JSON object with `meta` and
+`results`. The results are lists of boxes by sample token: in the map frame, size as width, length,
+height, rotation as w, x, y, z. Each box has the additional keys `weight` (v) and `k`.
+
+Labels of weight 0 are not in `results` but, in the same form, in `ignored` or `background`, which
+nuScenes' tools do not read. `zero_weight` in `meta` gives the meaning of weight 0. Velocities are
+unknown and written as 0.
 """
 
 import json
@@ -19,7 +20,7 @@ from curate.datasets.nuscenes.names import detection_name
 from curate.errors import DataError
 from curate.exporters.base import LabelSet
 from curate.exporters.objects import FrameObjects, frame_objects
-from curate.exporters.place import check_place, says
+from curate.exporters.place import check_place, has_description
 from curate.files.atomic import replace_file
 from curate.frames import Calibration
 
@@ -27,7 +28,7 @@ _FORMAT = "curate weighted labels, nuScenes"
 
 
 class NuScenesExporter:
-    """An `Exporter` that writes the weighted labels of X_u as nuScenes' results."""
+    """An `Exporter` that writes the weighted labels of X_u as nuScenes results."""
 
     name: ClassVar[str] = "nuscenes"
     suffix: ClassVar[str] = ".json"
@@ -37,10 +38,10 @@ class NuScenesExporter:
 
         Raises:
             ConfigError: if the data set has no poses.
-            DataError: if the calibration of a frame cannot be read, or a category is none of
-                nuScenes'.
+            DataError: if the calibration of a frame cannot be read, or a category does not exist in
+                nuScenes.
         """
-        check_place(path, says("meta", _FORMAT))
+        check_place(path, has_description("meta", _FORMAT))
         parts: dict[str, dict[str, list[dict[str, Any]]]] = {
             "results": {}, "ignored": {}, "background": {},
         }  # fmt: skip
@@ -74,7 +75,7 @@ class NuScenesExporter:
 
 
 def _boxes(objects: FrameObjects, calibration: Calibration) -> list[dict[str, Any]]:
-    """Return the labels of a frame in the frame of the map."""
+    """Return the labels of a frame as boxes in the map frame."""
     pose = calibration.pose_in_map()
     found = objects.detections
     centres = found.boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3]
@@ -97,7 +98,7 @@ def _boxes(objects: FrameObjects, calibration: Calibration) -> list[dict[str, An
 
 
 def _quaternions(pose: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-    """Return (n, 4) w, x, y, z in the map of boxes with a yaw in the LiDAR's frame."""
+    """Return (n, 4) rotations w, x, y, z in the map frame, from yaws in the LiDAR frame."""
     if len(yaw) == 0:
         return np.zeros((0, 4))
     turns = Rotation.from_matrix(pose[:3, :3]) * Rotation.from_euler("z", yaw[:, None])
@@ -109,6 +110,7 @@ def _name(objects: FrameObjects, k: int) -> str:
     name = detection_name(category)
     if name is None:
         raise DataError(
-            f"frame {objects.frame_id}: category {category!r} is none of nuScenes' detection task"
+            f"frame {objects.frame_id}: category {category!r} is not in nuScenes' detection task; "
+            "use nuScenes' categories in dataset.categories"
         )
     return name

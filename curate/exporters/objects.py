@@ -1,4 +1,4 @@
-"""A label set frame by frame, as formats take it that hold X_l and X_u side by side."""
+"""Iterate over a label set frame by frame, for formats that contain both X_l and X_u."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ class FrameObjects:
 
     Attributes:
         frame_id: name of the frame.
-        labeled: whether they are ground truth (X_l) or pseudo-labels (X_u).
+        labeled: True for ground truth (X_l), False for pseudo-labels (X_u).
         files: points and image, relative to the root of the data set.
         detections: boxes in the LiDAR frame; ground truth has score 1.
-        weights: (n,) in [0, 1]; ground truth has 1.
-        ignored: (n,) bool, which labels of weight 0 are regions to ignore.
-        points: (n,) int64 LiDAR points in each box; -1 unknown.
-        truncated: (n,) share outside the image; -1 unknown.
-        occluded: (n,) int64, KITTI's levels 0 to 3; -1 unknown.
+        weights: (n,) in [0, 1]; ground truth has weight 1.
+        ignored: (n,) bool, True for labels of weight 0 that are regions to ignore.
+        points: (n,) int64 LiDAR points in each box; -1 if unknown.
+        truncated: (n,) share outside the image; -1 if unknown.
+        occluded: (n,) int64, KITTI's levels 0 to 3; -1 if unknown.
     """
 
     frame_id: str
@@ -42,52 +42,54 @@ class FrameObjects:
 
     @property
     def background(self) -> np.ndarray:
-        """(n,) bool, which labels of weight 0 are background: no objects."""
+        """(n,) bool, True for labels of weight 0 that are background."""
         return np.asarray((self.weights == 0) & ~self.ignored)
 
 
 def frame_objects(labels: LabelSet) -> Iterator[FrameObjects]:
-    """The frames of a label set in its order, those without objects too; one walk, none is held.
+    """Yield the frames of a label set in their order, including frames without objects.
+
+    The labels are read once and only one frame is in memory at a time.
 
     Raises:
-        DataError: see `LabelSet.blocks`; or the labels are not in the order of the frames.
+        DataError: see `LabelSet.blocks`, or if the labels are not in the order of the frames.
     """
     truth: Mapping[str, Columns] = dict(by_frame([labels.truth()]))
-    nothing: Columns = {name: [] for name in (*labels.column_names, "truncated", "occluded")}
+    no_rows: Columns = {name: [] for name in (*labels.column_names, "truncated", "occluded")}
     found = by_frame(labels.blocks())
     following = next(found, None)
     for files in labels.frames:
         if files.split == "labeled":
-            yield _true_objects(files, truth.get(files.frame, nothing))
+            yield _true_objects(files, truth.get(files.frame, no_rows))
         elif following is not None and following[0] == files.frame:
             yield _weighted_objects(files, following[1], labels)
             following = next(found, None)
         else:
-            yield _weighted_objects(files, nothing, labels)
+            yield _weighted_objects(files, no_rows, labels)
     if following is not None:
         raise DataError(
-            f"labels of frame {following[0]} are out of order; labels to export are in the order "
-            "of their frames"
+            f"labels of frame {following[0]} are out of order; sort the labels in the order of the "
+            "frames"
         )
 
 
 def count_labels(frames: Sequence[FrameObjects]) -> int:
-    """Return how many pseudo-labels some frames have."""
+    """Return the number of pseudo-labels of the frames."""
     return sum(len(objects.weights) for objects in frames if not objects.labeled)
 
 
 def categories_of(frames: Sequence[FrameObjects]) -> set[str]:
-    """Return the categories that occur in some frames."""
+    """Return the categories that occur in the frames."""
     return {name for objects in frames for name in objects.detections.categories.tolist()}
 
 
 def difficulties(boxes_2d: np.ndarray, truncated: np.ndarray, occluded: np.ndarray) -> np.ndarray:
-    """(n,) int32 KITTI's difficulty: 0 easy, 1 moderate, 2 hard, -1 beyond; unknown counts as 0.
+    """Return (n,) int32 KITTI's difficulty: 0 easy, 1 moderate, 2 hard, -1 harder.
 
     Args:
         boxes_2d: (n, 4) left, top, right, bottom in pixels.
-        truncated: (n,) share outside the image.
-        occluded: (n,) levels 0 to 3.
+        truncated: (n,) share outside the image; -1 (unknown) is treated like 0.
+        occluded: (n,) levels 0 to 3; -1 (unknown) is treated like 0.
     """
     found = np.full(len(boxes_2d), -1, dtype=np.int32)
     height = boxes_2d[:, 3] - boxes_2d[:, 1]
@@ -116,8 +118,8 @@ def _true_objects(files: FrameFiles, rows: Columns) -> FrameObjects:
 def _weighted_objects(files: FrameFiles, rows: Columns, labels: LabelSet) -> FrameObjects:
     count = len(rows["category"])
     weights = np.array(rows["weight"], dtype=np.float64)
-    # What a person rejected is background, whatever the policy takes a weight of 0 for.
-    doubted = [each != "human" for each in rows["provenance"]]
+    # A label that a person rejected is background, whatever weight 0 means for the policy.
+    by_detector = [each != "human" for each in rows["provenance"]]
     ignoring = labels.description.zero_weight == "ignore"
     return FrameObjects(
         files.frame,
@@ -125,7 +127,7 @@ def _weighted_objects(files: FrameFiles, rows: Columns, labels: LabelSet) -> Fra
         files=(files.points, str(files.image)),
         detections=_detections(rows, rows["score"]),
         weights=weights,
-        ignored=(weights == 0) & ignoring & np.array(doubted, dtype=bool),
+        ignored=(weights == 0) & ignoring & np.array(by_detector, dtype=bool),
         points=np.array([UNKNOWN if m is None else m for m in rows["points"]], dtype=np.int64),
         truncated=np.full(count, float(UNKNOWN)),
         occluded=np.full(count, UNKNOWN, dtype=np.int64),

@@ -1,21 +1,21 @@
-"""Labels as OpenPCDet's KITTI infos and object database, each object with its weight.
+"""Export labels as OpenPCDet's KITTI infos and object database, each object with its weight.
 
-Source: OpenPCDet's KITTI data set (github.com/open-mmlab/OpenPCDet). DIRECTORY holds
+Source: OpenPCDet's KITTI data set (github.com/open-mmlab/OpenPCDet). DIRECTORY contains
 
-    kitti_infos_train.pkl    a list with a dict per frame of X_l and X_u: point_cloud, image, calib,
-                             annos
-    kitti_dbinfos_train.pkl  the objects of X_l by category, for its cut-and-paste augmentation
-    gt_database/*.bin        their points, relative to the box centre
+    kitti_infos_train.pkl    a list with one dict per frame of X_l and X_u: point_cloud, image,
+                             calib, annos
+    kitti_dbinfos_train.pkl  the objects of X_l by category, for OpenPCDet's GT sampling
+    gt_database/*.bin        the points of these objects, relative to the box centre
 
-Beside OpenPCDet's own arrays `annos` has `weight` (v; 1 for ground truth), `category`, and
-`ignored`, which labels of weight 0 are regions to ignore; the others are background. The `name` of
-a label of weight 0 is DontCare, which OpenPCDet leaves out, so that a trainer that reads no weights
-never takes it for an object; to it, all of them are background. `zero_weight` of export.json says
-what a weight of 0 means.
+`annos` has additional arrays: `weight` (v; 1 for ground truth), `category`, and `ignored` (True for
+labels of weight 0 that are regions to ignore, False for those that are background). The `name` of
+a label of weight 0 is DontCare, which OpenPCDet skips: a trainer that does not read the weights
+treats all these labels as background, never as objects. `zero_weight` of export.json gives the
+meaning of weight 0.
 
-Annos are in the rectified camera frame (`location` is the bottom centre, `dimensions` length,
-height, width), `gt_boxes_lidar` is (n, 7) at the box centre in the LiDAR frame. R0_rect is the
-identity and Tr_velo_to_cam the whole way from the LiDAR to the rectified camera.
+Annos are in the rectified camera frame (`location` is the bottom centre, `dimensions` are length,
+height, width). `gt_boxes_lidar` is (n, 7) at the box centre in the LiDAR frame. R0_rect is the
+identity, and Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera.
 """
 
 from collections.abc import Mapping
@@ -73,8 +73,8 @@ def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
 
 def _info(objects: FrameObjects, frame: Frame) -> Info:
     width, height = frame.image_size
-    square = np.array([[0.0, 0, 0, 1]])
-    shown = from_detections(objects.detections, frame.calibration, frame.image_size)
+    last_row = np.array([[0.0, 0, 0, 1]])
+    in_camera = from_detections(objects.detections, frame.calibration, frame.image_size)
     return {
         "point_cloud": {"num_features": 4, "lidar_idx": objects.frame_id},
         "image": {
@@ -82,15 +82,15 @@ def _info(objects: FrameObjects, frame: Frame) -> Info:
             "image_shape": np.array([height, width], dtype=np.int32),
         },
         "calib": {
-            "P2": np.concatenate([frame.calibration.projection, square]),
+            "P2": np.concatenate([frame.calibration.projection, last_row]),
             "R0_rect": np.eye(4),
             "Tr_velo_to_cam": np.asarray(frame.calibration.lidar_to_camera),
         },
-        "annos": _annos(objects, shown),
+        "annos": _annos(objects, in_camera),
     }
 
 
-def _annos(objects: FrameObjects, shown: KittiObjects) -> Info:
+def _annos(objects: FrameObjects, in_camera: KittiObjects) -> Info:
     """Return the arrays of a frame's objects, all of the same length."""
     found, count = objects.detections, len(objects.detections)
     names = np.where(objects.weights == 0, DONT_CARE, found.categories)
@@ -101,13 +101,13 @@ def _annos(objects: FrameObjects, shown: KittiObjects) -> Info:
         "ignored": objects.ignored,
         "truncated": objects.truncated,
         "occluded": objects.occluded,
-        "alpha": shown.alpha,
-        "bbox": shown.boxes_2d,
-        "dimensions": shown.dimensions[:, [2, 0, 1]],
-        "location": shown.locations,
-        "rotation_y": shown.rotations_y,
+        "alpha": in_camera.alpha,
+        "bbox": in_camera.boxes_2d,
+        "dimensions": in_camera.dimensions[:, [2, 0, 1]],
+        "location": in_camera.locations,
+        "rotation_y": in_camera.rotations_y,
         "score": np.full(count, float(UNKNOWN)) if objects.labeled else found.scores,
-        "difficulty": difficulties(shown.boxes_2d, objects.truncated, objects.occluded),
+        "difficulty": difficulties(in_camera.boxes_2d, objects.truncated, objects.occluded),
         "index": np.arange(count, dtype=np.int32),
         "gt_boxes_lidar": found.boxes,
         "num_points_in_gt": objects.points.astype(np.int32),
@@ -115,7 +115,7 @@ def _annos(objects: FrameObjects, shown: KittiObjects) -> Info:
 
 
 def _cut_out(folder: Path, frame: Frame, annos: Info, database: dict[str, list[Info]]) -> None:
-    """Write the points of a labeled frame's objects, and counts them in its annos."""
+    """Write the points of a labeled frame's objects and store their number in `annos`."""
     for k, box in enumerate(annos["gt_boxes_lidar"]):
         points = frame.points[points_in_box_mask(frame.points, box)].astype(np.float32)
         points[:, :3] -= box[:3].astype(np.float32)

@@ -1,10 +1,10 @@
-"""Weighted labels as one Parquet file: a row per label with its evidence, its weight, and units.
+"""Export weighted labels as one Parquet file: one row per label with its evidence and weight.
 
 Source: the Apache Parquet format (parquet.apache.org). The columns are those of `weighted_labels`,
-typed; what is unknown is null. The metadata of each field says its unit and meaning, that of the
-file (keys `curate.*`) the frame of reference, round, policy, what a weight of 0 means
-(`curate.zero_weight`), data set, categories and version.
-Rows are streamed in row groups, so that millions of labels need no more memory than one group.
+with their types; unknown values are null. The metadata of each field contains its unit and meaning.
+The metadata of the file (keys `curate.*`) contains the frame of reference, the round, the policy,
+the meaning of weight 0 (`curate.zero_weight`), the data set, the categories and the version. Rows
+are written in row groups, and only one group is in memory at a time.
 """
 
 import json
@@ -27,13 +27,13 @@ ROWS_PER_GROUP = 65_536
 
 
 class ParquetExporter:
-    """An `Exporter` that writes the weighted labels of X_u as Parquet; ground truth is not in it.
+    """An `Exporter` that writes the weighted labels of X_u as Parquet, without ground truth.
 
     Args:
-        rows_per_group: of a row group.
+        rows_per_group: size of a row group.
 
     Raises:
-        ConfigError: pyarrow is not installed.
+        ConfigError: if pyarrow is not installed.
     """
 
     name: ClassVar[str] = "parquet"
@@ -45,7 +45,7 @@ class ParquetExporter:
 
     def write(self, path: Path, labels: LabelSet) -> int:
         """See `curate.exporters.base.Exporter`."""
-        check_place(path, _is_former)
+        check_place(path, _is_export)
         arrow, parquet = load_parquet()
         schema = label_schema(labels.description, labels.columns)
         count = 0
@@ -61,7 +61,7 @@ class ParquetExporter:
 
 
 def label_schema(about: LabelFileDescription, columns: Iterable[Column] = WEIGHTED_LABELS) -> Any:
-    """Return the Arrow schema of a label file, with what the labels are about as its metadata."""
+    """Return the Arrow schema of a label file, with the description of the labels as metadata."""
     arrow, _ = load_parquet()
     types = {
         "int32": arrow.int32(),
@@ -71,14 +71,14 @@ def label_schema(about: LabelFileDescription, columns: Iterable[Column] = WEIGHT
     }
     fields = []
     for column in columns:
-        told = {"meaning": column.meaning} | ({"unit": column.unit} if column.unit else {})
-        fields.append(arrow.field(column.name, types[column.kind], column.optional, told))
+        metadata = {"meaning": column.meaning} | ({"unit": column.unit} if column.unit else {})
+        fields.append(arrow.field(column.name, types[column.kind], column.optional, metadata))
     return arrow.schema(fields, _metadata(about))
 
 
 def _metadata(about: LabelFileDescription) -> dict[str, str]:
-    """What the file says of all its rows."""
-    told = {
+    """Return the metadata of the file."""
+    metadata = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "frame_of_reference": FRAME_OF_REFERENCE,
@@ -91,20 +91,20 @@ def _metadata(about: LabelFileDescription) -> dict[str, str]:
         "zero_weight": about.zero_weight,
         "version": about.code_version,
     }
-    return {f"curate.{key}": value for key, value in told.items()}
+    return {f"curate.{key}": value for key, value in metadata.items()}
 
 
 def _groups(blocks: Iterable[Columns], size: int) -> Iterator[Columns]:
-    """Yield the same rows in blocks of that size, of which the last may be smaller."""
-    waiting: dict[str, list[Any]] = {}
+    """Yield the same rows in blocks of `size` rows; the last block may be smaller."""
+    pending: dict[str, list[Any]] = {}
     for block in blocks:
         for name, values in block.items():
-            waiting.setdefault(name, []).extend(values)
-        while len(waiting["k"]) >= size:
-            yield {name: values[:size] for name, values in waiting.items()}
-            waiting = {name: values[size:] for name, values in waiting.items()}
-    if waiting and waiting["k"]:
-        yield waiting
+            pending.setdefault(name, []).extend(values)
+        while len(pending["k"]) >= size:
+            yield {name: values[:size] for name, values in pending.items()}
+            pending = {name: values[size:] for name, values in pending.items()}
+    if pending and pending["k"]:
+        yield pending
 
 
 def _batch(arrow: Any, schema: Any, rows: Columns) -> Any:
@@ -113,20 +113,20 @@ def _batch(arrow: Any, schema: Any, rows: Columns) -> Any:
     for field in schema:
         values = rows[field.name]
         if not field.nullable and None in values:
-            place = values.index(None)
+            row = values.index(None)
             raise DataError(
-                f"frame {rows['frame'][place]}: label {rows['k'][place]} has no {field.name}"
+                f"frame {rows['frame'][row]}: label {rows['k'][row]} has no {field.name}"
             )
         try:
             columns.append(arrow.array(values, field.type))
         except (arrow.ArrowException, OverflowError) as error:
             raise DataError(
-                f"column {field.name}: not all of it is {field.type}: {one_line(error)}"
+                f"column {field.name}: not all values are of type {field.type}: {one_line(error)}"
             ) from None
     return arrow.record_batch(columns, schema)
 
 
-def _is_former(path: Path) -> bool:
+def _is_export(path: Path) -> bool:
     arrow, parquet = load_parquet()
     try:
         metadata = parquet.read_schema(path).metadata or {}

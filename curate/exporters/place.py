@@ -1,4 +1,4 @@
-"""Where an export may be written: nothing is replaced but a former export."""
+"""Check where an export may be written: it may only replace a previous export."""
 
 import json
 from collections.abc import Callable
@@ -7,32 +7,35 @@ from pathlib import Path
 from curate.errors import ConfigError
 
 
-def check_place(path: Path, is_former: Callable[[Path], bool]) -> None:
-    """Raise ConfigError where an export would replace something that is not a former export.
+def check_place(path: Path, is_export: Callable[[Path], bool]) -> None:
+    """Check that an export replaces nothing but a previous export.
 
     Args:
-        path: of the export to come.
-        is_former: whether what is there is a former export of the same format; an error of reading
-            it says no.
+        path: path of the new export.
+        is_export: returns whether the existing file or folder is an export of the same format; an
+            error while reading it means no.
+
+    Raises:
+        ConfigError: if something else is at the path, or the path is a symbolic link.
     """
     if path.is_symlink():
         raise ConfigError(
-            f"{path}: is a link, in whose place the export would come; name what it leads to, or "
-            "remove the link"
+            f"{path}: is a symbolic link, which the export would replace; use the path of its "
+            "target, or remove the link"
         )
     if not path.exists():
         return
     try:
-        known = is_former(path)
+        replaceable = is_export(path)
     except (OSError, ValueError, TypeError, KeyError):
-        known = False
-    if not known:
+        replaceable = False
+    if not replaceable:
         raise ConfigError(
-            f"{path}: is there and is no former export; name another "
+            f"{path}: exists and is not a previous export; choose another "
             f"{'folder' if path.is_dir() else 'file'}"
         )
 
 
-def says(section: str, words: str) -> Callable[[Path], bool]:
-    """Return a check whether a JSON file has these words as the description in a section."""
-    return lambda path: bool(json.loads(path.read_bytes())[section]["description"] == words)
+def has_description(section: str, description: str) -> Callable[[Path], bool]:
+    """Return a function that checks the `description` in a section of a JSON file."""
+    return lambda path: bool(json.loads(path.read_bytes())[section]["description"] == description)

@@ -1,12 +1,11 @@
-"""Weighted labels as one SQLite file: what a training needs, and what anyone can query with SQL.
+"""Export weighted labels as one SQLite file, for training and for queries in SQL.
 
-The file keeps the two kinds of truth apart by construction: a row of `ground_truth` can only refer
-to a frame of the labeled split, a row of `label` only to one of the unlabeled split, and other
-splits cannot be written at all.
+The tables prevent data leakage by their constraints: a row of `ground_truth` can only refer to a
+labeled frame, a row of `label` only to an unlabeled frame, and there are no other splits.
 
-A label file of version 1 has the core columns, one of version 2 those of further evidence behind
-them. The row `zero_weight` of `meta` says what a label of weight 0 is; files without that row are
-older, and mean "ignore".
+A label file of version 1 has the core columns. Version 2 has columns of further evidence after
+them. The row `zero_weight` of `meta` gives the meaning of weight 0; in older files, which lack this
+row, it is "ignore".
 """
 
 import json
@@ -57,7 +56,7 @@ CREATE TABLE ground_truth (
 ) STRICT;
 """
 
-# An index that exists during the load makes it several times slower.
+# Created after the rows are inserted: with the indexes, inserting is several times slower.
 _INDEXES = """
 CREATE UNIQUE INDEX ground_truth_frame ON ground_truth (frame, k);
 CREATE UNIQUE INDEX label_frame ON label (frame, k, round, policy);
@@ -84,18 +83,22 @@ class SqliteExporter:
                     return _fill(connection, path, labels)
             except sqlite3.OperationalError as error:
                 raise DataError(
-                    f"{path}: cannot be written: {error}; see to the space and the rights of its "
-                    "folder"
+                    f"{path}: cannot be written: {error}; check the free space and the permissions "
+                    "of its folder"
                 ) from None
 
 
 def check_label_file_place(path: Path) -> None:
-    """Raise ConfigError where a label file would replace something that is not a label file."""
-    check_place(path, lambda former: _is_former(former, path))
+    """Check that a label file replaces nothing but another label file.
+
+    Raises:
+        ConfigError: if something else is at the path.
+    """
+    check_place(path, lambda former: _is_export(former, path))
 
 
 def tables(columns: Sequence[Column] = WEIGHTED_LABELS) -> str:
-    """Return the SQL that makes the tables; `label_file` reads no file with others."""
+    """Return the SQL that creates the tables; `label_file` rejects files with other tables."""
     lines = "\n".join(f"    {_column(each)},  -- {_note(each)}" for each in columns)
     return f"""{_FIXED_TABLES}CREATE TABLE label (
 {lines}
@@ -111,10 +114,10 @@ def format_version(columns: Sequence[Column]) -> str:
 
 
 def raise_if_locked(path: Path, error: Exception) -> None:
-    """Raise DataError if a label file could not be read for another program's lock."""
+    """Raise DataError if a label file could not be read because another program locks it."""
     if "locked" in str(error):
         raise DataError(
-            f"{path}: another program writes into it; end that one and run the command again"
+            f"{path}: another program is writing to this file; stop it and rerun the command"
         ) from None
 
 
@@ -127,12 +130,12 @@ def _column(column: Column) -> str:
 
 
 def _note(column: Column) -> str:
-    """Unit and meaning on one line, as a comment."""
+    """Return the meaning and the unit of a column on one line, for a comment."""
     unit = f" [{column.unit}]" if column.unit not in ("", "1") else ""
     return " ".join(column.meaning.split()) + unit
 
 
-def _is_former(former: Path, path: Path) -> bool:
+def _is_export(former: Path, path: Path) -> bool:
     query = "SELECT value FROM meta WHERE key = 'format_version'"
     try:
         with closing(sqlite3.connect(f"{former.absolute().as_uri()}?mode=ro", uri=True)) as opened:
@@ -143,12 +146,12 @@ def _is_former(former: Path, path: Path) -> bool:
 
 
 def _fill(connection: sqlite3.Connection, path: Path, labels: LabelSet) -> int:
-    """Write all tables; returns the number of labels."""
+    """Write all tables and return the number of labels."""
     names = labels.column_names
     view = f"CREATE VIEW weighted_labels AS SELECT {', '.join(names)} FROM label;"  # noqa: S608
     last: list[Any] = ["none"]
     count = 0
-    # The file is thrown away unless it gets finished: no journal is needed to undo a half.
+    # No journal: an incomplete file is deleted, never rolled back.
     connection.executescript(
         "PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;" + tables(labels.columns)
     )
@@ -164,10 +167,12 @@ def _fill(connection: sqlite3.Connection, path: Path, labels: LabelSet) -> int:
             count += len(block["k"])
         connection.executescript(view + _INDEXES)
     except sqlite3.IntegrityError as error:
-        raise DataError(f"{path}: a row was refused: {error}; the last was {last[0]}") from None
+        raise DataError(
+            f"{path}: a row violates a constraint: {error}; the row is {last[0]}"
+        ) from None
     except (sqlite3.ProgrammingError, sqlite3.InterfaceError) as error:
         raise DataError(
-            f"{path}: a row does not fit its table: {error}; it was {last[0]}"
+            f"{path}: a row does not fit its table: {error}; the row is {last[0]}"
         ) from None
     return count
 
@@ -192,7 +197,7 @@ def _meta(about: LabelFileDescription, version: str) -> Mapping[str, str]:
 
 
 def _remembered(block: Columns, last: list[Any]) -> Iterator[tuple[Any, ...]]:
-    """The rows; `last[0]` is the one that was taken last, for the message where it is refused."""
+    """Yield the rows and store the current one in `last[0]`, for error messages."""
     for row in zip(*block.values(), strict=True):
         last[0] = row
         yield row

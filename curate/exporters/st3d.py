@@ -1,22 +1,21 @@
-"""Weighted labels as the pseudo-label file of ST3D and MS3D.
+"""Export weighted labels as the pseudo-label file of ST3D and MS3D.
 
 Source: Yang et al., "ST3D", CVPR 2021, and Tsai et al., "MS3D", RA-L 2023, with their code
-(github.com/CVMI-Lab/ST3D, github.com/darrenjkt/MS3D). DIRECTORY/ps_label_e0.pkl, the file that
-SELF_TRAIN.INIT_PS names, is a dict by frame id of X_u:
+(github.com/CVMI-Lab/ST3D, github.com/darrenjkt/MS3D). DIRECTORY/ps_label_e0.pkl, to be set as
+SELF_TRAIN.INIT_PS, is a dict by frame id of X_u:
 
     gt_boxes        (n, 9) float32: x, y, z of the box centre, length, width, height, yaw in the
                     LiDAR frame; category, from 1 in the order of the configured categories, and
                     negative for a label of weight 0 that is a region to ignore; score
-    cls_scores      (n,) float32, the score
+    cls_scores      (n,) float32 scores
     iou_scores      None
     memory_counter  (n,) zeros: no round has missed the label yet
-    weight          (n,) v, to be read by the loss
+    weight          (n,) v, for a loss that uses it
 
-Labels of weight 0 that are background are left out, as is what ST3D drops. `zero_weight` of
-export.json says what a weight of 0 means.
+Background labels of weight 0 are omitted, like the labels that ST3D itself drops. `zero_weight` of
+export.json gives the meaning of weight 0.
 
-A data set configuration with SHIFT_COOR works in shifted coordinates: the boxes here are not
-shifted.
+The boxes are not shifted. A data set configuration with SHIFT_COOR expects shifted coordinates.
 """
 
 from collections.abc import Mapping
@@ -69,11 +68,11 @@ def _pseudo_labels(objects: FrameObjects, categories: tuple[str, ...]) -> dict[s
     kept = ~objects.background
     found, weights = objects.detections.select(kept), objects.weights[kept]
     numbers = {name: number for number, name in enumerate(categories, start=1)}
-    strangers = sorted(set(found.categories.tolist()) - set(numbers))
-    if strangers:
+    unexpected = sorted(set(found.categories.tolist()) - set(numbers))
+    if unexpected:
         raise DataError(
-            f"frame {objects.frame_id}: category {strangers[0]!r} has no number; "
-            f"dataset.categories names {', '.join(categories)}"
+            f"frame {objects.frame_id}: category {unexpected[0]!r} is not in dataset.categories "
+            f"({', '.join(categories)}); add it there"
         )
     order = np.array([numbers[str(name)] for name in found.categories], dtype=np.float64)
     order = np.where(weights == 0, -order, order)

@@ -1,1 +1,1 @@
-"""Pictures of frames and labels."""
+"""Images, charts, HTML pages and 3D recordings of frames and labels."""

@@ -1,4 +1,4 @@
-"""Bird's eye view: the sweep from above with labels coloured by weight; x (forward) points up."""
+"""Draw a bird's eye view: the sweep with labels coloured by weight; x (forward) points up."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,27 +15,27 @@ from curate.viewing.legend import (
     TRUTH_DOTS,
     draw_title,
 )
-from curate.viewing.overlay import Shown
+from curate.viewing.overlay import FrameContent
 from curate.viewing.palette import DARK, Colour, Style, height_shades, weight_colours
 from curate.viewing.tags import ShownLabels, ShownRepredictions, draw_tags
 
 _RING_METRES = 10.0
 _SCALE_BAR_METRES = 10.0
-# A box farther away, which only a broken detector predicts, does not shrink the picture further.
+# Only a broken detector predicts boxes farther away; they must not make the rest of the image tiny.
 _FARTHEST_METRES = 120.0
 _MARGIN_METRES = 2.0
 
 
 @dataclass(frozen=True)
 class Region:
-    """The part of the LiDAR frame that the picture shows, in metres.
+    """The part of the LiDAR frame that the image shows, in metres.
 
     Attributes:
-        x_min: nearest; the LiDAR stands at x = 0.
-        x_max: farthest ahead.
-        y_min: rightmost, as y points left.
-        y_max: leftmost.
-        pixels_per_metre: scale of the picture.
+        x_min: lower edge of the image; the LiDAR is at x = 0.
+        x_max: upper edge.
+        y_min: right edge, because y points left.
+        y_max: left edge.
+        pixels_per_metre: scale of the image.
     """
 
     x_min: float = -2.0
@@ -51,29 +51,29 @@ class Region:
         return round((self.y_max - self.y_min) * scale), round((self.x_max - self.x_min) * scale)
 
     def to_pixels(self, places: np.ndarray) -> np.ndarray:
-        """(..., 2) x and y in metres to pixels from the left and from the top of the canvas."""
+        """Convert (..., 2) x and y in metres to pixels from the left and the top of the canvas."""
         across = (self.y_max - places[..., 1]) * self.pixels_per_metre
         down = (self.x_max - places[..., 0]) * self.pixels_per_metre + TITLE_HEIGHT
         return np.stack([across, down], axis=-1)
 
 
 def region_around(boxes: Sequence[np.ndarray], width: int) -> Region:
-    """Return the usual region, widened to where boxes are: also behind the LiDAR.
+    """Return the default region, extended to contain all boxes, also those behind the LiDAR.
 
     Args:
         boxes: arrays (n, 7) in the LiDAR frame.
-        width: of the picture in pixels.
+        width: width of the image in pixels.
     """
-    usual = Region()
+    default = Region()
     corners = bev_corners(np.concatenate([np.zeros((0, 7)), *boxes])).reshape(-1, 2)
     corners = np.clip(corners, -_FARTHEST_METRES, _FARTHEST_METRES)
     low, high = corners.min(axis=0, initial=np.inf), corners.max(axis=0, initial=-np.inf)
     half = max(
-        width / usual.pixels_per_metre / 2, high[1] + _MARGIN_METRES, _MARGIN_METRES - low[1]
+        width / default.pixels_per_metre / 2, high[1] + _MARGIN_METRES, _MARGIN_METRES - low[1]
     )
     return Region(
-        min(usual.x_min, low[0] - _MARGIN_METRES),
-        max(usual.x_max, high[0] + _MARGIN_METRES),
+        min(default.x_min, low[0] - _MARGIN_METRES),
+        max(default.x_max, high[0] + _MARGIN_METRES),
         -half,
         half,
         width / (2 * half),
@@ -89,37 +89,37 @@ def draw_bird_eye(
     title: str = "",
     style: Style = DARK,
 ) -> np.ndarray:
-    """Return the picture, (height, width, 3) uint8 RGB.
+    """Return the image, (height, width, 3) uint8 RGB.
 
     Args:
         points: (n, >=3) LiDAR points in metres.
-        labels: see `Shown`.
-        truth_boxes: see `Shown`.
-        region: what to show, and how large; None for all labels.
-        title: written at the top.
+        labels: see `FrameContent`.
+        truth_boxes: see `FrameContent`.
+        region: the region to show and its scale; None for one that contains all boxes.
+        title: text at the top.
         style: colours.
     """
-    shown = Shown(labels, truth_boxes, title=title, style=style)
-    region = region or region_around([labels.boxes, shown.known_truth], Region().size[0])
+    shown = FrameContent(labels, truth_boxes, title=title, style=style)
+    region = region or region_around([labels.boxes, shown.valid_truth], Region().size[0])
     canvas = Canvas(*bird_eye_size(region), style.background)
     paint_bird_eye(canvas, points, shown, region)
     return canvas.finish()
 
 
 def bird_eye_size(region: Region) -> tuple[int, int]:
-    """Return width and height of the picture of a region."""
+    """Return width and height of the image of a region, in pixels."""
     width, height = region.size
     return width, height + TITLE_HEIGHT + STRIP_HEIGHT
 
 
-def paint_bird_eye(canvas: Canvas, points: np.ndarray, shown: Shown, region: Region) -> None:
-    """Draw the points and all boxes, the highest weight on top, and the legend.
+def paint_bird_eye(canvas: Canvas, points: np.ndarray, shown: FrameContent, region: Region) -> None:
+    """Draw the points, all boxes with the highest weight on top, and the legend.
 
     Args:
-        canvas: of `bird_eye_size`.
+        canvas: canvas of the size `bird_eye_size`.
         points: (n, >=3) LiDAR points in metres.
         shown: the boxes.
-        region: what to show.
+        region: the region to show.
     """
     style, labels, (width, height) = shown.style, shown.labels, region.size
     _draw_rings(canvas, region, style)
@@ -132,7 +132,7 @@ def paint_bird_eye(canvas: Canvas, points: np.ndarray, shown: Shown, region: Reg
         _draw_repredictions(canvas, region, shown.repredictions, style)
     if shown.human_boxes is not None:
         canvas.dashes(_sides(shown.human_boxes, region), style.human, 2.0, HUMAN_DASHES)
-    canvas.dashes(_sides(shown.known_truth, region), style.ground_truth, 1.5, TRUTH_DOTS)
+    canvas.dashes(_sides(shown.valid_truth, region), style.ground_truth, 1.5, TRUTH_DOTS)
     anchors = np.concatenate([footprints.min(axis=1), footprints.max(axis=1)], axis=1)
     bounds = np.array([0, TITLE_HEIGHT, width, TITLE_HEIGHT + height])
     draw_tags(canvas, labels, anchors, bounds, style)
@@ -142,7 +142,7 @@ def paint_bird_eye(canvas: Canvas, points: np.ndarray, shown: Shown, region: Reg
 
 
 def _draw_label(canvas: Canvas, footprint: np.ndarray, colour: Colour, weight: float) -> None:
-    """A footprint with its heading; the outline grows with the weight."""
+    """Draw a footprint with its heading; the line width increases with the weight."""
     stroke = 1.0 if weight <= 0 else 1.4 + 1.2 * float(weight)
     canvas.fill(footprint, colour, 0.0 if weight <= 0 else 0.12 + 0.22 * float(weight))
     canvas.lines(footprint, colour, stroke, closed=True)
@@ -154,7 +154,7 @@ def _draw_label(canvas: Canvas, footprint: np.ndarray, colour: Colour, weight: f
 def _draw_repredictions(
     canvas: Canvas, region: Region, shown: ShownRepredictions, style: Style
 ) -> None:
-    """Draw footprints in dashes, the highest weight on top."""
+    """Draw dashed footprints, the highest weight on top."""
     sides = _sides(shown.boxes, region).reshape(-1, 4, 2, 2)
     colours = weight_colours(shown.weights, style).tolist()
     for index in np.argsort(shown.weights, kind="stable"):
@@ -162,7 +162,7 @@ def _draw_repredictions(
 
 
 def _sides(boxes: np.ndarray, region: Region) -> np.ndarray:
-    """Return (4 n, 2, 2) start and end in pixels of the sides of n footprints."""
+    """Return (4 n, 2, 2) start and end of the sides of n footprints, in pixels."""
     corners = region.to_pixels(bev_corners(boxes))
     return np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
 
@@ -174,7 +174,7 @@ def _draw_points(canvas: Canvas, region: Region, points: np.ndarray, style: Styl
 
 
 def _draw_rings(canvas: Canvas, region: Region, style: Style) -> None:
-    """Distances from the LiDAR, and the LiDAR itself."""
+    """Draw circles of equal distance from the LiDAR, and the LiDAR itself."""
     origin = region.to_pixels(np.zeros(2))
     farthest = max(region.x_max, -region.x_min, region.y_max)
     for metres in np.arange(_RING_METRES, farthest + _RING_METRES, _RING_METRES):

@@ -1,7 +1,8 @@
-"""One style for all charts, and their output as SVG, PNG or PDF.
+"""The common style of all charts, and their output as SVG, PNG or PDF.
 
-Charts are matplotlib figures without pyplot. Equal data gives equal bytes: no dates, fixed ids. The
-colours of a page's inline SVG are the page's own, so that they follow its light or dark scheme.
+Charts are matplotlib figures without pyplot. The same data gives the same bytes: files contain no
+dates, and ids are fixed. An inline SVG uses the colours of the HTML page, to follow its light or
+dark scheme.
 """
 
 import re
@@ -53,22 +54,22 @@ _RC: dict[str, Any] = {
     "legend.frameon": False,
     "figure.facecolor": GROUND,
     "figure.constrained_layout.use": True,
-    "pdf.fonttype": 42,  # keeps text as text, also for editors of PDF
+    "pdf.fonttype": 42,  # TrueType: text stays editable in PDF editors
 }
 
 
 @contextmanager
 def chart_style(**settings: Any) -> Iterator[None]:
-    """Set matplotlib's settings for a while; `settings` come on top of the style."""
+    """Apply the style, then `settings`, to matplotlib within a `with` block."""
     from matplotlib import rc_context
 
-    known: Any = {**_RC, **settings}
-    with rc_context(known):
+    style: Any = {**_RC, **settings}
+    with rc_context(style):
         yield
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure of a size in inches, within `chart_style`."""
+    """Return an empty figure with its size in inches; call it within `chart_style`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -83,9 +84,9 @@ def check_format(name: str) -> ImageFormat:
     Raises:
         ConfigError: if the name is not svg, png or pdf.
     """
-    for known in get_args(ImageFormat):
-        if name == known:
-            return known  # type: ignore[no-any-return]
+    for image_format in get_args(ImageFormat):
+        if name == image_format:
+            return image_format  # type: ignore[no-any-return]
     raise ConfigError(f"--format {name}: use {', '.join(get_args(ImageFormat))}")
 
 
@@ -94,9 +95,9 @@ class Chart:
     """A finished chart.
 
     Attributes:
-        name: stem of its file's name; unique within a page.
-        description: what it shows, for readers who cannot see it.
-        figure: of matplotlib.
+        name: stem of the file name; unique within a page.
+        description: text alternative for screen readers.
+        figure: the matplotlib figure.
     """
 
     name: str
@@ -104,15 +105,15 @@ class Chart:
     figure: "Figure"
 
     def content(self, kind: ImageFormat) -> bytes:
-        """Return the content of a file in this format."""
+        """Return the content of an image file."""
         return figure_content(self.figure, kind, self.name)
 
     def save(self, path: Path) -> None:
-        """Write a file, whole or not at all; its suffix is the format."""
+        """Write an image file atomically; the suffix of `path` is the format."""
         replace_file(path, self.content(check_format(path.suffix[1:])))
 
     def inline(self) -> str:
-        """Return an <svg> element that takes its colours from the page."""
+        """Return an <svg> element that uses the colours of the page."""
         content = figure_content(self.figure, "svg", self.name, _DPI, **{"svg.fonttype": "none"})
         text = content.decode("utf-8")
         text = text[text.index("<svg") :].rstrip()
@@ -126,7 +127,7 @@ class Chart:
             count=1,
         )
         text = re.sub(r"<defs>\s*<style.*?</defs>", "", text, flags=re.DOTALL)
-        # A page may hold several charts: their parts get classes, because ids must not repeat.
+        # A page may contain several charts, and ids must be unique: parts get classes instead.
         text = re.sub(r'<g id="([a-z]+)[^"]*"', r'<g class="\1"', text)
         text = _without_references(text).replace("'DejaVu Sans'", "system-ui")
         for colour, variable in _PAGE_COLOURS.items():
@@ -137,14 +138,14 @@ class Chart:
 def figure_content(
     figure: "Figure", kind: ImageFormat, salt: str, dpi: int = _DPI, **settings: Any
 ) -> bytes:
-    """Return a figure as the content of a file; equal figures give equal bytes.
+    """Return a figure as the content of an image file; equal figures give equal bytes.
 
     Args:
-        figure: of matplotlib.
-        kind: of the file.
-        salt: the ids in an SVG follow from it and from what they stand for.
-        dpi: resolution of a PNG, and of what is not drawn as vectors.
-        settings: of matplotlib, on top of the style.
+        figure: a matplotlib figure.
+        kind: format of the file.
+        salt: matplotlib derives the ids in an SVG from it.
+        dpi: resolution of a PNG, and of the parts that are not vectors.
+        settings: matplotlib settings in addition to the style.
     """
     dates = {"svg": {"Date": None}, "png": {"Software": None}, "pdf": {"CreationDate": None}}
     buffer = BytesIO()
@@ -154,7 +155,7 @@ def figure_content(
 
 
 def _without_references(svg: str) -> str:
-    """Return an SVG with each <use> replaced by the path that it refers to."""
+    """Replace each <use> in an SVG by the path that it refers to."""
     shapes = dict(re.findall(r'<path id="(\w+)" d="([^"]*)"', svg))
     svg = re.sub(r"<defs>.*?</defs>", "", svg, flags=re.DOTALL)
     return re.sub(
@@ -165,6 +166,6 @@ def _without_references(svg: str) -> str:
 
 
 def unclip(axes: "Axes") -> None:
-    """Let nothing be cut at the edge of the axes, such as half of a dot on it."""
+    """Turn off clipping at the edge of the axes, which would cut a dot on the edge in half."""
     for artist in axes.findobj():
         artist.set_clip_on(False)

@@ -1,4 +1,4 @@
-"""The charts of reports, audits and benches; see `chart_style` for how they look."""
+"""The charts of reports, audits and benchmarks; see `chart_style` for their style."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 _FEW_LABELS = 10
 _COLUMNS = 4
 _READING_AID = (
-    "dots: share of correct labels in a tenth of the weights, at their mean weight; on the dashed "
-    "line the weight is that share; bars: {level:.0f} % Wilson interval; hollow: fewer than "
+    "dots: share of correct labels in each tenth of the weight range, at their mean weight; dashed "
+    "line: perfect calibration; bars: {level:.0f} % Wilson interval; hollow: fewer than "
     f"{_FEW_LABELS} labels; below: number of labels, log scale"
 )
-# Okabe and Ito's colours, which the colour-blind can tell apart, in pairs with markers.
+# Okabe and Ito's colours, which colour-blind readers can distinguish, each with its own marker.
 _LINES = (
     "#5b6675", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5230", "#0072b2",
     "#1b2129",
@@ -44,8 +44,8 @@ class Mark:
     """A vertical line over a chart.
 
     Attributes:
-        place: on the horizontal axis.
-        name: written beside it.
+        place: position on the horizontal axis.
+        name: text beside the line.
     """
 
     place: float
@@ -57,9 +57,9 @@ class Curve:
     """A line of a `CurvePanel`.
 
     Attributes:
-        name: for the legend.
-        means: (n,) a value per share; NaN where there is none.
-        stds: (n,) half the length of the error bar; NaN for none.
+        name: name in the legend.
+        means: (n,) one value per share; NaN if missing.
+        stds: (n,) half the length of the error bars; NaN for no bar.
     """
 
     name: str
@@ -69,11 +69,11 @@ class Curve:
 
 @dataclass(frozen=True)
 class CurvePanel:
-    """Several lines over the same shares.
+    """Several lines over the same shares of labeled frames.
 
     Attributes:
-        title: of the panel.
-        shares: (n,) rising, above 0; the axis is logarithmic.
+        title: title of the panel.
+        shares: (n,) ascending, above 0; the axis is logarithmic.
         curves: the lines.
     """
 
@@ -85,14 +85,14 @@ class CurvePanel:
 def histogram(
     name: str, counts: np.ndarray, edges: np.ndarray, axis: str, marks: Sequence[Mark] = ()
 ) -> Chart:
-    """Return bars of counts.
+    """Return a histogram of counts.
 
     Args:
-        name: of the chart.
+        name: name of the chart.
         counts: (n,) not negative.
-        edges: (n + 1,) rising.
-        axis: name of the horizontal axis.
-        marks: drawn over the bars; those outside of the edges are left out.
+        edges: (n + 1,) edges of the bins, ascending.
+        axis: label of the horizontal axis.
+        marks: lines over the bars; marks outside the edges are omitted.
     """
     with chart_style():
         figure = new_figure(4.6, 2.4)
@@ -123,13 +123,13 @@ def histogram(
 def reliability(
     name: str, weights: np.ndarray, shares: np.ndarray, labels: np.ndarray, level: float = 0.95
 ) -> Chart:
-    """Return the share of correct labels over their mean weight, with the number of labels below.
+    """Return a reliability diagram: the share of correct labels over the mean weight, by bin.
 
     Args:
-        name: of the chart.
+        name: name of the chart.
         weights: (b,) mean weight of each bin; NaN in an empty bin.
-        shares: (b,) share of correct labels.
-        labels: (b,) number of labels.
+        shares: (b,) share of correct labels in each bin.
+        labels: (b,) number of labels in each bin.
         level: coverage of the intervals.
     """
     with chart_style():
@@ -139,11 +139,11 @@ def reliability(
 
 
 def audit_chart(audit: Audit, title: str) -> Chart:
-    """Return the reliability of each policy's weights, and the AUROC of all policies.
+    """Return a reliability diagram for each policy, and the AUROC of all policies.
 
     Args:
-        audit: its figures of all categories, distances and point counts together are shown.
-        title: written at the top.
+        audit: the audit; the chart shows its figures over all categories, distances and points.
+        title: text at the top.
     """
     found = list(audit.whole().values())
     columns = min(_COLUMNS, len(found) + 1)
@@ -171,9 +171,9 @@ def curves_chart(panels: Sequence[CurvePanel], title: str, note: str) -> Chart:
     """Return AP with error bars over the share of labeled frames, in panels side by side.
 
     Args:
-        panels: at least one.
-        title: written at the top.
-        note: written below, what line and bar are.
+        panels: one or more panels.
+        title: text at the top.
+        note: text below, which explains lines and bars.
     """
     with chart_style():
         figure = new_figure(5.6 * len(panels), 4.4)
@@ -189,7 +189,7 @@ def curves_chart(panels: Sequence[CurvePanel], title: str, note: str) -> Chart:
 def _draw_reliability(
     figure: "FigureBase", bins: tuple[np.ndarray, np.ndarray, np.ndarray], level: float
 ) -> "Axes":
-    """Draw dots with intervals and, below, how many labels each of them stands for."""
+    """Draw dots with intervals and, below them, the number of labels of each dot."""
     from scipy.stats import binomtest
 
     grid = figure.add_gridspec(2, 1, height_ratios=(4, 1.3), hspace=0.02)
@@ -207,7 +207,7 @@ def _draw_reliability(
     axes.set(xlim=(0, 1), ylim=(0, 1), ylabel="share correct")
     axes.set_yticks([0, 0.5, 1])
     axes.tick_params(labelbottom=False)
-    # A bar is at its dot; neighbours whose mean weights are close stay apart.
+    # A bar is as wide as the smallest gap between dots allows, so that bars do not overlap.
     gap = float(np.diff(weights).min(initial=0.08))
     counted.bar(weights, np.log10(1 + labels), min(0.06, 0.8 * gap), color=RULE, gid="count")
     most = float(np.log10(1 + labels.max(initial=1)))
@@ -230,8 +230,8 @@ def _write_figures(axes: "Axes", figures: Figures) -> None:
     """Write a policy's name and figures above its panel."""
     axes.set_title(figures.policy, pad=26)
     lines = (
-        f"AUROC {_shown(figures.auroc)}   calibration error {_shown(figures.calibration_error)}",
-        f"weight on correct labels {_shown(figures.weighted_precision)}",
+        f"AUROC {_format(figures.auroc)}   calibration error {_format(figures.calibration_error)}",
+        f"weight on correct labels {_format(figures.weighted_precision)}",
     )
     axes.annotate(
         "\n".join(lines), (0, 1), (0, 5), xycoords="axes fraction", textcoords="offset points",
@@ -240,7 +240,7 @@ def _write_figures(axes: "Axes", figures: Figures) -> None:
 
 
 def _draw_aurocs(axes: "Axes", found: Sequence[Figures], level: float) -> None:
-    """Draw a dot with its interval per policy, the best on top."""
+    """Draw the AUROC of each policy with its interval, the best on top."""
     axes.set_title("AUROC", pad=26)
     axes.annotate(
         f"correct ranked above wrong labels\nbars: {100 * level:.0f} % interval, by frames",
@@ -274,22 +274,23 @@ def _draw_aurocs(axes: "Axes", found: Sequence[Figures], level: float) -> None:
 
 
 def _draw_curves(axes: "Axes", panel: CurvePanel) -> None:
-    """Draw the lines, a little beside each other, and name them in the order of their ends."""
+    """Draw the lines with a legend that is sorted by their last values."""
     axes.set_title(panel.title)
     axes.set_xscale("log")
     order = []
     for number, curve in enumerate(panel.curves):
-        known = ~np.isnan(curve.means)
-        if not known.any():
+        defined = ~np.isnan(curve.means)
+        if not defined.any():
             continue
-        # Error bars at one place would cover each other.
-        beside = 1.012 ** (number - (len(panel.curves) - 1) / 2)
+        # Each curve is shifted a little, because error bars at the same place hide each other.
+        shift = 1.012 ** (number - (len(panel.curves) - 1) / 2)
         drawn = axes.errorbar(
-            panel.shares[known] * beside, curve.means[known], np.nan_to_num(curve.stds[known]),
+            panel.shares[defined] * shift, curve.means[defined],
+            np.nan_to_num(curve.stds[defined]),
             color=_LINES[number % len(_LINES)], marker=_MARKERS[number % len(_MARKERS)], ms=4.5,
             lw=1.3, elinewidth=1, capsize=0, gid="curve",
         )  # fmt: skip
-        last = float(curve.means[known][-1])
+        last = float(curve.means[defined][-1])
         drawn.set_label(f"{curve.name}  {last:.1f}")
         order.append((last, drawn))
     axes.set_ylim(bottom=max(0.0, axes.get_ylim()[0]))
@@ -305,7 +306,7 @@ def _draw_curves(axes: "Axes", panel: CurvePanel) -> None:
 
 
 def _whole_numbers(axes: "Axes") -> None:
-    """Let the vertical axis count: whole numbers with commas, few of them."""
+    """Label the vertical axis with a few whole numbers, with commas."""
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
     axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
@@ -318,7 +319,7 @@ def _wrapped(text: str, width: int) -> str:
     return fill(text, width)
 
 
-def _shown(estimate: Estimate) -> str:
+def _format(estimate: Estimate) -> str:
     return "-" if np.isnan(estimate.value) else f"{estimate.value:.2f}"
 
 

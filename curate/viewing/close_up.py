@@ -1,4 +1,4 @@
-"""A label from near: its part of the image beside its surroundings from above."""
+"""Draw a close-up of a label: the camera image around it, and the points around it from above."""
 
 from dataclasses import dataclass
 
@@ -20,13 +20,13 @@ _LEAST_PIXELS = 60.0
 
 
 @dataclass(frozen=True)
-class LabelShown:
-    """A label as a close-up shows it.
+class CloseUpLabel:
+    """A label to draw in a close-up.
 
     Attributes:
         box: (7,) in the LiDAR frame.
-        weight: in [0, 1]; gives the colour.
-        former: (7,) its box in the round before, dashed; None where there was none.
+        weight: weight in [0, 1], which gives the colour.
+        former: (7,) its box in the previous round, drawn dashed; None if there was none.
     """
 
     box: np.ndarray
@@ -34,8 +34,8 @@ class LabelShown:
     former: np.ndarray | None = None
 
 
-def draw_close_up(frame: Frame, label: LabelShown) -> np.ndarray:
-    """(260, 650, 3) uint8 RGB; the left part is empty where the image does not show the label."""
+def draw_close_up(frame: Frame, label: CloseUpLabel) -> np.ndarray:
+    """Return (260, 650, 3) uint8 RGB; the left part is empty if the label is outside the image."""
     canvas = Canvas(_WIDE + _SIDE, _SIDE, BACKGROUND)
     red, green, blue = weight_colours(np.array([label.weight]))[0].tolist()
     colour = (red, green, blue)
@@ -48,14 +48,14 @@ def draw_close_up(frame: Frame, label: LabelShown) -> np.ndarray:
 def _draw_above(
     canvas: Canvas, frame: Frame, boxes: np.ndarray, colour: tuple[int, int, int]
 ) -> None:
-    """The right part: points within a few metres, x forward points up."""
+    """Draw the right part: the points within a few metres; x (forward) points up."""
     reach = _REACH_METRES
     x, y = boxes[0, :2]
     region = Region(x - reach, x + reach, y - reach, y + reach, _SIDE / (2 * reach))
     near = (np.abs(frame.points[:, :2] - boxes[0, :2]) < reach).all(axis=1)
     points = frame.points[near]
     points = points[np.argsort(points[:, 2], kind="stable")]
-    # Region leaves room for a title, which a close-up has not.
+    # Region reserves space for a title, which a close-up does not have.
     shift = np.array([_WIDE, -region.to_pixels(np.array([region.x_max, y]))[1]])
     places = region.to_pixels(points[:, :2].astype(np.float64)) + shift
     canvas.dots(places, height_shades(points[:, 2]))
@@ -71,7 +71,7 @@ def _draw_above(
 def _draw_image(
     canvas: Canvas, frame: Frame, boxes: np.ndarray, colour: tuple[int, int, int]
 ) -> None:
-    """The left part: the image around the label, cut to the shape of the picture."""
+    """Draw the left part: the camera image around the label."""
     canvas.box(0, 0, _WIDE, _SIDE, PANEL)
     rectangle = image_rectangles(boxes[:1], frame.calibration, frame.image_size)[0]
     if frame.image is None or np.isnan(rectangle).any():
@@ -85,8 +85,8 @@ def _draw_image(
     canvas.image(int(corner[0]), int(corner[1]), *size, frame.image[top:bottom, left:right])
     strokes = box_strokes(boxes, frame.calibration, frame.image_size)
     low, high = corner, corner + np.array(size)
-    for index, own in enumerate(strokes):
-        places = (own - np.array([left, top])) * factor + corner
+    for index, box_lines in enumerate(strokes):
+        places = (box_lines - np.array([left, top])) * factor + corner
         inside = places[((places >= low) & (places <= high)).all(axis=(1, 2))]
         if index:
             canvas.dashes(inside, TEXT, 1.2, REPREDICTION_DASHES)
@@ -96,7 +96,7 @@ def _draw_image(
 
 
 def _window(rectangle: np.ndarray, image_size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of what is shown around a rectangle of the image, in pixels."""
+    """Return left, top, right, bottom of the image part around a rectangle, in pixels."""
     middle = (rectangle[:2] + rectangle[2:]) / 2
     half = (rectangle[2:] - rectangle[:2]) * (0.5 + _MARGIN_SHARE)
     height = max(half[1], half[0] * _SIDE / _WIDE, _LEAST_PIXELS)

@@ -1,4 +1,4 @@
-"""One picture of a frame: the image with the boxes over it, and below it the same from above."""
+"""Draw a frame: the camera image with the boxes over it, and the bird's eye view below."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from curate.frames import Frame
 from curate.viewing.bird_eye import bird_eye_size, paint_bird_eye, region_around
 from curate.viewing.canvas import Canvas
 from curate.viewing.chart_style import ImageFormat
-from curate.viewing.overlay import Shown, overlay_size, paint_overlay
+from curate.viewing.overlay import FrameContent, overlay_size, paint_overlay
 from curate.viewing.tags import ShownLabels, ShownRepredictions
 from curate.viewing.vector_canvas import VectorCanvas
 
@@ -23,30 +23,30 @@ def draw_frame(
     human_boxes: np.ndarray | None = None,
     title: str = "",
 ) -> np.ndarray:
-    """Return the picture in the dark style, (height, width, 3) uint8 RGB.
+    """Return the drawn frame in the dark style, (height, width, 3) uint8 RGB.
 
     Args:
-        frame: with its image.
-        labels: coloured by weight.
-        truth_boxes: (m, 7) ground truth in the LiDAR frame; None where it is unknown.
-        repredictions: None where none are to be shown.
-        human_boxes: (h, 7) what people decided on; None for none.
-        title: written at the top.
+        frame: a frame with its image.
+        labels: labels, coloured by weight.
+        truth_boxes: (m, 7) ground truth in the LiDAR frame; None if unknown.
+        repredictions: repredictions; None to draw none.
+        human_boxes: (h, 7) boxes that people decided on; None for none.
+        title: text at the top.
 
     Raises:
         DataError: if the frame has no image.
     """
-    shown = Shown(labels, truth_boxes, repredictions, human_boxes, title)
+    shown = FrameContent(labels, truth_boxes, repredictions, human_boxes, title)
     return paint_frame(frame, shown).finish()
 
 
-def paint_frame(frame: Frame, shown: Shown, kind: ImageFormat = "png") -> Canvas:
-    """Return a canvas with the picture, whose content in a format is that of a file.
+def paint_frame(frame: Frame, shown: FrameContent, kind: ImageFormat = "png") -> Canvas:
+    """Return a canvas with the drawn frame; `Canvas.content` encodes it.
 
     Args:
-        frame: with its image.
+        frame: a frame with its image.
         shown: the boxes.
-        kind: lines and texts are vectors where it is pdf or svg.
+        kind: format to encode; for pdf and svg, lines and texts are vectors.
 
     Raises:
         DataError: if the frame has no image.
@@ -54,7 +54,7 @@ def paint_frame(frame: Frame, shown: Shown, kind: ImageFormat = "png") -> Canvas
     if frame.image is None:
         raise DataError(f"frame {frame.frame_id}: the data set has no image")
     width, above = overlay_size(frame.image)
-    boxes = [shown.labels.boxes, shown.known_truth]
+    boxes = [shown.labels.boxes, shown.valid_truth]
     boxes += [] if shown.human_boxes is None else [shown.human_boxes]
     region = region_around(boxes, width)
     below = bird_eye_size(region)[1]

@@ -1,4 +1,4 @@
-"""The strip below a picture that says what its colours mean."""
+"""Draw the title strip above an image and the legend strip below it."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from curate.weighting.base import ZeroWeight
 STRIP_HEIGHT = 40
 TITLE_HEIGHT = 36
 
-# Lengths of a dash and a gap in pixels: line styles tell apart whose box it is.
+# Lengths of dash and gap in pixels: the line style shows the origin of a box.
 REPREDICTION_DASHES = (6.0, 4.0)
 TRUTH_DOTS = (1.5, 3.0)
 HUMAN_DASHES = (12.0, 3.0)
@@ -20,7 +20,7 @@ _ZERO_WEIGHT_WORDS = {"background": "v = 0: background", "ignore": "v = 0: ignor
 
 
 def draw_title(canvas: Canvas, title: str, note: str, style: Style = DARK) -> None:
-    """Draw the strip above the picture: a title, and a note at the right."""
+    """Draw the strip at the top: a title on the left and a note on the right."""
     canvas.box(0, 0, canvas.width, TITLE_HEIGHT, style.panel)
     canvas.text(14, 24, title, style.text, 16)
     left = canvas.width - 14 - canvas.text_width(note, 12)
@@ -37,7 +37,7 @@ def draw_legend(
     human: bool = False,
     style: Style = DARK,
 ) -> None:
-    """Draw the strip at the bottom: the weight scale, and the line styles that occur."""
+    """Draw the strip at the bottom: the weight scale, and the line styles that are used."""
     top = canvas.height - STRIP_HEIGHT
     canvas.box(0, top, canvas.width, canvas.height, style.panel)
     baseline = top + 25.0
@@ -58,7 +58,7 @@ def draw_legend(
 
 
 def _weight_bar(canvas: Canvas, left: float, top: float, baseline: float, style: Style) -> float:
-    """Draw the colour bar from 0 to 1; return where the next entry may start."""
+    """Draw the colour bar from 0 to 1 and return the left edge of the next entry."""
     for text, colour, gap in (("weight v", style.text, 10), ("0", style.faint_text, 6)):
         canvas.text(left, baseline, text, colour)
         left += canvas.text_width(text) + gap

@@ -1,4 +1,4 @@
-"""The camera's image with the labels' 3D boxes over it, coloured by weight."""
+"""Draw the 3D boxes of labels over the camera image, coloured by weight."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,24 +25,24 @@ _Pattern = tuple[float, float]
 
 _LEAST_WIDTH = 1200
 _NEAR_METRES = 0.1
-# Pairs of `box_corners`: the front face first, then the rear face and what joins them.
+# Pairs of `box_corners`: the front face, then the rear face, then the edges between them.
 _STARTS = np.array([0, 3, 7, 4, 1, 2, 6, 5, 0, 3, 7, 4])
 _ENDS = np.array([3, 7, 4, 0, 2, 6, 5, 1, 1, 2, 6, 5])
 _FRONT_EDGES = 4
-# Far outside any image; a stroke that runs farther is not worth its numbers.
+# Far outside any image; pixel coordinates are limited to this value.
 _PIXEL_LIMIT = 10_000.0
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What a picture shows of a frame, over its image or from above.
+class FrameContent:
+    """The boxes, title and style of a drawn frame, for the overlay and the bird's eye view.
 
     Attributes:
-        labels: coloured by weight, with captions.
-        truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None where it is unknown.
-        repredictions: dashed, in the colour of the label that each was matched with.
-        human_boxes: (h, 7) what people decided on, in long dashes; None for none.
-        title: written at the top.
+        labels: labels, coloured by weight, with captions.
+        truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None if unknown.
+        repredictions: repredictions, dashed, each in the colour of its matched label.
+        human_boxes: (h, 7) boxes that people decided on, with long dashes; None for none.
+        title: text at the top.
         style: colours.
     """
 
@@ -54,15 +54,15 @@ class Shown:
     style: Style = DARK
 
     @property
-    def known_truth(self) -> np.ndarray:
-        """(m, 7) ground truth without regions that have no box."""
+    def valid_truth(self) -> np.ndarray:
+        """(m, 7) ground truth without DontCare regions, which have no 3D box."""
         if self.truth_boxes is None:
             return np.zeros((0, 7))
-        known: np.ndarray = self.truth_boxes[~np.isnan(self.truth_boxes).any(axis=1)]
-        return known
+        valid: np.ndarray = self.truth_boxes[~np.isnan(self.truth_boxes).any(axis=1)]
+        return valid
 
     def draw_legend(self, canvas: Canvas) -> None:
-        """Draw the strip at the bottom that explains what is shown."""
+        """Draw the legend at the bottom."""
         draw_legend(
             canvas,
             zero_weight=self.labels.zero_weight,
@@ -83,40 +83,40 @@ def draw_overlay(
     title: str = "",
     style: Style = DARK,
 ) -> np.ndarray:
-    """Return the picture with a legend, (height, width, 3) uint8 RGB.
+    """Return the overlay with a legend, (height, width, 3) uint8 RGB.
 
     Args:
-        image: (h, w, 3) uint8 RGB; enlarged by a whole factor where it is small.
-        calibration: of the frame.
-        labels: see `Shown`.
-        truth_boxes: see `Shown`.
-        title: written above the image.
+        image: (h, w, 3) uint8 RGB camera image; a small image is enlarged by a whole factor.
+        calibration: calibration of the frame.
+        labels: see `FrameContent`.
+        truth_boxes: see `FrameContent`.
+        title: text above the image.
         style: colours.
     """
     width, height = overlay_size(image)
     canvas = Canvas(width, height + STRIP_HEIGHT, style.background)
-    shown = Shown(labels, truth_boxes, title=title, style=style)
+    shown = FrameContent(labels, truth_boxes, title=title, style=style)
     paint_overlay(canvas.part(0, height), image, calibration, shown)
     shown.draw_legend(canvas)
     return canvas.finish()
 
 
 def overlay_size(image: np.ndarray) -> tuple[int, int]:
-    """Return width and height of the picture of an image without its legend."""
+    """Return width and height of the overlay without its legend, in pixels."""
     height, width = image.shape[:2]
     factor = _enlargement(image)
     return width * factor, height * factor + TITLE_HEIGHT
 
 
 def paint_overlay(
-    canvas: Canvas, image: np.ndarray, calibration: Calibration, shown: Shown
+    canvas: Canvas, image: np.ndarray, calibration: Calibration, shown: FrameContent
 ) -> None:
-    """Draw an image, and over it all boxes, far labels first.
+    """Draw an image and all boxes over it, far labels first.
 
     Args:
-        canvas: of `overlay_size`.
+        canvas: canvas of the size `overlay_size`.
         image: (h, w, 3) uint8 RGB.
-        calibration: of the frame.
+        calibration: calibration of the frame.
         shown: the boxes.
     """
     height, width = image.shape[:2]
@@ -124,11 +124,13 @@ def paint_overlay(
     size, within = (width, height), canvas.part(TITLE_HEIGHT, canvas.height - TITLE_HEIGHT)
     within.image(0, 0, width * factor, height * factor, image)
 
-    def dash(boxes: np.ndarray, colours: Sequence[Colour], stroke: float, how: _Pattern) -> None:
+    def dash(
+        boxes: np.ndarray, colours: Sequence[Colour], stroke: float, pattern: _Pattern
+    ) -> None:
         for strokes, colour in zip(box_strokes(boxes, calibration, size), colours, strict=True):
-            within.dashes(strokes * factor, colour, stroke, how)
+            within.dashes(strokes * factor, colour, stroke, pattern)
 
-    truth = shown.known_truth
+    truth = shown.valid_truth
     dash(truth, [style.ground_truth] * len(truth), 1.6, TRUTH_DOTS)
     if shown.repredictions is not None:
         colours = [tuple(c) for c in weight_colours(shown.repredictions.weights, style).tolist()]
@@ -148,51 +150,51 @@ def paint_overlay(
 
 
 def _enlargement(image: np.ndarray) -> int:
-    """Return the whole factor that makes a small image large enough to read captions on."""
+    """Return the whole factor that makes a small image large enough for readable captions."""
     return int(max(1, -(-_LEAST_WIDTH // image.shape[1])))
 
 
 def box_strokes(
     boxes: np.ndarray, calibration: Calibration, image_size: tuple[int, int]
 ) -> list[np.ndarray]:
-    """Return the edges of each box in the image, cut where they come nearer than the near plane.
+    """Return the edges of each box in the image, clipped at the near plane of the camera.
 
     Args:
         boxes: (n, 7) in the LiDAR frame.
-        calibration: of the frame.
+        calibration: calibration of the frame.
         image_size: (width, height) in pixels.
 
     Returns:
-        n arrays (strokes, 2, 2) of start and end in pixels: 12 where the box is wholly ahead, those
-        around its front face first; fewer where it is partly behind; none where the image does
-        not show the box.
+        n arrays (strokes, 2, 2) of start and end in pixels. A box in front of the camera has 12
+        strokes, the front face first; a box that is partly behind the camera has fewer; a box
+        outside the image has none.
     """
     seen = ~np.isnan(image_rectangles(boxes, calibration, image_size)).any(axis=1)
     matrix = calibration.lidar_to_image
     corners = box_corners(boxes) @ matrix[:, :3].T + matrix[:, 3]
     return [
-        _project_strokes(own[_STARTS], own[_ENDS]) if visible else np.zeros((0, 2, 2))
-        for own, visible in zip(corners, seen, strict=True)
+        _project_strokes(points[_STARTS], points[_ENDS]) if visible else np.zeros((0, 2, 2))
+        for points, visible in zip(corners, seen, strict=True)
     ]
 
 
 def _project_strokes(starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """(strokes, 2, 2) pixels of strokes between (n, 3) homogeneous image points."""
+    """Return (strokes, 2, 2) pixels of strokes between (n, 3) homogeneous image points."""
     ahead = (starts[:, 2] > _NEAR_METRES) | (ends[:, 2] > _NEAR_METRES)
     starts, ends = starts[ahead], ends[ahead]
-    strokes = np.stack([_drawn_ahead(starts, ends), _drawn_ahead(ends, starts)], axis=1)
+    strokes = np.stack([_clipped_near(starts, ends), _clipped_near(ends, starts)], axis=1)
     pixels = strokes[..., :2] / strokes[..., 2:]
     limited: np.ndarray = np.clip(pixels, -_PIXEL_LIMIT, _PIXEL_LIMIT)
     return limited
 
 
-def _drawn_ahead(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Points behind the near plane, moved towards the others until they lie on it."""
+def _clipped_near(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Move the points behind the near plane towards `others` until they are on the plane."""
     depth, other_depth = points[:, 2], others[:, 2]
     behind = depth < _NEAR_METRES
     share = np.where(behind, (_NEAR_METRES - depth) / np.where(behind, other_depth - depth, 1), 0)
     moved: np.ndarray = points + share[:, None] * (others - points)
-    # The sum leaves nothing of the near plane where a box is as large as the universe.
+    # For a gigantic box, rounding errors of the sum are larger than the near plane's depth.
     moved[behind, 2] = _NEAR_METRES
     return moved
 
@@ -200,7 +202,7 @@ def _drawn_ahead(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 def _draw_strokes(
     canvas: Canvas, strokes: np.ndarray, colour: Colour, weight: float, style: Style
 ) -> None:
-    """Draw a box with its front face shaded; a rim keeps it apart from the image."""
+    """Draw a box with a shaded front face, and a dark rim that separates it from the image."""
     width = 1.0 if weight <= 0 else 1.5 + weight
     if weight > 0 and len(strokes) == len(_STARTS):
         canvas.fill(strokes[:_FRONT_EDGES, 0], colour, 0.22)

@@ -1,4 +1,4 @@
-"""A page that stands alone: one HTML file with its style, its charts and its pictures inside."""
+"""Render a self-contained HTML page: style, charts and images are inside the file."""
 
 import base64
 from collections.abc import Iterable, Sequence
@@ -38,17 +38,17 @@ th:first-child, td.text { text-align: left; } tr.all td { font-weight: 600; }
 
 
 ALL = "all"
-"""What the first or second cell of a row of sums says."""
+"""The text of the first or second cell in a row of totals."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A chart or a picture with its caption.
+    """A chart or an image with its caption.
 
     Attributes:
-        content: finished SVG, or an <img>, see `picture`; it is not escaped.
+        content: an <svg> or <img> element, which is not escaped.
         caption: plain text.
-        chart: the chart, which can be saved as a file too; None for a picture.
+        chart: the chart, which can also be saved as a file; None for an image.
     """
 
     content: str
@@ -57,12 +57,12 @@ class Figure:
 
     @classmethod
     def of_chart(cls, chart: Chart, caption: str) -> "Figure":
-        """Return a chart inside the page."""
+        """Return a figure with an inline chart."""
         return cls(chart.inline(), caption, chart)
 
     @classmethod
-    def picture(cls, rgb: np.ndarray, caption: str) -> "Figure":
-        """Return an (h, w, 3) uint8 RGB picture inside the page."""
+    def of_image(cls, rgb: np.ndarray, caption: str) -> "Figure":
+        """Return a figure with an embedded (h, w, 3) uint8 RGB image."""
         data = base64.b64encode(jpeg(rgb)).decode("ascii")
         image = f'<img alt="{escape(caption)}" src="data:image/jpeg;base64,{data}">'
         return cls(image, caption)
@@ -70,16 +70,16 @@ class Figure:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page; every text is plain and gets escaped.
+    """A section of the page; all texts are plain and are escaped.
 
     Attributes:
-        title: its heading.
-        note: below the heading, "" for none.
-        facts: values with their names, as tiles.
-        columns: heads of its table, none for no table.
-        rows: of the table; floats are shown with four digits, None as nothing; a row that begins
-            with ALL is a sum and stands out.
-        figures: side by side.
+        title: heading of the section.
+        note: text below the heading, "" for none.
+        facts: names and values, shown as tiles.
+        columns: column names of the table; empty for no table.
+        rows: rows of the table; floats are shown with four digits, None as an empty cell. A row
+            with ALL in the first or second cell is highlighted as a total.
+        figures: figures, shown side by side.
     """
 
     title: str
@@ -91,7 +91,7 @@ class Section:
 
 
 def render_page(title: str, note: str, sections: Iterable[Section]) -> str:
-    """Return the HTML text; it loads nothing from anywhere."""
+    """Return the HTML text; it loads no external resources."""
     body = "\n".join(_section(each) for each in sections)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'

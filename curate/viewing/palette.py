@@ -1,8 +1,8 @@
-"""Colours that carry meaning: the weight scale, ground truth, and what surrounds them.
+"""The colours of images: weight scale, ground truth, text and background.
 
-The weight scale runs through a few anchors in the manner of viridis. Its lightness changes evenly,
-so that weights can be told apart in print and by the colour-blind: on the dark ground a higher
-weight is lighter, on the white ground of the paper style it is darker.
+The weight scale interpolates between a few anchors, similar to viridis. Its lightness changes
+evenly, so that weights can be distinguished in print and by colour-blind readers: a higher weight
+is lighter on the dark background, and darker on the white background of the paper style.
 """
 
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ Colour = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Style:
-    """The colours of a picture, RGB.
+    """The RGB colours of an image.
 
     Attributes:
-        background: ground of the bird's eye view, and the rim around boxes on an image.
-        panel: ground of titles and legends.
+        background: background of the bird's eye view, and the rim around boxes on an image.
+        panel: background of titles and legends.
         grid: distance rings.
         text: titles and names.
-        faint_text: what is said by the way.
+        faint_text: secondary text.
         ground_truth: ground truth boxes.
         human: boxes that people decided on.
         zero_weight: labels of weight 0.
         unweighted: labels without a weight.
         weights: anchors of the weight scale from 0 to 1.
-        points: LiDAR points near the ground and 2 m above the LiDAR.
+        points: LiDAR points 2 m below the LiDAR (ground) and 2 m above it.
     """
 
     background: Colour
@@ -86,7 +86,7 @@ def find_style(name: str) -> Style:
     """Return the style with this name.
 
     Raises:
-        ConfigError: if there is no such style.
+        ConfigError: if the style is unknown.
     """
     if name not in STYLES:
         raise ConfigError(f"--style {name}: use {' or '.join(STYLES)}")
@@ -96,7 +96,7 @@ def find_style(name: str) -> Style:
 def weight_colours(weights: np.ndarray, style: Style = DARK) -> np.ndarray:
     """Return the (n, 3) uint8 RGB colours of (n,) weights in [0, 1].
 
-    Weight 0, which is not learned as an object, is grey; NaN, a label without weight, is orange.
+    Weight 0 (not learned as an object) is grey; NaN (a label without weight) is orange.
     """
     unknown = np.isnan(weights)
     place = np.clip(np.where(unknown, 0, weights), 0, 1) * (len(style.weights) - 1)
@@ -109,7 +109,7 @@ def weight_colours(weights: np.ndarray, style: Style = DARK) -> np.ndarray:
 
 
 def height_shades(heights: np.ndarray, style: Style = DARK) -> np.ndarray:
-    """Return (n, 3) uint8 RGB of LiDAR points by their z in metres: the ground is faint."""
+    """Return (n, 3) uint8 RGB colours of LiDAR points by their z in metres; the ground is faint."""
     share = np.clip((np.asarray(heights) + 2.0) / 4.0, 0, 1)[:, None]
     low, high = np.array(style.points)
     shades: np.ndarray = np.rint(low + share * (high - low)).astype(np.uint8)

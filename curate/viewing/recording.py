@@ -1,6 +1,6 @@
-"""A 3D recording of frames for the rerun viewer: points, image, and boxes coloured by weight.
+"""Write a 3D recording of frames for the rerun viewer: points, image, boxes coloured by weight.
 
-Format: rerun's .rrd, https://rerun.io. Its time line `frame` counts the recorded frames.
+Format: rerun's .rrd, https://rerun.io. The timeline `frame` counts the recorded frames.
 """
 
 import os
@@ -33,16 +33,16 @@ _JPEG_QUALITY = 90
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """What is recorded of one frame.
+    """The recorded data of one frame.
 
     Attributes:
-        frame: with its image, or without.
+        frame: a frame with or without its image.
         labels: the predictions, coloured by weight.
-        evidence: (n,) numbers per prediction by name, NaN where unknown.
-        repredictions: in the colour of the label that each was matched with.
-        truth_boxes: (m, 7) in the LiDAR frame; None where the ground truth is unknown.
-        truth_categories: (m,) str; None likewise.
-        title: what the frame is.
+        evidence: (n,) numbers per prediction, by name; NaN if unknown.
+        repredictions: repredictions, each in the colour of its matched label.
+        truth_boxes: (m, 7) ground truth in the LiDAR frame; None if unknown.
+        truth_categories: (m,) str; None if unknown.
+        title: description of the frame.
     """
 
     frame: Frame
@@ -55,17 +55,17 @@ class RecordedFrame:
 
 
 def write_recording(path: Path, frames: Iterable[RecordedFrame]) -> int:
-    """Write an .rrd file; whole, or not at all.
+    """Write an .rrd file atomically.
 
     Args:
-        path: an existing file is replaced.
-        frames: taken one after the other, in the order of the time line.
+        path: path of the file; an existing file is replaced.
+        frames: the frames in the order of the timeline, read one after the other.
 
     Returns:
         The number of frames.
 
     Raises:
-        ConfigError: rerun is not installed, or the file cannot be written.
+        ConfigError: if rerun is not installed, or the file cannot be written.
     """
     rerun = load_rerun()
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -73,7 +73,7 @@ def write_recording(path: Path, frames: Iterable[RecordedFrame]) -> int:
     count = 0
     try:
         _open(stream, partial)
-        # The viewer opens at the only time line; when something was written is of no interest.
+        # With `frame` as the only timeline, the viewer opens with it.
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -90,7 +90,7 @@ def write_recording(path: Path, frames: Iterable[RecordedFrame]) -> int:
 
 
 def load_rerun() -> ModuleType:
-    """Return the package, imported only where a recording is written.
+    """Import and return the package rerun, which is optional.
 
     Raises:
         ConfigError: if it is not installed.
@@ -109,8 +109,8 @@ def camera_pose(calibration: Calibration) -> tuple[np.ndarray, np.ndarray, np.nd
     """Return the camera as a pinhole in the LiDAR frame.
 
     Returns:
-        (3, 3) intrinsics in pixels, (3, 3) rotation from camera to LiDAR frame, and (3,) the
-        camera's place in the LiDAR frame, metres.
+        (3, 3) intrinsics in pixels, (3, 3) rotation from the camera to the LiDAR frame, and (3,)
+        the position of the camera in the LiDAR frame, in metres.
     """
     projection = calibration.lidar_to_image
     if np.linalg.det(projection[:, :3]) < 0:
@@ -122,27 +122,27 @@ def camera_pose(calibration: Calibration) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def captions(labels: ShownLabels, evidence: Mapping[str, np.ndarray]) -> list[str]:
-    """What is written at each label: weight, category, score, points, and the evidence."""
+    """Return the text at each label: weight, category, score, points and evidence."""
     lines = []
     for i in range(len(labels)):
-        known = {name: values[i] for name, values in evidence.items() if np.isfinite(values[i])}
-        shown = "  ".join(f"{name} {value:.3g}" for name, value in known.items())
+        defined = {name: values[i] for name, values in evidence.items() if np.isfinite(values[i])}
+        numbers = "  ".join(f"{name} {value:.3g}" for name, value in defined.items())
         weight = f"  weight {labels.weights[i]:.2f}" if labels.weights[i] > 0 else ""
-        words = [f"k {labels.number(i)}{weight}", labels.details(i), shown]
-        lines.append("\n".join(filter(None, words)))
+        parts = [f"k {labels.number(i)}{weight}", labels.details(i), numbers]
+        lines.append("\n".join(filter(None, parts)))
     return lines
 
 
 def _open(stream: Any, path: Path) -> None:
-    """Let the stream write into a file; RERUN=off in the environment would silence it."""
+    """Open a file for the stream; with RERUN=off in the environment rerun writes nothing."""
     try:
         stream.save(path, default_blueprint=_blueprint())
     except (OSError, RuntimeError) as error:
         raise ConfigError(
-            f"{path.parent}: no recording can be written there: {one_line(error)}"
+            f"{path.parent}: a recording cannot be written there: {one_line(error)}"
         ) from error
     if not path.exists():
-        raise ConfigError("rerun is switched off: unset the environment variable RERUN")
+        raise ConfigError("rerun is disabled: unset the environment variable RERUN")
 
 
 def _log_frame(rerun: ModuleType, stream: Any, recorded: RecordedFrame) -> None:
@@ -170,7 +170,7 @@ def _log_frame(rerun: ModuleType, stream: Any, recorded: RecordedFrame) -> None:
 
 
 def _log_camera(rerun: ModuleType, stream: Any, frame: Frame) -> None:
-    """The pinhole where it stands, and its image."""
+    """Log the pose of the camera, its intrinsics and its image."""
     if frame.image is None:
         return
     intrinsics, rotation, centre = camera_pose(frame.calibration)
@@ -186,13 +186,13 @@ def _log_camera(rerun: ModuleType, stream: Any, frame: Frame) -> None:
 def _boxes(
     rerun: ModuleType, place: str, boxes: np.ndarray, colours: np.ndarray, names: list[str]
 ) -> Any:
-    """Return (n, 7) boxes; none at all empties what an earlier frame left at the same place."""
+    """Return (n, 7) boxes for rerun; an empty array clears the boxes of earlier frames."""
     half = boxes[:, 6] / 2
-    nothing = np.zeros(len(boxes))
+    zeros = np.zeros(len(boxes))
     return rerun.Boxes3D(
         centers=boxes[:, :3],
         half_sizes=boxes[:, 3:6] / 2,
-        quaternions=np.column_stack([nothing, nothing, np.sin(half), np.cos(half)]),
+        quaternions=np.column_stack([zeros, zeros, np.sin(half), np.cos(half)]),
         colors=colours,
         radii=np.full(len(boxes), _LINE_RADII[place]),
         labels=names,
@@ -200,7 +200,7 @@ def _boxes(
 
 
 def _blueprint() -> Any:
-    """How the viewer lays the recording out: the world on top, the image below."""
+    """Return the layout of the viewer: the LiDAR view on top, the image below."""
     from rerun import blueprint
 
     boxes = [f"/{place}" for place in (PREDICTIONS, REPREDICTIONS, TRUTH)]

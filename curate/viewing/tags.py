@@ -1,4 +1,4 @@
-"""Weighted labels as pictures show them, and where their captions find room."""
+"""The labels of a drawn frame, and the placement of their captions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,10 +12,10 @@ from curate.weighting.base import ZeroWeight
 _LARGE, _SMALL = 14.0, 10.5
 _LINE_PIXELS = (15.0, 12.0)
 _MARGIN = 3.0
-# A caption may lie over other boxes with this share of its area.
+# At most this share of a caption's area may cover other boxes.
 _COVERED_LIMIT = 0.4
 _NEAR = 3.0
-# Distances from its box at which a number is tried when the places beside the box are taken.
+# Distances from the box to try for a short caption when the places beside the box are occupied.
 _FAR = (16.0, 32.0, 52.0, 76.0, 104.0, 140.0)
 # Directions from a box, x to the right and y down: above first.
 _SIDES = np.array([[0, -1], [1, 0], [-1, 0], [0, 1]])
@@ -24,15 +24,15 @@ _AROUND = np.array([[0, -1], [1, -1], [-1, -1], [1, 0], [-1, 0], [1, 1], [-1, 1]
 
 @dataclass(frozen=True)
 class ShownLabels:
-    """The labels of one frame with what a picture says about each.
+    """The labels of one frame, with the data for their captions.
 
     Attributes:
         boxes: (n, 7) in the LiDAR frame.
         categories: (n,) str.
         scores: (n,) in [0, 1].
-        weights: (n,) in [0, 1]; NaN where the label has no weight.
-        points: (n,) LiDAR points inside each box, or None where they were not counted.
-        zero_weight: what a label of weight 0 is to a student, for the legend.
+        weights: (n,) in [0, 1]; NaN for labels without a weight.
+        points: (n,) LiDAR points inside each box; None if they were not counted.
+        zero_weight: the meaning of weight 0, for the legend.
         numbers: (n,) k of each label in its frame; None for 0 to n - 1.
     """
 
@@ -54,7 +54,7 @@ class ShownLabels:
 
     @property
     def emphasis(self) -> np.ndarray:
-        """(n,) in [0, 1], how much a label stands out: its weight, or half where it has none."""
+        """(n,) in [0, 1], how strongly to draw each label: its weight, or 0.5 without one."""
         return np.where(np.isnan(self.weights), 0.5, self.weights)
 
     def number(self, index: int) -> int:
@@ -67,14 +67,14 @@ class ShownLabels:
         return f"{self.categories[index]} {self.scores[index]:.2f}{points}"
 
     def caption(self, index: int) -> tuple[str, str]:
-        """Return the two lines of a label's caption; without a weight the first line is empty."""
+        """Return the two lines of a caption; the first is empty unless the weight is above 0."""
         name = self.short_caption(index)
         if self.weights[index] > 0:
             return f"{name}  {self.weights[index]:.2f}", self.details(index)
         return "", f"{name}  {self.details(index)}"
 
     def short_caption(self, index: int) -> str:
-        """Return what is written where the caption finds no room."""
+        """Return the caption to use if there is no room for the full one."""
         return f"k{self.number(index)}"
 
 
@@ -84,7 +84,7 @@ class ShownRepredictions:
 
     Attributes:
         boxes: (n, 7) in the LiDAR frame.
-        weights: (n,) of the label that each was matched with; 0 where it was matched with none.
+        weights: (n,) weight of the matched label; 0 without a match.
     """
 
     boxes: np.ndarray
@@ -93,13 +93,13 @@ class ShownRepredictions:
 
 @dataclass(frozen=True)
 class Tag:
-    """A caption and its place in the picture.
+    """A caption and its place in the image.
 
     Attributes:
-        index: of the label.
-        lines: of the caption; the first may be empty.
+        index: index of the label.
+        lines: the two lines of the caption; the first may be empty.
         place: (4,) left, top, right, bottom.
-        beside: whether it is right beside its box; else a line leads there.
+        beside: True if the caption is next to its box; otherwise a line connects them.
     """
 
     index: int
@@ -115,14 +115,14 @@ def draw_tags(
     bounds: np.ndarray,
     style: Style = DARK,
 ) -> None:
-    """Write each label's caption beside its box, see `place_tags`.
+    """Draw the captions of all labels, see `place_tags`.
 
     Args:
-        canvas: drawn on.
+        canvas: the canvas to draw on.
         labels: the labels.
-        anchors: (n, 4) left, top, right, bottom of each box in the picture; NaN: no caption.
-        bounds: (4,) left, top, right, bottom of the room for captions.
-        style: of the picture.
+        anchors: (n, 4) left, top, right, bottom of each box in the image; NaN for no caption.
+        bounds: (4,) left, top, right, bottom of the area for captions.
+        style: style of the image.
     """
     tags = place_tags(canvas, labels, anchors, bounds)
     for tag in tags:
@@ -144,25 +144,25 @@ def draw_tags(
 def place_tags(
     canvas: Canvas, labels: ShownLabels, anchors: np.ndarray, bounds: np.ndarray
 ) -> list[Tag]:
-    """Return a caption for every label in the picture; they do not cover each other.
+    """Return a caption for every label in the image, without overlaps if possible.
 
-    First, labels by falling emphasis get their whole caption above, right, left or below the box,
-    where it covers no other caption and little of other boxes. Each label that is left gets its
-    short caption, which names it, at the nearest free place. Only where no place within reach is
-    free does it lie over another one.
+    First the labels get, by falling emphasis, their full caption above, right, left or below the
+    box, if it covers no other caption and little of other boxes there. Each remaining label gets
+    its short caption at the nearest free place. A short caption covers another one only if all
+    places within reach are occupied.
 
     Args:
-        canvas: measures text.
+        canvas: the canvas, used to measure text.
         labels: the labels.
-        anchors: (n, 4) left, top, right, bottom of each box in the picture; NaN: no caption.
-        bounds: (4,) left, top, right, bottom of the room for captions.
+        anchors: (n, 4) left, top, right, bottom of each box in the image; NaN for no caption.
+        bounds: (4,) left, top, right, bottom of the area for captions.
     """
     clipped = np.array([_clipped(anchor, bounds) for anchor in anchors]).reshape(-1, 4)
     order = np.argsort(-labels.emphasis, kind="stable")
     seen = [int(i) for i in order if (clipped[i, 2:] > clipped[i, :2]).all()]
     boxes = clipped[seen]
     tags: list[Tag] = []
-    left_out = []
+    remaining = []
     for i in seen:
         lines = labels.caption(i)
         places = _candidates(clipped[i], _size(canvas, lines), _SIDES, _NEAR)
@@ -171,8 +171,8 @@ def place_tags(
         if cost[best] < _COVERED_LIMIT:
             tags.append(Tag(i, lines, places[best]))
         else:
-            left_out.append(i)
-    for i in left_out:
+            remaining.append(i)
+    for i in remaining:
         tags.append(_place_short(canvas, labels, i, tags, (boxes, clipped[i], bounds)))
     return tags
 
@@ -184,12 +184,12 @@ def _place_short(
     tags: Sequence[Tag],
     around: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> Tag:
-    """Return the short caption at the nearest place that is free."""
+    """Return the short caption at the nearest free place."""
     boxes, anchor, bounds = around
     lines = ("", labels.short_caption(index))
     size = _size(canvas, lines)
     rings = [_candidates(anchor, size, _AROUND, gap) for gap in (_NEAR, *_FAR)]
-    # The corner within its own box comes last: for a box that fills the picture.
+    # The last place is the corner inside the box, for a box that fills the image.
     within = np.concatenate([anchor[:2] + _MARGIN, anchor[:2] + _MARGIN + size])
     for ring, places in enumerate([*rings, [within]]):
         cost = [_cost(place, tags, boxes, anchor, bounds) for place in places]
@@ -201,7 +201,7 @@ def _place_short(
 
 
 def _size(canvas: Canvas, lines: tuple[str, str]) -> np.ndarray:
-    """(2,) width and height of a caption."""
+    """Return (2,) width and height of a caption."""
     heavy, light = lines
     width = max(canvas.text_width(heavy, _LARGE), canvas.text_width(light, _SMALL))
     height = _LINE_PIXELS[1] + (_LINE_PIXELS[0] if heavy else 0)
@@ -210,7 +210,7 @@ def _size(canvas: Canvas, lines: tuple[str, str]) -> np.ndarray:
 
 
 def _clipped(anchor: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Return (4,) the part of a rectangle within bounds; empty where there is none."""
+    """Return (4,) the part of a rectangle within bounds, which may be empty."""
     low, high = np.tile(bounds[:2], 2), np.tile(bounds[2:], 2)
     clipped: np.ndarray = np.clip(np.nan_to_num(anchor, nan=-np.inf), low, high)
     return clipped
@@ -219,7 +219,7 @@ def _clipped(anchor: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 def _candidates(
     anchor: np.ndarray, size: np.ndarray, directions: np.ndarray, gap: float
 ) -> list[np.ndarray]:
-    """Return rectangles at a distance from a box, in some directions."""
+    """Return one rectangle per direction, at a distance `gap` from a box."""
     middle = (anchor[:2] + anchor[2:]) / 2
     away = (anchor[2:] - anchor[:2]) / 2 + size / 2 + gap
     lows = middle + directions * away - size / 2
@@ -230,20 +230,23 @@ def _cost(
     place: np.ndarray,
     tags: Sequence[Tag],
     boxes: np.ndarray,
-    own: np.ndarray,
+    anchor: np.ndarray,
     bounds: np.ndarray,
 ) -> float:
-    """Return the share of a caption that lies over other boxes; infinite where it must not be."""
+    """Return the share of a caption that covers other boxes; infinite for a forbidden place.
+
+    A place is forbidden if it is outside the bounds or covers another caption.
+    """
     if (place[:2] < bounds[:2]).any() or (place[2:] > bounds[2:]).any():
         return np.inf
     if tags and _common_area(place, np.array([tag.place for tag in tags])).any():
         return np.inf
-    others = boxes[(boxes != own).any(axis=1)]
+    others = boxes[(boxes != anchor).any(axis=1)]
     return float(_common_area(place, others).sum() / np.prod(place[2:] - place[:2]))
 
 
 def _common_area(place: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return (n,) areas that a rectangle shares with (n, 4) others."""
+    """Return (n,) the intersection areas of a rectangle with (n, 4) others."""
     low = np.maximum(place[:2], others[:, :2])
     high = np.minimum(place[2:], others[:, 2:])
     areas: np.ndarray = np.prod(np.maximum(high - low, 0), axis=1)

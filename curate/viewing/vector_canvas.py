@@ -1,4 +1,4 @@
-"""A canvas whose lines and texts are vectors, for PDF and SVG; drawn by matplotlib."""
+"""A canvas that draws lines and texts as vectors with matplotlib, for PDF and SVG."""
 
 from typing import Any, Self
 
@@ -8,17 +8,17 @@ from curate.viewing.canvas import Canvas
 from curate.viewing.chart_style import ImageFormat, figure_content, new_figure
 from curate.viewing.palette import Colour
 
-# A pixel of the canvas is a point of the page: 72 to the inch.
+# One pixel of the canvas is one point of the page, 1/72 inch.
 _POINTS = 72.0
-# LiDAR points are too many for vectors: they become an image of this resolution.
+# There are too many LiDAR points for vectors: they are rasterized at this resolution.
 _DPI = 216
 _FONT = "DejaVu Sans"
-# It has the capitals of the raster font at this share of its size.
+# At this share of the size, its capital letters are as high as those of the raster font.
 _FONT_SHARE = 0.92
 
 
 class VectorCanvas(Canvas):
-    """An RGB picture of a given size, see `Canvas`."""
+    """A vector canvas with the interface of `Canvas`."""
 
     def __init__(self, width: int, height: int, colour: Colour) -> None:
         self.width, self.height = width, height
@@ -28,17 +28,18 @@ class VectorCanvas(Canvas):
         self._prepare(height)
 
     def part(self, top: int, height: int) -> Self:
-        """Return the rows from `top` on as a canvas of its own; nothing leaves it."""
+        """Return `height` rows from `top` as a canvas that clips what is drawn outside of it."""
         part = object.__new__(type(self))
         part.width, part.height, part._figure = self.width, height, self._figure
-        own = self._axes.get_position()
-        share = own.height / self.height
-        part._axes = self._figure.add_axes((0, own.y1 - (top + height) * share, 1, height * share))
+        whole = self._axes.get_position()
+        share = whole.height / self.height
+        bottom = whole.y1 - (top + height) * share
+        part._axes = self._figure.add_axes((0, bottom, 1, height * share))
         part._prepare(height)
         return part
 
     def image(self, left: int, top: int, width: int, height: int, image: np.ndarray) -> None:
-        """Place an RGB image, embedded as it is."""
+        """Draw an RGB image; it is embedded at its own resolution."""
         extent = (left, left + width, top + height, top)
         self._axes.imshow(
             image, extent=extent, aspect="auto", interpolation="none", zorder=self._next()
@@ -65,7 +66,7 @@ class VectorCanvas(Canvas):
     def dashes(
         self, strokes: np.ndarray, colour: Colour, width: float, pattern: tuple[float, float]
     ) -> None:
-        """Draw straight strokes (n, 2, 2) as dashes."""
+        """Draw dashed line segments (n, 2, 2); `pattern` is the length of dash and gap."""
         dash, gap = pattern
         self._add_lines(
             strokes, colour, width, linestyles=[(0, (dash / width, gap / width))], capstyle="butt"
@@ -89,14 +90,14 @@ class VectorCanvas(Canvas):
     def text(
         self, left: float, baseline: float, text: str, colour: Colour, size: float = 13.0
     ) -> None:
-        """Write a line of text."""
+        """Draw a line of text."""
         self._axes.text(
             left, baseline, text, color=_rgb(colour), fontsize=size * _FONT_SHARE,
             fontfamily=_FONT, zorder=self._next(), parse_math=False, clip_on=True,
         )  # fmt: skip
 
     def text_width(self, text: str, size: float = 13.0) -> float:
-        """Return the width of a line of text of a size."""
+        """Return the width of a line of text."""
         from matplotlib.font_manager import findfont, get_font
 
         font = get_font(findfont(_FONT))
@@ -105,12 +106,12 @@ class VectorCanvas(Canvas):
         return float(font.get_width_height()[0]) / 64
 
     def content(self, kind: ImageFormat) -> bytes:
-        """Return the content of a file."""
+        """Return the content of an image file."""
         placed = {"figure.constrained_layout.use": False}
         return figure_content(self._figure, kind, "picture", _DPI, **placed)
 
     def finish(self) -> np.ndarray:
-        """Return the (height, width, 3) uint8 RGB picture."""
+        """Return the image, (height, width, 3) uint8 RGB."""
         self._figure.set_dpi(_POINTS)
         self._figure.canvas.draw()
         pixels: np.ndarray = np.asarray(self._figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
@@ -122,7 +123,7 @@ class VectorCanvas(Canvas):
         self._drawn = 0
 
     def _next(self) -> int:
-        """Return the place in the order of drawing."""
+        """Return the next position in the drawing order."""
         self._drawn += 1
         return self._drawn
 

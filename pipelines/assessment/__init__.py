@@ -1,1 +1,1 @@
-"""Audits, evaluations and checks against known ground truth."""
+"""Audits and evaluations against ground truth, and the checks of `curate doctor`."""

@@ -1,7 +1,8 @@
-"""The audit: labeled frames that the teacher has not seen, treated as if they were unlabeled.
+"""Audit labels and weights on labeled frames that the teacher has not been trained on.
 
-The same stages make their labels and gather the evidence, and the policies weigh them over these
-frames alone, lambda included. Only then is the ground truth asked.
+The frames are treated as if they were unlabeled: the same stages make their labels and evidence,
+and the policies weight them (lambda is computed over these frames only). Only then are the labels
+matched to the ground truth.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,9 +16,9 @@ from curate.detections import Detections
 from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.audit import Audit, audit
 from curate.evaluation.audit_summary import summary_sentences
-from curate.evaluation.judged_labels import AuditedFrame, JudgedLabels, judge_frames
+from curate.evaluation.evaluated_labels import AuditedFrame, EvaluatedLabels, evaluate_frames
 from curate.evaluation.kitti_rules import MIN_OVERLAPS
-from curate.evaluation.reliability import JudgeSettings, Overlap
+from curate.evaluation.reliability import MatchSettings, Overlap
 from curate.geometry.projection import image_rectangles
 from curate.weighting.base import Evidence
 from db import bulk
@@ -39,23 +40,23 @@ EVIDENCE: Mapping[str, Callable[[Evidence], np.ndarray]] = {
     "rho_det": lambda evidence: evidence.rho_det,
     "consistency": lambda evidence: np.where(evidence.matched, np.exp(-evidence.loss), 0.0),
 }
-"""Judges that no training uses by themselves: what the weights are made of, each within [0, 1]."""
+"""Evidence to audit like a weight, each in [0, 1]; no training uses it as a weight directly."""
 OTHER_IOU = 0.5  # for categories that KITTI does not evaluate
 
-Tell = Callable[[Report], None]
+ReportCallback = Callable[[Report], None]
 
 
 @dataclass(frozen=True)
 class AuditRequest:
-    """What to audit.
+    """The frames, policies and settings of an audit.
 
     Attributes:
-        split: "val", or "labeled" for a detector that has not seen these frames.
-        folds: held-out folds of X_l in place of a split; 0 for none.
-        round_number: e; None for the first that has no student yet.
-        names: policies and pieces of `EVIDENCE`.
-        overlap: by which a label is right, "bev" or "3d".
-        replicates: draws of the bootstrap.
+        split: "val", or "labeled" for a detector that has not been trained on these frames.
+        folds: number of held-out folds of X_l to use instead of a split; 0 for none.
+        round_number: e; None for the first round without a student.
+        names: names of policies and of `EVIDENCE`.
+        overlap: the overlap to match labels by, "bev" or "3d".
+        replicates: number of bootstrap draws.
     """
 
     split: str = "val"
@@ -67,7 +68,7 @@ class AuditRequest:
 
     @property
     def frames(self) -> str:
-        """Which frames, in words."""
+        """The audited frames as text: the split, or the number of folds."""
         return f"{self.folds} folds" if self.folds else self.split
 
     @property
@@ -77,19 +78,19 @@ class AuditRequest:
 
     @property
     def evidence(self) -> tuple[str, ...]:
-        """The names that are pieces of evidence."""
+        """The names that are evidence."""
         return tuple(name for name in self.names if name in EVIDENCE)
 
 
 @dataclass(frozen=True)
 class AuditedRound:
-    """An audit and what it is about.
+    """The result of an audit.
 
     Attributes:
         request: see `AuditRequest`.
-        context: the round; that of the first fold.
-        figures: what was found.
-        reports: what the stages did.
+        context: the audited round; with folds, the round of the first fold.
+        figures: the figures of the audit.
+        reports: the reports of the stages.
     """
 
     request: AuditRequest
@@ -99,39 +100,39 @@ class AuditedRound:
 
 
 def run_audit(
-    workspace: Workspace, request: AuditRequest, progress: Progress, tell: Tell
+    workspace: Workspace, request: AuditRequest, progress: Progress, on_report: ReportCallback
 ) -> AuditedRound:
-    """Bring the frames up to date, weighs their labels and asks the truth.
+    """Run the stages on the frames, weight their labels and match them to the ground truth.
 
     Args:
         workspace: see `Workspace`.
         request: see `AuditRequest`.
         progress: see `Progress`.
-        tell: takes what each stage did, as it ends.
+        on_report: called with the report of each stage when it ends.
 
     Raises:
-        ConfigError: if the request makes no sense.
-        LeakageError: if the teacher has learned from the frames.
-        WorkspaceError: if there are no such frames.
+        ConfigError: if the request is invalid.
+        LeakageError: if the teacher has been trained on the frames.
+        WorkspaceError: if the split has no frames.
     """
     _check(workspace, request)
     reports: list[Report] = []
 
-    def note(report: Report) -> None:
+    def record(report: Report) -> None:
         reports.append(report)
-        tell(report)
+        on_report(report)
 
     parts, contexts = [], []
-    for plan, split, done in _places(workspace, request, progress, note):
+    for plan, split, done in _audited_splits(workspace, request, progress, record):
         failed = _run_stages(plan, split, progress, done)
-        parts.append(_judge(plan, split, request, failed))
+        parts.append(_evaluate(plan, split, request, failed))
         contexts.append(plan.context)
-    judged = JudgedLabels.joined([part for part, _ in parts])
+    labels = EvaluatedLabels.joined([part for part, _ in parts])
     weights = {
         name: np.concatenate([weights[name] for _, weights in parts]) for name in request.names
     }
     figures = audit(
-        judged,
+        labels,
         weights,
         workspace.config.dataset.categories,
         np.random.default_rng([workspace.config.run.seed, contexts[0].number]),
@@ -141,65 +142,68 @@ def run_audit(
 
 
 def describe_audit(found: AuditedRound) -> list[str]:
-    """What the audit means, with its own limits."""
+    """Return a summary of the audit in sentences, with its limitations."""
     request = found.request
-    words = summary_sentences(found.figures, request.policies, request.evidence)
+    sentences = summary_sentences(found.figures, request.policies, request.evidence)
     if request.split == "labeled" and not request.folds:
-        words.append(
-            "The point prior has its thresholds from these very frames, which may flatter it; "
-            "with --folds it has them from other frames."
+        sentences.append(
+            "The thresholds of the point prior were computed from the audited frames, so its "
+            "figures may be too good; --folds computes them from other frames."
         )
-    return words
+    return sentences
 
 
 def picture_path(workspace: Workspace, found: AuditedRound, suffix: str = "png") -> Path:
-    """Return where the reliability diagram belongs."""
+    """Return the path of the reliability diagram."""
     frames = found.request.frames.replace(" ", "-")
     name = f"audit-round-{found.context.number:02d}-{frames}-{found.request.overlap}.{suffix}"
     return workspace.root / "reports" / name
 
 
 def _check(workspace: Workspace, request: AuditRequest) -> None:
-    """Reject before the detector runs what could not be audited after it."""
+    """Check the request, so that errors appear before the detector runs."""
     if request.split not in ("val", "labeled"):
         raise ConfigError(
-            f"--split {request.split}: only val and labeled frames have ground truth to ask"
+            f"--split {request.split}: use val or labeled; other frames have no ground truth"
         )
     check_executor(workspace.config)
     for name in request.policies:
         open_policy(workspace.config, name)
     if request.folds:
         if request.round_number not in (None, 1):
-            raise ConfigError("--folds audits the first round: its teachers learn from X_l alone")
+            raise ConfigError(
+                "--folds audits the first round only, because its teachers are trained on X_l "
+                "only; omit --round"
+            )
     elif request.split == "labeled" and is_trainable(workspace):
         raise LeakageError(
-            "--split labeled: the teacher has learned from these frames and knows their labels; "
-            "use --folds 5, or --split val"
+            "--split labeled: the teacher has been trained on these frames; use --folds 5, or "
+            "--split val"
         )
     elif not workspace.frames(request.split):
         raise WorkspaceError(f"there are no {request.split} frames; use --folds 5 to hold some out")
 
 
-def _places(
-    workspace: Workspace, request: AuditRequest, progress: Progress, note: Tell
-) -> Iterator[tuple[Plan, str, Tell]]:
-    """Yield the rounds and splits to audit, and who is told of the stages there."""
+def _audited_splits(
+    workspace: Workspace, request: AuditRequest, progress: Progress, record: ReportCallback
+) -> Iterator[tuple[Plan, str, ReportCallback]]:
+    """Yield the plan and the split to audit, and the callback for the reports of its stages."""
     if not request.folds:
-        yield open_plan(workspace, request.round_number), request.split, note
+        yield open_plan(workspace, request.round_number), request.split, record
         return
     for number, fold in enumerate(open_folds(workspace, request.folds), start=1):
-        place = f" {number}/{request.folds}"
+        suffix = f" {number}/{request.folds}"
 
-        def done(report: Report, place: str = place) -> None:
-            note(replace(report, stage=report.stage + place))
+        def done(report: Report, suffix: str = suffix) -> None:
+            record(replace(report, stage=report.stage + suffix))
 
         for first in graph_of(fold).first_stages:
             done(run_first(fold, first, progress))
         yield open_plan(fold, 1), "val", done
 
 
-def _run_stages(plan: Plan, split: str, progress: Progress, done: Tell) -> set[str]:
-    """Bring every frame stage up to date; the frames that failed in one."""
+def _run_stages(plan: Plan, split: str, progress: Progress, done: ReportCallback) -> set[str]:
+    """Run every frame stage and return the frames that failed in any of them."""
     failed: set[str] = set()
     with open_executor(plan.workspace) as executor:
         for stage in plan.graph.frames_stages:
@@ -209,22 +213,22 @@ def _run_stages(plan: Plan, split: str, progress: Progress, done: Tell) -> set[s
     return failed
 
 
-def _judge(
+def _evaluate(
     plan: Plan, split: str, request: AuditRequest, failed: set[str]
-) -> tuple[JudgedLabels, dict[str, np.ndarray]]:
-    """Return the labels of a split with what the truth says of them, and their weights."""
+) -> tuple[EvaluatedLabels, dict[str, np.ndarray]]:
+    """Return the evaluated labels of a split, and their weights by policy."""
     workspace, context = plan.workspace, plan.context
-    # By key, as the evidence is ordered.
+    # Sorted by key, like the evidence.
     frames = sorted(
         (key, name) for name, key in workspace.frames(split).items() if name not in failed
     )
     complete = plan.complete_frames(plan.graph.of_rounds("solve"), split)
     _, evidence = read_evidence(workspace, context.number, complete)
-    judged = judge_frames(
+    labels = evaluate_frames(
         _frames(workspace, context, split, frames, complete),
-        judge_settings(workspace.config, request.overlap),
+        match_settings(workspace.config, request.overlap),
     )
-    return judged, {
+    return labels, {
         name: EVIDENCE[name](evidence)
         if name in EVIDENCE
         else open_policy(workspace.config, name).weigh(evidence, context.age).v
@@ -232,10 +236,10 @@ def _judge(
     }
 
 
-def judge_settings(config: Config, overlap: Overlap) -> JudgeSettings:
-    """When a label is right: KITTI's overlaps for the configured categories."""
+def match_settings(config: Config, overlap: Overlap) -> MatchSettings:
+    """Return the settings to match labels: KITTI's IoU thresholds for the configured categories."""
     categories = config.dataset.categories
-    return JudgeSettings(
+    return MatchSettings(
         overlap=overlap,
         minimum_iou={name: MIN_OVERLAPS.get(name, OTHER_IOU) for name in categories},
     )
@@ -248,23 +252,23 @@ def _frames(
     frames: Sequence[tuple[int, str]],
     complete: Sequence[int],
 ) -> Iterator[AuditedFrame]:
-    """The frames with their labels, of which only those of complete frames would be weighed."""
+    """Yield the frames with their labels; a frame that is not complete has no labels."""
     labels = workspace.predictions(context.number, complete)
     points = _points(workspace, context.number)
     truth = workspace.ground_truth(split)
     for key, name in frames:
-        own = labels.get(key, Detections.empty())
+        found = labels.get(key, Detections.empty())
         frame = workspace.dataset.read(name, points=False)
         yield AuditedFrame(
-            own,
+            found,
             truth[name],
-            image_rectangles(own.boxes, frame.calibration, frame.image_size),
-            np.array([points.get((key, k), np.nan) for k in range(len(own))], dtype=np.float64),
+            image_rectangles(found.boxes, frame.calibration, frame.image_size),
+            np.array([points.get((key, k), np.nan) for k in range(len(found))], dtype=np.float64),
         )
 
 
 def _points(workspace: Workspace, round_number: int) -> dict[tuple[int, int], int]:
-    """LiDAR points in each label, by frame and k."""
+    """Return the LiDAR points in each label, by frame key and k."""
     table = bulk.table("point_prior")
     query = select(table.c.frame_id, table.c.k, table.c.points).where(table.c.round == round_number)
     return {(frame, k): points for frame, k, points in workspace.database.rows(query)}

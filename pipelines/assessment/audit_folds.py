@@ -1,8 +1,8 @@
 """Held-out folds of X_l: small workspaces inside the workspace, each with its own database.
 
-The teacher of a fold learns from the other folds; the fold itself is its val split, and made of
-whole sequences where the data set knows them. What a fold has done it keeps, so an audit that was
-killed continues.
+The teacher of a fold is trained on the other folds; the fold itself is its val split. If the data
+set has sequences, a fold contains whole sequences. A fold keeps its results, so an interrupted
+audit resumes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,21 +21,21 @@ from pipelines.workspace.workspace import Workspace
 
 
 def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
-    """Yield the workspace of every fold, made where it does not exist yet.
+    """Yield the workspace of every fold; a missing one is created.
 
     Raises:
-        ConfigError: if there are fewer labeled frames, or sequences of them, than folds.
+        ConfigError: if there are fewer labeled frames, or sequences of labeled frames, than folds.
     """
     labeled = sorted(workspace.frames("labeled"))
     if not 2 <= folds <= len(labeled):
         raise ConfigError(
-            f"--folds {folds}: the {len(labeled)} labeled frames make 2 to {len(labeled)} folds"
+            f"--folds {folds}: {len(labeled)} labeled frames allow 2 to {len(labeled)} folds"
         )
     seed = workspace.config.run.seed
-    dealt = _dealt(workspace, labeled, folds, np.random.default_rng([seed, folds]))
-    home = workspace.root / "reports" / "audit" / f"{folds}-folds-seed-{seed}"
-    for fold, held_out in enumerate(dealt):
-        root = home / f"fold-{fold + 1}"
+    frames_of_folds = _split_folds(workspace, labeled, folds, np.random.default_rng([seed, folds]))
+    parent = workspace.root / "reports" / "audit" / f"{folds}-folds-seed-{seed}"
+    for fold, held_out in enumerate(frames_of_folds):
+        root = parent / f"fold-{fold + 1}"
         root.mkdir(parents=True, exist_ok=True)
         rest = sorted(set(labeled) - set(held_out))
         lists = [
@@ -44,34 +44,35 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
         ]
         config = _fold_config(workspace)
         if (root / CONFIG_NAME).exists() and read_config(root / CONFIG_NAME) != config:
-            # Settings of the workspace have changed since; what depends on them becomes stale.
+            # The workspace's settings have changed; the results that depend on them become stale.
             write_config(root / CONFIG_NAME, config)
         yield initialise(root, config, *map(str, lists))
 
 
-def _dealt(
+def _split_folds(
     workspace: Workspace, labeled: Sequence[str], folds: int, generator: np.random.Generator
 ) -> list[list[str]]:
-    """Return the labeled frames in folds of about the same size; no sequence is in two of them.
+    """Split the labeled frames into folds of about the same size, without splitting sequences.
 
-    Where frames were split singly all the same, too few sequences are cut here, too.
+    Only if there are too few sequences, and the configuration does not require splits by sequence,
+    are frames assigned one by one.
     """
     groups = group_by_sequence(sequences_of(workspace.dataset, labeled), labeled)
     if len(groups) < folds:
         if workspace.config.dataset.split_by == "sequence":
             raise ConfigError(
-                f"--folds {folds}: the labeled frames are of {len(groups)} sequences, which are "
-                "not cut; ask for fewer folds, or label frames of more sequences"
+                f"--folds {folds}: the labeled frames are from only {len(groups)} sequences, and "
+                "a sequence is not split; use fewer folds, or label frames of more sequences"
             )
         groups = {frame: [frame] for frame in labeled}
-    dealt: list[list[str]] = [[] for _ in range(folds)]
+    split: list[list[str]] = [[] for _ in range(folds)]
     for name in generator.permutation(sorted(groups)).tolist():
-        min(dealt, key=len).extend(groups[name])
-    return [sorted(fold) for fold in dealt]
+        min(split, key=len).extend(groups[name])
+    return [sorted(fold) for fold in split]
 
 
 def _fold_config(workspace: Workspace) -> Config:
-    """Return the workspace's settings with absolute paths and the fold's own database."""
+    """Return the workspace's settings with absolute paths and the default database."""
     config = workspace.config
     detector, segmenter = config.detector.path, config.segmenter.path
     changes = {

@@ -1,4 +1,4 @@
-"""One frame through the whole chain: data set, detector, augmented views, segmenter."""
+"""Check one frame from end to end: data set, detector, augmented views, segmenter."""
 
 from collections.abc import Callable, Sequence
 
@@ -16,20 +16,20 @@ from pipelines.workspace.workspace import Workspace
 
 
 def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Finding]]:
-    """Return the frame, and what each check says of it; nothing is stored.
+    """Return the name of the checked frame and the findings; nothing is stored.
 
     Args:
         workspace: see `Workspace`.
-        frame_id: None for the first unlabeled frame.
+        frame_id: the frame to check; None for the first unlabeled frame.
 
     Raises:
-        ConfigError: if the workspace has no such frame.
+        ConfigError: if the frame is not in the workspace.
     """
     names = list(workspace.frames("unlabeled", "val", "labeled"))
     unlabeled = list(workspace.frames("unlabeled"))
     name = frame_id or next(iter(unlabeled or names), None)
     if name not in names:
-        raise ConfigError(f"doctor: no frame {name} in {workspace.root}")
+        raise ConfigError(f"doctor: frame {name} is not in the workspace {workspace.root}")
     semantic = "semantic" in workspace.config.run.priors
     try:
         frame = workspace.dataset.read(name, image=semantic)
@@ -42,12 +42,12 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     return name, findings
 
 
-def _guarded(check: str, examined: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:
-    """Return the findings, or the error that keeps a part of the chain from being examined."""
+def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:
+    """Return the findings of a check, or its error as a finding."""
     try:
-        return examined()
+        return check()
     except CurateError as error:
-        return [Finding(check, "wrong", str(error))]
+        return [Finding(name, "wrong", str(error))]
 
 
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
@@ -64,22 +64,24 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
             if views
             else _no_views(config)
         )
-        for similarity, moved in views:
-            back = examine_detections(
-                seen.with_points(similarity.apply_to_points(seen.points)), moved, ()
-            )
-            findings += [one for one in back if one.check == "boxes" and one.state == "wrong"]
+        for similarity, detections in views:
+            augmented = seen.with_points(similarity.apply_to_points(seen.points))
+            findings += [
+                finding
+                for finding in examine_detections(augmented, detections, ())
+                if finding.check == "boxes" and finding.state == "wrong"
+            ]
     return findings
 
 
 def _no_views(config: Config) -> Finding:
-    """Return a record without a second pass is fine for methods that need none."""
+    """Return the finding for recorded detections without augmented views."""
     if not wants_views(config):
-        return Finding("views", "ok", "none recorded; the priors alone weigh")
+        return Finding("views", "ok", "none recorded; the weights come from the priors only")
     return Finding(
         "views",
         "suspect",
-        "no second pass over augmented copies, so no label has a consistency loss: name passes in "
+        "no second pass over augmented copies, so no label has a consistency loss: set passes in "
         "detector.options, or set solve.self_paced = false",
     )
 
@@ -94,12 +96,12 @@ def _segmenter(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     categories = workspace.config.dataset.categories
     missing = [name for name in categories if name not in found.category_classes]
     if missing:
-        message = f"no class counts for {', '.join(missing)}; see segmenter.classes"
+        message = f"no class is mapped to {', '.join(missing)}; see segmenter.classes"
         return [Finding("segmenter", "wrong", message)]
     shares = {
         name: float(np.isin(found.class_ids, found.category_classes[name]).mean())
         for name in categories
     }
-    told = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
+    summary = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
     state = "ok" if any(shares.values()) else "suspect"
-    return [Finding("segmenter", state, f"share of the pixels: {told}")]
+    return [Finding("segmenter", state, f"share of the pixels: {summary}")]

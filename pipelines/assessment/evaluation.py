@@ -1,4 +1,4 @@
-"""How good a detector is on the val split, whose ground truth no training has seen."""
+"""Evaluate a detector on the val split, which is never trained on."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +20,7 @@ ValObjects = tuple[list[KittiObjects], list[KittiObjects]]
 
 
 def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str, Detections]:
-    """What a checkpoint finds in the val frames.
+    """Return the detections of a checkpoint in the val frames, by frame name.
 
     Raises:
         FramesFailed: if the detector failed on some frames.
@@ -40,10 +40,12 @@ def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str
 
 
 def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]:
-    """What a round's teacher found in the val frames, as `curate predict --split val` stored it.
+    """Return the stored detections of a round's teacher in the val frames, by frame name.
+
+    `curate predict --split val` stores them.
 
     Raises:
-        WorkspaceError: if the round has no predictions for some val frames.
+        WorkspaceError: if the round has no teacher, or lacks predictions for some val frames.
     """
     keys = workspace.frames("val")
     context = peek_round(workspace, round_number)
@@ -62,14 +64,14 @@ def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]
 
 
 def val_objects(workspace: Workspace, found: Mapping[str, Detections]) -> ValObjects:
-    """Ground truth and detections of the val frames in KITTI's form, in the order of their names.
+    """Return ground truth and detections of the val frames as KITTI objects, sorted by frame name.
 
     Raises:
         WorkspaceError: if there are no val frames.
     """
     truth = workspace.ground_truth("val")
     if not truth:
-        raise WorkspaceError("no val frames; `curate init --val` takes some")
+        raise WorkspaceError("no val frames; set some aside with `curate init --val`")
     labels: list[KittiObjects] = []
     results: list[KittiObjects] = []
     for name, annotations in truth.items():

@@ -1,6 +1,6 @@
-"""How good the labels of simulated frames are, by the truth that the simulation wrote beside them.
+"""Evaluate the labels of simulated frames against the ground truth that the simulation wrote.
 
-Nothing of it is stored: the ground truth of X_u never enters the database.
+The results are not stored, because ground truth of X_u must never enter the database.
 """
 
 from collections.abc import Sequence
@@ -8,7 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from sqlalchemy import select
 
-from curate.evaluation.reliability import auroc, judge, weighted_precision, weighted_recall
+from curate.evaluation.reliability import (
+    auroc,
+    match_to_ground_truth,
+    weighted_precision,
+    weighted_recall,
+)
 from curate.geometry.projection import image_rectangles
 from db import bulk
 from pipelines.workspace.workspace import Workspace
@@ -17,32 +22,39 @@ from pipelines.workspace.workspace import Workspace
 def label_quality(
     workspace: Workspace, round_number: int, policies: Sequence[str]
 ) -> list[tuple[str, int, int, float, float, float]]:
-    """Per policy: labels, labels with weight, weighted precision and recall in percent, AUROC."""
+    """Return a row per policy with the quality of its labels.
+
+    Returns:
+        Rows of policy, number of labels, number of labels with a weight above 0, weighted precision
+        and weighted recall in percent, and AUROC.
+    """
     keys = workspace.frames("unlabeled")
     found = workspace.predictions(round_number, list(keys.values()))
-    right: dict[tuple[int, int], bool] = {}
+    correct: dict[tuple[int, int], bool] = {}
     objects = 0
     for name, key in keys.items():
         frame = workspace.dataset.read(name, points=False)
         rectangles = image_rectangles(found[key].boxes, frame.calibration, frame.image_size)
-        verdict = judge(found[key], workspace.dataset.annotations(name), rectangles=rectangles)
-        objects += sum(verdict.ground_truths.values())
-        for k in np.flatnonzero(verdict.counted):
-            right[key, int(k)] = bool(verdict.right[k])
+        matches = match_to_ground_truth(
+            found[key], workspace.dataset.annotations(name), rectangles=rectangles
+        )
+        objects += sum(matches.ground_truths.values())
+        for k in np.flatnonzero(matches.counted):
+            correct[key, int(k)] = bool(matches.correct[k])
     rows = []
     for policy in policies:
         weights = _weights(workspace, round_number, policy)
-        judged = [label for label in weights if label in right]
-        v = np.array([weights[label] for label in judged])
-        truth = np.array([right[label] for label in judged], dtype=bool)
+        counted = [label for label in weights if label in correct]
+        v = np.array([weights[label] for label in counted])
+        is_correct = np.array([correct[label] for label in counted], dtype=bool)
         rows.append(
             (
                 policy,
                 len(weights),
                 int((v > 0).sum()),
-                100 * weighted_precision(v, truth),
-                100 * weighted_recall(v, truth, objects),
-                auroc(v, truth),
+                100 * weighted_precision(v, is_correct),
+                100 * weighted_recall(v, is_correct, objects),
+                auroc(v, is_correct),
             )
         )
     return rows

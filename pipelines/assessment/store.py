@@ -1,4 +1,4 @@
-"""Audits and evaluations in the database."""
+"""Store audits and evaluations in the database."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,7 +9,7 @@ from sqlalchemy import Connection
 
 from curate.detections import Detections
 from curate.evaluation.audit import Estimate, Figures
-from curate.evaluation.judged_labels import WHOLE
+from curate.evaluation.evaluated_labels import WHOLE
 from curate.evaluation.kitti_ap import KittiEvaluation
 from curate.evaluation.kitti_outcomes import Outcomes, object_outcomes
 from curate.evaluation.kitti_rules import DIFFICULTIES
@@ -33,7 +33,7 @@ Row = dict[str, Any]
 
 
 def store_audit(workspace: Workspace, found: AuditedRound) -> None:
-    """Replace what is stored of the same round, frames and overlap."""
+    """Store an audit; it replaces the audit of the same round, frames and overlap."""
     request = found.request
     key = {
         "round": found.context.number,
@@ -62,16 +62,20 @@ def store_evaluation(
     objects: ValObjects,
     figures: KittiEvaluation,
 ) -> Mapping[str, int]:
-    """Replace what is stored of a source, and count the objects by their outcome.
+    """Store the evaluation of a source, replacing its previous one, and count the outcomes.
 
-    Detections of every score take part, so an object is missed only where none of them finds it.
+    Detections of every score take part: an object is a false negative only if no detection of any
+    score matches it.
 
     Args:
         workspace: see `Workspace`.
-        source: whose detections, as people will ask for it.
+        source: name of the evaluated detections, for queries.
         found: detections of the val frames.
-        objects: the same in KITTI's form, with the ground truth.
-        figures: their evaluation.
+        objects: ground truth and the same detections as KITTI objects.
+        figures: the evaluation of the detections.
+
+    Returns:
+        The number of ground truth objects by outcome.
     """
     keys = workspace.frames("val")
     of_objects, of_detections = object_outcomes(
@@ -98,7 +102,7 @@ def store_evaluation(
 
 
 def _replace(connection: Connection, name: str, key: Row, rows: Sequence[Row]) -> None:
-    """Put rows in the place of all that have the same key."""
+    """Replace all rows with the same key by new rows."""
     table = bulk.table(name)
     same = (table.c[column] == value for column, value in key.items())
     connection.execute(table.delete().where(*same))
@@ -106,7 +110,7 @@ def _replace(connection: Connection, name: str, key: Row, rows: Sequence[Row]) -
 
 
 def _figures(figures: Figures) -> Row:
-    """Return the columns that `audit` and `audit_slice` have in common."""
+    """Return the columns that `audit` and `audit_slice` share."""
     row: Row = {
         "labels": figures.labels,
         "neutral": figures.neutral,
@@ -122,7 +126,7 @@ def _figures(figures: Figures) -> Row:
 
 
 def _bins(figures: Figures) -> Iterator[Row]:
-    """Yield the bins that hold a label."""
+    """Yield a row for every bin with labels."""
     bins = figures.bins
     for i in np.flatnonzero(bins.labels).tolist():
         yield {
@@ -138,7 +142,7 @@ def _bins(figures: Figures) -> Iterator[Row]:
 def _outcomes(
     side: str, outcomes: Outcomes, frame_ids: Sequence[int], boxes: Sequence[np.ndarray]
 ) -> Iterator[Row]:
-    """Rows of `evaluation_object`; frame_ids and boxes by position of the frame."""
+    """Yield the rows of `evaluation_object`; `frame_ids` and `boxes` are by index of the frame."""
     columns = (
         *(outcomes.frames, outcomes.indices, outcomes.categories, outcomes.outcomes),
         *(outcomes.matches, outcomes.overlaps, outcomes.scores),
@@ -162,7 +166,7 @@ def _outcomes(
 
 
 def _averages(figures: KittiEvaluation) -> Iterator[Row]:
-    """Rows of `evaluation_ap`."""
+    """Yield the rows of `evaluation_ap`."""
     plain = figures.as_dict()
     for category, by_figure in plain["AP_R40"].items():
         for figure, r40 in by_figure.items():
@@ -179,5 +183,5 @@ def _averages(figures: KittiEvaluation) -> Iterator[Row]:
 
 
 def _finite(value: float) -> float | None:
-    """Return a number of Python; None where it is undefined or infinite."""
+    """Return a Python float, or None for NaN and infinity."""
     return float(value) if math.isfinite(value) else None

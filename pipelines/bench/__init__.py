@@ -1,1 +1,1 @@
-"""The bench: methods x labeled ratios x seeds as a resumable grid, and the tables of it."""
+"""The benchmark: a resumable grid of methods x labeled ratios x seeds, and its tables."""

@@ -1,4 +1,4 @@
-"""A job of the grid, as its own process does it: a workspace brought up to date and evaluated."""
+"""Run one job of the grid in its own process: bring its workspace up to date and evaluate it."""
 
 import math
 import os
@@ -35,19 +35,19 @@ DATABASE = "curate.db"
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A detector's figures in the form of `JobResult`."""
+    """The figures of a detector, in the form of `JobResult`."""
 
     ap: dict[str, dict[str, dict[str, tuple[float, float, float]]]]
     recall: dict[str, tuple[float, float, float]]
 
 
 def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
-    """Does a job, or what an earlier run has left of it, and writes its result."""
+    """Run a job, or resume an interrupted one, and write its result."""
     start = time.monotonic()
     resumed = job.folder(bench.root).exists()
-    workspace = _prepared(bench, job) if job.method is None else _copied(bench, job)
+    workspace = _open_shared(bench, job) if job.method is None else _open_cell(bench, job)
     if job.method is None:
-        reports = _share(workspace, progress)
+        reports = _run_shared(workspace, progress)
     else:
         graph, evidence = graph_of(workspace), looks_at_unlabeled(job)
         reports = list(run_all(workspace, graph, None, progress, evidence=evidence))
@@ -73,17 +73,17 @@ def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
     return result
 
 
-def _prepared(bench: Bench, job: Job) -> Workspace:
-    """Return the workspace with its draw of labeled frames."""
+def _open_shared(bench: Bench, job: Job) -> Workspace:
+    """Open or create the shared workspace of a draw of labeled frames."""
     config = bench.config(job.seed)
     root = job.folder(bench.root)
     if (root / CONFIG_NAME).exists():
-        write_config(root / CONFIG_NAME, config)  # the bench may have been moved
+        write_config(root / CONFIG_NAME, config)  # the folder may have been moved
     return initialise(root, config, str(job.ratio), "")
 
 
-def _share(workspace: Workspace, progress: Metered) -> list[Report]:
-    """Return the teacher, and what round 1 asks of it whatever the method."""
+def _run_shared(workspace: Workspace, progress: Metered) -> list[Report]:
+    """Train the teacher and run the stages of round 1 that do not depend on the method."""
     firsts = graph_of(workspace).first_stages
     reports = [run_first(workspace, first, progress) for first in firsts]
     plan = open_plan(workspace, 1)
@@ -92,10 +92,10 @@ def _share(workspace: Workspace, progress: Metered) -> list[Report]:
         return [*reports, *(run_frames(plan, stage, executor, progress) for stage in stages)]
 
 
-def _copied(bench: Bench, job: Job) -> Workspace:
-    """Return the method's workspace, which starts as a copy of the shared one.
+def _open_cell(bench: Bench, job: Job) -> Workspace:
+    """Open or create the workspace of a method, which starts as a copy of the shared one.
 
-    Whatever of the copy does not fit the method's settings is stale and done again.
+    Results in the copy that do not match the method's settings are stale and are computed again.
     """
     root = job.folder(bench.root)
     if not root.exists():
@@ -113,13 +113,13 @@ def _copied(bench: Bench, job: Job) -> Workspace:
 
 
 def _copy_database(source: Path, target: Path) -> None:
-    """SQLite's own backup, which is whole whatever lies in the write-ahead log."""
+    """Copy a database with SQLite's backup, which includes the write-ahead log."""
     with closing(sqlite3.connect(source)) as old, closing(sqlite3.connect(target)) as new:
         old.backup(new)
 
 
 def _evaluate(workspace: Workspace, checkpoint: Path, progress: Metered) -> Evaluated:
-    """How good a detector is on val, at KITTI's overlaps and at loose ones."""
+    """Evaluate a detector on val, at KITTI's and at the relaxed IoU thresholds."""
     objects = val_objects(workspace, detect_val(workspace, checkpoint, progress))
     categories = workspace.config.dataset.categories
     figures = {
@@ -135,7 +135,7 @@ def _evaluate(workspace: Workspace, checkpoint: Path, progress: Metered) -> Eval
 
 
 def _averages(evaluation: KittiEvaluation) -> dict[str, dict[str, tuple[float, float, float]]]:
-    """AP R40 by figure and category."""
+    """Return AP R40 by figure and category."""
     plain = evaluation.as_dict()["AP_R40"]
     return {
         figure: {category: tuple(by_figure[figure]) for category, by_figure in plain.items()}
@@ -144,7 +144,7 @@ def _averages(evaluation: KittiEvaluation) -> dict[str, dict[str, tuple[float, f
 
 
 def _recalls(evaluation: KittiEvaluation) -> dict[str, tuple[float, float, float]]:
-    """Recall by category, at the overlap at which its AP is computed."""
+    """Return the recall by category, at the IoU threshold of its AP."""
     plain = evaluation.as_dict()["recall_3d"]
     return {
         category: tuple(plain[category][f"{overlap:g}"])
@@ -153,7 +153,7 @@ def _recalls(evaluation: KittiEvaluation) -> dict[str, tuple[float, float, float
 
 
 def _labels(workspace: Workspace, policy: str) -> tuple[LabelFigures, ...]:
-    """Return the labels of every round under a policy, judged by the simulation's truth."""
+    """Return the quality of a policy's labels in every round, by the simulated ground truth."""
     rows = []
     for number in range(1, workspace.config.run.rounds + 1):
         [found] = label_quality(workspace, number, (policy,))
@@ -173,7 +173,7 @@ def _labels(workspace: Workspace, policy: str) -> tuple[LabelFigures, ...]:
 
 
 def _about(workspace: Workspace) -> dict[str, str]:
-    """What the figures may depend on beside the settings."""
+    """Return versions and device, on which the figures may depend."""
     import torch
 
     on = device(workspace.config)

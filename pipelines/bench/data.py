@@ -1,4 +1,4 @@
-"""The data set that all cells of a bench share."""
+"""Prepare the data set that all cells of a bench share."""
 
 from curate.errors import DataError
 from pipelines.bench.running import Say
@@ -8,7 +8,7 @@ from pipelines.workspace.workspace import open_dataset
 
 
 def make_data(bench: Bench, workers: int, say: Say, progress: Progress) -> None:
-    """Simulate the frames that are not there yet, or looks whether a folder can be used.
+    """Simulate missing frames, or check that the data folder can be used.
 
     Raises:
         DataError: if the folder has no lists of training and validation frames.
@@ -20,7 +20,8 @@ def make_data(bench: Bench, workers: int, say: Say, progress: Progress) -> None:
     for name in ("train", "val"):
         if not splits.get(name):
             raise DataError(
-                f"{bench.data}: ImageSets/{name}.txt names no frames; a bench needs train and val"
+                f"{bench.data}: ImageSets/{name}.txt is missing or empty; a bench needs frames in "
+                "both train.txt and val.txt"
             )
 
 

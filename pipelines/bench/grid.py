@@ -1,4 +1,4 @@
-"""The grid: which jobs it has, where they live, what each needs and how much work it is."""
+"""The grid: its jobs, their folders, their dependencies and their amounts of work."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -16,12 +16,13 @@ TRAIN, EVALUATE = "train", "evaluate"
 
 @dataclass(frozen=True)
 class Job:
-    """A cell of the grid, or what the cells of one draw of labeled frames share.
+    """A cell of the grid, or the work that all cells of one draw of labeled frames share.
 
     Attributes:
         ratio: share of the training frames that is labeled.
-        seed: of the draw.
-        method: None for what is shared: the teacher, and what round 1 asks of it.
+        seed: seed of the draw.
+        method: the method of the cell; None for the shared work: training the teacher, and its
+            stages in round 1.
     """
 
     ratio: float
@@ -30,47 +31,47 @@ class Job:
 
     @property
     def name(self) -> str:
-        """A name for a folder."""
+        """The name of the job's folder."""
         return "-".join(
             [f"ratio-{self.ratio:g}", f"seed-{self.seed}", *filter(None, [self.method])]
         )
 
     def __str__(self) -> str:
-        """As a person reads it."""
+        """Return a readable name."""
         return f"ratio {self.ratio:g}, seed {self.seed}, {self.method or 'teacher'}"
 
     @property
     def shared(self) -> "Job":
-        """The job whose workspace this one starts from."""
+        """The job with the shared work that this job starts from."""
         return Job(self.ratio, self.seed)
 
     def folder(self, root: Path) -> Path:
-        """Its workspace."""
+        """Return the folder of the job's workspace."""
         return root / ("shared" if self.method is None else "cells") / self.name
 
     def result(self, root: Path) -> Path:
-        """Return the file that is there once the job is done."""
+        """Return the path of the result file, which exists only if the job is finished."""
         return self.folder(root) / RESULT_FILE
 
     def is_done(self, root: Path) -> bool:
-        """Return whether it is finished; it is never done again."""
+        """Return whether the job is finished; finished jobs are never rerun."""
         return self.result(root).is_file()
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Frames of the data set's training and validation lists."""
+    """The numbers of training and validation frames."""
 
     train: int
     val: int
 
     def labeled(self, ratio: float) -> int:
-        """Labeled frames at a ratio, as `curate init` counts them."""
+        """Return the number of labeled frames at a ratio, as `curate init` computes it."""
         return max(1, round(ratio * self.train))
 
 
 def jobs(axes: Axes) -> list[Job]:
-    """All jobs; a seed is finished before the next begins, and what is shared comes first."""
+    """Return all jobs, sorted by seed; the shared job of each draw is before its cells."""
     return [
         Job(ratio, seed, method)
         for seed in axes.seeds
@@ -80,19 +81,19 @@ def jobs(axes: Axes) -> list[Job]:
 
 
 def waiting(axes: Axes, root: Path) -> list[Job]:
-    """Return the jobs that are not done, without preparations that nobody needs any more."""
+    """Return the unfinished jobs, without shared jobs that no unfinished cell needs."""
     unfinished = [job for job in jobs(axes) if not job.is_done(root)]
     needed = {job.shared for job in unfinished if job.method is not None}
     return [job for job in unfinished if job.method is not None or job in needed]
 
 
 def looks_at_unlabeled(job: Job) -> bool:
-    """Whether it predicts and scores frames of X_u; later rounds of the baseline need not."""
+    """Return whether the job runs the detector on X_u; later rounds of the baseline do not."""
     return job.method is None or bool(POLICIES.load(METHODS[job.method].policy).uses_unlabeled)
 
 
 def work(job: Job, config: Config, sizes: Sizes) -> Mapping[str, int]:
-    """Optimiser steps, and frames by stage."""
+    """Return the work of a job: the number of optimiser steps, and of frames per stage."""
     section = config.train
     first = job.method is None
     steps = section.pretrain_steps if first else section.round_steps * config.run.rounds
@@ -102,5 +103,5 @@ def work(job: Job, config: Config, sizes: Sizes) -> Mapping[str, int]:
 
 
 def frame_stages(config: Config) -> Iterator[str]:
-    """Return the stages that go through the frames of X_u."""
+    """Return the names of the stages that process the frames of X_u."""
     return (stage.name for stage in round_graph(config.run.priors).frames_stages)

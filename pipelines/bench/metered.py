@@ -1,4 +1,4 @@
-"""A job's progress as its parent process hears of it: a line of JSON now and then."""
+"""Report the progress of a job to its parent process as lines of JSON."""
 
 import json
 import time
@@ -11,14 +11,14 @@ from pipelines.engine.progress import Advance
 from pipelines.registry import PRIORS
 from pipelines.round import round_graph
 
-TELL_EVERY_S = 0.5
+REPORT_EVERY_S = 0.5
 
 
 class Metered:
-    """Counts units of work by kind, measures what they take, and tells both.
+    """Count and time units of work by kind, and report the counts.
 
     Args:
-        stream: where each line is {"kind": KIND, "units": HOW_MANY_MORE}.
+        stream: receives lines of the form {"kind": KIND, "units": NUMBER_OF_FURTHER_UNITS}.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -29,34 +29,35 @@ class Metered:
 
     @property
     def timings(self) -> Mapping[str, tuple[int, float]]:
-        """Units and seconds by kind; what a track starts with, models to load, is left out."""
+        """Units and seconds by kind, without the time to load models at the start."""
         return self._measured
 
     @contextmanager
     def track(self, what: str, total: int) -> Iterator[Advance]:  # noqa: ARG002
-        """Yield a function that counts; a training's name is that of its checkpoint."""
+        """Yield a function that counts units of work."""
+        # A training is tracked under the name of its checkpoint.
         kind = what if what in self._kinds else TRAIN
-        begun: float | None = None
-        told, units, untold = time.monotonic(), 0, 0
+        started: float | None = None
+        last_report, units, unreported = time.monotonic(), 0, 0
 
         def advance(step: int, _note: str) -> None:
-            nonlocal begun, told, units, untold
+            nonlocal started, last_report, units, unreported
             now = time.monotonic()
-            # The first units may be those of an earlier run, and wait for what is loaded.
-            if begun is None:
-                begun = now if step else None
+            # The first units are not timed: they may be of an earlier run, or include loading.
+            if started is None:
+                started = now if step else None
             else:
                 units += step
-            untold += step
-            if now - told >= TELL_EVERY_S:
-                self._report(kind, untold)
-                told, untold = now, 0
+            unreported += step
+            if now - last_report >= REPORT_EVERY_S:
+                self._report(kind, unreported)
+                last_report, unreported = now, 0
 
         yield advance
-        self._report(kind, untold)
-        if begun is not None:
+        self._report(kind, unreported)
+        if started is not None:
             before = self._measured.get(kind, (0, 0.0))
-            self._measured[kind] = (before[0] + units, before[1] + time.monotonic() - begun)
+            self._measured[kind] = (before[0] + units, before[1] + time.monotonic() - started)
 
     def _report(self, kind: str, units: int) -> None:
         if units:

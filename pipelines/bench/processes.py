@@ -1,4 +1,4 @@
-"""A job in a process of its own: one thread, its log in a file, and no life after its parent."""
+"""Run a job in its own process: with one thread and a log file, and killed with its parent."""
 
 import contextlib
 import json
@@ -12,14 +12,14 @@ from pathlib import Path
 
 from pipelines.bench.grid import Job
 
-# Takes a kind of work and how many units of it are done.
+# Called with a kind of work and the number of finished units.
 ProgressCallback = Callable[[str, int], None]
 LOGS = "logs"
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 class JobProcesses:
-    """Runs jobs of a bench as processes, from several threads at once."""
+    """Run jobs of a bench as processes; several threads may call it at once."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -27,8 +27,8 @@ class JobProcesses:
         self._ended = False
         self._lock = threading.Lock()
 
-    def __call__(self, job: Job, told: ProgressCallback) -> str | None:
-        """Run a job to its end; gives None, or in one line why it failed."""
+    def __call__(self, job: Job, on_progress: ProgressCallback) -> str | None:
+        """Run a job and return None, or the reason of its failure in one line."""
         log = self._root / LOGS / f"{job.name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("w", encoding="utf-8") as stream:
@@ -38,17 +38,18 @@ class JobProcesses:
                 return f"cannot be started: {error}"
             if process is None:
                 return "interrupted"
-            with process:  # which closes its pipes
+            with process:  # closes its pipes
                 for line in process.stdout or ():
-                    with contextlib.suppress(ValueError, KeyError):  # not ours, or cut by a kill
+                    # Other output, or a line that a kill cut off.
+                    with contextlib.suppress(ValueError, KeyError):
                         message = json.loads(line)
-                        told(message["kind"], int(message["units"]))
+                        on_progress(message["kind"], int(message["units"]))
         with self._lock:
             self._running.discard(process)
         return None if process.returncode == 0 else _reason(process.returncode, log)
 
     def end(self) -> None:
-        """Kill what runs and starts nothing more; the next run goes on from there."""
+        """Kill the running jobs and start no others; the next run resumes them."""
         with self._lock:
             self._ended = True
             for process in self._running:
@@ -65,7 +66,7 @@ class JobProcesses:
                 return None
             process = subprocess.Popen(  # noqa: S603
                 command,
-                stdin=subprocess.PIPE,  # it ends where this does, see `end_with_parent`
+                stdin=subprocess.PIPE,  # it closes when this process ends, see `end_with_parent`
                 stdout=subprocess.PIPE,
                 stderr=log,
                 text=True,
@@ -76,7 +77,7 @@ class JobProcesses:
 
 
 def end_with_parent() -> None:
-    """End this process, whatever it does, once the pipe from its parent closes."""
+    """End this process immediately when the pipe from its parent closes."""
     threading.Thread(target=_wait_for_end, daemon=True).start()
 
 
@@ -87,7 +88,7 @@ def _wait_for_end() -> None:
 
 
 def _reason(code: int, log: Path) -> str:
-    """Why a process failed, from the last line that it wrote."""
+    """Return why a process failed: its signal, or the last line of its log."""
     if code < 0:
         return f"killed by signal {signal.Signals(-code).name}; {log}"
     lines = log.read_text(encoding="utf-8", errors="replace").split("\n")

@@ -1,4 +1,4 @@
-"""What a bench found: terminal tables, results.md, results.json and a chart."""
+"""The report of a bench: tables, results.md, results.json and a chart."""
 
 import json
 import math
@@ -28,11 +28,11 @@ MARKDOWN, NUMBERS = "results.md", "results.json"
 
 @dataclass(frozen=True)
 class BenchReport:
-    """The state of a bench.
+    """The report of the finished jobs of a bench.
 
     Attributes:
         bench: see `Bench`.
-        image_format: of the chart.
+        image_format: format of the chart.
     """
 
     bench: Bench
@@ -40,21 +40,21 @@ class BenchReport:
 
     @cached_property
     def results(self) -> list[JobResult]:
-        """Of all finished jobs."""
+        """The results of all finished jobs."""
         return read_results(self.bench.root)
 
     @cached_property
     def finished(self) -> Finished:
-        """The same by method, ratio and seed."""
+        """The results by method, ratio and seed."""
         return Finished(self.results)
 
     @cached_property
     def tables(self) -> list[Table]:
-        """All tables, and first how hard the data is."""
-        return [*self._hardness(), *all_tables(self.finished)]
+        """All tables; the first describes the objects of the data set."""
+        return [*self._object_tables(), *all_tables(self.finished)]
 
     def write(self) -> list[Path]:
-        """Write results.md, results.json and, where a cell is finished, the chart."""
+        """Write results.md, results.json and, if a cell is finished, the chart."""
         root = self.bench.root
         replace_file(root / MARKDOWN, self.markdown().encode())
         replace_file(root / NUMBERS, (json.dumps(self.numbers(), indent=1) + "\n").encode())
@@ -65,7 +65,7 @@ class BenchReport:
         return written
 
     def numbers(self) -> dict[str, Any]:
-        """Everything as plain numbers."""
+        """Return all results as plain numbers for JSON."""
         return {
             "settings": self.bench.settings.model_dump(mode="json"),
             "grid": self.bench.axes.model_dump(mode="json"),
@@ -83,8 +83,8 @@ class BenchReport:
         }
 
     def markdown(self) -> str:
-        """Return the document."""
-        lines = ["# The methods, compared by `curate bench`", ""]
+        """Return the content of results.md."""
+        lines = ["# Comparison of the methods by `curate bench`", ""]
         lines += [f"- {condition}" for condition in self.conditions()]
         if self.finished.methods:
             lines += ["", f"![Mean AP over labeled ratio]({self._chart_name})"]
@@ -99,7 +99,7 @@ class BenchReport:
         return "\n".join([*lines, ""])
 
     def conditions(self) -> Iterator[str]:
-        """What the figures hold for, a sentence each."""
+        """Yield the conditions of the experiments, one sentence each."""
         settings, finished = self.bench.settings, self.finished
         yield f"command: `{command(self.bench)}`"
         cells = sum(result.method is not None for result in self.results)
@@ -111,19 +111,20 @@ class BenchReport:
                 yield f"`{name}`: {METHODS[name].note}"
         yield (
             f"equal optimiser steps: every method trains {settings.rounds} x {settings.steps} "
-            f"steps from the same teacher, itself {settings.teacher_steps or settings.steps} steps "
-            "on X_l; batches, "
-            "augmentation and learning rates are the same"
+            "steps from the same teacher, which is trained for "
+            f"{settings.teacher_steps or settings.steps} steps on X_l; batches, augmentation and "
+            "learning rates are the same"
         )
         yield (
-            "a seed draws the labeled frames (those of a ratio are among those of a greater one), "
-            "the training and the augmented views; all cells share one data set and its val frames"
+            "the seed determines the labeled frames (those of a ratio include those of smaller "
+            "ratios), the training and the augmented views; all cells share one data set and its "
+            "val frames"
         )
         yield (
             "KITTI AP, 40 recall positions, in percent; mean is over categories and difficulties; "
             "± is the standard deviation over n seeds, (+) the gain over the baseline"
         )
-        yield "what the last round trained is evaluated on val, on which no training was chosen"
+        yield "the student of the last round is evaluated on val; val is not used to select models"
         for about in {tuple(sorted(result.about.items())) for result in self.results}:
             versions = dict(about)
             yield (
@@ -132,14 +133,14 @@ class BenchReport:
             )
         failed = sum(result.failed_frames for result in self.results)
         if failed:
-            yield f"{failed} results of single frames failed and were left out"
+            yield f"{failed} results of single frames failed and are not included"
 
     @property
     def _chart_name(self) -> str:
         return f"curve.{self.image_format}"
 
     def chart(self) -> Chart:
-        """Return mean 3D AP over the labeled ratio, at KITTI's overlaps and at loose ones."""
+        """Return mean 3D AP over the labeled ratio, at KITTI's and the relaxed IoU thresholds."""
         panels = []
         for overlaps in OVERLAPS:
             values = {
@@ -156,9 +157,9 @@ class BenchReport:
             title = self._summary(overlaps).title
             panels.append(CurvePanel(title, np.array(self.finished.ratios), curves))
         note = (
-            "dot: mean over seeds; bar: standard deviation; legend: AP at a line's end; "
-            "AP R40, mean over categories and difficulties; teacher: on X_l once, baseline: on X_l "
-            "as long as the other methods"
+            "dot: mean over seeds; bar: standard deviation; legend: AP at the end of the line; "
+            "AP R40, mean over categories and difficulties; teacher: trained on X_l once; "
+            "baseline: trained on X_l for as many steps as the other methods"
         )
         return curves_chart(panels, "AP over labeled ratio", note)
 
@@ -169,8 +170,8 @@ class BenchReport:
             if table.overlaps == overlaps and table.title.startswith("mean 3D AP, IoU")
         )
 
-    def _hardness(self) -> Iterator[Table]:
-        """How hard the val frames are; their ground truth is no secret."""
+    def _object_tables(self) -> Iterator[Table]:
+        """Yield the table of the objects in the val frames, by difficulty."""
         config = self.bench.config(0)
         if not (self.bench.data / "ImageSets" / "val.txt").is_file():
             return
@@ -195,7 +196,7 @@ class BenchReport:
             )
         quantiles = "/".join(f"{100 * share:.0f}" for share in QUANTILES)
         yield Table(
-            f"how hard the data is: objects of the {len(names)} val frames",
+            f"difficulty of the data: objects of the {len(names)} val frames",
             (
                 *("category", "objects", "per\nframe", "count at\neasy", "at\nmod.", "at\nhard"),
                 *("occluded", "mostly\noccluded", "truncated\n> 15 %"),
@@ -206,7 +207,7 @@ class BenchReport:
 
 
 def command(bench: Bench) -> str:
-    """Return the command that makes the bench, for the folder DIR."""
+    """Return the command that reproduces the bench in the folder DIR."""
     settings, axes = bench.settings, bench.axes
     words = ["curate bench DIR", f"--data {settings.data}"]
     if settings.data == SYNTHETIC:
@@ -224,7 +225,7 @@ def command(bench: Bench) -> str:
 
 
 def shown(value: Value, *, full: bool = False) -> str:
-    """Return a value as a table shows it."""
+    """Return a value as text for a table; `full` adds the gain."""
     if isinstance(value, Entry):
         return value.full if full else value.short
     if isinstance(value, PairedDifference):
@@ -236,7 +237,7 @@ def shown(value: Value, *, full: bool = False) -> str:
 
 
 def _plain(value: Value) -> Any:
-    """Return a value for JSON, which knows no NaN."""
+    """Return a value for JSON, with None instead of NaN."""
     if isinstance(value, Entry):
         return {**_finite(asdict(value.spread)), **_finite({"gain": value.gain})}
     if isinstance(value, PairedDifference):

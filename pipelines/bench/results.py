@@ -1,4 +1,4 @@
-"""What is kept of a finished job: figures of its detector, of its labels, and its times."""
+"""The stored result of a finished job: figures of its detector and labels, and its times."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,15 +16,15 @@ OVERLAPS = ("kitti", "loose")
 
 
 class LabelFigures(Section):
-    """How good the labels of a round were; only simulated frames know.
+    """The quality of the labels of a round; known for simulated frames only.
 
     Attributes:
         round: e.
-        labels: pseudo-labels of the round.
-        trusted: those with a weight above 0.
-        precision: share of the weight that lies on right labels, percent; None without weight.
-        recall: weight on right labels per object, percent.
-        auroc: chance that a right label weighs more than a wrong one.
+        labels: number of pseudo-labels.
+        trusted: number of pseudo-labels with a weight above 0.
+        precision: share of the weight that is on correct labels, percent; None without weight.
+        recall: weight on correct labels per object, percent.
+        auroc: probability that a correct label weighs more than a wrong one.
     """
 
     round: int
@@ -36,19 +36,19 @@ class LabelFigures(Section):
 
 
 class JobResult(Section):
-    """A finished job.
+    """The result of a finished job.
 
     Attributes:
         ratio, seed, method: see `Job`.
-        frames: how many are labeled, unlabeled, val.
-        ap: R40 in percent by overlaps ("kitti" or "loose"), figure ("3d", "bev") and category;
-            easy, moderate, hard.
-        recall: percent by category at KITTI's 3D overlaps; easy, moderate, hard.
-        labels: by round.
-        failed_frames: results of frames that failed and were left out.
-        seconds: of the run that finished the job.
-        resumed: whether an earlier run had begun it.
-        timings: units of work and the seconds they took, by kind.
+        frames: number of frames by split: labeled, unlabeled, val.
+        ap: AP R40 in percent by IoU thresholds ("kitti", or "loose" for the relaxed ones), figure
+            ("3d", "bev") and category; easy, moderate, hard.
+        recall: recall in percent by category at KITTI's 3D IoU thresholds; easy, moderate, hard.
+        labels: quality of the labels by round.
+        failed_frames: number of results of frames that failed and are not included.
+        seconds: duration of the run that finished the job.
+        resumed: whether an earlier run had started the job.
+        timings: units of work and their seconds, by kind.
         about: versions and device.
     """
 
@@ -67,11 +67,11 @@ class JobResult(Section):
 
     @property
     def job(self) -> Job:
-        """Which job it was."""
+        """The job with this result."""
         return Job(self.ratio, self.seed, self.method)
 
     def table(self, overlaps: str, figure: str) -> Mapping[str, Levels]:
-        """AP, or "recall", by category."""
+        """Return AP by category, or the recall for the figure "recall"."""
         return self.recall if figure == "recall" else self.ap[overlaps][figure]
 
     def mean(self, overlaps: str, figure: str) -> float:
@@ -80,7 +80,7 @@ class JobResult(Section):
 
 
 def write_result(root: Path, result: JobResult) -> None:
-    """Mark the job as done, by writing its file whole."""
+    """Write the result file atomically, which marks the job as finished."""
     content = result.model_dump_json(indent=1) + "\n"
     replace_file(result.job.result(root), content.encode())
 
@@ -91,7 +91,7 @@ def read_result(root: Path, job: Job) -> JobResult:
 
 
 def read_results(root: Path) -> list[JobResult]:
-    """Return the results of all finished jobs of a bench, those of shared work included."""
+    """Return the results of all finished jobs of a bench, including shared jobs."""
     paths = [path for kind in ("shared", "cells") for path in root.glob(f"{kind}/*/{RESULT_FILE}")]
     found = [_read(path) for path in paths]
     return sorted(found, key=lambda result: (result.ratio, result.seed, result.method or ""))
@@ -101,4 +101,4 @@ def _read(path: Path) -> JobResult:
     try:
         return JobResult.model_validate_json(path.read_bytes())
     except (ValidationError, OSError) as error:
-        raise DataError(f"{path}: is damaged; delete it and run the bench again") from error
+        raise DataError(f"{path}: is damaged; delete it and rerun the bench") from error

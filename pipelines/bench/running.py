@@ -1,4 +1,4 @@
-"""Runs the grid: several jobs at once, shared work first; no failure stops the others."""
+"""Run the grid: several jobs at once, shared jobs first; a failed job does not stop the others."""
 
 import fcntl
 import threading
@@ -20,51 +20,51 @@ from pipelines.workspace.workspace import open_dataset
 
 Say = Callable[[str], None]
 
-_PARTS = 1000  # of the grid's bar
+_BAR_STEPS = 1000
 
 
 class RunJob(Protocol):
-    """Where jobs are done."""
+    """Runs jobs, for example in processes."""
 
-    def __call__(self, job: Job, told: ProgressCallback) -> str | None:
-        """Run a job to its end; gives None, or in one line why it failed."""
+    def __call__(self, job: Job, on_progress: ProgressCallback) -> str | None:
+        """Run a job and return None, or the reason of its failure in one line."""
         ...
 
     def end(self) -> None:
-        """End what runs, because the grid was interrupted."""
+        """Stop the running jobs, because the grid was interrupted."""
         ...
 
 
 def run_grid(bench: Bench, run_job: RunJob, workers: int, say: Say, progress: Progress) -> None:
-    """Does every job that is not done.
+    """Run every unfinished job.
 
     Raises:
-        CellsFailed: if some cells failed; the others are done.
+        CellsFailed: if some cells failed; the others are finished.
     """
     waiting = grid.waiting(bench.axes, bench.root)
     cells = [job for job in grid.jobs(bench.axes) if job.method is not None]
     done = sum(job.is_done(bench.root) for job in cells)
-    known = f"{len(cells)} cells" + (f", {done} of them finished before" if done else "")
+    summary = f"{len(cells)} cells" + (f", {done} of them already finished" if done else "")
     if not waiting:
-        say(known)
+        say(summary)
         return
-    with progress.track("grid", _PARTS) as advance:
+    with progress.track("grid", _BAR_STEPS) as advance:
         run = _GridRun(bench, waiting, say, advance)
-        say(f"{known}: about {_minutes(run.total / workers)} with {workers} at once")
+        say(f"{summary}: about {_minutes(run.total / workers)} with {workers} at once")
         failed = run.go(run_job, workers)
     if failed:
         raise CellsFailed(
-            f"{failed} of {len(cells)} cells failed; the others are kept. Mend the cause and run "
-            "the same command again: finished cells are not redone"
+            f"{failed} of {len(cells)} cells failed. Fix the cause and rerun the command; finished "
+            "cells are kept"
         )
 
 
 @contextmanager
 def alone(root: Path) -> Iterator[None]:
-    """Hold the bench's folder; the operating system lets go of it with the process.
+    """Lock the bench's folder; the operating system releases the lock when the process ends.
 
     Raises:
-        WorkspaceError: if another process holds it.
+        WorkspaceError: if another process holds the lock.
     """
     root.mkdir(parents=True, exist_ok=True)
     with (root / ".lock").open("w") as file:
@@ -72,13 +72,13 @@ def alone(root: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise WorkspaceError(
-                f"{root}: another `curate bench` works here; wait for it or end it"
+                f"{root}: another `curate bench` is running in this folder; wait for it or stop it"
             ) from error
         yield
 
 
 class _GridRun:
-    """One run over the waiting jobs."""
+    """One run of the unfinished jobs."""
 
     def __init__(self, bench: Bench, waiting: list[Job], say: Say, advance: Advance) -> None:
         self.bench, self.say = bench, say
@@ -97,7 +97,7 @@ class _GridRun:
         return grid.work(job, self.bench.config(job.seed, job.method), self.sizes)
 
     def go(self, run_job: RunJob, workers: int) -> int:
-        """Run all jobs; gives how many cells failed."""
+        """Run all jobs and return the number of failed cells."""
         running: dict[Future[str | None], Job] = {}
         with ThreadPoolExecutor(workers) as pool:
             try:
@@ -115,44 +115,44 @@ class _GridRun:
         return sum(job.method is not None for job in self.failed)
 
     def _ready(self) -> list[Job]:
-        """Return the waiting jobs whose shared work is done."""
+        """Return the waiting jobs that can start: their shared job is finished."""
         root = self.bench.root
         return [job for job in self.waiting if job.method is None or job.shared.is_done(root)]
 
     def _announce(self, job: Job) -> None:
         work = self.work(job)
         frames = sum(units for kind, units in work.items() if kind != grid.TRAIN)
-        guess = "" if self.costs.measured else ", a first guess"
+        guess = "" if self.costs.measured else ", a rough estimate"
         self.say(
             f"{job}: about {_minutes(self.costs.seconds(work))} ({work[grid.TRAIN]} steps, "
             f"{frames} frame passes{guess})"
         )
 
-    def _end(self, job: Job, fault: str | None) -> None:
-        """Take a job's end into account, and says how it went."""
+    def _end(self, job: Job, error: str | None) -> None:
+        """Record the end of a job and print its result; a failed job fails its dependent jobs."""
         self._bar.finish(job)
-        if fault is None:
+        if error is None:
             result = read_result(self.bench.root, job)
             self.costs.learn(result)
-            strict, loose = (result.mean(overlaps, "3d") for overlaps in ("kitti", "loose"))
+            kitti, relaxed = (result.mean(overlaps, "3d") for overlaps in ("kitti", "loose"))
             notes = f", {result.failed_frames} frame results failed" if result.failed_frames else ""
             self.say(
-                f"{job}: mean 3D AP {strict:.1f}, at loose overlaps {loose:.1f}, in "
+                f"{job}: mean 3D AP {kitti:.1f}, at relaxed IoU thresholds {relaxed:.1f}, in "
                 f"{_minutes(result.seconds)}{notes}"
             )
             return
-        self.failed[job] = fault
+        self.failed[job] = error
         dependent = [other for other in self.waiting if other.shared == job]
         for other in dependent:
             self.waiting.remove(other)
-            self.failed[other] = fault
+            self.failed[other] = error
             self._bar.finish(other)
         without = f" (so {len(dependent)} cells cannot run)" if dependent else ""
-        self.say(f"{job}: failed{without}: {fault}")
+        self.say(f"{job}: failed{without}: {error}")
 
 
 class _GridBar:
-    """Turns units of work of many jobs into one bar, weighed by what they are expected to cost."""
+    """One progress bar for the work of many jobs, weighted by its expected time."""
 
     def __init__(
         self, seconds: Mapping[Job, float], rates: Mapping[str, float], advance: Advance
@@ -165,25 +165,25 @@ class _GridBar:
         self._lock = threading.Lock()
 
     def progress_of(self, job: Job) -> ProgressCallback:
-        """Take a job's finished units."""
+        """Return the function that counts the finished units of a job."""
 
-        def told(kind: str, units: int) -> None:
+        def on_progress(kind: str, units: int) -> None:
             with self._lock:
                 now = self._done[job] + units * self._rates.get(kind, 0.0)
                 self._done[job] = min(now, self._seconds[job])
                 self._show()
 
-        return told
+        return on_progress
 
     def finish(self, job: Job) -> None:
-        """Count a job as done, however it ended."""
+        """Count a job as finished, also if it failed."""
         with self._lock:
             self._done[job] = self._seconds[job]
             self._finished += 1
             self._show()
 
     def _show(self) -> None:
-        now = int(_PARTS * sum(self._done.values()) / self._total + 1e-6)
+        now = int(_BAR_STEPS * sum(self._done.values()) / self._total + 1e-6)
         self._advance(now - self._shown, f"{self._finished} of {len(self._done)} jobs")
         self._shown = now
 

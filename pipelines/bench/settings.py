@@ -1,4 +1,4 @@
-"""What all cells of a bench have in common, and the configuration that follows from it."""
+"""The common settings of all cells of a bench, and the configuration of each cell."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,8 +19,8 @@ from pipelines.workspace.config_faults import describe_faults
 SYNTHETIC = "synthetic"
 SETTINGS_FILE = "bench.json"
 SIMULATION_FILE = "simulation.json"
-# Settings that the grid itself decides, and the option that does.
-OWN = {
+# Settings that overrides may not change, and the option that sets them.
+FIXED = {
     "dataset.kind": "--data",
     "dataset.root": "--data",
     "run.method": "--methods",
@@ -31,20 +31,20 @@ OWN = {
     "run.seed": "--seeds",
     "run.executor": "--workers",
     "run.workers": "--workers",
-    "run.database": "nothing: every cell keeps its own database",
+    "run.database": None,
 }
 
 
 class BenchSettings(Section):
-    """What cells must share to be comparable; a bench's folder holds one of these.
+    """The settings that all cells of a bench share, because cells must be comparable.
 
     Attributes:
         data: "synthetic", or a folder in KITTI's layout.
-        frames: training frames to simulate; None for a folder.
-        val: validation frames to simulate; None for a folder.
-        data_seed: of the simulation; None for a folder.
+        frames: number of training frames to simulate; None for a folder.
+        val: number of validation frames to simulate; None for a folder.
+        data_seed: seed of the simulation; None for a folder.
         steps: optimiser steps of every round.
-        teacher_steps: of the teacher's training; None for as many.
+        teacher_steps: optimiser steps of the teacher's training; None for the same number.
         rounds: E.
         overrides: "section.key=value", for every method.
     """
@@ -65,7 +65,7 @@ class Axes(Section):
     Attributes:
         methods: names in `METHODS`.
         ratios: shares of the training frames that are labeled.
-        seeds: of the draw of labeled frames, of training and of the augmented views.
+        seeds: seeds of the draw of labeled frames, of training and of the augmented views.
     """
 
     methods: tuple[str, ...]
@@ -78,9 +78,9 @@ class Bench:
     """A bench on disk.
 
     Attributes:
-        root: its folder, absolute.
+        root: absolute path of its folder.
         settings: see `BenchSettings`.
-        axes: the grid that was asked for last.
+        axes: the grid of the last run.
     """
 
     root: Path
@@ -89,19 +89,19 @@ class Bench:
 
     @property
     def data(self) -> Path:
-        """The data set."""
+        """The folder of the data set."""
         return self.root / "data" if self.settings.data == SYNTHETIC else Path(self.settings.data)
 
     @property
     def simulated(self) -> bool:
-        """Whether the truth of X_u is known because it was simulated."""
+        """Whether the data is simulated, so that the ground truth of X_u is known."""
         return self.settings.data == SYNTHETIC or (self.data / SIMULATION_FILE).is_file()
 
     def config(self, seed: int, method: str | None = None) -> Config:
-        """Return the settings of a cell's workspace; without a method, of what all methods share.
+        """Return the configuration of a cell; without a method, of the shared job.
 
         Raises:
-            ConfigError: if an override is wrong, or the method decides it.
+            ConfigError: if an override is invalid, or the method sets the same setting.
         """
         overrides = _parsed(self.settings.overrides)
         document: dict[str, Any] = {
@@ -119,35 +119,39 @@ class Bench:
         shared = make_config(document, "curate bench")
         if trainable(shared.detector.name) is None:
             raise ConfigError(
-                f"--set detector.name={shared.detector.name}: a bench trains its detector; use "
-                f"one of {', '.join(trainable_names())}"
+                f"--set detector.name={shared.detector.name}: a bench needs a detector that it can "
+                f"train; use one of {', '.join(trainable_names())}"
             )
         return shared if method is None else _under(shared, method, overrides)
 
 
 def check_axes(axes: Axes) -> Axes:
-    """Return the axes as they are.
+    """Check the axes and return them unchanged.
 
     Raises:
-        ConfigError: if an axis is empty or repeats itself, or a method or ratio does not exist.
+        ConfigError: if an axis is empty or has duplicates, or a method, ratio or seed is invalid.
     """
     for name, values in axes.model_dump().items():
         if not values or len(set(values)) < len(values):
-            raise ConfigError(f"--{name} {','.join(map(str, values))}: give one or more, each once")
+            raise ConfigError(
+                f"--{name} {','.join(map(str, values))}: give one or more values without duplicates"
+            )
     unknown = [name for name in axes.methods if name not in METHODS]
     if unknown:
         meant = did_you_mean(unknown[0], METHODS)
-        raise ConfigError(f"--methods {unknown[0]}: use some of {', '.join(METHODS)}{meant}")
+        raise ConfigError(
+            f"--methods {unknown[0]}: unknown method; choose from {', '.join(METHODS)}{meant}"
+        )
     for ratio in axes.ratios:
         if not 0 < ratio <= 1:
-            raise ConfigError(f"--ratios {ratio:g}: a share is above 0 and at most 1")
+            raise ConfigError(f"--ratios {ratio:g}: must be above 0 and at most 1")
     if min(axes.seeds) < 0:
         raise ConfigError(f"--seeds {min(axes.seeds)}: must not be negative")
     return axes
 
 
 def read_bench(root: Path) -> Bench | None:
-    """Return the bench in a folder; None where there is none yet.
+    """Return the bench in a folder; None if there is none yet.
 
     Raises:
         DataError: if its settings are damaged.
@@ -170,22 +174,25 @@ def read_bench(root: Path) -> Bench | None:
 
 
 def claim(bench: Bench) -> None:
-    """Mark the folder with the bench; a grid may grow, what its cells share may not change.
+    """Write the settings of the bench into its folder.
+
+    The grid may change later, but not the settings, because all cells must be comparable.
 
     Raises:
-        WorkspaceError: if the folder holds a bench with other settings.
+        WorkspaceError: if the folder contains a bench with other settings.
     """
     stored = read_bench(bench.root)
     if stored is not None and stored.settings != bench.settings:
-        held, asked = stored.settings.model_dump(), bench.settings.model_dump()
-        changed = [name for name in asked if held[name] != asked[name]]
+        before, requested = stored.settings.model_dump(), bench.settings.model_dump()
+        changed = [name for name in requested if before[name] != requested[name]]
         differences = ", ".join(
-            f"{name.replace('_', '-')} {_shown(held[name])} instead of {_shown(asked[name])}"
+            f"{name.replace('_', '-')} {_as_text(before[name])} instead of "
+            f"{_as_text(requested[name])}"
             for name in changed
         )
         raise WorkspaceError(
-            f"{bench.root}: holds a bench with {differences}; its cells could not be compared, "
-            "choose another folder"
+            f"{bench.root}: contains a bench with {differences}; its cells would not be "
+            "comparable: choose another folder"
         )
     document = {
         "settings": bench.settings.model_dump(mode="json"),
@@ -195,28 +202,30 @@ def claim(bench: Bench) -> None:
 
 
 def _under(shared: Config, method: str, overrides: Mapping[str, Any]) -> Config:
-    """Return the shared settings under a method, which must leave the overrides alone."""
+    """Return the configuration of a method; it may not change settings of the overrides."""
     config = with_method(shared, method)
     before, after = shared.model_dump(), config.model_dump()
     for path in _paths(overrides):
         if _at(before, path) != _at(after, path):
-            raise ConfigError(f"--set {'.'.join(path)}: method {method} decides that itself")
+            raise ConfigError(f"--set {'.'.join(path)}: the method {method} sets this itself")
     return config
 
 
 def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
-    """Return the overrides as a document."""
+    """Parse the overrides into a configuration document."""
     document: dict[str, Any] = {}
     for override in overrides:
         key = override.partition("=")[0].strip()
-        if key in OWN:
-            raise ConfigError(f"--set {override}: decided by {OWN[key]}")
+        if key in FIXED:
+            option = FIXED[key]
+            reason = f"use {option}" if option else "every cell has its own database"
+            raise ConfigError(f"--set {override}: cannot be set for a bench; {reason}")
         change_setting(document, override)
     return document
 
 
 def _merge(document: dict[str, Any], other: Mapping[str, Any]) -> None:
-    """Put the other document's values into the first, table by table."""
+    """Update a document with the values of another one, table by table."""
     for key, value in other.items():
         if isinstance(value, dict) and isinstance(document.get(key), dict):
             _merge(document[key], value)
@@ -225,7 +234,7 @@ def _merge(document: dict[str, Any], other: Mapping[str, Any]) -> None:
 
 
 def _paths(document: Mapping[str, Any], of: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Yield the paths of the document's values."""
+    """Yield the path of every value in a document."""
     for key, value in document.items():
         if isinstance(value, dict):
             yield from _paths(value, (*of, key))
@@ -240,5 +249,5 @@ def _at(document: Mapping[str, Any], path: Sequence[str]) -> Any:
     return value
 
 
-def _shown(value: Any) -> str:
+def _as_text(value: Any) -> str:
     return " ".join(value) or "none" if isinstance(value, tuple) else str(value)

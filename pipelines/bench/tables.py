@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from curate.evaluation.comparison import PairedDifference, Spread, paired_difference, spread
-from curate.evaluation.kitti_rules import DIFFICULTIES, LOOSE_OVERLAPS, MIN_OVERLAPS
+from curate.evaluation.kitti_rules import DIFFICULTIES, MIN_OVERLAPS, RELAXED_OVERLAPS
 from pipelines.bench.grid import Job
 from pipelines.bench.results import JobResult, Levels
 from pipelines.stages.methods import METHODS
 
 BASELINE = "baseline"
 TEACHER = "teacher"
-RULES = {"kitti": MIN_OVERLAPS, "loose": LOOSE_OVERLAPS}
+RULES = {"kitti": MIN_OVERLAPS, "loose": RELAXED_OVERLAPS}
 NAMES = {"3d": "3D AP", "bev": "BEV AP", "recall": "recall, 3D"}
-# What is tabulated per ratio: overlaps and figure.
+# The tables of each ratio: IoU thresholds and figure.
 PER_RATIO = (
     ("kitti", "3d"), ("kitti", "bev"), ("kitti", "recall"), ("loose", "3d"), ("loose", "bev"),
 )  # fmt: skip
@@ -25,7 +25,7 @@ SUMMARISED = (("kitti", "3d"), ("loose", "3d"), ("kitti", "bev"), ("loose", "bev
 
 @dataclass(frozen=True)
 class Entry:
-    """A figure over the seeds, and by how much it is above the baseline's on the same seeds."""
+    """A figure over the seeds, and its gain over the baseline on the same seeds."""
 
     spread: Spread
     gain: float = math.nan
@@ -33,7 +33,7 @@ class Entry:
 
     @property
     def short(self) -> str:
-        """Mean and standard deviation."""
+        """Mean and standard deviation as text."""
         if math.isnan(self.spread.mean):
             return "-"
         std = "" if math.isnan(self.spread.std) else f"±{self.spread.std:.{self.digits}f}"
@@ -41,13 +41,13 @@ class Entry:
 
     @property
     def full(self) -> str:
-        """With the gain."""
+        """Mean, standard deviation and gain as text."""
         text = self.short.replace("±", " ± ")
         return text if math.isnan(self.gain) else f"{text} ({signed(self.gain)})"
 
 
 def signed(points: float) -> str:
-    """Return a difference with its sign; 0 has none below it."""
+    """Return a difference with its sign; 0 is +0.0, never -0.0."""
     return f"{round(points, 1) + 0.0:+.1f}"
 
 
@@ -56,13 +56,13 @@ Value = Entry | PairedDifference | str | int | float
 
 @dataclass(frozen=True)
 class Table:
-    """A table; `overlaps` is None where none is meant.
+    """A table.
 
     Attributes:
-        title: what it shows.
-        columns: their names, of one or two lines; the first is that of the row.
-        rows: one value per column.
-        overlaps: "kitti" or "loose".
+        title: title of the table.
+        columns: column names of one or two lines; the first column contains the row names.
+        rows: rows with one value per column.
+        overlaps: "kitti" or "loose"; None for a table without IoU thresholds.
     """
 
     title: str
@@ -72,15 +72,15 @@ class Table:
 
 
 class Finished:
-    """Results by method, ratio and seed.
+    """The results of finished jobs by method, ratio and seed.
 
     Args:
-        results: of all finished jobs.
+        results: the results of all finished jobs.
 
     Attributes:
-        methods: that have results, in the order of `METHODS`.
-        ratios: rising.
-        seeds: rising.
+        methods: the methods with results, in the order of `METHODS`.
+        ratios: ratios, ascending.
+        seeds: seeds, ascending.
     """
 
     def __init__(self, results: Sequence[JobResult]) -> None:
@@ -94,11 +94,11 @@ class Finished:
 
     @property
     def results(self) -> Collection[JobResult]:
-        """Of all finished jobs."""
+        """The results of all finished jobs."""
         return self._by_job.values()
 
     def result(self, method: str | None, ratio: float, seed: int) -> JobResult | None:
-        """Return a job's result, where it is finished; no method means the teacher."""
+        """Return the result of a job, None if it is not finished; no method means the teacher."""
         return self._by_job.get(Job(ratio, seed, method))
 
     @property
@@ -107,7 +107,7 @@ class Finished:
         return tuple(next(iter(self.results)).recall) if self.results else ()
 
     def values(self, method: str | None, ratio: float, overlaps: str, figure: str) -> np.ndarray:
-        """(seeds, categories, 3) percent; NaN where a cell is not finished."""
+        """Return (seeds, categories, 3) percent; NaN where a cell is not finished."""
         missing: dict[str, Levels] = dict.fromkeys(self.categories, (math.nan,) * 3)
         results = [self.result(method, ratio, seed) for seed in self.seeds]
         tables = [missing if each is None else each.table(overlaps, figure) for each in results]
@@ -115,7 +115,7 @@ class Finished:
         return np.array(values, dtype=np.float64).reshape(len(self.seeds), -1, len(DIFFICULTIES))
 
     def means(self, method: str | None, ratio: float, overlaps: str, figure: str) -> np.ndarray:
-        """(seeds,) means over categories and difficulties."""
+        """Return (seeds,) means over categories and difficulties."""
         means: np.ndarray = self.values(method, ratio, overlaps, figure).mean(axis=(1, 2))
         return means
 
@@ -140,7 +140,7 @@ def all_tables(finished: Finished) -> list[Table]:
 
 
 def _of_ratio(finished: Finished, ratio: float, overlaps: str, figure: str) -> Table:
-    """The paper's table of a ratio: categories and difficulties, their mean, and the gains."""
+    """Return a table as in the paper: categories and difficulties, their mean, and the gains."""
     baseline = finished.values(BASELINE, ratio, overlaps, figure)
     rows: list[tuple[Value, ...]] = []
     for method in (None, *finished.methods):
@@ -148,8 +148,8 @@ def _of_ratio(finished: Finished, ratio: float, overlaps: str, figure: str) -> T
         compared = method not in (None, BASELINE)
         columns = (values.reshape(len(values), -1), baseline.reshape(len(values), -1))
         entries = [
-            _entry(mine, base, compared=compared)
-            for mine, base in zip(columns[0].T, columns[1].T, strict=True)
+            _entry(value, base, compared=compared)
+            for value, base in zip(columns[0].T, columns[1].T, strict=True)
         ]
         mean = _entry(values.mean(axis=(1, 2)), baseline.mean(axis=(1, 2)), compared=compared)
         gain = "" if math.isnan(mean.gain) else signed(mean.gain)
@@ -183,7 +183,7 @@ def _summary(finished: Finished, overlaps: str, figure: str) -> Table:
 
 
 def _differences(finished: Finished, overlaps: str, figure: str) -> Iterator[Table]:
-    """Differences of mean AP between methods, paired by seed, with their intervals."""
+    """Yield the differences of mean AP between methods, paired by seed, with their intervals."""
     means = {
         method: np.array(
             [finished.means(method, ratio, overlaps, figure) for ratio in finished.ratios]
@@ -192,10 +192,10 @@ def _differences(finished: Finished, overlaps: str, figure: str) -> Iterator[Tab
     }
     rows: list[tuple[Value, ...]] = []
     for better, other in _compared(finished.methods):
-        mine, base = means[better], means[other]
-        pairs = [paired_difference(*of) for of in zip(mine, base, strict=True)]
-        # A seed's differences at all ratios are not independent; its mean over them is one pair.
-        pooled = paired_difference(mine.mean(axis=0), base.mean(axis=0))
+        values, base = means[better], means[other]
+        pairs = [paired_difference(*of) for of in zip(values, base, strict=True)]
+        # The differences of a seed at several ratios are not independent: their mean is one pair.
+        pooled = paired_difference(values.mean(axis=0), base.mean(axis=0))
         rows.append((f"{better} - {other}", *pairs, pooled))
     if rows:
         yield Table(
@@ -208,19 +208,19 @@ def _differences(finished: Finished, overlaps: str, figure: str) -> Iterator[Tab
 
 
 def _compared(methods: Sequence[str]) -> list[tuple[str, str]]:
-    """Return every method with the baseline, and the paper's two with all that are not theirs."""
+    """Return the pairs to compare: every method with the baseline, the paper's with the others."""
     pairs = [(method, BASELINE) for method in methods if BASELINE in methods]
     pairs += [
-        (own, other)
-        for own, but in (("pspsl", ()), ("spsl", ("pspsl",)))
+        (paper_method, other)
+        for paper_method, excluded in (("pspsl", ()), ("spsl", ("pspsl",)))
         for other in methods
-        if own in methods and other not in (*but, BASELINE)
+        if paper_method in methods and other not in (*excluded, BASELINE)
     ]
     return [(one, other) for one, other in pairs if one != other]
 
 
 def _labels(finished: Finished, ratio: float) -> Iterator[Table]:
-    """Yield the labels of the last round, judged by the simulation's truth."""
+    """Yield the quality of the labels of the last round, against the simulated ground truth."""
     rows: list[tuple[Value, ...]] = []
     for method in finished.methods:
         results = [finished.result(method, ratio, seed) for seed in finished.seeds]
@@ -247,7 +247,7 @@ def _labels(finished: Finished, ratio: float) -> Iterator[Table]:
 
 
 def _times(finished: Finished) -> Table:
-    """What a job took, where one run did all of it."""
+    """Return the times of the jobs that finished in a single run."""
     rows: list[tuple[Value, ...]] = []
     for method in (None, *finished.methods):
         minutes = [
@@ -257,14 +257,14 @@ def _times(finished: Finished) -> Table:
         ]
         rows.append((method or TEACHER, len(minutes), Entry(spread(_numbers(minutes)))))
     return Table(
-        "minutes per cell, one process of one thread; the teacher's once for all methods",
+        "minutes per cell, one process with one thread; the teacher is shared by all methods",
         ("method", "cells", "minutes"),
         tuple(rows),
     )
 
 
 def _entry(values: np.ndarray, baseline: np.ndarray, *, compared: bool) -> Entry:
-    """Values over the seeds; the gain is over the seeds that both have."""
+    """Return the spread over the seeds; the gain uses only seeds that both methods have."""
     gain = spread(values - baseline).mean if compared else math.nan
     return Entry(spread(values), gain)
 
@@ -278,7 +278,7 @@ def _overlaps(finished: Finished, overlaps: str) -> str:
 
 
 def _ratio(finished: Finished, ratio: float) -> str:
-    """Return a ratio with its frames, which are as many for every seed and method."""
+    """Return a ratio with its numbers of frames, which are the same for every seed and method."""
     frames = next(result.frames for result in finished.results if result.ratio == ratio)
     train = frames["labeled"] + frames["unlabeled"]
     return f"{100 * ratio:g} % labeled ({frames['labeled']} of {train} frames)"

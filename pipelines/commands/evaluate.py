@@ -147,7 +147,7 @@ def _compare(
     from curate.geometry.compiled import is_compiled
 
     kitti_ap.check_frames(labels, results)  # a fault is told alone
-    if not is_compiled(kitti_matching.tally):
+    if not is_compiled(kitti_matching.count_at_thresholds):
         typer.echo("compiling the evaluation, once: this takes some ten seconds", err=True)
     return kitti_ap.evaluate(labels, results)
 

@@ -12,7 +12,7 @@ from curate.viewing.bird_eye import draw_bird_eye
 from curate.viewing.canvas import Canvas, save_png
 from curate.viewing.chart_style import ImageFormat
 from curate.viewing.frame_view import paint_frame
-from curate.viewing.overlay import Shown, draw_overlay
+from curate.viewing.overlay import FrameContent, draw_overlay
 from curate.viewing.palette import DARK, Style
 from curate.viewing.tags import ShownLabels
 from pipelines.labels.columns import LabelColumns, read_columns
@@ -118,7 +118,7 @@ def _painted(
     number, policy = weighted
     found = read_frame(workspace, name, number, policy)
     frame = workspace.dataset.read(name, image=True)
-    shown = Shown(
+    shown = FrameContent(
         shown_labels(workspace, frame, found, policy),
         found.truth_boxes,
         found.repredictions,

@@ -10,7 +10,7 @@ from sqlalchemy import select
 from curate.files.atomic import replace_file
 from curate.viewing.chart_style import Chart, ImageFormat
 from curate.viewing.charts import reliability
-from curate.viewing.close_up import LabelShown, draw_close_up
+from curate.viewing.close_up import CloseUpLabel, draw_close_up
 from curate.viewing.page import Figure, Section, render_page
 from db import bulk
 from db.views import WEIGHTED_LABELS
@@ -130,7 +130,7 @@ def _changed(workspace: Workspace, found: Difference, each: ChangedLabel) -> Fig
         for number, k in zip(found.rounds, (each.k_before, each.k_after), strict=True)
         if k is not None
     ]
-    label = LabelShown(boxes[-1], each.weight_after, boxes[0] if len(boxes) == 2 else None)
+    label = CloseUpLabel(boxes[-1], each.weight_after, boxes[0] if len(boxes) == 2 else None)
     caption = (
         f"{each.change}: {each.category} in frame {each.frame}, weight "
         f"{each.weight_before:.2f} to {each.weight_after:.2f}"
@@ -167,7 +167,7 @@ def _shown(
         _close_up(
             workspace,
             each.frame,
-            LabelShown(each.box, each.numbers["weight"]),
+            CloseUpLabel(each.box, each.numbers["weight"]),
             _describe_label(
                 each,
                 priors,
@@ -247,6 +247,6 @@ def _box(workspace: Workspace, number: int, policy: str, frame: str, k: int) -> 
     return box
 
 
-def _close_up(workspace: Workspace, name: str, label: LabelShown, caption: str) -> Figure:
+def _close_up(workspace: Workspace, name: str, label: CloseUpLabel, caption: str) -> Figure:
     frame = workspace.dataset.read(name, image=True)
-    return Figure.picture(draw_close_up(frame, label), caption)
+    return Figure.of_image(draw_close_up(frame, label), caption)

@@ -329,7 +329,7 @@ def test_a_link_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
         exporter.write(target, labels)
     path.symlink_to(target)
     before = sorted(path.parent.iterdir())
-    with pytest.raises(ConfigError, match=f"{path.name}: is a link") as caught:
+    with pytest.raises(ConfigError, match=f"{path.name}: is a symbolic link") as caught:
         exporter.write(path, labels)
     assert_one_line(caught.value)
     assert path.is_symlink()

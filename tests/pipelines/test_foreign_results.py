@@ -64,7 +64,7 @@ def test_the_priors_alone_weigh_where_the_setting_says_so(
     """Every label weighs rho_det, and explain works it out again."""
     work = tmp_path / "work"
     begin(curate, work, toy_kitti, results, "--set", "solve.self_paced=false")
-    assert "the priors alone weigh" in curate("doctor", "-w", work)[1]
+    assert "the weights come from the priors only" in curate("doctor", "-w", work)[1]
     code, _, err = curate("run", "-w", work)
     assert code == 0, err
     assert "no second pass" not in caplog.text

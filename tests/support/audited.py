@@ -4,7 +4,7 @@ import numpy as np
 
 from curate.detections import as_categories
 from curate.evaluation.audit import audit
-from curate.evaluation.judged_labels import JudgedLabels
+from curate.evaluation.evaluated_labels import EvaluatedLabels
 
 WEIGHTS = {
     "good": np.array([0.9, 0.8, 0.15, 0.05, 0.5, 0.0]),
@@ -19,13 +19,13 @@ def six_labels(points=(5, 60, 300, 5, 60, 20)):
 
     Distances 10, 30, 30, 50, 10 and 15 m.
     """
-    return JudgedLabels(
+    return EvaluatedLabels(
         frames=3,
         frame_index=np.array([0, 0, 1, 1, 1, 1]),
         category=as_categories(["Car"] * 5 + ["Cyclist"]),
         distance=np.array([10.0, 30, 30, 50, 10, 15]),
         points=np.array(points, dtype=np.float64),
-        right=np.array([True, True, False, False, False, False]),
+        correct=np.array([True, True, False, False, False, False]),
         counted=np.array([True, True, True, True, False, True]),
         object_frame=np.array([0, 0, 1, 1, 2]),
         object_category=as_categories(["Car", "Car", "Car", "Car", "Cyclist"]),
@@ -50,13 +50,13 @@ def many_labels(frames=60, seed=0):
     frame = np.repeat(np.arange(frames), 5)
     n = len(frame)
     right = generator.random(n) < 0.4
-    labels = JudgedLabels(
+    labels = EvaluatedLabels(
         frames=frames,
         frame_index=frame,
         category=as_categories(generator.choice(["Car", "Cyclist"], n)),
         distance=generator.uniform(0, 60, n),
         points=generator.integers(0, 400, n).astype(float),
-        right=right,
+        correct=right,
         counted=np.full(n, True),
         object_frame=frame,
         object_category=as_categories(["Car"] * n),

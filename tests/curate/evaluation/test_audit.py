@@ -5,7 +5,7 @@ import pytest
 from support.audited import WEIGHTS, many_labels, six_labels, small_audit
 
 from curate.evaluation.audit import audit
-from curate.evaluation.judged_labels import JudgedLabels
+from curate.evaluation.evaluated_labels import EvaluatedLabels
 
 
 def part(found, policy, category, name):
@@ -115,7 +115,7 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says():
     for seed in range(60):
         labels, _ = many_labels(frames=50, seed=seed)
         u = np.random.default_rng(1000 + seed).random((2, len(labels)))
-        weights = np.where(labels.right, u[0], u[0] * u[1])
+        weights = np.where(labels.correct, u[0], u[0] * u[1])
         found = audit(
             labels, {"judge": weights}, (), np.random.default_rng(seed), replicates=200, level=0.8
         ).whole()["judge"]
@@ -136,7 +136,7 @@ def test_the_same_seed_gives_the_same_audit():
 def test_the_order_of_frames_does_not_change_a_figure():
     """Frames renumbered backwards."""
     labels = six_labels()
-    turned = JudgedLabels(
+    turned = EvaluatedLabels(
         **{
             **vars(labels),
             "frame_index": 2 - labels.frame_index,
@@ -151,7 +151,7 @@ def test_the_order_of_frames_does_not_change_a_figure():
 
 def test_no_labels_and_no_objects_are_no_failure():
     """Counts of 0 and figures that are undefined."""
-    nothing = JudgedLabels.no_frames()
+    nothing = EvaluatedLabels.no_frames()
     found = small_audit({name: np.zeros(0) for name in WEIGHTS}, nothing).whole()["good"]
     assert (found.labels, found.right, found.objects) == (0, 0, 0)
     for name in ("share_right", "auroc", "weighted_precision", "weighted_recall"):

@@ -7,7 +7,7 @@ from support.audited import many_labels, six_labels, small_audit
 
 from curate.evaluation.audit import audit
 from curate.evaluation.audit_summary import as_numbers, summary_sentences
-from curate.evaluation.judged_labels import JudgedLabels
+from curate.evaluation.evaluated_labels import EvaluatedLabels
 
 
 def words(labels, weights, policies, evidence=()):
@@ -19,28 +19,28 @@ def words(labels, weights, policies, evidence=()):
 def test_it_says_how_much_is_right_and_what_was_left_out():
     """In all and by category, with the neutral labels and a warning for few frames."""
     text = " ".join(summary_sentences(small_audit(), ("good", "bad", "all"), ()))
-    assert text.startswith("2 of 5 labels are right, 40.0 % (")
+    assert text.startswith("2 of 5 labels are correct, 40.0 % (")
     assert "on 3 frames with 5 objects (Car 50.0 %, Cyclist 0.0 %)" in text
-    assert "1 more are neither right nor wrong" in text
-    assert "With 3 frames the intervals are rough" in text
+    assert "1 more are neither correct nor wrong" in text
+    assert "With 3 frames the intervals are only approximate" in text
 
 
 def test_it_names_the_best_judge_and_the_next():
     """With the difference, and whether that may be chance."""
     labels, weights = many_labels()
     text = words(labels, weights, ("blind", "good"))
-    assert "Of the policies, good judges best: AUROC 1.000" in text
-    assert "before blind with 0.5" in text
-    assert "is more than chance" in text
+    assert "Of the policies, good ranks the labels best: AUROC 1.000" in text
+    assert "Next is blind with 0.5" in text
+    assert "is significant" in text
     weights["as blind"] = np.random.default_rng(4).random(len(labels))
-    assert "may be chance" in words(labels, weights, ("blind", "as blind"))
+    assert "is not significant" in words(labels, weights, ("blind", "as blind"))
 
 
 def test_it_says_where_the_weight_lies():
     """The best policy by that measure first, with the share of each."""
     text = " ".join(summary_sentences(small_audit(), ("all", "good"), ()))
-    assert "from good, 89.5 %" in text
-    assert text.endswith("lies on right labels; all 40.0 %.")
+    assert "that good gives, 89.5 %" in text
+    assert text.endswith("is on correct labels; all 40.0 %.")
 
 
 def test_evidence_that_judges_better_than_every_policy_is_not_hidden():
@@ -54,17 +54,19 @@ def test_evidence_that_judges_better_than_every_policy_is_not_hidden():
 
 def test_evidence_without_a_policy_is_judged_too():
     """As if each piece were a policy."""
-    assert "good judges best" in words(*many_labels(), (), ("good", "blind"))
+    assert "good ranks the labels best" in words(*many_labels(), (), ("good", "blind"))
 
 
 def test_nothing_to_tell_apart_is_said():
     """All wrong, and no labels at all."""
     wrong = six_labels()
-    wrong.right[:] = False
+    wrong.correct[:] = False
     text = words(wrong, {"all": np.ones(6)}, ("all",))
-    assert "All labels are wrong, so no weight can tell right from wrong" in text
-    nothing = words(JudgedLabels.no_frames(), {"all": np.zeros(0)}, ("all",))
-    assert nothing == "There is no label on 0 frames with 0 objects, so there is nothing to audit."
+    assert "All labels are wrong, so the AUROC is undefined" in text
+    nothing = words(EvaluatedLabels.no_frames(), {"all": np.zeros(0)}, ("all",))
+    assert (
+        nothing == "There are no labels on 0 frames with 0 objects, so there is nothing to audit."
+    )
 
 
 def test_the_numbers_are_strict_json():

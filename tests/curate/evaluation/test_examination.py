@@ -67,13 +67,13 @@ def test_a_sound_frame_is_ok():
         (lambda b: b[:, [0, 1, 2, 4, 3, 5, 6]], "turned by 90 degrees"),
         (lambda b: b * [1, 1, 1, 1, 1, 1, -1], "yaw is negated"),
         (lambda b: b * [1, 1, 1, 1, 1, 1, -1] - [0, 0, 0, 0, 0, 0, np.pi / 2], "rotation_y"),
-        (lambda b: b - b[:, 5:6] / 2 * [0, 0, 1, 0, 0, 0, 0], "z is that of the bottom"),
-        (lambda b: b + b[:, 5:6] / 2 * [0, 0, 1, 0, 0, 0, 0], "their centre was taken for"),
+        (lambda b: b - b[:, 5:6] / 2 * [0, 0, 1, 0, 0, 0, 0], "z is the bottom of the box"),
+        (lambda b: b + b[:, 5:6] / 2 * [0, 0, 1, 0, 0, 0, 0], "z is the top of the box"),
         (
             lambda b: np.column_stack(
                 [-b[:, 1], -b[:, 2] + b[:, 5] / 2, b[:, 0], b[:, 3:6], -b[:, 6] - np.pi / 2]
             ),
-            "camera's frame of reference",
+            "converted from the camera frame",
         ),
     ],
 )
@@ -135,4 +135,4 @@ def test_real_boxes_are_sound_and_wrong_ones_are_found(kitti_root):
     assert {one.state for one in said["right"]} == {"ok"}
     assert all("90 degrees" in one.message or "rotation_y" in one.message for one in said["turned"])
     assert np.mean(["bottom" in one.message for one in said["bottom"]]) > 0.75
-    assert np.mean(["taken for" in one.message for one in said["high"]]) > 0.65
+    assert np.mean(["top of the box" in one.message for one in said["high"]]) > 0.65

@@ -288,7 +288,7 @@ def test_results_without_scores_or_frames_are_refused():
     labels = objects_of([[car()]])
     with pytest.raises(DataError, match="results of frame 0, object 1: no score"):
         evaluate(labels, objects_of([[car(), car(score=np.nan)]]))
-    with pytest.raises(DataError, match="labels of 1 frames"):
+    with pytest.raises(DataError, match="1 frames of labels"):
         evaluate(labels, [])
 
 

@@ -54,7 +54,7 @@ def test_a_missing_result_file_is_an_error(folders):
     """It names the first file and the remedy; a partial run is not scored as a whole one."""
     (folders[1] / "000002.txt").unlink()
     (folders[1] / "000007.txt").unlink()
-    with pytest.raises(DataError, match=r"results/000002\.txt.*and 1 other frames.*empty one"):
+    with pytest.raises(DataError, match=r"results/000002\.txt.*and 1 other frames.*empty file"):
         read_folders(*folders)
 
 
@@ -89,5 +89,5 @@ def test_folders_without_text_files_are_refused(folders, tmp_path):
     with pytest.raises(DataError, match="no such folder"):
         read_folders(tmp_path / "absent", folders[1])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match=r"holds no \.txt files"):
+    with pytest.raises(DataError, match=r"no \.txt files"):
         read_folders(folders[0], tmp_path / "empty")

@@ -71,5 +71,5 @@ def test_greedy_against_a_plain_loop():
 
 def test_an_overlap_without_meaning_is_refused():
     """At 1 nothing could match."""
-    with pytest.raises(ConfigError, match="least overlap"):
+    with pytest.raises(ConfigError, match="minimum IoU"):
         compare_labels(labels([]), labels([]), 1.0)

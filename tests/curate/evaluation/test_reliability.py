@@ -9,11 +9,11 @@ from oracles import ranking
 from curate.detections import Annotations, Detections, as_categories
 from curate.errors import ConfigError
 from curate.evaluation.reliability import (
-    JudgeSettings,
+    MatchSettings,
     auroc,
     average_precision,
     expected_calibration_error,
-    judge,
+    match_to_ground_truth,
     reliability_bins,
     weighted_precision,
     weighted_recall,
@@ -51,11 +51,11 @@ def truth(boxes, categories=None, boxes_2d=None):
 def test_a_label_is_right_above_the_minimum_iou_of_its_category():
     """A shift of 0.8 m along 4 m is an IoU of 2/3: enough for a cyclist, not for a car."""
     shifted = [car_at(0.8), car_at(20.8)]
-    found = judge(
+    found = match_to_ground_truth(
         labels(shifted, categories=["Car", "Cyclist"]),
         truth([car_at(0), car_at(20)], ["Car", "Cyclist"]),
     )
-    assert found.right.tolist() == [False, True]
+    assert found.correct.tolist() == [False, True]
     assert found.matched.tolist() == [-1, 1]
     assert found.iou == pytest.approx([2 / 3, 2 / 3])
     assert found.counted.tolist() == [True, True]
@@ -64,36 +64,40 @@ def test_a_label_is_right_above_the_minimum_iou_of_its_category():
 
 def test_an_iou_equal_to_the_minimum_is_wrong():
     """The IoU must exceed it."""
-    settings_ = JudgeSettings(minimum_iou={"Car": 1.0})
-    assert not judge(labels([car_at(0)]), truth([car_at(0)]), settings_).right[0]
+    settings_ = MatchSettings(minimum_iou={"Car": 1.0})
+    assert not match_to_ground_truth(labels([car_at(0)]), truth([car_at(0)]), settings_).correct[0]
 
 
 def test_height_counts_for_3d_only():
     """The same footprint 0.5 m higher: right in BEV, wrong in 3D."""
     lifted = labels([car_at(0, z=0.5)])
-    assert judge(lifted, truth([car_at(0)]), JudgeSettings(overlap="bev")).right[0]
-    assert not judge(lifted, truth([car_at(0)]), JudgeSettings(overlap="3d")).right[0]
+    assert match_to_ground_truth(lifted, truth([car_at(0)]), MatchSettings(overlap="bev")).correct[
+        0
+    ]
+    assert not match_to_ground_truth(
+        lifted, truth([car_at(0)]), MatchSettings(overlap="3d")
+    ).correct[0]
 
 
 def test_a_second_label_on_the_same_object_is_wrong():
     """The higher score takes the object, whatever the order of the labels."""
     twice = labels([car_at(0), car_at(0.2)], scores=[0.4, 0.6])
-    found = judge(twice, truth([car_at(0)]))
-    assert found.right.tolist() == [False, True]
+    found = match_to_ground_truth(twice, truth([car_at(0)]))
+    assert found.correct.tolist() == [False, True]
     assert found.counted.tolist() == [True, True]
 
 
 def test_a_label_takes_the_object_that_fits_best():
     """Two objects qualify; the larger overlap wins and leaves the other free."""
     objects = truth([car_at(0.4), car_at(0.0)])
-    found = judge(labels([car_at(0.05), car_at(0.35)]), objects)
+    found = match_to_ground_truth(labels([car_at(0.05), car_at(0.35)]), objects)
     assert found.matched.tolist() == [1, 0]
 
 
 def test_another_category_is_no_match():
     """A perfect box with the wrong name is wrong."""
-    found = judge(labels([car_at(0)], categories=["Cyclist"]), truth([car_at(0)]))
-    assert not found.right[0]
+    found = match_to_ground_truth(labels([car_at(0)], categories=["Cyclist"]), truth([car_at(0)]))
+    assert not found.correct[0]
     assert found.counted[0]
 
 
@@ -101,12 +105,12 @@ def test_a_label_on_a_neighbour_is_neutral_or_right():
     """A van under a car label is neither; by option it counts as a car to be found."""
     van = truth([car_at(0), car_at(20)], ["Van", "Car"])
     twice = labels([car_at(0), car_at(0.1), car_at(20)])
-    neutral = judge(twice, van)
-    assert neutral.right.tolist() == [False, False, True]
+    neutral = match_to_ground_truth(twice, van)
+    assert neutral.correct.tolist() == [False, False, True]
     assert neutral.counted.tolist() == [False, False, True]
     assert neutral.ground_truths["Car"] == 1
-    right = judge(twice, van, JudgeSettings(neighbors_are="right"))
-    assert right.right.tolist() == [True, False, True]
+    right = match_to_ground_truth(twice, van, MatchSettings(neighbors_are="correct"))
+    assert right.correct.tolist() == [True, False, True]
     assert right.counted.all()
     assert right.ground_truths["Car"] == 2
 
@@ -121,12 +125,12 @@ def test_labels_in_dont_care_regions_are_neutral():
     rectangles = np.array(
         [[0, 0, 4, 4], [6, 0, 14, 10], [5, 0, 14, 10], [np.nan] * 4, [0, 0, 4, 4]]
     )
-    found = judge(
+    found = match_to_ground_truth(
         labels([car_at(0), car_at(30), car_at(40), car_at(50), car_at(60)]),
         regions,
         rectangles=rectangles,
     )
-    assert found.right.tolist() == [True, False, False, False, False]
+    assert found.correct.tolist() == [True, False, False, False, False]
     # 4 of 8 pixels of width are exactly half, which is not more than half.
     assert found.counted.tolist() == [True, True, False, True, False]
 
@@ -136,8 +140,8 @@ def test_labels_in_dont_care_regions_are_neutral():
 def test_empty_frames_are_judged(n, m):
     """No labels, no objects, or neither."""
     boxes = [car_at(0), car_at(20)]
-    found = judge(labels(boxes[:n]), truth(boxes[:m]), rectangles=np.zeros((n, 4)))
-    assert found.right.tolist() == [m > 0] * n
+    found = match_to_ground_truth(labels(boxes[:n]), truth(boxes[:m]), rectangles=np.zeros((n, 4)))
+    assert found.correct.tolist() == [m > 0] * n
     assert found.counted.all()
     assert found.ground_truths["Car"] == m
 
@@ -145,14 +149,14 @@ def test_empty_frames_are_judged(n, m):
 def test_a_category_without_minimum_iou_is_named():
     """The error names the category."""
     with pytest.raises(ConfigError, match="Tram"):
-        judge(labels([car_at(0)], categories=["Tram"]), truth([]))
+        match_to_ground_truth(labels([car_at(0)], categories=["Tram"]), truth([]))
 
 
 @pytest.mark.parametrize("wrong", [{"overlap": "image"}, {"neighbors_are": "wrong"}])
 def test_unknown_options_are_refused(wrong):
     """The error names the option."""
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        JudgeSettings(**wrong)
+        MatchSettings(**wrong)
 
 
 @settings(max_examples=40)
@@ -165,13 +169,13 @@ def test_judgement_is_one_to_one_and_blind_to_order(rows, places, random):
     """Each object makes one label right at most; shuffled labels get the same verdicts."""
     detections = labels([car_at(x / 4) for x, _ in rows], [score for _, score in rows])
     objects = truth([car_at(x / 4) for x in places])
-    found = judge(detections, objects)
-    taken = found.matched[found.right]
+    found = match_to_ground_truth(detections, objects)
+    taken = found.matched[found.correct]
     assert len(set(taken)) == len(taken)
     order = np.array(random.sample(range(len(rows)), len(rows)), dtype=np.int64)
-    again = judge(detections.select(order), objects)
-    verdict = sorted(zip(rows, found.right, strict=True))
-    assert verdict == sorted(zip([rows[i] for i in order], again.right, strict=True))
+    again = match_to_ground_truth(detections.select(order), objects)
+    verdict = sorted(zip(rows, found.correct, strict=True))
+    assert verdict == sorted(zip([rows[i] for i in order], again.correct, strict=True))
 
 
 WEIGHTED = st.lists(

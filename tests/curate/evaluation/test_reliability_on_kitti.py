@@ -9,7 +9,12 @@ from curate.consistency import consistency
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.detections import Detections
 from curate.detectors.recorded import RecordedDetector
-from curate.evaluation.reliability import JudgeSettings, auroc, judge, weighted_precision
+from curate.evaluation.reliability import (
+    MatchSettings,
+    auroc,
+    match_to_ground_truth,
+    weighted_precision,
+)
 from curate.priors.points import PointPrior, learn_thresholds
 from curate.priors.semantic import SemanticPrior
 from curate.segmenters.classes import class_map
@@ -62,12 +67,14 @@ def judged(request, kitti_root):
         back = Detections(
             similarity.invert_boxes(answered.boxes), answered.scores, answered.categories
         )
-        verdict = judge(found, dataset.annotations(frame_id), JudgeSettings(neighbors_are="right"))
+        verdict = match_to_ground_truth(
+            found, dataset.annotations(frame_id), MatchSettings(neighbors_are="correct")
+        )
         rows.append((
             np.full(len(found), index), found.categories, found.scores,
             consistency(found, back).loss,
             *(prior.score(frame, found)[prior.rho_column] for prior in priors),
-            verdict.right,
+            verdict.correct,
         ))  # fmt: skip
     *columns, diff, anno, right = (np.concatenate(column) for column in zip(*rows, strict=True))
     evidence = Evidence(*columns, {"rho_diff": diff, "rho_anno": anno})

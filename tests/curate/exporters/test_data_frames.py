@@ -156,7 +156,7 @@ def test_what_holds_no_weighted_labels_is_rejected(tmp_path):
     pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     parquet = pytest.importorskip("pyarrow.parquet")
     parquet.write_table(pyarrow.table({"frame": ["1"]}), tmp_path / "mine.parquet")
-    with pytest.raises(DataError, match="not one that curate exported"):
+    with pytest.raises(DataError, match="is not an export of curate"):
         read_labels(tmp_path / "mine.parquet")
 
 

@@ -137,7 +137,7 @@ def test_folders_that_are_no_former_export_are_left_alone(tmp_path, marker):
     label.write_text("precious")
     if marker is not None:
         (tmp_path / "training" / "export.json").write_text(marker)
-    with pytest.raises(ConfigError, match="no former export; name another folder"):
+    with pytest.raises(ConfigError, match="not a previous export; choose another folder"):
         export_kitti(tmp_path / "training", [weighted_frame()])
     assert label.read_text() == "precious"
 
@@ -145,7 +145,7 @@ def test_folders_that_are_no_former_export_are_left_alone(tmp_path, marker):
 def test_a_file_in_the_place_of_the_folder_is_left_alone(tmp_path):
     """The same for a file."""
     (tmp_path / "out").write_text("precious")
-    with pytest.raises(ConfigError, match="no former export"):
+    with pytest.raises(ConfigError, match="not a previous export"):
         export_kitti(tmp_path / "out", [weighted_frame()])
 
 

@@ -18,7 +18,7 @@ def test_weights_that_are_no_numbers_are_refused(weight):
     """SQLite keeps what another program writes into a column of numbers."""
     rows = rows_of(toy_labels())
     labels = with_rows(toy_labels(), [*rows[:2], rows[2] | {"weight": weight}])
-    with pytest.raises(DataError, match=r"frame 000001: label 2 has weight .*weights are in"):
+    with pytest.raises(DataError, match=r"frame 000001: label 2 has weight .*expected a number in"):
         list(labels.blocks())
 
 

@@ -91,5 +91,5 @@ def test_a_category_that_nuscenes_does_not_have_is_refused(dataset, tmp_path):
     """Its tools would stop at it."""
     labels = labels_of(dataset)
     rows = [row | {"category": "Tram"} for row in rows_of(labels)]
-    with pytest.raises(DataError, match="category 'Tram' is none of nuScenes'"):
+    with pytest.raises(DataError, match="category 'Tram' is not in nuScenes'"):
         NuScenesExporter().write(tmp_path / "a.json", with_rows(labels, rows))

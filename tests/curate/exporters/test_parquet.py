@@ -73,8 +73,8 @@ def test_rows_are_written_in_groups(tmp_path):
     ("column", "value", "message"),
     [
         ("score", None, "frame 000001: label 2 has no score"),
-        ("k", 2**40, "column k: not all of it is int32"),
-        ("points", "many", "column points: not all of it is int32"),
+        ("k", 2**40, "column k: not all values are of type int32"),
+        ("points", "many", "column points: not all values are of type int32"),
     ],
 )
 def test_a_value_that_does_not_fit_is_named(tmp_path, column, value, message):

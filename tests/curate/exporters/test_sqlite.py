@@ -186,7 +186,7 @@ def test_a_file_that_another_program_writes_is_not_taken_for_a_foreign_one(tmp_p
     with closing(sqlite3.connect(path, isolation_level=None, timeout=0)) as other:
         other.execute("BEGIN EXCLUSIVE")
         for look in (lambda: SqliteExporter().write(path, toy_labels()), lambda: read_frames(path)):
-            with pytest.raises(DataError, match="another program writes into it"):
+            with pytest.raises(DataError, match="another program is writing to this file"):
                 look()
         other.execute("ROLLBACK")
     SqliteExporter().write(path, toy_labels())
@@ -216,7 +216,9 @@ def test_further_evidence_stands_behind_the_core_columns(tmp_path):
 def test_further_evidence_that_does_not_fit_is_refused(tmp_path, value):
     """Text for a number, nothing where something was declared."""
     rows = [label("b", visible_faces=2, density=value)]
-    with pytest.raises(DataError, match=r"labels\.sqlite: a row was refused: .*label.density"):
+    with pytest.raises(
+        DataError, match=r"labels\.sqlite: a row violates a constraint: .*label.density"
+    ):
         write(tmp_path / "labels.sqlite", labels=rows, columns=(*WEIGHTED_LABELS, *VISIBILITY))
 
 
@@ -233,7 +235,7 @@ def test_only_plain_columns_may_stand_behind_the_core_ones(tmp_path, column):
             "DROP VIEW weighted_labels; DROP TABLE label;"
             + made.replace("    split TEXT", f"    {column},\n    split TEXT")
         )
-    with pytest.raises(DataError, match="table label is not the one that an export makes"):
+    with pytest.raises(DataError, match="table label differs from that of an export"):
         read_frames(path)
 
 

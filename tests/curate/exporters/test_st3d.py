@@ -39,6 +39,6 @@ def test_a_category_without_a_number_is_refused(tmp_path):
     """The error names the frame and what is configured."""
     labels = toy_labels()
     fewer = replace(labels, description=replace(labels.description, categories=("Car",)))
-    with pytest.raises(DataError, match="frame 000001: category 'Pedestrian' has no number"):
+    with pytest.raises(DataError, match="frame 000001: category 'Pedestrian' is not in"):
         ST3DExporter().write(tmp_path / "out", fewer)
     assert list(tmp_path.iterdir()) == []

@@ -10,7 +10,7 @@ from support.audited import many_labels, six_labels, small_audit
 
 from curate.errors import ConfigError
 from curate.evaluation.audit import audit
-from curate.evaluation.judged_labels import JudgedLabels
+from curate.evaluation.evaluated_labels import EvaluatedLabels
 from curate.viewing.chart_style import check_format
 from curate.viewing.charts import (
     Curve,
@@ -90,7 +90,7 @@ def test_honest_weights_lie_on_the_diagonal():
     labels, _ = many_labels(frames=200)
     generator = np.random.default_rng(0)
     weights = generator.random(len(labels))
-    labels.right[:] = generator.random(len(labels)) < weights
+    labels.correct[:] = generator.random(len(labels)) < weights
     found = audit(labels, {"honest": weights}, (), generator, replicates=20)
     x, y = places(audit_chart(found, "title").figure.get_axes()[0]).T
     assert len(x) == 10
@@ -116,10 +116,10 @@ def test_every_policy_has_its_panel_and_its_auroc(policies):
 def test_undefined_figures_are_drawn_as_nothing():
     """All labels wrong, and no labels at all."""
     wrong = six_labels()
-    wrong.right[:] = False
+    wrong.correct[:] = False
     for found in (
         small_audit(labels=wrong),
-        small_audit({"all": np.zeros(0)}, JudgedLabels.no_frames()),
+        small_audit({"all": np.zeros(0)}, EvaluatedLabels.no_frames()),
     ):
         chart = audit_chart(found, "title")
         assert not drawn(chart.figure.get_axes()[-1], "dot")

@@ -9,7 +9,7 @@ from support.toys import toy_calibration
 
 from curate.frames import Frame
 from curate.viewing.charts import histogram
-from curate.viewing.close_up import LabelShown, draw_close_up
+from curate.viewing.close_up import CloseUpLabel, draw_close_up
 from curate.viewing.page import Figure, Section, render_page
 
 EVIL = "<script>alert('x')</script> & \"q\""
@@ -40,7 +40,7 @@ class Reader(HTMLParser):
 
 def test_a_page_is_well_formed_and_loads_nothing():
     """Hostile texts stay texts; the only source is the picture inside."""
-    picture = Figure.picture(np.zeros((8, 8, 3), np.uint8), EVIL)
+    picture = Figure.of_image(np.zeros((8, 8, 3), np.uint8), EVIL)
     chart = histogram("a", np.array([1, 2]), np.array([0, 0.5, 1]), EVIL)
     figures = [picture, Figure.of_chart(chart, EVIL)]
     rows = [(EVIL, 1.23456, None, float("nan"))]
@@ -73,7 +73,7 @@ def test_a_close_up_shows_a_label_wherever_it_is(place):
     image = rng.integers(0, 255, (40, 120, 3), dtype=np.uint8)
     frame = Frame("000000", points, toy_calibration(), (120, 40), image)
     box = np.array([*place, -0.5, 4, 2, 1.5, 0.3])
-    alone = draw_close_up(frame, LabelShown(box, 0.8))
-    both = draw_close_up(frame, LabelShown(box, 0.8, box + np.array([1, 1, 0, 0, 0, 0, 0])))
+    alone = draw_close_up(frame, CloseUpLabel(box, 0.8))
+    both = draw_close_up(frame, CloseUpLabel(box, 0.8, box + np.array([1, 1, 0, 0, 0, 0, 0])))
     assert alone.shape == (260, 650, 3)
     assert (alone != both)[:, 390:].any()

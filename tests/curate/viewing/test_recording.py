@@ -183,5 +183,5 @@ def test_without_rerun_the_extra_is_named(
 def test_where_nothing_can_be_written_is_named(tmp_path: Path, full: RecordedFrame) -> None:
     """A folder that is not there."""
     pytest.importorskip("rerun", reason="the extra [rerun] is not installed")
-    with pytest.raises(ConfigError, match="no recording can be written there"):
+    with pytest.raises(ConfigError, match="a recording cannot be written there"):
         write_recording(tmp_path / "gone" / "a.rrd", iter([full]))

@@ -11,7 +11,7 @@ from support.toys import toy_calibration
 from curate.frames import Frame
 from curate.viewing.canvas import Canvas
 from curate.viewing.frame_view import paint_frame
-from curate.viewing.overlay import Shown
+from curate.viewing.overlay import FrameContent
 from curate.viewing.palette import PAPER
 from curate.viewing.tags import ShownLabels
 from curate.viewing.vector_canvas import VectorCanvas
@@ -67,7 +67,7 @@ def painted(kind):
     frame = Frame("000000", points, toy_calibration(), (120, 40), image)
     boxes = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3]])
     labels = ShownLabels(boxes, np.array(["Car"]), np.array([0.9]), np.array([0.7]))
-    shown = Shown(labels, title="a <title>", style=PAPER)
+    shown = FrameContent(labels, title="a <title>", style=PAPER)
     return paint_frame(frame, shown, kind).content(kind)
 
 

@@ -122,8 +122,8 @@ def test_the_labeled_frames_can_be_audited_with_a_detector_that_never_saw_them(
 @pytest.mark.parametrize(
     ("request_of", "error", "message"),
     [
-        ({"split": "unlabeled"}, ConfigError, "only val and labeled"),
-        ({"folds": 3}, ConfigError, "--folds 3: the 2 labeled frames make 2 to 2 folds"),
+        ({"split": "unlabeled"}, ConfigError, "use val or labeled"),
+        ({"folds": 3}, ConfigError, "--folds 3: 2 labeled frames allow 2 to 2 folds"),
         ({"folds": 2, "round_number": 2}, ConfigError, "first round"),
         ({"names": ("nonsense",)}, ConfigError, "unknown policy 'nonsense'"),
     ],
@@ -161,7 +161,7 @@ def test_the_command_tells_draws_and_stores(curate: Curate, workspace: Workspace
     for _ in range(2):
         code, out, err = curate("audit", "-w", workspace.root, "--replicates", "50")
         assert (code, err) == (0, "")
-    assert "of 12 labels are right" in out
+    assert "of 12 labels are correct" in out
     assert "Of the policies, " in out
     picture = workspace.root / "reports" / "audit-round-01-val-bev.png"
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -214,7 +214,7 @@ def test_frames_without_labels_count_their_objects(
         (toy_kitti / "training" / "velodyne" / f"{frame}.bin").write_bytes(b"")
     code, out, _ = curate("audit", "-w", workspace.root, "--replicates", "10")
     assert code == 0
-    assert "There is no label on 4 frames with 12 objects" in out
+    assert "There are no labels on 4 frames with 12 objects" in out
 
 
 def test_an_audit_without_the_point_prior_has_no_point_slices(

@@ -49,14 +49,14 @@ def test_a_wrong_convention_fails(curate: Curate, tmp_path: Path, toy_kitti: Pat
     begin(curate, tmp_path / "w", toy_kitti, results)
     code, out, _ = curate("doctor", "000003", "-w", tmp_path / "w")
     assert (code, out.splitlines()[0]) == (1, "frame 000003")
-    assert "z is that of the bottom" in out
+    assert "z is the bottom of the box" in out
     code, out, _ = curate("doctor", "000003", "--json", "-w", tmp_path / "w")
     assert code == 1
     found = {one["check"]: one["state"] for one in json.loads(out)["findings"]}
     assert found["convention"] == "wrong"
     code, _, err = curate("doctor", "999999", "-w", tmp_path / "w")
     assert code == 2
-    assert "no frame 999999" in err
+    assert "frame 999999 is not in the workspace" in err
 
 
 def test_what_cannot_be_opened_is_a_finding(

@@ -155,7 +155,7 @@ def test_a_missing_result_file_is_no_empty_one(curate: Curate, folders: tuple[Pa
     (folders[1] / "000002.txt").unlink()
     code, _, err = evaluate(curate, folders)
     assert code == DataError.exit_code
-    assert "results/000002.txt: no result file for frame 000002; write an empty one" in err
+    assert "results/000002.txt: no result file for frame 000002; write an empty file" in err
 
 
 @pytest.mark.parametrize("empty", [(0,), (1,), (0, 1)])

@@ -177,7 +177,7 @@ def test_changed_settings_are_refused_in_one_line(
     for options in (("--steps", 5), ("--set", "train.batch_size=4"), ("--rounds", 2)):
         code, _, err = curate("bench", tmp_path / "bench", *options)
         assert code == WorkspaceError.exit_code
-        assert "holds a bench with" in err
+        assert "contains a bench with" in err
         assert err.count("\n") == 1
     assert (tmp_path / "bench" / "bench.json").read_bytes() == before
 
@@ -211,7 +211,7 @@ def test_a_folder_without_val_frames_is_refused(
     (toy_kitti / "ImageSets" / "val.txt").write_text("")
     code, _, err = curate("bench", tmp_path / "bench", "--data", toy_kitti)
     assert code == DataError.exit_code
-    assert "ImageSets/val.txt names no frames" in err
+    assert "ImageSets/val.txt is missing or empty" in err
 
 
 def test_a_failing_cell_ends_in_its_own_exit_code(

@@ -42,7 +42,7 @@ def test_finished_cells_are_never_redone(toy_kitti: Path, tmp_path: Path) -> Non
     """A second run finds nothing to do; a grown grid does what is new."""
     run(make_bench(tmp_path, toy_kitti), ToyJobs(tmp_path))
     jobs = ToyJobs(tmp_path)
-    assert run(make_bench(tmp_path, toy_kitti), jobs) == ["2 cells, 2 of them finished before"]
+    assert run(make_bench(tmp_path, toy_kitti), jobs) == ["2 cells, 2 of them already finished"]
     assert jobs.done == []
     run(make_bench(tmp_path, toy_kitti, methods=("baseline", "pspsl", "spsl")), jobs)
     assert jobs.done == [Job(0.25, 0, "spsl")]
@@ -60,7 +60,7 @@ def test_a_jobs_cost_is_told_before_it_starts(toy_kitti: Path, tmp_path: Path) -
 def test_the_first_cost_is_called_a_guess(toy_kitti: Path, tmp_path: Path) -> None:
     """Nothing has been measured yet."""
     said = run(make_bench(tmp_path, toy_kitti), ToyJobs(tmp_path))
-    assert said[1].endswith("a first guess)")
+    assert said[1].endswith("a rough estimate)")
     assert not any("guess" in line for line in said[2:])
 
 

@@ -42,11 +42,11 @@ def test_overrides_reach_every_methods_configuration(toy_kitti: Path, tmp_path: 
     [
         ("train.zero_wight=ignore", "train.zero_wight"),
         ("train.zero_weight=nothing", "train.zero_weight"),
-        ("run.seed=3", "decided by --seeds"),
-        ("train.round_steps=3", "decided by --steps"),
+        ("run.seed=3", "cannot be set for a bench; use --seeds"),
+        ("train.round_steps=3", "cannot be set for a bench; use --steps"),
         ("zero_weight=ignore", "section.key=value"),
         ("train.zero_weight", "section.key=value"),
-        ("detector.name=recorded", "trains its detector"),
+        ("detector.name=recorded", "needs a detector that it can train"),
     ],
 )
 def test_wrong_overrides_are_refused(
@@ -60,10 +60,10 @@ def test_wrong_overrides_are_refused(
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
-        ({"methods": ("pspsll",)}, "--methods pspsll: use some of baseline"),
-        ({"methods": ()}, "--methods : give one or more"),
-        ({"ratios": (0.5, 0.5)}, "--ratios 0.5,0.5: give one or more, each once"),
-        ({"ratios": (4.0,)}, "--ratios 4: a share"),
+        ({"methods": ("pspsll",)}, "--methods pspsll: unknown method; choose from baseline"),
+        ({"methods": ()}, "--methods : give one or more values"),
+        ({"ratios": (0.5, 0.5)}, "--ratios 0.5,0.5: give one or more values without duplicates"),
+        ({"ratios": (4.0,)}, "--ratios 4: must be above 0"),
         ({"seeds": (-1,)}, "--seeds -1"),
     ],
 )

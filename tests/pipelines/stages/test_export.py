@@ -97,7 +97,7 @@ def test_what_is_no_export_is_not_overwritten(
     precious.write_text("precious")
     code, _, err = curate("export", "--output", precious, "-w", workspace.root)
     assert code == ConfigError.exit_code
-    assert "thesis.tex: is there and is no former export" in err
+    assert "thesis.tex: exists and is not a previous export" in err
     assert precious.read_text() == "precious"
     code, _, err = curate("export", "--format", "kitti", "--policy", "spsl", "-w", workspace.root)
     assert code == WorkspaceError.exit_code
@@ -118,7 +118,9 @@ def test_what_stands_where_the_trainer_looks_is_not_overwritten(
         former.write_text("precious")
     else:
         former.symlink_to(target)
-    with pytest.raises(ConfigError, match=r"labels.sqlite: is (a link|there and is no former)"):
+    with pytest.raises(
+        ConfigError, match=r"labels.sqlite: (is a symbolic link|exists and is not a previous)"
+    ):
         run(workspace.with_settings("solve", quantile=0.4))
     assert former.read_text() == "precious" if leads == "thesis" else former.is_symlink()
     assert target.exists() == (leads == "link")

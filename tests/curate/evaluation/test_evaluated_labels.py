@@ -5,15 +5,15 @@ import pytest
 from support.audited import six_labels
 
 from curate.detections import Annotations, Detections, as_categories
-from curate.evaluation.judged_labels import (
+from curate.evaluation.evaluated_labels import (
     WHOLE,
     AuditedFrame,
-    JudgedLabels,
+    EvaluatedLabels,
     Slice,
-    judge_frames,
+    evaluate_frames,
     slices,
 )
-from curate.evaluation.reliability import JudgeSettings
+from curate.evaluation.reliability import MatchSettings
 
 
 def frame(labels, truth, categories=None):
@@ -40,18 +40,18 @@ def frame(labels, truth, categories=None):
 
 def test_frames_become_columns():
     """A right, a wrong and a neutral label; an object that is missed; a frame with nothing."""
-    found = judge_frames(
+    found = evaluate_frames(
         [
             frame([(3, 4), (30, 0)], [(3, 4)]),
             frame([], []),
             frame([(20, 0)], [(20, 0), (0, 12)], ["Van", "Car"]),
         ],
-        JudgeSettings(),
+        MatchSettings(),
     )
     assert found.frames == 3
     assert found.frame_index.tolist() == [0, 0, 2]
     assert found.distance.tolist() == [5, 30, 20]
-    assert found.right.tolist() == [True, False, False]
+    assert found.correct.tolist() == [True, False, False]
     assert found.counted.tolist() == [True, True, False]
     assert found.points.tolist() == [0, 1, 0]
     assert found.object_frame.tolist() == [0, 2]
@@ -61,7 +61,7 @@ def test_frames_become_columns():
 
 def test_parts_are_joined_frame_after_frame():
     """The frames of the second part come after all of the first, empty ones included."""
-    whole = JudgedLabels.joined([six_labels(), six_labels()])
+    whole = EvaluatedLabels.joined([six_labels(), six_labels()])
     assert whole.frames == 6
     assert whole.frame_index.tolist() == [0, 0, 1, 1, 1, 1, 3, 3, 4, 4, 4, 4]
     assert whole.object_frame.tolist() == [0, 0, 1, 1, 2, 3, 3, 4, 4, 5]
@@ -70,7 +70,7 @@ def test_parts_are_joined_frame_after_frame():
 
 def test_no_frames_make_empty_columns():
     """Nothing in, nothing out."""
-    found = judge_frames([], JudgeSettings())
+    found = evaluate_frames([], MatchSettings())
     assert (found.frames, len(found), len(found.object_frame)) == (0, 0, 0)
 
 

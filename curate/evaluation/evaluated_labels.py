@@ -1,4 +1,4 @@
-"""The labels of frames whose ground truth is known, with what the truth says of them."""
+"""The labels of frames with ground truth, each marked as correct, wrong or neutral."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -8,16 +8,16 @@ from typing import Self
 import numpy as np
 
 from curate.detections import Annotations, Detections, as_categories
-from curate.evaluation.reliability import JudgeSettings, judge
+from curate.evaluation.reliability import MatchSettings, match_to_ground_truth
 from curate.shapes import Bool, Float, Int, Shaped
 
 ALL = "all"
-"""Stands for all categories together."""
+"""The name that stands for all categories together."""
 
 DISTANCES = (0.0, 20.0, 40.0, np.inf)
-"""Edges in metres, over the ground from the LiDAR to the centre of the box."""
+"""Edges of the distance ranges in metres, on the ground from the LiDAR to the box centre."""
 POINTS = (0.0, 10.0, 50.0, 200.0, np.inf)
-"""Edges in LiDAR points inside the box."""
+"""Edges of the ranges of LiDAR points inside the box."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,9 @@ class AuditedFrame:
 
     Attributes:
         labels: n labels in the LiDAR frame.
-        truth: what annotators wrote.
-        rectangles: (n, 4) left, top, right, bottom of the labels in the image, NaN where invisible.
+        truth: the ground truth annotations.
+        rectangles: (n, 4) left, top, right, bottom of the labels in the image, in pixels; NaN for
+            labels outside the image.
         points: (n,) LiDAR points in each label, NaN where they were not counted.
     """
 
@@ -38,20 +39,20 @@ class AuditedFrame:
 
 
 @dataclass(frozen=True)
-class JudgedLabels:
+class EvaluatedLabels:
     """The n labels and the m objects of all audited frames, as columns.
 
     Attributes:
-        frames: number of frames, those without labels or objects included.
-        frame_index: (n,) int64.
+        frames: number of frames, including those without labels or objects.
+        frame_index: (n,) int64 frame of each label.
         category: (n,) str.
-        distance: (n,) metres over the ground.
+        distance: (n,) metres on the ground.
         points: (n,) float64, NaN where unknown.
-        right: (n,) bool.
-        counted: (n,) bool, False where a label is neither right nor wrong.
-        object_frame: (m,) int64.
+        correct: (n,) bool.
+        counted: (n,) bool, False for neutral labels, which are neither correct nor wrong.
+        object_frame: (m,) int64 frame of each object.
         object_category: (m,) str.
-        object_distance: (m,) metres over the ground.
+        object_distance: (m,) metres on the ground.
     """
 
     frames: int
@@ -59,7 +60,7 @@ class JudgedLabels:
     category: Shaped[np.ndarray, " n"]
     distance: Float[np.ndarray, " n"]
     points: Float[np.ndarray, " n"]
-    right: Bool[np.ndarray, " n"]
+    correct: Bool[np.ndarray, " n"]
     counted: Bool[np.ndarray, " n"]
     object_frame: Int[np.ndarray, " m"]
     object_category: Shaped[np.ndarray, " m"]
@@ -70,7 +71,7 @@ class JudgedLabels:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the frames of all parts, one after the other."""
+        """Concatenate the frames of all parts and renumber them."""
         starts = np.cumsum([0, *(part.frames for part in parts)])
         numbered = [cls.no_frames()] + [
             replace(
@@ -89,20 +90,20 @@ class JudgedLabels:
 
     @classmethod
     def no_frames(cls) -> Self:
-        """Neither labels nor objects."""
-        numbers, names = np.zeros(0), as_categories([])
-        keys, truths = numbers.astype(np.int64), numbers.astype(bool)
-        return cls(0, keys, names, numbers, numbers, truths, truths, keys, names, numbers)
+        """Return an instance without labels and objects."""
+        floats, names = np.zeros(0), as_categories([])
+        integers, flags = floats.astype(np.int64), floats.astype(bool)
+        return cls(0, integers, names, floats, floats, flags, flags, integers, names, floats)
 
 
 @dataclass(frozen=True)
 class Slice:
-    """Labels of a range of distances or of point counts; the whole where `by` is "all".
+    """A range of distances or point counts, or all labels if `by` is "all".
 
     Attributes:
         by: "all", "distance" or "points".
-        low: lower edge, included.
-        high: upper edge, not included.
+        low: lower edge, inclusive.
+        high: upper edge, exclusive.
     """
 
     by: str
@@ -110,7 +111,7 @@ class Slice:
     high: float = np.inf
 
     def holds(self, values: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Return (n,) bool, which of the values it holds."""
+        """Return (n,) bool, True for values inside the range."""
         return np.asarray((values >= self.low) & (values < self.high))
 
     def __str__(self) -> str:
@@ -123,17 +124,17 @@ class Slice:
 WHOLE = Slice("all")
 
 
-def judge_frames(frames: Iterable[AuditedFrame], settings: JudgeSettings) -> JudgedLabels:
-    """Ask the truth about the labels of some frames.
+def evaluate_frames(frames: Iterable[AuditedFrame], settings: MatchSettings) -> EvaluatedLabels:
+    """Match the labels of frames to their ground truth.
 
     Raises:
         ConfigError: if a label's category has no minimum IoU.
     """
-    return JudgedLabels.joined([_judge_frame(frame, settings) for frame in frames])
+    return EvaluatedLabels.joined([_evaluate_frame(frame, settings) for frame in frames])
 
 
-def slices(labels: JudgedLabels) -> tuple[Slice, ...]:
-    """Return the ranges of distance, and those of point counts where points were counted."""
+def slices(labels: EvaluatedLabels) -> tuple[Slice, ...]:
+    """Return the ranges of distance, and those of point counts if points were counted."""
     edges: dict[str, tuple[float, ...]] = {"distance": DISTANCES}
     if not np.isnan(labels.points).all():
         edges["points"] = POINTS
@@ -142,18 +143,18 @@ def slices(labels: JudgedLabels) -> tuple[Slice, ...]:
     )
 
 
-def _judge_frame(frame: AuditedFrame, settings: JudgeSettings) -> JudgedLabels:
-    verdict = judge(frame.labels, frame.truth, settings, frame.rectangles)
+def _evaluate_frame(frame: AuditedFrame, settings: MatchSettings) -> EvaluatedLabels:
+    matches = match_to_ground_truth(frame.labels, frame.truth, settings, frame.rectangles)
     objects = np.isin(frame.truth.categories, list(settings.minimum_iou))
     n, m = len(frame.labels), int(objects.sum())
-    return JudgedLabels(
+    return EvaluatedLabels(
         frames=1,
         frame_index=np.zeros(n, dtype=np.int64),
         category=as_categories(frame.labels.categories),
         distance=np.hypot(frame.labels.boxes[:, 0], frame.labels.boxes[:, 1]),
         points=np.asarray(frame.points, dtype=np.float64),
-        right=verdict.right,
-        counted=verdict.counted,
+        correct=matches.correct,
+        counted=matches.counted,
         object_frame=np.zeros(m, dtype=np.int64),
         object_category=as_categories(frame.truth.categories[objects]),
         object_distance=np.hypot(*frame.truth.boxes[objects, :2].T),
