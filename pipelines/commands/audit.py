@@ -187,8 +187,3 @@ def _interval(estimate: "Estimate") -> str:
 
 def _shown(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.3f}"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(audit)

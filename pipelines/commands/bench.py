@@ -246,9 +246,3 @@ def _announce(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
             rows = [[shown(value) for value in row] for row in table.rows]
             print_table(table.columns, rows, title=table.title)
     typer.echo("\n".join(str(path) for path in written))
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(bench)
-    app.command(name="bench-cell", hidden=True)(bench_cell)

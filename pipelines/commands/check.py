@@ -1,7 +1,5 @@
 """curate check: the leakage firewall by itself."""
 
-import typer
-
 from pipelines.commands.options import JsonOption, WorkspaceOption
 
 
@@ -34,8 +32,3 @@ def check(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> Non
             f"{len(broken)} of {len(findings)} rules are broken; {first.rule}: {first.told}; "
             f"{first.remedy or 'see above'}"
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(check)

@@ -51,8 +51,3 @@ def demo(
         ),
         print_line,
     )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(demo)

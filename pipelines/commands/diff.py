@@ -41,8 +41,3 @@ def diff(
     if found.labels:
         names = ("change", "frame", "category", "k", "k after", "IoU", "weight", "weight after")
         print_table(names, map(astuple, found.labels), title="the most changed labels")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(diff)

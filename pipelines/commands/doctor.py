@@ -34,8 +34,3 @@ def doctor(
             print_line(f"{one.state:<8} {one.check:<12} {one.message}", indent=22)
     if any(one.state == "wrong" for one in findings):
         raise typer.Exit(1)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(doctor)

@@ -169,8 +169,3 @@ def _print(figures: dict[str, Any]) -> None:
 
 def _percent(value: Any) -> str:
     return f"{value:.2f}" if isinstance(value, float) else str(value)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(evaluate)

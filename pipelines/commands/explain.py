@@ -35,8 +35,3 @@ def explain(
     else:
         for line in found.lines:
             print_line(line, indent=17)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(explain)

@@ -75,8 +75,3 @@ def export(
     if not as_json:
         typer.echo(summary)
     end([report], as_json=as_json)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(export)

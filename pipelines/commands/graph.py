@@ -29,8 +29,3 @@ def graph(
     else:
         rows = ((", ".join(each.reads), each.name, ", ".join(each.writes)) for each in found.stages)
         print_table(("reads", "stage", "writes"), rows)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(graph)

@@ -145,8 +145,3 @@ def _option(text: str) -> tuple[str, Any]:
         return name, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
         return name, value
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(init)

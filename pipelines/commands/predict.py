@@ -1,7 +1,5 @@
 """curate predict: the teacher's boxes."""
 
-import typer
-
 from pipelines.commands.options import (
     DryRunOption,
     ExecutorOption,
@@ -31,8 +29,3 @@ def predict(
         ("predict",), workspace, round_number, split, executor, workers,
         as_json=as_json, dry_run=dry_run,
     )  # fmt: skip
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(predict)

@@ -1,7 +1,5 @@
 """curate pretrain: w_0 on X_l."""
 
-import typer
-
 from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import (
     DryRunOption,
@@ -43,8 +41,3 @@ def pretrain(
     if not as_json:
         print_report(reports[0])
     end(reports, as_json=as_json)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(pretrain)

@@ -199,8 +199,3 @@ def _print(
         print_table(columns, shown, page=True)
         if len(shown) == limit and next(rows, None) is not None:
             print_line(f"the first {limit} rows; more with --limit, all with --format csv or json")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(query)

@@ -196,11 +196,6 @@ def clear_reviews(
         )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.add_typer(group)
-
-
 def _names(text: str) -> tuple[str, ...]:
     return tuple(filter(None, (name.strip() for name in text.split(","))))
 

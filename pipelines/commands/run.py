@@ -68,8 +68,3 @@ def run(
         if not as_json:
             print_report(report)
     end(reports, as_json=as_json)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(run)

@@ -60,8 +60,3 @@ def _announce(served: "Served", url: str) -> None:
     for name, path in served.files.items():
         typer.echo(f"{name}: {path}")
     typer.echo(f"serving at {url} until Ctrl-C")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(serve)

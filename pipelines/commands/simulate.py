@@ -45,8 +45,3 @@ def simulate(
     typer.echo(
         f"{frames} frames in {directory}, as KITTI lays them out; labels in training/label_2"
     )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(simulate)

@@ -39,8 +39,3 @@ def solve(
     run_round_command(
         "solve", open_workspace(workspace), round_number, policy, as_json=as_json, dry_run=dry_run
     )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(solve)

@@ -80,8 +80,3 @@ def _remember(folder: Path | None, policy: str | None, told: Mapping[str, str]) 
         typer.echo(
             f"{CONFIG_NAME}: [train] now says {' and '.join(new)}, for later rounds too", err=True
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(name="train-round")(train_round)

@@ -107,8 +107,3 @@ def _image_format(name: str | None, output: Path | None) -> "ImageFormat":
     if suffix and suffix != kind:
         raise ConfigError(f"--output {output}: the suffix of a {kind} file is .{kind}")
     return kind
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(view)
