@@ -74,7 +74,7 @@ def query(
     if form not in FORMATS:
         raise ConfigError(f"--format {form}: use one of {', '.join(FORMATS)}")
     if (sql is not None and not schema) + (named is not None) + show_list + schema != 1:
-        raise ConfigError("query: give exactly one of a SELECT, --named NAME, --list or --schema")
+        raise ConfigError("query: give one of a SELECT, --named NAME, --list or --schema")
     if named is None and (policy is not None or round_number is not None):
         raise ConfigError("query: --policy and --round go with --named; write WHERE in a SELECT")
     if schema:

@@ -138,7 +138,7 @@ def test_the_list_names_every_query(curate: Curate) -> None:
         ([], "give one of"),
         (["--named", "kepd"], "did you mean 'kept'?"),
         (["--named", "kept", "--policy", "pspls"], "did you mean 'pspsl'?"),
-        (["--named", "splits", "--policy", "pspsl"], "the query 'splits' has no policy"),
+        (["--named", "splits", "--policy", "pspsl"], "the query 'splits' has no column policy"),
         (["--named", "false", "--round", "1"], "the query 'false' has no column round"),
         (["SELECT 1", "--policy", "pspsl"], "go with --named"),
         (["--schema", "--named", "kept"], "give one of"),
