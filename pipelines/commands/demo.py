@@ -1,4 +1,4 @@
-"""curate demo: the whole job on simulated data."""
+"""curate demo: run the whole pipeline on simulated data."""
 
 from pathlib import Path
 from typing import Annotated, Optional

@@ -1,4 +1,4 @@
-"""curate diff: what changed between two rounds."""
+"""curate diff: compare the labels of two rounds."""
 
 from typing import Annotated
 

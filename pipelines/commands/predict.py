@@ -1,4 +1,4 @@
-"""curate predict: the teacher's boxes."""
+"""curate predict: run the teacher on frames."""
 
 from pipelines.commands.options import (
     DryRunOption,
@@ -21,7 +21,7 @@ def predict(
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the teacher on frames and store its boxes, low scores included.
+    """Run the teacher on frames and store its predictions, including low scores.
 
     Example: curate predict --split unlabeled
     """

@@ -1,4 +1,4 @@
-"""curate pretrain: w_0 on X_l."""
+"""curate pretrain: train the first teacher, w_0, on X_l."""
 
 from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import (
@@ -18,7 +18,7 @@ def pretrain(
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train the first teacher, on the labeled frames only.
+    """Train the first teacher on the labeled frames only.
 
     Example: curate pretrain
     """

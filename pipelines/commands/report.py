@@ -1,4 +1,4 @@
-"""curate report: a round on one page."""
+"""curate report: summarise a round on one page."""
 
 import typer
 

@@ -1,4 +1,4 @@
-"""curate repredict: the teacher's answers for augmented copies."""
+"""curate repredict: run the teacher on augmented copies of frames."""
 
 from pipelines.commands.options import (
     DryRunOption,

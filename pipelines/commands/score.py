@@ -1,4 +1,4 @@
-"""curate score: ask the priors."""
+"""curate score: compute the priors of predictions."""
 
 from typing import Annotated, Optional
 

@@ -1,4 +1,4 @@
-"""curate solve: weigh the labels."""
+"""curate solve: compute the weights of labels."""
 
 from typing import Annotated, Optional
 

@@ -1,4 +1,4 @@
-"""curate status: how far the work is."""
+"""curate status: show the progress of the stages."""
 
 from typing import Annotated
 

@@ -2,7 +2,7 @@
 
 from curate.datasets.base import sequences_of
 from curate.exporters.base import named
-from curate.firewall.sequences import straddling
+from curate.firewall.sequences import shared_sequences
 from pipelines.firewall.finding import Finding
 from pipelines.workspace.split_record import SplitRecord, changed_lists
 from pipelines.workspace.workspace import Workspace
@@ -45,7 +45,7 @@ def sequences_apart(workspace: Workspace, record: SplitRecord) -> Finding:
     sequences = sequences_of(workspace.dataset, list(record.split_of))
     if not sequences:
         return Finding(rule, True, "the data set has no sequences")
-    shared = straddling(sequences, splits)
+    shared = shared_sequences(sequences, splits)
     divided = ", ".join(
         f"{len(names)} in both {one} and {other} ({named(names)})"
         for (one, other), names in shared.items()

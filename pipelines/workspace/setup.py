@@ -15,7 +15,7 @@ from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
 from curate.files.batches import batched
-from curate.firewall.sequences import choose_sequences, group_by_sequence, straddling
+from curate.firewall.sequences import choose_sequences, group_by_sequence, shared_sequences
 from curate.segmenters.classes import CLASS_MAPS
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
@@ -153,7 +153,7 @@ def choose_split(
 
 def _check_sequences(sequences: Mapping[str, str], split: Split) -> None:
     """Raise LeakageError if a sequence is in two splits."""
-    shared = straddling(sequences, {name: getattr(split, name) for name in SPLITS})
+    shared = shared_sequences(sequences, {name: getattr(split, name) for name in SPLITS})
     for (one, other), names in shared.items():
         raise LeakageError(
             f"{len(names)} sequences ({named(names)}) have frames in both {one} and {other}, which "
