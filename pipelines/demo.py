@@ -102,7 +102,7 @@ def run_demo(demo: Demo, say: Say) -> None:
     say("   model, which was trained on other simulated images.\n")
     for report in run_all(workspace, graph, demo.rounds, Bar(), train=False):
         print_report(report)
-    _weigh_for_others(workspace)
+    _weight_for_others(workspace)
     say("\n   Query any weight with SQL:\n")
     say(f'   curate query -w {_shown(demo.directory)} "{QUERY}"')
     _print_query(workspace)
@@ -143,7 +143,7 @@ def _simulate(demo: Demo, say: Say) -> None:
     say(f"   {total} frames in {_shown(demo.data)} ({time.perf_counter() - start:.1f} s)")
 
 
-def _weigh_for_others(workspace: Workspace) -> None:
+def _weight_for_others(workspace: Workspace) -> None:
     """Compute and export the weights of other policies, for the first round."""
     plan = open_plan(workspace, 1)
     for name, policies in (("solve", (*EVALUATED, *OTHERS)), ("export", tuple(OTHERS))):

@@ -1,4 +1,4 @@
-"""review.csv: one row per box, where a person may write a decision.
+"""review.csv: one row per box, in which a person may write a decision.
 
 The column `decision` takes `accept` or `reject`. `accept` in the row `all` of a frame accepts every
 unchanged box of the frame that has no decision of its own. An unchanged box without a decision

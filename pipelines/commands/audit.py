@@ -64,7 +64,7 @@ def audit(
     labels are then compared with the ground truth. A label is correct with an IoU above 0.7 (Car)
     or 0.5 (others). With --folds K, K teachers are each trained without one fold. The chart is
     reports/audit-*.png. The tables audit, audit_slice (by distance and points) and audit_bin (by
-    weight) hold the numbers: curate query "SELECT policy, category, auroc, auroc_low, auroc_high
+    weight) contain the numbers: curate query "SELECT policy, category, auroc, auroc_low, auroc_high
     FROM audit"
 
     Example: curate audit --policy pspsl --policy threshold --policy score

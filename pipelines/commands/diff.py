@@ -40,4 +40,4 @@ def diff(
     )
     if found.labels:
         names = ("change", "frame", "category", "k", "k after", "IoU", "weight", "weight after")
-        print_table(names, map(astuple, found.labels), title="the most changed labels")
+        print_table(names, map(astuple, found.labels), title="labels with the largest changes")

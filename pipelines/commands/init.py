@@ -34,7 +34,8 @@ def init(
         ),
     ] = "0.04",
     val: Annotated[
-        str, typer.Option(help="The same for validation; default: the data set's own val list.")
+        str,
+        typer.Option(help="The same for validation frames; default: the val list of the data set."),
     ] = "",
     split_by: Annotated[
         str,

@@ -203,10 +203,10 @@ def _describe_import(found: "ReviewImport") -> str:
         f"{found.accepted} accepted, {found.rejected} rejected, {found.moved} moved, "
         f"{found.added} added, {found.untouched} untouched"
     )
-    where = f"{found.frames} frames" + (
+    frames = f"{found.frames} frames" + (
         f" ({found.missing} more without edits)" if found.missing else ""
     )
-    line = f"review {found.review}: {decisions} in {where}"
+    line = f"review {found.review}: {decisions} in {frames}"
     if found.replaced:
         line += f"; they replace {found.replaced} earlier decisions"
     if found.dry_run:

@@ -15,7 +15,7 @@ from typing import Any
 from curate.errors import CurateError
 
 MOST_VALUES = 1 << 25
-"""Values that one median or quantile may hold in memory: 256 MiB of numbers."""
+"""Maximum number of values of one median or quantile: 256 MiB of memory."""
 _BOX = ("x", "y", "length", "width", "yaw")
 
 
@@ -46,7 +46,7 @@ FUNCTIONS = (
     SqlFunction(
         "quantile",
         "x, q",
-        "Value below which a share q of x lies, interpolated linearly; q from 0 to 1.",
+        "Quantile q of x, interpolated linearly; q from 0 to 1.",
         "`percentile_cont(q) WITHIN GROUP (ORDER BY x)`",
     ),
     SqlFunction("corr", "x, y", "Pearson correlation of x and y.", "built in"),

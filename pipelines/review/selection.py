@@ -106,10 +106,10 @@ def _weighted_round(workspace: Workspace, number: int | None, policy: str) -> in
     """Return the requested round, or the last one with weights of the policy."""
     found = weighted_round(workspace, policy, number)
     if found is None:
-        where = "" if number is None else f" --round {number}"
+        option = "" if number is None else f" --round {number}"
         raise WorkspaceError(
-            f"{policy} has weighted no labels{where and f' of round {number}'} yet; "
-            f"run `curate solve{where} --policy {policy}`"
+            f"{policy} has weighted no labels{option and f' of round {number}'} yet; "
+            f"run `curate solve{option} --policy {policy}`"
         )
     return found
 

@@ -342,7 +342,7 @@ class TrainSection(Section):
         examples=["python train.py {labels} {output}"],
     )
     labels_format: ExporterName = Field(
-        default="sqlite", description="Format in which your own trainer gets the labels."
+        default="sqlite", description="Format of the labels for your own trainer."
     )
     options: Options = Field(
         default={},
@@ -354,7 +354,7 @@ class RunSection(Section):
     """Which method is used, and how the work is organised."""
 
     method: PolicyName = Field(
-        default="pspsl", description="Method that weighs the labels; see docs/methods.md."
+        default="pspsl", description="Method that weights the labels; see docs/methods.md."
     )
     rounds: AtLeastOne = Field(
         default=3, description="Number of rounds E.", json_schema_extra=_unit("rounds")

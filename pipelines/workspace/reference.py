@@ -22,8 +22,8 @@ class Accepted:
     """The values that a setting accepts.
 
     Attributes:
-        type: in words.
-        range: of a number, in words; "" without limits.
+        type: name of the type, such as "whole number".
+        range: limits of a number, such as "at least 1"; "" without limits.
         choices: the valid names; () if any value of the type is valid.
         open: whether `module:Class` is valid, too.
     """

@@ -204,7 +204,7 @@ def _choose(
 
 
 def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
-    """Return the frames that a file lists, each once; a sequence stands for its frames."""
+    """Return the frames that a file lists, without repetition; a sequence means all its frames."""
     try:
         names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
     except (OSError, UnicodeDecodeError) as error:

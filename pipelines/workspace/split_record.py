@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import select
 
 from curate.errors import ConfigError
-from curate.firewall.split_lists import SplitList, changes
+from curate.firewall.split_lists import SplitList, describe_changes
 from db import bulk
 from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace
@@ -122,7 +122,7 @@ def changed_lists(workspace: Workspace, record: SplitRecord) -> Mapping[str, str
 
 def _describe_changes(lists: Iterable[tuple[str, SplitList, Iterable[str]]]) -> Mapping[str, str]:
     """Describe the changes by list name; unchanged lists are absent."""
-    described = {name: changes(before, SplitList.of(now)) for name, before, now in lists}
+    described = {name: describe_changes(before, SplitList.of(now)) for name, before, now in lists}
     return {name: what for name, what in described.items() if what}
 
 
