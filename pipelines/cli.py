@@ -3,6 +3,7 @@
 import logging
 import os
 import sys
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -10,59 +11,57 @@ from typer.core import TyperGroup
 
 import curate
 from curate.errors import CurateError
-from pipelines.commands import (
-    audit,
-    bench,
-    check,
-    demo,
-    diff,
-    doctor,
-    evaluate,
-    explain,
-    export,
-    graph,
-    init,
-    predict,
-    pretrain,
-    query,
-    report,
-    repredict,
-    review,
-    run,
-    score,
-    serve,
-    simulate,
-    solve,
-    status,
-    train_round,
-    view,
-)
+from pipelines.commands.audit import audit
+from pipelines.commands.bench import bench, bench_cell
+from pipelines.commands.check import check
+from pipelines.commands.demo import demo
+from pipelines.commands.diff import diff
+from pipelines.commands.doctor import doctor
+from pipelines.commands.evaluate import evaluate
+from pipelines.commands.explain import explain
+from pipelines.commands.export import export
+from pipelines.commands.graph import graph
+from pipelines.commands.init import init
+from pipelines.commands.predict import predict
+from pipelines.commands.pretrain import pretrain
+from pipelines.commands.query import query
+from pipelines.commands.report import report
+from pipelines.commands.repredict import repredict
+from pipelines.commands.review import group as review
+from pipelines.commands.run import run
+from pipelines.commands.score import score
+from pipelines.commands.serve import serve
+from pipelines.commands.simulate import simulate
+from pipelines.commands.solve import solve
+from pipelines.commands.status import status
+from pipelines.commands.train_round import train_round
+from pipelines.commands.view import view
 
-GROUPS = {
+GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
     "Set up": (simulate, demo, init, doctor, check, status, graph),
     "Stages": (pretrain, predict, repredict, score, solve, export, train_round, run),
     "Look and ask": (query, explain, view, report, diff, serve, review),
     "Measure": (evaluate, audit, bench),
 }
-"""The commands as the help shows them."""
+"""The commands under the headings of the help text."""
 
 
 class GroupedCommands(TyperGroup):
-    """A group with help that lists its commands under headings, each with its whole sentence."""
+    """A command group whose help lists commands under headings, with untruncated descriptions."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a section per heading."""
+        """Write one section per heading."""
         sections: dict[str, list[tuple[str, str]]] = {}
         for name in self.list_commands(ctx):
             command = self.get_command(ctx, name)
             if command is not None and not command.hidden:
                 heading = getattr(command, "rich_help_panel", None) or "Commands"
-                words = command.get_short_help_str(limit=1000)
-                sections.setdefault(heading, []).append((name, words))
+                description = command.get_short_help_str(limit=1000)
+                sections.setdefault(heading, []).append((name, description))
         widest = max(len(name) for rows in sections.values() for name, _ in rows)
         for heading, rows in sections.items():
             with formatter.section(heading):
-                formatter.write_dl([(name.ljust(widest), words) for name, words in rows])
+                formatter.write_dl([(name.ljust(widest), text) for name, text in rows])
 
 
 app = typer.Typer(
@@ -76,8 +75,8 @@ app = typer.Typer(
 )
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"curate {curate.__version__}")
         raise typer.Exit
 
@@ -94,17 +93,15 @@ def _curate(
     """Take the options that come before a command."""
 
 
-for _heading, _modules in GROUPS.items():
-    for _module in _modules:
-        _known = (len(app.registered_commands), len(app.registered_groups))
-        _module.register(app)
-        for _command in app.registered_commands[_known[0] :]:
-            _command.rich_help_panel = _heading
-        for _group in app.registered_groups[_known[1] :]:
-            _group.rich_help_panel = _heading
-            _group.cls = GroupedCommands
+for _heading, _commands in GROUPS.items():
+    for _command in _commands:
+        if isinstance(_command, typer.Typer):
+            app.add_typer(_command, rich_help_panel=_heading, cls=GroupedCommands)
+        else:
+            app.command(rich_help_panel=_heading)(_command)
+app.command(hidden=True)(bench_cell)
 COMMANDS = tuple(
-    command.name or getattr(command.callback, "__name__", "")
+    getattr(command.callback, "__name__", "").replace("_", "-")
     for command in app.registered_commands
     if not command.hidden
 ) + tuple(
@@ -116,24 +113,24 @@ COMMANDS = tuple(
 
 
 def main() -> None:
-    """Run the command line; a wrong input ends in one line and its own exit code."""
+    """Run the command line; an error ends in one line on stderr and its own exit code."""
     # Idle threads of torch's pool sleep instead of spinning on the core of another process.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
         app(prog_name="curate")
     except CurateError as error:
-        # One line, whatever a foreign file has put into it.
+        # The message may quote a file with line breaks; it is printed as one line.
         sys.stderr.write(f"error: {' '.join(str(error).splitlines())}\n")
         sys.exit(error.exit_code)
     except BrokenPipeError:
         sys.exit(0)
     except OSError as error:
-        # The machine's fault, not the input's: a full disk, a folder that cannot be written.
+        # The system is at fault, not the input: a full disk or a read-only folder, for example.
         place = f"{error.filename}: " if error.filename else ""
         reason = error.strerror or error
         sys.stderr.write(f"error: {place}{reason}; fix it and rerun; finished work is kept\n")
         sys.exit(CurateError.exit_code)
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted; the same command resumes\n")
+        sys.stderr.write("interrupted; run the same command again to resume\n")
         sys.exit(130)

@@ -1,7 +1,7 @@
-"""The demo: the whole job on simulated data, and an honest account of what it was good for.
+"""The demo: the whole pipeline on simulated data, with an evaluation of its labels and detectors.
 
-The demo alone may look at the ground truth of X_u, because it simulated it: it reads the label
-files to say how good the labels are, after the fact, and stores nothing of them.
+The demo may read the ground truth of X_u because it simulated it. It reads the label files at the
+end, to evaluate the pseudo-labels, and stores nothing of them.
 """
 
 import os
@@ -34,13 +34,13 @@ from pipelines.workspace.workspace import Workspace
 
 Say = Callable[[str], None]
 
-# Policies whose students the demo compares with the one of the configured policy.
-LEARNED = "from X_l and the pseudo-labels, weighted"
+LEARNED = "from X_l and the weighted pseudo-labels"
+# The demo compares the student of the configured policy with the students of these.
 OTHERS = {
-    "baseline": "from X_l alone, as long again",
+    "baseline": "from X_l alone, for the same number of steps",
     "uniform": "from X_l and all pseudo-labels, unweighted",
 }
-JUDGED = ("uniform", "threshold", "spsl", "pspsl")
+EVALUATED = ("uniform", "threshold", "spsl", "pspsl")
 QUERY = (
     "SELECT frame, k, category, score, loss, points, rho_det, weight FROM weighted_labels "
     "WHERE policy = 'pspsl' ORDER BY weight DESC LIMIT 5"
@@ -67,11 +67,11 @@ class Demo:
 
     @property
     def processes(self) -> int:
-        """How many processes work."""
+        """Number of processes to use."""
         return self.workers or os.cpu_count() or 1
 
     def config(self) -> Config:
-        """Return the workspace's settings."""
+        """Return the settings of the workspace."""
         document = {
             "dataset": {"root": self.data},
             "segmenter": {"name": "simulated"},
@@ -86,7 +86,7 @@ class Demo:
 
 
 def run_demo(demo: Demo, say: Say) -> None:
-    """Simulate, trains, weighs, trains again, compares, draws; continues where it was killed."""
+    """Simulate, train, weight labels, train students, evaluate and draw; resume after a kill."""
     start = time.perf_counter()
     _simulate(demo, say)
     workspace = initialise(demo.directory, demo.config(), str(demo.labeled), "")
@@ -95,30 +95,30 @@ def run_demo(demo: Demo, say: Say) -> None:
     )
     graph = graph_of(workspace)
     counts = [len(workspace.frames(split)) for split in ("labeled", "unlabeled", "val")]
-    say("\n2. The teacher learns from few labels, guesses, and its guesses are weighed.")
+    say("\n2. Train the teacher on few labels, predict on the others, weight the predictions.")
     say(
-        "   {} labeled, {} unlabeled, {} val frames; segmentation: the shipped ONNX".format(*counts)
+        "   {} labeled, {} unlabeled, {} val frames. Segmentation: the shipped ONNX".format(*counts)
     )
-    say("   model, trained on other simulated images (never the renderer's truth).\n")
+    say("   model, which was trained on other simulated images.\n")
     for report in run_all(workspace, graph, demo.rounds, Bar(), train=False):
         print_report(report)
-    _weigh_for_others(workspace)
-    say("\n   Ask for any weight in SQL:\n")
+    _weight_for_others(workspace)
+    say("\n   Query any weight with SQL:\n")
     say(f'   curate query -w {_shown(demo.directory)} "{QUERY}"')
     _print_query(workspace)
-    say("3. Students learn, all from the teacher and for as long as it did.\n")
+    say("3. Train students, starting from the teacher, for the same number of steps.\n")
     _train_students(workspace, demo)
     for report in run_all(workspace, graph, demo.rounds, Bar()):
         if report.done:
             print_report(report)
     for policy, how in {workspace.config.run.method: LEARNED, **OTHERS}.items():
         say(f"   {policy:<9} {how}")
-    say("\n4. How good are the labels? Judged by the truth that the simulation knows.\n")
+    say("\n4. Evaluate the pseudo-labels against the ground truth of the simulation.\n")
     _print_quality(workspace)
-    say("5. How good are the detectors, on val frames that nobody trained on?\n")
+    say("5. Evaluate the detectors on the val frames, which no training used.\n")
     _print_detectors(workspace)
     _draw(workspace, say)
-    say(f"\nThe demo took {(time.perf_counter() - start) / 60:.1f} minutes. Look around:")
+    say(f"\nThe demo took {(time.perf_counter() - start) / 60:.1f} minutes. Next:")
     for command in ("status", "explain FRAME K", "graph", "audit", "evaluate"):
         say(
             f"   curate {command}" + ("" if command == "graph" else f" -w {_shown(demo.directory)}")
@@ -143,17 +143,17 @@ def _simulate(demo: Demo, say: Say) -> None:
     say(f"   {total} frames in {_shown(demo.data)} ({time.perf_counter() - start:.1f} s)")
 
 
-def _weigh_for_others(workspace: Workspace) -> None:
-    """Weights of other policies beside those of the configured one, for the first round."""
+def _weight_for_others(workspace: Workspace) -> None:
+    """Compute and export the weights of other policies, for the first round."""
     plan = open_plan(workspace, 1)
-    for name, policies in (("solve", (*JUDGED, *OTHERS)), ("export", tuple(OTHERS))):
+    for name, policies in (("solve", (*EVALUATED, *OTHERS)), ("export", tuple(OTHERS))):
         for policy in dict.fromkeys(policies):
             if policy != workspace.config.run.method:
                 run_round(plan, name, policy, Bar())
 
 
 def _train_students(workspace: Workspace, demo: Demo) -> None:
-    """One process of one thread per student; more threads hardly help so small a network."""
+    """Train one student per process with one thread; the network is too small for more threads."""
     policies = (workspace.config.run.method, *OTHERS)
     with ThreadPoolExecutor(len(policies) if demo.processes > 1 else 1) as pool:
         list(pool.map(lambda policy: _train_student(workspace, policy), policies))
@@ -167,7 +167,7 @@ def _train_student(workspace: Workspace, policy: str) -> None:
     ]
     ended = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)  # noqa: S603
     if ended.returncode:
-        raise CurateError(f"training the student of {policy} failed; its message is above")
+        raise CurateError(f"training the student of {policy} failed; see the message above")
 
 
 def _print_query(workspace: Workspace) -> None:
@@ -178,7 +178,7 @@ def _print_query(workspace: Workspace) -> None:
 
 
 def _print_quality(workspace: Workspace) -> None:
-    rows = label_quality(workspace, 1, JUDGED)
+    rows = label_quality(workspace, 1, EVALUATED)
     print_table(("policy", "labels", "weight > 0", "weighted precision", "recall", "AUROC"), rows)
 
 
@@ -186,15 +186,15 @@ def _print_detectors(workspace: Workspace) -> None:
     rows = []
     for name, path in _detectors(workspace):
         objects = val_objects(workspace, detect_val(workspace, path, Bar()))
-        strict = kitti_ap.evaluate(*objects).ap_r40[:, :, 1]
-        loose = kitti_ap.evaluate(*objects, min_overlaps=RELAXED_OVERLAPS).ap_r40[:, :, 1]
+        at_kitti = kitti_ap.evaluate(*objects).ap_r40[:, :, 1]
+        relaxed = kitti_ap.evaluate(*objects, min_overlaps=RELAXED_OVERLAPS).ap_r40[:, :, 1]
         bev, box = kitti_ap.FIGURES.index("bev"), kitti_ap.FIGURES.index("3d")
-        means = (loose[:, box], loose[:, bev], strict[:, box], strict[:, bev])
-        rows.append((name, *map(float, loose[:, box]), *(float(mean.mean()) for mean in means)))
-    columns = ("detector", *CATEGORIES, "3D mean", "BEV mean", "3D strict", "BEV strict")
+        means = (relaxed[:, box], relaxed[:, bev], at_kitti[:, box], at_kitti[:, bev])
+        rows.append((name, *map(float, relaxed[:, box]), *(float(mean.mean()) for mean in means)))
+    columns = ("detector", *CATEGORIES, "3D mean", "BEV mean", "3D KITTI", "BEV KITTI")
     print_table(columns, rows, title="AP R40, moderate, percent")
     overlaps = ", ".join(f"{name} {overlap}" for name, overlap in RELAXED_OVERLAPS.items())
-    typer.echo(f"   IoU above {overlaps}; strict is KITTI's own 0.7, 0.5, 0.5.")
+    typer.echo(f"   IoU thresholds: {overlaps}; in the columns KITTI: 0.7, 0.5, 0.5.")
 
 
 def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:
@@ -222,13 +222,13 @@ def _draw(workspace: Workspace, say: Say) -> None:
 
     try:
         pictures = draw_example_frame(workspace, 1)
-    except WorkspaceError:  # a teacher of a few steps finds nothing
-        say("   no picture: there are no labels; train for more --steps")
+    except WorkspaceError:  # after a few steps, a teacher detects nothing
+        say("   no picture: there are no labels; train longer with --steps")
         return
     for path in pictures:
         say(f"   picture: {_shown(path)}")
 
 
 def _shown(path: Path) -> str:
-    """Return a path as a person in the current folder would type it."""
+    """Return a path relative to the current folder if it is inside, or else the path itself."""
     return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)

@@ -93,7 +93,7 @@ def test_the_demo_runs_outside_the_checkout(installed: Path, tmp_path: Path) -> 
     """With its migrations, queries, templates and the model of the segmenter."""
     small = ("--frames", 12, "--val", 4, "--labeled", 0.25, "--steps", 20)
     printed = run(tmp_path, installed / "curate", "demo", "work", *small)
-    assert "How good are the detectors" in printed
+    assert "Evaluate the detectors" in printed
     query = ("query", "-w", "work", "--csv", "SELECT split, count(*) FROM frame GROUP BY split")
     splits = run(tmp_path, installed / "curate", *query).split()
     assert sorted(splits[1:]) == ["labeled,3", "unlabeled,9", "val,4"]

@@ -13,9 +13,9 @@ def copied_boxes(boxes: np.ndarray, truth: Annotations) -> np.ndarray:
 
     A yaw that differs by half a turn still counts as the same box.
     """
-    known = truth.boxes[np.isfinite(truth.boxes).all(axis=1)]
-    if len(boxes) == 0 or len(known) == 0:
+    objects = truth.boxes[np.isfinite(truth.boxes).all(axis=1)]
+    if len(boxes) == 0 or len(objects) == 0:
         return np.zeros(len(boxes), dtype=bool)
-    apart = np.abs(boxes[:, None, :6] - known[None, :, :6]).max(axis=2)
-    turned = np.abs(np.sin(boxes[:, None, 6] - known[None, :, 6]))
+    apart = np.abs(boxes[:, None, :6] - objects[None, :, :6]).max(axis=2)
+    turned = np.abs(np.sin(boxes[:, None, 6] - objects[None, :, 6]))
     return np.asarray(((apart < _TOLERANCE) & (turned < _TOLERANCE)).any(axis=1))

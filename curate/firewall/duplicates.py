@@ -44,24 +44,24 @@ class HeadHashes:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._known: dict[str, list[int | str]] = _read_known(path)
+        self._cache: dict[str, list[int | str]] = _read_cache(path)
         self._changed = False
 
     def of(self, path: Path, size: int, changed_ns: int) -> str:
         """Return the hash of a file's first bytes; the file is read only if it has changed."""
-        known = self._known.get(str(path))
-        if isinstance(known, list) and known[:2] == [size, changed_ns] and len(known) == 3:
-            return str(known[2])
+        cached = self._cache.get(str(path))
+        if isinstance(cached, list) and cached[:2] == [size, changed_ns] and len(cached) == 3:
+            return str(cached[2])
         with path.open("rb") as file:
             head = hashlib.sha256(file.read(HEAD_BYTES)).hexdigest()
-        self._known[str(path)] = [size, changed_ns, head]
+        self._cache[str(path)] = [size, changed_ns, head]
         self._changed = True
         return head
 
     def save(self) -> None:
         """Write the cache if it has changed."""
         if self._changed:
-            replace_file(self._path, json.dumps(self._known).encode())
+            replace_file(self._path, json.dumps(self._cache).encode())
 
 
 def find_duplicates(
@@ -85,18 +85,18 @@ def find_duplicates(
             by_head: dict[str, list[SplitFile]] = {}
             for file, changed_ns in group:
                 by_head.setdefault(heads.of(file.path, size, changed_ns), []).append(file)
-            for alike in by_head.values():
-                pairs += _pairs(alike)
+            for candidates in by_head.values():
+                pairs += _pairs(candidates)
     heads.save()
     return pairs
 
 
-def _pairs(alike: list[SplitFile]) -> list[tuple[SplitFile, SplitFile]]:
+def _pairs(candidates: list[SplitFile]) -> list[tuple[SplitFile, SplitFile]]:
     """Return the pairs across splits, among files with equal first bytes, that are equal."""
-    if len({file.split for file in alike}) < 2:
+    if len({file.split for file in candidates}) < 2:
         return []
     first: dict[str, dict[str, SplitFile]] = {}
-    for file in alike:
+    for file in candidates:
         with file.path.open("rb") as content:
             digest = hashlib.file_digest(content, "sha256").hexdigest()
         first.setdefault(digest, {}).setdefault(file.split, file)
@@ -107,12 +107,12 @@ def _pairs(alike: list[SplitFile]) -> list[tuple[SplitFile, SplitFile]]:
     ]
 
 
-def _read_known(path: Path) -> dict[str, list[int | str]]:
+def _read_cache(path: Path) -> dict[str, list[int | str]]:
     try:
-        known = json.loads(path.read_text(encoding="utf-8"))
+        cached = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, RecursionError):
         _log.warning("%s is damaged; hashing all files again", path)
         return {}
-    return dict(known) if isinstance(known, Mapping) else {}
+    return dict(cached) if isinstance(cached, Mapping) else {}

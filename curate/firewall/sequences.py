@@ -8,7 +8,7 @@ import numpy as np
 from curate.errors import ConfigError
 
 
-def straddling(
+def shared_sequences(
     sequences: Mapping[str, str], splits: Mapping[str, Iterable[str]]
 ) -> Mapping[tuple[str, str], list[str]]:
     """Return the sequences that two splits share, by pair of splits.
@@ -17,11 +17,14 @@ def straddling(
         sequences: the sequence of each frame; frames without a sequence are absent.
         splits: the frames of each split.
     """
-    held = {
+    sequences_of = {
         name: {sequences[frame] for frame in frames if frame in sequences}
         for name, frames in splits.items()
     }
-    shared = {pair: sorted(held[pair[0]] & held[pair[1]]) for pair in combinations(held, 2)}
+    shared = {
+        (one, other): sorted(sequences_of[one] & sequences_of[other])
+        for one, other in combinations(sequences_of, 2)
+    }
     return {pair: names for pair, names in shared.items() if names}
 
 
@@ -40,7 +43,7 @@ def choose_sequences(
         generator: draws the order.
 
     Raises:
-        ConfigError: if all frames belong to one sequence, so that it is all or nothing.
+        ConfigError: if all frames belong to one sequence, so that a part of them cannot be chosen.
     """
     groups = group_by_sequence(sequences, pool)
     if len(groups) == 1 and 0 < count < len(next(iter(groups.values()))):

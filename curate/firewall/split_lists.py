@@ -9,7 +9,7 @@ from curate.exporters.base import named
 
 @dataclass(frozen=True)
 class SplitList:
-    """Frame names, unique and sorted, so that the hash depends on nothing else.
+    """Frame names, unique and sorted; the hash does not depend on their order.
 
     Attributes:
         frames: their names.
@@ -41,7 +41,7 @@ class SplitList:
         return len(self.frames)
 
 
-def changes(before: SplitList, now: SplitList) -> str:
+def describe_changes(before: SplitList, now: SplitList) -> str:
     """Describe added and removed frames with a few names; empty if nothing changed."""
     added, removed = set(now.frames) - set(before.frames), set(before.frames) - set(now.frames)
     parts = [

@@ -1,1 +1,1 @@
-"""Labels that people correct: what they are shown, in which editor, and what they decided."""
+"""Reviews of labels by people: the boxes shown, the editors' files, and the decisions."""

@@ -17,7 +17,7 @@ from curate.geometry.similarity import wrap_angle
 from curate.review.human_labels import ACCEPTED, ADDED, MOVED, REJECTED, SAME_OBJECT_IOU
 from curate.review.sheet import ShownFrame
 
-# Editors round; KITTI's text here has four decimals.
+# Editors round numbers; the KITTI files of a review have four decimals.
 _SAME_METRES, _SAME_RADIANS = 2e-3, 2e-3
 _FURTHEST_METRES, _LONGEST_METRES = 500.0, 50.0
 
@@ -93,33 +93,33 @@ def compare_frame(
     unchanged, moved = _pairs(shown, edited)
     decisions, untouched = [], 0
     for place, box in enumerate(shown.boxes):
-        word = explicit.get(place + 1)
+        decision = explicit.get(place + 1)
         if place in moved:
             now = edited[moved[place]]
-            if word == REJECTED:
+            if decision == REJECTED:
                 raise DataError(
                     f"{now.place}: box {place + 1} of frame {shown.frame} is moved and also marked "
                     "as rejected; undo one of the two"
                 )
             found = Decision(place + 1, MOVED, now.category, now.box, box.box)
-        elif word == REJECTED or (place not in unchanged and word is None):
+        elif decision == REJECTED or (place not in unchanged and decision is None):
             found = Decision(place + 1, REJECTED, box.category, box.box, box.box)
         elif place not in unchanged:
             raise DataError(
                 f"frame {shown.frame}: box {place + 1} is marked as accepted but deleted; undo one "
                 "of the two"
             )
-        elif not box.human and (word == ACCEPTED or accept_rest):
+        elif not box.human and (decision == ACCEPTED or accept_rest):
             found = Decision(place + 1, ACCEPTED, box.category, box.box, box.box)
         else:
             untouched += 1
             continue
         decisions.append(found)
-    known = {*unchanged.values(), *moved.values()}
+    paired = {*unchanged.values(), *moved.values()}
     decisions += [
         Decision(None, ADDED, new.category, new.box, None)
         for place, new in enumerate(edited)
-        if place not in known
+        if place not in paired
     ]
     return FrameEdits(shown.frame, tuple(decisions), untouched)
 

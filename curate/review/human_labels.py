@@ -72,7 +72,7 @@ def match_human_labels(
     iou, leads = np.zeros(len(boxes)), np.zeros(len(boxes), dtype=bool)
     if len(labels) == 0 or len(boxes) == 0:
         return CoveredPredictions(label, iou, leads)
-    with_box, with_seen = bev_iou(boxes, labels.boxes), bev_iou(boxes, _known(labels.seen))
+    with_box, with_seen = bev_iou(boxes, labels.boxes), bev_iou(boxes, _without_nan(labels.seen))
     overlap = np.maximum(with_box, with_seen)
     rejected = labels.decisions == REJECTED
     same_category = categories[:, None] == labels.categories[None]
@@ -83,9 +83,9 @@ def match_human_labels(
         free = (label < 0) & (gain.max(axis=1) > 0)
         label[free], iou[free] = gain[free].argmax(axis=1), gain[free].max(axis=1)
     for row in np.flatnonzero(~rejected):
-        mine = np.flatnonzero(label == row)
-        if len(mine):
-            leads[mine[np.argmax(iou[mine])]] = True
+        covered = np.flatnonzero(label == row)
+        if len(covered):
+            leads[covered[np.argmax(iou[covered])]] = True
     return CoveredPredictions(label, iou, leads)
 
 
@@ -94,7 +94,7 @@ def superseded(former: HumanLabels, later: HumanLabels) -> np.ndarray:
     if len(former) == 0 or len(later) == 0:
         return np.zeros(len(former), dtype=bool)
     overlap = np.maximum(
-        bev_iou(former.boxes, later.boxes), bev_iou(former.boxes, _known(later.seen))
+        bev_iou(former.boxes, later.boxes), bev_iou(former.boxes, _without_nan(later.seen))
     )
     # Rejecting a box does not decide about an object of another category at the same place.
     counts = (later.decisions != REJECTED) | (former.categories[:, None] == later.categories[None])
@@ -110,6 +110,6 @@ def overlapping_objects(labels: HumanLabels) -> list[tuple[int, int]]:
     return list(zip(objects[rows].tolist(), objects[columns].tolist(), strict=True))
 
 
-def _known(boxes: np.ndarray) -> np.ndarray:
-    """Replace unknown (NaN) boxes by boxes without size, which overlap nothing."""
+def _without_nan(boxes: np.ndarray) -> np.ndarray:
+    """Replace NaN boxes by boxes without size, which overlap nothing."""
     return np.where(np.isnan(boxes).any(axis=1)[:, None], 0.0, boxes)

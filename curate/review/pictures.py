@@ -23,7 +23,7 @@ class NumberedLabels(ShownLabels):
 
     @property
     def emphasis(self) -> np.ndarray:
-        """(n,) in [0, 1]; 1 where a decision is requested."""
+        """(n,) in [0, 1]; 1 if a decision is requested."""
         return np.where(self._is_requested, 1.0, 0.25 + 0.25 * self.weights)
 
     def caption(self, index: int) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""review.csv: one row per box, where a person may write a decision.
+"""review.csv: one row per box, in which a person may write a decision.
 
 The column `decision` takes `accept` or `reject`. `accept` in the row `all` of a frame accepts every
 unchanged box of the frame that has no decision of its own. An unchanged box without a decision
@@ -71,11 +71,11 @@ def read_table(folder: Path, sheet: Sheet) -> dict[str, ExplicitDecisions]:
     for row in rows:
         word = (row["decision"] or "").strip().lower()
         if word:
-            _take(row, word, f"{path}:{rows.line_num}", sheet, found)
+            _add_decision(row, word, f"{path}:{rows.line_num}", sheet, found)
     return found
 
 
-def _take(
+def _add_decision(
     row: dict[str, str], word: str, place: str, sheet: Sheet, found: dict[str, ExplicitDecisions]
 ) -> None:
     if word not in _WORDS:
@@ -97,9 +97,9 @@ def _take(
 def _frame(name: str, place: str, sheet: Sheet) -> str:
     """Return the frame of a row; spreadsheets remove leading zeros."""
     names = [frame.frame for frame in sheet.frames]
-    alike = [each for each in names if each.lstrip("0") == name.strip().lstrip("0")]
+    matches = [each for each in names if each.lstrip("0") == name.strip().lstrip("0")]
     if name in names:
         return name
-    if len(alike) != 1:
+    if len(matches) != 1:
         raise DataError(f"{place}: frame '{name}' is not in this review")
-    return alike[0]
+    return matches[0]

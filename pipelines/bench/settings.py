@@ -14,7 +14,7 @@ from curate.spelling import did_you_mean
 from pipelines.registry import trainable, trainable_names
 from pipelines.stages.methods import METHODS, with_method
 from pipelines.workspace.config import AtLeastOne, Config, Section, change_setting, make_config
-from pipelines.workspace.config_faults import describe_faults
+from pipelines.workspace.config_errors import describe_errors
 
 SYNTHETIC = "synthetic"
 SETTINGS_FILE = "bench.json"
@@ -166,7 +166,7 @@ def read_bench(root: Path) -> Bench | None:
         return Bench(root, settings, Axes.model_validate(document["grid"]))
     except (ValueError, KeyError, TypeError) as error:
         reason = (
-            describe_faults(error, Axes if error.title == "Axes" else BenchSettings)
+            describe_errors(error, Axes if error.title == "Axes" else BenchSettings)
             if isinstance(error, ValidationError)
             else error
         )

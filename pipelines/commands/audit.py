@@ -1,4 +1,4 @@
-"""curate audit: how far weights can be trusted."""
+"""curate audit: compare pseudo-labels and their weights with ground truth."""
 
 import math
 from collections.abc import Iterator
@@ -62,9 +62,9 @@ def audit(
 
     Frames with ground truth that the teacher was not trained on are treated as unlabeled, and their
     labels are then compared with the ground truth. A label is correct with an IoU above 0.7 (Car)
-    or 0.5 (others). With --folds K, K teachers are each trained without one fold. The plot is
+    or 0.5 (others). With --folds K, K teachers are each trained without one fold. The chart is
     reports/audit-*.png. The tables audit, audit_slice (by distance and points) and audit_bin (by
-    weight) hold the numbers: curate query "SELECT policy, category, auroc, auroc_low, auroc_high
+    weight) contain the numbers: curate query "SELECT policy, category, auroc, auroc_low, auroc_high
     FROM audit"
 
     Example: curate audit --policy pspsl --policy threshold --policy score
@@ -97,20 +97,20 @@ def audit(
     store_audit(opened, found)
     picture = picture_path(opened, found, kind)
     audit_chart(found.figures, _title(found)).save(picture)
-    words = describe_audit(found)
+    summary = describe_audit(found)
     if as_json:
-        about = {
+        header = {
             "round": found.context.number,
             "rounds": found.context.rounds,
             "audited": request.frames,
             "overlap": overlap,
-            "summary": words,
+            "summary": summary,
             "picture": str(picture),
         }
-        print_json({**about, **as_numbers(found.figures)})
+        print_json({**header, **as_numbers(found.figures)})
     else:
         _print(found.figures, _title(found))
-        print_line("\n".join(words), indent=2)
+        print_line("\n".join(summary), indent=2)
         print_line(f"picture: {picture}")
     end(found.reports, as_json=False)
 
@@ -120,12 +120,12 @@ def _title(found: "AuditedRound") -> str:
     kind = "BEV" if request.overlap == "bev" else "3D"
     return (
         f"audit of round {context.number} of {context.rounds} on {request.frames}, "
-        f"right by {kind} overlap"
+        f"correct by {kind} overlap"
     )
 
 
 def _print(figures: "Audit", title: str) -> None:
-    """All policies, their AUROC by category, the first one's weight bins, and the slices."""
+    """Print all policies, their AUROC by slice, and the weight bins of the first one."""
     by_policy = figures.whole()
     print_line(f"{title}; {100 * figures.level:.0f} % intervals over {figures.frames} frames\n")
     print_table(
@@ -140,10 +140,10 @@ def _print(figures: "Audit", title: str) -> None:
             )
             for each in by_policy.values()
         ],
-        title="the weight as a judge, and what of it lies on right labels",
+        title="ranking of labels by weight, and share of the weight on correct labels",
     )
     print_table(
-        ("labels", "right", "of", "objects", *by_policy),
+        ("slice", "correct", "of labels", "objects", *by_policy),
         _parts(figures),
         title="AUROC by category, distance and points in the label",
     )
@@ -159,24 +159,24 @@ def _print(figures: "Audit", title: str) -> None:
             )
             if labels
         ],
-        title=f"labels by weight of {first.policy}; the others are in the table audit_bin",
+        title=f"labels by weight of {first.policy}; the other policies are in the table audit_bin",
     )
 
 
 def _parts(figures: "Audit") -> Iterator[tuple[Any, ...]]:
-    """A row per category over all distances, then per distance and point count over all of them."""
+    """Yield a row per category, then one per distance and point count over all categories."""
     rows: dict[tuple[str, str], list[Figures]] = {}
     for each in figures.figures:
         if each.slice.by == "all" or each.category == "all":
             rows.setdefault((each.category, f"{each.slice.by} {each.slice}"), []).append(each)
     for (category, part), policies in sorted(rows.items(), key=lambda row: row[0][1] != "all all"):
-        some = policies[0]
+        first = policies[0]
         name = category if part == "all all" else part
         yield (
             name,
-            some.right,
-            some.labels,
-            "" if some.objects is None else some.objects,
+            first.right,
+            first.labels,
+            "" if first.objects is None else first.objects,
             *(_shown(each.auroc.value) for each in policies),
         )
 
@@ -187,8 +187,3 @@ def _interval(estimate: "Estimate") -> str:
 
 def _shown(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.3f}"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(audit)

@@ -1,4 +1,4 @@
-"""curate bench: every method of the paper on the same data, and the tables that compare them."""
+"""curate bench: run methods on the same data, and compare them in tables."""
 
 import os
 import sys
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pipelines.bench.report import BenchReport
     from pipelines.bench.settings import Bench
 
-# The paper's seven, its ratios, and a size of which two cores make a cell in some ten minutes.
+# The seven methods and the ratios of the paper. A cell of this size takes two cores ten minutes.
 METHODS = "baseline,uda,uda-cl,sess,3dioumatch,spsl,pspsl"
 RATIOS = "0.04,0.08,0.16,0.32,0.64"
 SEEDS = "0,1,2"
@@ -109,7 +109,7 @@ def bench(
     kind = check_format(image_format or "png")
     if overlaps not in {"kitti", "loose", "all"}:
         raise ConfigError(f"--overlaps {overlaps}: use kitti, loose or all")
-    asked = {
+    requested = {
         "data": data,
         "frames": frames,
         "val": val,
@@ -120,7 +120,7 @@ def bench(
         "overrides": tuple(map(_absolute, override)) if override else None,
     }
     grid = {"methods": methods, "ratios": ratios, "seeds": seeds}
-    chosen = _open(directory) if report else _choose(directory, asked, grid)
+    chosen = _open(directory) if report else _choose(directory, requested, grid)
     try:
         if not report:
             _run(chosen, workers or os.cpu_count() or 1, quiet=as_json)
@@ -136,7 +136,7 @@ def bench_cell(
     seed: Annotated[int, typer.Option()],
     method: Annotated[Optional[str], typer.Option()] = None,  # noqa: UP045
 ) -> None:
-    """Do one job of a bench and tell its parent process how far it is; it ends with it."""
+    """Run one job of a bench and report its progress to the parent process; end with it."""
     from pipelines.bench.cell import run_job
     from pipelines.bench.grid import Job
     from pipelines.bench.metered import Metered
@@ -153,28 +153,29 @@ def _open(directory: Path) -> "Bench":
 
     found = read_bench(directory)
     if found is None:
-        raise WorkspaceError(f"{directory}: no bench here; start one with `curate bench DIR`")
+        raise WorkspaceError(f"{directory}: no benchmark here; start one with `curate bench DIR`")
     return found
 
 
-def _choose(directory: Path, asked: dict[str, Any], grid: dict[str, str | None]) -> "Bench":
-    """Return the bench as it is asked for; what is not asked is as it was, or the default."""
+def _choose(directory: Path, requested: dict[str, Any], grid: dict[str, str | None]) -> "Bench":
+    """Return the requested bench; other settings are those of the previous run, or the defaults."""
     from curate.errors import ConfigError
     from pipelines.bench.settings import SYNTHETIC, Bench, BenchSettings, check_axes, read_bench
 
     stored = read_bench(directory)
-    given = {name: value for name, value in asked.items() if value is not None}
+    given = {name: value for name, value in requested.items() if value is not None}
     if stored is not None:
         given = {**stored.settings.model_dump(), **given}
     if given.get("data", SYNTHETIC) == SYNTHETIC:
         given = {"frames": FRAMES, "val": VAL, "data_seed": 0, **given}
     else:
         for name in ("frames", "val", "data_seed"):
-            if asked[name] is not None:
-                raise ConfigError(f"--{name.replace('_', '-')}: only simulated data has a choice")
+            if requested[name] is not None:
+                option = name.replace("_", "-")
+                raise ConfigError(f"--{option}: only for simulated data; leave it out with --data")
         given["data"] = str(Path(given["data"]).resolve())
         if not Path(given["data"]).is_dir():
-            raise ConfigError(f"--data {given['data']}: no such folder, nor 'synthetic'")
+            raise ConfigError(f"--data {given['data']}: no such folder; give a folder or synthetic")
     axes = check_axes(_axes(grid, stored))
     chosen = Bench(directory.resolve(), BenchSettings(**given), axes)
     for method in axes.methods:
@@ -183,18 +184,18 @@ def _choose(directory: Path, asked: dict[str, Any], grid: dict[str, str | None])
 
 
 def _absolute(override: str) -> str:
-    """Return an override whose path holds wherever the bench is continued."""
+    """Return an override with an absolute path, so that the bench can resume in any folder."""
     key, _, value = override.partition("=")
     return f"{key}={Path(value).resolve()}" if key.endswith(".path") else override
 
 
 def _axes(grid: dict[str, str | None], stored: "Bench | None") -> Any:
-    """Return the axes of the grid from the words of the command line."""
+    """Return the axes of the grid from the options of the command line."""
     from curate.errors import ConfigError
     from pipelines.bench.settings import Axes
-    from pipelines.stages.methods import METHODS as KNOWN
+    from pipelines.stages.methods import METHODS as ALL_METHODS
 
-    paper = ",".join(name for name in METHODS.split(",") if name in KNOWN)
+    paper = ",".join(name for name in METHODS.split(",") if name in ALL_METHODS)
     axes: dict[str, Any] = {}
     for name, default, kind in (
         ("methods", paper, str), ("ratios", RATIOS, float), ("seeds", SEEDS, int),
@@ -203,16 +204,16 @@ def _axes(grid: dict[str, str | None], stored: "Bench | None") -> Any:
         if text is None and stored is not None:
             axes[name] = getattr(stored.axes, name)
             continue
-        words = (default if text is None else text).split(",")
+        items = (default if text is None else text).split(",")
         try:
-            axes[name] = tuple(kind(word.strip()) for word in words if word.strip())
+            axes[name] = tuple(kind(item.strip()) for item in items if item.strip())
         except ValueError as error:
-            raise ConfigError(f"--{name} {text}: numbers with commas between them") from error
+            raise ConfigError(f"--{name} {text}: give numbers separated by commas") from error
     return Axes(**axes)
 
 
 def _run(bench: "Bench", workers: int, *, quiet: bool) -> None:
-    """Simulate what is to be simulated and runs the grid; in JSON mode it talks on stderr."""
+    """Simulate the data if needed, and run the grid; `quiet` sends messages to stderr."""
     from pipelines.bench.data import make_data
     from pipelines.bench.processes import JobProcesses
     from pipelines.bench.running import alone, run_grid
@@ -229,7 +230,7 @@ def _run(bench: "Bench", workers: int, *, quiet: bool) -> None:
 
 
 def _announce(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
-    """Write the files, and prints the tables."""
+    """Write the result files and print the tables."""
     from pipelines.bench.report import shown
 
     if not report.results:
@@ -246,9 +247,3 @@ def _announce(report: "BenchReport", overlaps: str, *, as_json: bool) -> None:
             rows = [[shown(value) for value in row] for row in table.rows]
             print_table(table.columns, rows, title=table.title)
     typer.echo("\n".join(str(path) for path in written))
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(bench)
-    app.command(name="bench-cell", hidden=True)(bench_cell)

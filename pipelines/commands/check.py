@@ -1,6 +1,4 @@
-"""curate check: the leakage firewall by itself."""
-
-import typer
+"""curate check: run all rules of the leakage firewall."""
 
 from pipelines.commands.options import JsonOption, WorkspaceOption
 
@@ -8,8 +6,8 @@ from pipelines.commands.options import JsonOption, WorkspaceOption
 def check(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> None:
     """Check that no ground truth leaks into pseudo-labels or training; nothing is changed.
 
-    Every export and every training checks the same rules first, on a sample of frames. The exit
-    code is 5 if a rule is broken.
+    Every export and every training first checks the same rules on a sample of frames. The exit code
+    is 5 if a rule is broken.
 
     Example: curate check
     """
@@ -23,19 +21,14 @@ def check(workspace: WorkspaceOption = None, as_json: JsonOption = False) -> Non
         findings.append(finding)
         if not as_json:
             print_line(
-                f"{'pass' if finding.held else 'FAIL'}  {finding.rule:<36} {finding.told}", 6
+                f"{'pass' if finding.passed else 'FAIL'}  {finding.rule:<36} {finding.message}", 6
             )
     if as_json:
         print_json(findings)
-    broken = [finding for finding in findings if not finding.held]
+    broken = [finding for finding in findings if not finding.passed]
     if broken:
         first = broken[0]
         raise LeakageError(
-            f"{len(broken)} of {len(findings)} rules are broken; {first.rule}: {first.told}; "
+            f"{len(broken)} of {len(findings)} rules are broken; {first.rule}: {first.message}; "
             f"{first.remedy or 'see above'}"
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(check)

@@ -1,4 +1,4 @@
-"""curate demo: the whole job on simulated data."""
+"""curate demo: run the whole pipeline on simulated data."""
 
 from pathlib import Path
 from typing import Annotated, Optional
@@ -51,8 +51,3 @@ def demo(
         ),
         print_line,
     )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(demo)

@@ -1,4 +1,4 @@
-"""curate diff: what changed between two rounds."""
+"""curate diff: compare the labels of two rounds."""
 
 from typing import Annotated
 
@@ -40,9 +40,4 @@ def diff(
     )
     if found.labels:
         names = ("change", "frame", "category", "k", "k after", "IoU", "weight", "weight after")
-        print_table(names, map(astuple, found.labels), title="the most changed labels")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(diff)
+        print_table(names, map(astuple, found.labels), title="labels with the largest changes")

@@ -1,4 +1,4 @@
-"""curate doctor: is the chain from the sensors to the labels sound?"""
+"""curate doctor: check data, calibration and segmentation on one frame."""
 
 from typing import Annotated, Optional
 
@@ -16,7 +16,7 @@ def doctor(
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check one frame from file to box: data, calibration, segmentation, and how boxes are defined.
+    """Check one frame from file to box: data, calibration, segmentation, and box conventions.
 
     Choose a frame with objects near the vehicle. Nothing is stored. The exit code is 1 if a check
     fails.
@@ -30,12 +30,7 @@ def doctor(
         print_json({"frame": name, "findings": findings})
     else:
         typer.echo(f"frame {name}")
-        for one in findings:
-            print_line(f"{one.state:<8} {one.check:<12} {one.message}", indent=22)
-    if any(one.state == "wrong" for one in findings):
+        for finding in findings:
+            print_line(f"{finding.state:<8} {finding.check:<12} {finding.message}", indent=22)
+    if any(finding.state == "wrong" for finding in findings):
         raise typer.Exit(1)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(doctor)

@@ -1,4 +1,4 @@
-"""What a command prints under --dry-run."""
+"""Output of --dry-run."""
 
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def print_preview(planned: "Iterable[PlannedStage]", *, as_json: bool) -> None:
-    """Print what stages would do, why, and how long all of them would take."""
+    """Print what each stage would do and why, and the expected time of all."""
     from pipelines.engine.progress import duration
 
     stages = list(planned)
@@ -28,11 +28,11 @@ def print_preview(planned: "Iterable[PlannedStage]", *, as_json: bool) -> None:
     if not any(stage.reasons for stage in stages):
         typer.echo("Everything is up to date.")
         return
-    known = [f"about {duration(total)}"] if any(stage.seconds for stage in stages) else []
+    costs = [f"about {duration(total)}"] if any(stage.seconds for stage in stages) else []
     if unknown:
         names = ", ".join(dict.fromkeys(unknown))
-        known.append(f"an unknown time for {names}, which no earlier run has measured")
-    typer.echo(f"In all: {', and '.join(known)}. Nothing was done.")
+        costs.append(f"an unknown time for {names}, which no earlier run has measured")
+    typer.echo(f"Total: {', and '.join(costs)}. Nothing was done.")
 
 
 def _line(stage: "PlannedStage") -> str:

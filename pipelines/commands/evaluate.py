@@ -1,4 +1,4 @@
-"""curate evaluate: KITTI average precision."""
+"""curate evaluate: compute KITTI average precision."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from curate.evaluation.kitti_ap import KittiEvaluation
     from pipelines.workspace.workspace import Workspace
 
-OUTCOMES = {"tp": "found", "fn": "missed", "ignored": "ignored"}
+OUTCOMES = {"tp": "detected", "fn": "missed", "ignored": "ignored"}
 
 
 def evaluate(
@@ -82,8 +82,8 @@ def evaluate(
             raise ConfigError("evaluate: --store needs a workspace, not --labels and --results")
         from curate.evaluation.kitti_folders import read_folders
 
-        _, truth, answers = read_folders(labels, results, _read_ids(frames) if frames else None)
-        found = _compare(truth, answers)
+        _, truth, detections = read_folders(labels, results, _read_ids(frames) if frames else None)
+        found = _compare(truth, detections)
     else:
         if round_number is not None and checkpoint is not None:
             raise ConfigError("evaluate: give --round or --checkpoint, not both")
@@ -104,16 +104,16 @@ def _read_ids(path: Path) -> list[str]:
     try:
         found = path.read_text(encoding="utf-8").split()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: no list of frame ids: {error}") from error
+        raise DataError(f"{path}: is not a list of frame ids: {error}") from error
     if not found:
-        raise DataError(f"{path}: names no frames")
+        raise DataError(f"{path}: lists no frames; write one frame id per line")
     return found
 
 
 def _evaluate_val(
     workspace: "Workspace", round_number: int | None, checkpoint: Path | None, *, store: bool
 ) -> "tuple[KittiEvaluation, str]":
-    """Return the evaluation on the val frames, and what to say of it."""
+    """Return the evaluation on the val frames, and a line that describes it."""
     from curate.errors import WorkspaceError
     from pipelines.assessment.evaluation import detect_val, stored_val, val_objects
     from pipelines.assessment.store import store_evaluation
@@ -122,18 +122,18 @@ def _evaluate_val(
 
     if round_number is not None:
         source = f"round {round_number}"
-        answers = stored_val(workspace, round_number)
+        detections = stored_val(workspace, round_number)
     else:
         path = checkpoint or newest_checkpoint(workspace)
         if not path.exists():
             raise WorkspaceError(f"--checkpoint {path}: no such file")
         source = workspace.relative(path)
-        answers = detect_val(workspace, path, Bar())
-    objects = val_objects(workspace, answers)
+        detections = detect_val(workspace, path, Bar())
+    objects = val_objects(workspace, detections)
     found = _compare(*objects)
-    notes = f"{source} on {len(answers)} val frames"
+    notes = f"{source} on {len(detections)} val frames"
     if store:
-        counts = store_evaluation(workspace, source, answers, objects, found)
+        counts = store_evaluation(workspace, source, detections, objects, found)
         tail = ", ".join(f"{counts.get(name, 0)} {word}" for name, word in OUTCOMES.items())
         notes += f"; stored as source '{source}': {tail} objects"
     return found, notes
@@ -142,18 +142,18 @@ def _evaluate_val(
 def _compare(
     labels: "Sequence[KittiObjects]", results: "Sequence[KittiObjects]"
 ) -> "KittiEvaluation":
-    """Return the evaluation; says what takes so long where it must be compiled first."""
+    """Return the evaluation; print a message if its code must be compiled first."""
     from curate.evaluation import kitti_ap, kitti_matching
     from curate.geometry.compiled import is_compiled
 
-    kitti_ap.check_frames(labels, results)  # a fault is told alone
+    kitti_ap.check_frames(labels, results)  # report an error before the message below
     if not is_compiled(kitti_matching.count_at_thresholds):
-        typer.echo("compiling the evaluation, once: this takes some ten seconds", err=True)
+        typer.echo("compiling the evaluation code (first use only, about ten seconds)", err=True)
     return kitti_ap.evaluate(labels, results)
 
 
 def _print(figures: dict[str, Any]) -> None:
-    """R40 and R11 side by side, a row per category and figure."""
+    """Print R40 and R11 side by side, a row per category and figure."""
     levels = ("easy", "mod.", "hard")
     columns = ["category", "figure", *(f"{kind} {d}" for kind in ("R40", "R11") for d in levels)]
     rows = []
@@ -169,8 +169,3 @@ def _print(figures: dict[str, Any]) -> None:
 
 def _percent(value: Any) -> str:
     return f"{value:.2f}" if isinstance(value, float) else str(value)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(evaluate)

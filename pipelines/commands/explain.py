@@ -1,4 +1,4 @@
-"""curate explain: why a label has its weight."""
+"""curate explain: show how the weight of a label was computed."""
 
 from typing import Annotated
 
@@ -22,7 +22,7 @@ def explain(
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show every number behind a label's weight and the equation that it enters.
+    """Show every number behind a label's weight, and the equations that use it.
 
     Example: curate explain 000008 0
     """
@@ -35,8 +35,3 @@ def explain(
     else:
         for line in found.lines:
             print_line(line, indent=17)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(explain)

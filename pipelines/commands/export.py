@@ -1,4 +1,4 @@
-"""curate export: labels as files."""
+"""curate export: write weighted labels to files."""
 
 import time
 from pathlib import Path
@@ -43,7 +43,7 @@ def export(
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the weighted labels as files in the format of a trainer, see docs/training.md.
+    """Write the weighted labels as files in the format of a trainer; see docs/training.md.
 
     Example: curate export --format sqlite
     """
@@ -63,7 +63,7 @@ def export(
     path = output or opened.root / "exports" / f"{exporter.name}{exporter.suffix}"
     if dry_run:
         number = preview_round(opened, number).number
-        why = (f"{path} would be written; such an export is always made anew",)
+        why = (f"{path} would be written; this format is always exported again",)
         print_preview([PlannedStage(number, "export", None, (), why, None)], as_json=as_json)
         return
     start = time.perf_counter()
@@ -75,8 +75,3 @@ def export(
     if not as_json:
         typer.echo(summary)
     end([report], as_json=as_json)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(export)

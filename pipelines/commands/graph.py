@@ -1,4 +1,4 @@
-"""curate graph: the DAG."""
+"""curate graph: show the stages as a DAG."""
 
 from typing import Annotated
 
@@ -10,11 +10,11 @@ from pipelines.reports.terminal import print_json, print_table
 
 def graph(
     mermaid: Annotated[
-        bool, typer.Option("--mermaid", help="Print it as a Mermaid flowchart.")
+        bool, typer.Option("--mermaid", help="Print the graph as a Mermaid flowchart.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the stages of a round, and what each reads and writes.
+    """Show the stages of a round and what each reads and writes.
 
     Example: curate graph
     """
@@ -22,15 +22,10 @@ def graph(
 
     found = round_graph()
     if as_json:
-        shown = ("name", "command", "reads", "writes")
-        print_json([{name: getattr(stage, name) for name in shown} for stage in found.stages])
+        fields = ("name", "command", "reads", "writes")
+        print_json([{name: getattr(stage, name) for name in fields} for stage in found.stages])
     elif mermaid:
         typer.echo(found.as_mermaid())
     else:
         rows = ((", ".join(each.reads), each.name, ", ".join(each.writes)) for each in found.stages)
         print_table(("reads", "stage", "writes"), rows)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(graph)

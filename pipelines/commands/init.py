@@ -1,4 +1,4 @@
-"""curate init: a workspace over a data set."""
+"""curate init: create a workspace for a data set."""
 
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -34,7 +34,8 @@ def init(
         ),
     ] = "0.04",
     val: Annotated[
-        str, typer.Option(help="The same for validation; default: the data set's own val list.")
+        str,
+        typer.Option(help="The same for validation frames; default: the val list of the data set."),
     ] = "",
     split_by: Annotated[
         str,
@@ -86,9 +87,9 @@ def init(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Create a workspace: its settings, its database, and which frames are labeled.
+    """Create a workspace: settings, database, and the choice of labeled frames.
 
-    Ground truth of unlabeled frames is never read. Without a segmenter only the point prior is
+    Ground truth of unlabeled frames is never read. Without a segmenter, only the point prior is
     used.
 
     Example: curate init work --root data/simulated --labeled 0.06 --segmenter simulated
@@ -133,7 +134,7 @@ def init(
 
 
 def _option(text: str) -> tuple[str, Any]:
-    """Name and value, which is TOML where it can be and else a text; ConfigError without a =."""
+    """Return name and value of NAME=VALUE; a value that is not valid TOML becomes a string."""
     import tomllib
 
     from curate.errors import ConfigError
@@ -145,8 +146,3 @@ def _option(text: str) -> tuple[str, Any]:
         return name, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
         return name, value
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(init)

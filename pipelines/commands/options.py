@@ -15,20 +15,20 @@ if TYPE_CHECKING:
 
 
 def one_of(names: Iterable[str]) -> str:
-    """Return names as a help text lists them: "a, b or c"."""
+    """Return names as in help texts: "a, b or c"."""
     *others, last = names
     return f"{', '.join(others)} or {last}" if others else last
 
 
 def registered(registry: Registry, *others: str) -> str:
-    """Return the names that a configuration may use, and that a class of the user's is one, too."""
+    """Return the valid names of an extension, with `module:Class` for user-supplied classes."""
     return one_of((*registry.classes, *others, "module:Class"))
 
 
 def complete(names: Iterable[str]) -> Callable[[str], list[str]]:
     """Return a function that completes a half-typed name in the shell."""
-    known = list(names)
-    return lambda incomplete: [name for name in known if name.startswith(incomplete)]
+    choices = list(names)
+    return lambda incomplete: [name for name in choices if name.startswith(incomplete)]
 
 
 WorkspaceOption = Annotated[
@@ -49,8 +49,7 @@ PolicyOption = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
         "--policy",
-        help="Policy that gives the weights, see `curate solve -h`; default: run.method of "
-        "curate.toml.",
+        help="Policy of the weights, see `curate solve -h`; default: run.method of curate.toml.",
         autocompletion=complete(POLICIES.classes),
     ),
 ]
@@ -63,14 +62,14 @@ LastRoundOption = Annotated[
 SplitOption = Annotated[
     str,
     typer.Option(
-        "--split", help=f"Frames to work on: {one_of(SPLITS)}.", autocompletion=complete(SPLITS)
+        "--split", help=f"Frames to process: {one_of(SPLITS)}.", autocompletion=complete(SPLITS)
     ),
 ]
 ExecutorOption = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
         "--executor",
-        help=f"How frames are worked on: {registered(EXECUTORS)}; default: run.executor of "
+        help=f"How frames are processed: {registered(EXECUTORS)}; default: run.executor of "
         "curate.toml.",
         autocompletion=complete(EXECUTORS.classes),
     ),
@@ -80,7 +79,7 @@ WorkersOption = Annotated[
     typer.Option(
         "--workers",
         min=1,
-        help="Number of workers, each with its own copy of the model; more than one need the "
+        help="Number of workers, each with its own copy of the model; more than one needs the "
         "executor process or ray. Default: run.workers of curate.toml.",
     ),
 ]
@@ -97,7 +96,7 @@ DryRunOption = Annotated[
     bool,
     typer.Option(
         "--dry-run",
-        help="Print what would be done, why, and how long it takes; do nothing and write nothing.",
+        help="Print what would run, why, and how long it would take; do not run it.",
     ),
 ]
 ChartFormatOption = Annotated[
@@ -128,7 +127,7 @@ def open_workspace(
 
 
 def end(reports: Sequence["Report"], *, as_json: bool) -> None:
-    """End a command that ran stages.
+    """Print the JSON output of a command that ran stages, and fail if frames failed.
 
     Raises:
         FramesFailed: if frames failed.

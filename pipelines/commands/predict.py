@@ -1,6 +1,4 @@
-"""curate predict: the teacher's boxes."""
-
-import typer
+"""curate predict: run the teacher on frames."""
 
 from pipelines.commands.options import (
     DryRunOption,
@@ -23,7 +21,7 @@ def predict(
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the teacher on frames and store its boxes, low scores included.
+    """Run the teacher on frames and store its predictions, including low scores.
 
     Example: curate predict --split unlabeled
     """
@@ -31,8 +29,3 @@ def predict(
         ("predict",), workspace, round_number, split, executor, workers,
         as_json=as_json, dry_run=dry_run,
     )  # fmt: skip
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(predict)

@@ -1,6 +1,4 @@
-"""curate pretrain: w_0 on X_l."""
-
-import typer
+"""curate pretrain: train the first teacher, w_0, on X_l."""
 
 from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import (
@@ -20,7 +18,7 @@ def pretrain(
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train the first teacher, on the labeled frames only.
+    """Train the first teacher on the labeled frames only.
 
     Example: curate pretrain
     """
@@ -43,8 +41,3 @@ def pretrain(
     if not as_json:
         print_report(reports[0])
     end(reports, as_json=as_json)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(pretrain)

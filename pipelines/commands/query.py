@@ -1,4 +1,4 @@
-"""curate query: SQL."""
+"""curate query: run SQL on the database or an exported file."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,20 +16,22 @@ if TYPE_CHECKING:
 
 FORMATS = ("table", "csv", "json")
 AUDITED = ("score", "rho_det", "consistency")
-"""Evidence that `curate audit` stores beside the policies."""
+"""Evidence that `curate audit` stores in the column policy, besides the policies."""
 _SCHEMA = ("table", "kind", "column", "type", "unit", "key", "null", "meaning")
 
 
 def query(
     sql: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Argument(help="A SELECT; with --schema the table or view to describe."),
+        typer.Argument(help="A SELECT statement; with --schema, the table or view to describe."),
     ] = None,
     named: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Run a query that ships with curate, see --list."),
+        typer.Option(help="Run a query that ships with curate; --list shows them."),
     ] = None,
-    show_list: Annotated[bool, typer.Option("--list", help="List these queries.")] = False,
+    show_list: Annotated[
+        bool, typer.Option("--list", help="List the queries that ship with curate.")
+    ] = False,
     schema: Annotated[
         bool,
         typer.Option("--schema", help="List tables and views: columns, types, units, meaning."),
@@ -44,12 +46,12 @@ def query(
     ] = None,
     file: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Query an exported label file, not the workspace's database."),
+        typer.Option(help="Query an exported label file instead of the workspace's database."),
     ] = None,
     form: Annotated[str, typer.Option("--format", help="table, csv or json.")] = "table",
     as_csv: Annotated[bool, typer.Option("--csv", help="Short for --format csv.")] = False,
     limit: Annotated[
-        int, typer.Option(min=1, help="Rows of the table; csv and json print all.")
+        int, typer.Option(min=1, help="Maximum number of rows of a table; csv and json print all.")
     ] = 50,
     seconds: Annotated[
         float, typer.Option(min=0.1, help="Time after which the query is stopped.")
@@ -59,10 +61,10 @@ def query(
 ) -> None:
     """Query the database with SQL; the connection is read-only.
 
-    The view weighted_labels has a row per label and policy, with all evidence. SQLite gets the
-    functions median(x), quantile(x, q), corr(x, y), stddev(x) and iou_bev(x1, y1, length1, width1,
-    yaw1, x2, ...). In a terminal a table that does not fit becomes a block per row, and a long
-    one goes through the pager (PAGER=cat switches it off); a table rounds fractions to four digits.
+    The view weighted_labels has a row per label and policy, with all evidence. On SQLite, curate
+    adds the functions median(x), quantile(x, q), corr(x, y), stddev(x) and iou_bev(x1, y1, length1,
+    width1, yaw1, x2, ...). Tables round fractions to four digits. In a terminal, a table that is
+    too wide is shown as a block per row, and a long one in the pager (PAGER=cat switches it off).
 
     Example: curate query "SELECT frame, k, weight FROM weighted_labels WHERE weight > 0.5"
     """
@@ -110,7 +112,7 @@ def _named(name: str, policy: str | None, round_number: int | None, url: "URL") 
     """Return the SQL of a named query, for a policy and a round.
 
     Raises:
-        ConfigError: if a name is unknown, or the query does not depend on what is selected.
+        ConfigError: if a name is unknown, or the query has no column to select by.
     """
     from curate.errors import ConfigError
     from curate.spelling import did_you_mean
@@ -118,14 +120,14 @@ def _named(name: str, policy: str | None, round_number: int | None, url: "URL") 
     from pipelines.registry import POLICIES
 
     found = find_query(name)
-    known = (*POLICIES.classes, *AUDITED)
-    if policy is not None and policy not in known and ":" not in policy:
+    valid = (*POLICIES.classes, *AUDITED)
+    if policy is not None and policy not in valid and ":" not in policy:
         raise ConfigError(
-            f"--policy {policy}: unknown policy{did_you_mean(policy, known)}; "
-            f"use one of {', '.join(known)}, or module:Class"
+            f"--policy {policy}: unknown policy{did_you_mean(policy, valid)}; "
+            f"use one of {', '.join(valid)}, or module:Class"
         )
     postgresql = url.get_backend_name() == "postgresql"
-    return found.selecting(policy, round_number, postgresql=postgresql)
+    return found.filtered(policy, round_number, postgresql=postgresql)
 
 
 def _list() -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
@@ -143,7 +145,7 @@ def _list() -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
 
 
 def _schema(name: str | None, file: Path | None, workspace: Path | None) -> "tuple[Relation, ...]":
-    """Return all tables and views, or the named one; outside a workspace those of any."""
+    """Return all tables and views, or one; outside a workspace, those of a new workspace."""
     from curate.errors import WorkspaceError
     from pipelines.queries.schema import find_relation, read_schema, working_schema
 
@@ -161,7 +163,7 @@ def _print_schema(schema: "tuple[Relation, ...]", form: str) -> None:
         each: [
             (
                 *(column.name, column.type, column.unit),
-                *("yes" if said else "" for said in (column.key, column.optional)),
+                *("yes" if flag else "" for flag in (column.key, column.optional)),
                 column.meaning,
             )
             for column in each.columns
@@ -171,13 +173,13 @@ def _print_schema(schema: "tuple[Relation, ...]", form: str) -> None:
     if form == "table":
         print_tables(
             (
-                (f"{each.name} ({each.kind}): {each.meaning}", _SCHEMA[2:], of_it)
-                for each, of_it in rows.items()
+                (f"{each.name} ({each.kind}): {each.meaning}", _SCHEMA[2:], columns)
+                for each, columns in rows.items()
             ),
             page=True,
         )
     else:
-        flat = ((each.name, each.kind, *row) for each, of_it in rows.items() for row in of_it)
+        flat = ((each.name, each.kind, *row) for each, columns in rows.items() for row in columns)
         _print(_SCHEMA, flat, form, None)
 
 
@@ -199,8 +201,3 @@ def _print(
         print_table(columns, shown, page=True)
         if len(shown) == limit and next(rows, None) is not None:
             print_line(f"the first {limit} rows; more with --limit, all with --format csv or json")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(query)

@@ -1,4 +1,4 @@
-"""curate report: a round on one page."""
+"""curate report: summarise a round on one page."""
 
 import typer
 
@@ -40,8 +40,3 @@ def report(
         typer.echo(f"report: {path}")
         if charts:
             typer.echo(f"charts: {len(charts)} files in {charts[0].parent}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(report)

@@ -1,6 +1,4 @@
-"""curate repredict: the teacher's answers for augmented copies."""
-
-import typer
+"""curate repredict: run the teacher on augmented copies of frames."""
 
 from pipelines.commands.options import (
     DryRunOption,
@@ -31,8 +29,3 @@ def repredict(
         ("repredict",), workspace, round_number, split, executor, workers,
         as_json=as_json, dry_run=dry_run,
     )  # fmt: skip
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(repredict)

@@ -1,4 +1,4 @@
-"""curate review: labels to an editor and back."""
+"""curate review: export labels to an editor and import decisions from it."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
@@ -132,19 +132,19 @@ def import_review(
     """
     from pipelines.review.importing import apply_review
 
-    taken = apply_review(
+    found = apply_review(
         open_workspace(workspace),
         directory,
-        answer=answer,
+        edited=answer,
         accept=_names(accept),
         reviewer=reviewer,
         from_round=from_round,
         dry_run=dry_run,
     )
     if as_json:
-        print_json(taken)
+        print_json(found)
     else:
-        typer.echo(_describe_import(taken))
+        typer.echo(_describe_import(found))
 
 
 @group.command("list")
@@ -178,7 +178,7 @@ def clear_reviews(
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Delete human labels; the stored weights of the policies count again.
+    """Delete human labels; the stored weights of the policies apply again.
 
     Example: curate review clear --frames 000012,000017
     """
@@ -186,39 +186,32 @@ def clear_reviews(
     from pipelines.review.importing import clear
 
     if not (reviews or frames or everything):
-        raise ConfigError("clear: name reviews, --frames, or --all")
-    gone = clear(open_workspace(workspace), reviews or (), _names(frames))
+        raise ConfigError("clear: give review ids, --frames or --all")
+    deleted = clear(open_workspace(workspace), reviews or (), _names(frames))
     if as_json:
-        print_json({"cleared": gone})
+        print_json({"cleared": deleted})
     else:
-        typer.echo(
-            f"{gone} human labels forgotten; `curate run` brings files and students up to date"
-        )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.add_typer(group)
+        typer.echo(f"{deleted} human labels deleted; `curate run` updates files and students")
 
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(filter(None, (name.strip() for name in text.split(","))))
 
 
-def _describe_import(taken: "ReviewImport") -> str:
+def _describe_import(found: "ReviewImport") -> str:
     decisions = (
-        f"{taken.accepted} accepted, {taken.rejected} rejected, {taken.moved} moved, "
-        f"{taken.added} added, {taken.untouched} untouched"
+        f"{found.accepted} accepted, {found.rejected} rejected, {found.moved} moved, "
+        f"{found.added} added, {found.untouched} untouched"
     )
-    where = f"{taken.frames} frames" + (
-        f" ({taken.without_answer} did not come back)" if taken.without_answer else ""
+    frames = f"{found.frames} frames" + (
+        f" ({found.missing} more without edits)" if found.missing else ""
     )
-    line = f"review {taken.review}: {decisions} in {where}"
-    if taken.replaced:
-        line += f"; they take the place of {taken.replaced} earlier decisions"
-    if taken.dry_run:
+    line = f"review {found.review}: {decisions} in {frames}"
+    if found.replaced:
+        line += f"; they replace {found.replaced} earlier decisions"
+    if found.dry_run:
         return f"{line}; dry run, nothing is stored"
-    if not taken.changed:
-        decided = taken.accepted + taken.rejected + taken.moved + taken.added
-        return f"{line}; {'stored already' if decided else 'nothing is decided yet'}"
-    return f"{line}; they count from round {taken.from_round} on, `curate run` trains with them"
+    if not found.changed:
+        decided = found.accepted + found.rejected + found.moved + found.added
+        return f"{line}; {'already stored' if decided else 'no decisions yet'}"
+    return f"{line}; they count from round {found.from_round} on; `curate run` trains with them"

@@ -1,4 +1,4 @@
-"""curate run: the whole DAG."""
+"""curate run: run all stages of all rounds."""
 
 from typing import Annotated, Optional
 
@@ -41,7 +41,7 @@ def run(
 ) -> None:
     """Run every stage of every round that is not up to date.
 
-    With an external detector and without train.command there is one round, which ends with the
+    With an external detector and without train.command, there is one round, and it ends with the
     export.
 
     Example: curate run --rounds 3 --method pspsl
@@ -68,8 +68,3 @@ def run(
         if not as_json:
             print_report(report)
     end(reports, as_json=as_json)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(run)

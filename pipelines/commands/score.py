@@ -1,4 +1,4 @@
-"""curate score: ask the priors."""
+"""curate score: compute the priors of predictions."""
 
 from typing import Annotated, Optional
 
@@ -46,8 +46,3 @@ def score(
         stages, workspace, round_number, split, executor, workers,
         as_json=as_json, dry_run=dry_run,
     )  # fmt: skip
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(score)

@@ -1,4 +1,4 @@
-"""curate serve: the databases and the pictures in a browser."""
+"""curate serve: show databases and images of frames in a browser."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
@@ -45,23 +45,20 @@ def serve(
     from pipelines.serving.application import application
     from pipelines.serving.guard import is_loopback
     from pipelines.serving.server import listen
-    from pipelines.serving.server import serve as answer
+    from pipelines.serving.server import serve as run_server
     from pipelines.serving.sources import choose
 
     served = replace(choose(folder, workspace, file), time_limit_s=time_limit)
     with application(served, host) as pages:
-        taken = listen(host, port)
+        listener = listen(host, port)
         if not is_loopback(host):
-            typer.echo(f"warning: whoever reaches {host} reads these labels and pictures", err=True)
-        answer(pages, taken, lambda url: _announce(served, url), browse=browse)
+            typer.echo(
+                f"warning: everyone who can reach {host} can read these labels and images", err=True
+            )
+        run_server(pages, listener, lambda url: _announce(served, url), browse=browse)
 
 
 def _announce(served: "Served", url: str) -> None:
     for name, path in served.files.items():
         typer.echo(f"{name}: {path}")
     typer.echo(f"serving at {url} until Ctrl-C")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(serve)

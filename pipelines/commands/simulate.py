@@ -1,4 +1,4 @@
-"""curate simulate: a LiDAR-camera data set in KITTI format."""
+"""curate simulate: simulate a LiDAR-camera data set in KITTI format."""
 
 from pathlib import Path
 from typing import Annotated, Optional
@@ -37,16 +37,9 @@ def simulate(
     from pipelines.engine.progress import Bar, as_total
 
     with Bar().track("simulate", frames) as advance:
-        shown = as_total(advance)
-        run(directory, frames, seed, val_frames=val, workers=workers, progress=shown)
+        progress = as_total(advance)
+        run(directory, frames, seed, val_frames=val, workers=workers, progress=progress)
     if as_json:
         print_json({"folder": str(directory), "frames": frames, "val": val, "seed": seed})
         return
-    typer.echo(
-        f"{frames} frames in {directory}, as KITTI lays them out; labels in training/label_2"
-    )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(simulate)
+    typer.echo(f"{frames} frames in {directory}, in KITTI's layout; labels in training/label_2")

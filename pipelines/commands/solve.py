@@ -1,4 +1,4 @@
-"""curate solve: weigh the labels."""
+"""curate solve: compute the weights of labels."""
 
 from typing import Annotated, Optional
 
@@ -39,8 +39,3 @@ def solve(
     run_round_command(
         "solve", open_workspace(workspace), round_number, policy, as_json=as_json, dry_run=dry_run
     )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(solve)

@@ -1,4 +1,4 @@
-"""What the commands of single stages have in common."""
+"""Shared code of the commands that run a single stage."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ def run_frame_command(
     as_json: bool,
     dry_run: bool = False,
 ) -> None:
-    """Run frame stages for a split; None stands for the configured priors."""
+    """Run frame stages on a split; None for the stages of the configured priors."""
     from curate.errors import ConfigError
     from pipelines.assembly import check_executor
     from pipelines.engine.plan import Plan
@@ -41,23 +41,23 @@ def run_frame_command(
     names = priors if stages is None else stages
     unknown = [name for name in names if name not in (*priors, "predict", "repredict")]
     if unknown:
-        raise ConfigError(f"--prior {unknown[0]}: not among run.priors {list(priors)}")
+        raise ConfigError(f"--prior {unknown[0]}: not in run.priors {list(priors)}")
     check_executor(workspace.config)
     graph = graph_of(workspace)
-    wanted = [graph.of_frames(name) for name in names]
-    for stage in wanted:
+    selected = [graph.of_frames(name) for name in names]
+    for stage in selected:
         if stage.check:
             stage.check(workspace)
     if dry_run:
         context = preview_round(workspace, round_number)
         preview = Preview(workspace, graph, context.number, context)
-        planned = (preview.of_frames(stage, split, alone=True) for stage in wanted)
+        planned = (preview.of_frames(stage, split, alone=True) for stage in selected)
         print_preview(planned, as_json=as_json)
         return
     plan = Plan(workspace, open_round(workspace, round_number), graph)
     reports = []
     with open_executor(workspace) as work:
-        for stage in wanted:
+        for stage in selected:
             reports.append(run_frames(plan, stage, work, Bar(), split))
             if not as_json:
                 print_report(reports[-1])
@@ -73,7 +73,7 @@ def run_round_command(
     as_json: bool,
     dry_run: bool = False,
 ) -> None:
-    """Run a round stage for a policy."""
+    """Run a stage of a round for a policy; None for the configured policy."""
     from pipelines.engine.plan import Plan
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar

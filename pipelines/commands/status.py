@@ -1,4 +1,4 @@
-"""curate status: how far the work is."""
+"""curate status: show the progress of the stages."""
 
 from typing import Annotated
 
@@ -36,8 +36,3 @@ def status(
         splits = {split: len(opened.frames(split)) for split in ("labeled", "unlabeled", "val")}
         counts = ", ".join(f"{count} {split}" for split, count in splits.items())
         print_table(columns, rows, title=f"{opened.root}: {counts} frames")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(status)

@@ -1,4 +1,4 @@
-"""curate train-round: a student from the exported labels."""
+"""curate train-round: train a student on the exported labels."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -50,38 +50,33 @@ def train_round(
     --command runs your own trainer instead. {labels}, {output}, {teacher}, {round} and {policy} in
     it are replaced, and are in its environment as CURATE_LABELS, CURATE_OUTPUT and so on. No shell
     is involved. The trainer writes the file or folder {output}. After a student of the configured
-    policy, the command is stored in curate.toml and trains later rounds, too. docs/training.md
+    policy, the command is stored in curate.toml and also trains later rounds. docs/training.md
     shows how a trainer uses the weights.
 
     Example: curate train-round --command "python train.py {labels} {output}"
     """
     given = {"command": command, "labels_format": labels_format}
-    told = {name: value for name, value in given.items() if value is not None}
-    opened = open_workspace(workspace, threads=threads).with_settings("train", **told)
+    changes = {name: value for name, value in given.items() if value is not None}
+    opened = open_workspace(workspace, threads=threads).with_settings("train", **changes)
     run_round_command("train-round", opened, round_number, policy, as_json=as_json, dry_run=dry_run)
     if dry_run:
         return
-    _remember(workspace, policy, told)
+    _store_settings(workspace, policy, changes)
 
 
-def _remember(folder: Path | None, policy: str | None, told: Mapping[str, str]) -> None:
-    """Write how the next teacher was trained into curate.toml, where later rounds look."""
+def _store_settings(folder: Path | None, policy: str | None, changes: Mapping[str, str]) -> None:
+    """Store the trainer's settings in curate.toml, so that later rounds use them."""
     from pipelines.workspace.config_file import change_settings
     from pipelines.workspace.location import CONFIG_NAME
     from pipelines.workspace.workspace import Workspace
 
-    if not told:
+    if not changes:
         return
     workspace = Workspace.open(folder)
     current = workspace.config.train.model_dump()
-    new = {name: value for name, value in told.items() if current[name] != value}
+    new = {name: value for name, value in changes.items() if current[name] != value}
     if new and policy in (None, workspace.config.run.method):
         change_settings(workspace.root / CONFIG_NAME, "train", new)
         typer.echo(
-            f"{CONFIG_NAME}: [train] now says {' and '.join(new)}, for later rounds too", err=True
+            f"{CONFIG_NAME}: stored {' and '.join(new)} in [train] for later rounds", err=True
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(name="train-round")(train_round)

@@ -1,4 +1,4 @@
-"""curate view: pictures or a 3D recording of frames."""
+"""curate view: draw images or a 3D recording of frames."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
@@ -42,7 +42,7 @@ def view(
         ),
     ] = None,
     style: Annotated[
-        str, typer.Option(help="Colours: dark, or paper with a white ground.")
+        str, typer.Option(help="Colours: dark, or paper with a white background.")
     ] = "dark",
     recording: Annotated[
         Optional[Path],  # noqa: UP045
@@ -54,8 +54,8 @@ def view(
     """Draw frames: camera image and bird's eye view with all boxes, coloured by weight.
 
     Predictions are solid, repredictions dashed, ground truth dotted. Ground truth is drawn for
-    labeled and val frames only. Each label shows its k, to type `curate explain FRAME K`, and its
-    weight, score and LiDAR points where there is room. In PDF and SVG files boxes and texts are
+    labeled and val frames only. Each label shows its k, the K of `curate explain FRAME K`, and if
+    there is room, its weight, score and LiDAR points. In PDF and SVG files, boxes and texts are
     vectors. A recording holds points, image, boxes and the evidence of each label, frame by frame;
     open it with `rerun FILE` (pip install 'curate-pseudo-labels[rerun]').
 
@@ -69,12 +69,12 @@ def view(
     colours, kind = find_style(style), _image_format(image_format, output)
     opened = open_workspace(workspace)
     if bool(frames) == every:
-        raise ConfigError("name frames to draw, or give --all")
+        raise ConfigError("give the ids of the frames to draw, or --all")
     number = chosen_round(opened, round_number)
     method = policy or opened.config.run.method
     names = frames or labeled_by(opened, number, method, limit)
     if output is not None and (recording is not None or len(names) > 1):
-        raise ConfigError("--output is for the picture of one frame; leave it out")
+        raise ConfigError("--output is for the image of one frame; leave it out")
     if recording is not None:
         from pipelines.reports.recording import record_frames
 
@@ -94,10 +94,10 @@ def view(
 
 
 def _image_format(name: str | None, output: Path | None) -> "ImageFormat":
-    """Return the format of the picture.
+    """Return the image format.
 
     Raises:
-        ConfigError: if it is unknown, or the file's suffix says another one.
+        ConfigError: if it is unknown, or contradicts the suffix of the file.
     """
     from curate.errors import ConfigError
     from curate.viewing.chart_style import check_format
@@ -107,8 +107,3 @@ def _image_format(name: str | None, output: Path | None) -> "ImageFormat":
     if suffix and suffix != kind:
         raise ConfigError(f"--output {output}: the suffix of a {kind} file is .{kind}")
     return kind
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(view)

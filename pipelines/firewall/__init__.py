@@ -1,1 +1,1 @@
-"""The leakage firewall: rules that hold before anything is exported or trained on."""
+"""The leakage firewall: rules that are checked before every export and training."""

@@ -1,4 +1,4 @@
-"""What a rule of the firewall answers."""
+"""The result of a firewall rule."""
 
 from dataclasses import dataclass
 
@@ -7,22 +7,22 @@ from curate.errors import LeakageError
 
 @dataclass(frozen=True)
 class Finding:
-    """What became of one rule.
+    """The result of one rule.
 
     Attributes:
         rule: what must hold, in a few words.
-        held: whether it does.
-        told: with what numbers, or what breaks it.
-        remedy: what to do where it is broken.
+        passed: whether it holds.
+        message: figures if it holds, or else what breaks it.
+        remedy: what to do if it does not hold.
     """
 
     rule: str
-    held: bool
-    told: str
+    passed: bool
+    message: str
     remedy: str = ""
 
 
 def raise_finding(finding: Finding) -> None:
     """Raise LeakageError if a rule is broken."""
-    if not finding.held:
-        raise LeakageError(f"{finding.rule}: {finding.told}; {finding.remedy}")
+    if not finding.passed:
+        raise LeakageError(f"{finding.rule}: {finding.message}; {finding.remedy}")

@@ -1,4 +1,4 @@
-"""All rules, by themselves or before a command."""
+"""Run the firewall rules: all of them for `curate check`, the fast ones before a command."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ from pipelines.workspace.workspace import Workspace
 
 
 def check(workspace: Workspace) -> Iterator[Finding]:
-    """Yield every rule, one after the other, on everything that the workspace holds."""
+    """Check all rules on the whole workspace; yield a finding per rule."""
     record = SplitRecord.read(workspace)
     yield from _of_the_database(workspace, record)
     yield copied_truth(workspace, record, predicted_rounds(workspace), thorough=True)
@@ -30,15 +30,15 @@ def check(workspace: Workspace) -> Iterator[Finding]:
 
 
 def enforce(workspace: Workspace, round_number: int = 0, file: Path | None = None) -> None:
-    """Look at the rules before a command exports or trains.
+    """Check the rules before a command exports or trains.
 
-    Predictions are compared with label files in a sample of frames, files are not looked at for
-    duplicates: that is left to `check`.
+    Predictions are compared with label files only for a sample of frames, and files are not
+    compared with each other; `check` does both in full.
 
     Args:
         workspace: see `Workspace`.
-        round_number: whose predictions are exported or learned from; 0 for none.
-        file: the label file that is written or read; one that is not there yet is no matter.
+        round_number: round of the predictions that are exported or trained on; 0 for none.
+        file: the label file that is written or read; it need not exist yet.
 
     Raises:
         LeakageError: if a rule is broken; the message names the frames and the remedy.

@@ -1,4 +1,4 @@
-"""Rules about ground truth: none of X_u is stored, and none passes for a prediction."""
+"""Rules about ground truth: none of X_u is stored, and no prediction is a copy of it."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,14 +14,14 @@ from pipelines.firewall.finding import Finding
 from pipelines.workspace.split_record import SplitRecord
 from pipelines.workspace.workspace import Workspace
 
-# Before a command, so many frames are compared with label files besides those with a score of 1.
+# Frames that are compared with label files before a command, besides those with a score of 1.
 _SAMPLED_FRAMES = 256
 _CERTAIN = 0.9999
 _BATCH = 256
 
 
 def stored_truth(workspace: Workspace) -> Finding:
-    """Rows of ground truth belong to X_l and val, and X_u names no label file."""
+    """Check that stored ground truth is of X_l or val, and that X_u has no label paths."""
     rule = "no ground truth of X_u is stored"
     truth, frame = bulk.table("ground_truth"), bulk.table("frame")
     rows_of = (
@@ -34,25 +34,28 @@ def stored_truth(workspace: Workspace) -> Finding:
     )
     with workspace.database.reading() as connection:
         rows = bulk.select(connection, rows_of)
-        pointed = [row[0] for row in bulk.select(connection, paths)]
+        with_path = [row[0] for row in bulk.select(connection, paths)]
     leaked = [row for row in rows if row[0] not in ("labeled", "val") or row[0] != row[1]]
     remedy = (
-        "the database was changed: restore a backup, or make a new workspace with `curate init`"
+        "the database was changed: restore a backup, or create a new workspace with `curate init`"
     )
     if leaked:
         count, first = sum(row[2] for row in leaked), leaked[0][3]
-        return Finding(rule, False, f"{count} rows of ground_truth, such as {first}", remedy)
-    if pointed:
-        return Finding(rule, False, f"label paths of {named(pointed)}", remedy)
-    held = {row[0]: row[2] for row in rows}
-    told = f"{held.get('labeled', 0)} objects of X_l, {held.get('val', 0)} of val, 0 of X_u"
-    return Finding(rule, True, told)
+        message = (
+            f"{count} rows of ground_truth are of the wrong split, such as those of frame {first}"
+        )
+        return Finding(rule, False, message, remedy)
+    if with_path:
+        return Finding(rule, False, f"label paths are stored for {named(with_path)}", remedy)
+    counts = {row[0]: row[2] for row in rows}
+    message = f"{counts.get('labeled', 0)} objects of X_l, {counts.get('val', 0)} of val, 0 of X_u"
+    return Finding(rule, True, message)
 
 
 def copied_truth(
     workspace: Workspace, record: SplitRecord, rounds: Sequence[int], *, thorough: bool
 ) -> Finding:
-    """Predictions of X_u are compared with label files of X_u, of which nothing is kept."""
+    """Check that no prediction of X_u equals a box in a label file; label files are not stored."""
     rule = "no prediction repeats a label of X_u"
     files = workspace.dataset.files
     frames = {name: key for name, key in record.splits["unlabeled"].items() if files(name).label}
@@ -68,18 +71,18 @@ def copied_truth(
                 if copied:
                     copies[batch[key]] = copies.get(batch[key], 0) + copied
     if not copies:
-        told = f"{compared} predictions compared with label files"
-        return Finding(rule, True, told if frames else "X_u has no label files")
-    told = f"{sum(copies.values())} predictions are equal to label files, in frames {named(copies)}"
+        message = f"{compared} predictions compared with label files"
+        return Finding(rule, True, message if frames else "X_u has no label files")
+    message = f"{sum(copies.values())} predictions equal labels, in frames {named(copies)}"
     remedy = (
-        "the detector or its record has seen ground truth of X_u: bring one that has not, and run "
-        "`curate predict` again"
+        "the detector was trained on ground truth of X_u, or its results contain it: use a "
+        "detector that has not seen it, and rerun `curate predict`"
     )
-    return Finding(rule, False, told, remedy)
+    return Finding(rule, False, message, remedy)
 
 
 def _suspects(workspace: Workspace, number: int, frames: Mapping[str, int]) -> Mapping[str, int]:
-    """Return the frames with a prediction that is certain, and others spread over the rest."""
+    """Return the frames with a certain prediction, and an even sample of the others."""
     table = bulk.table("prediction")
     query = select(table.c.frame_id).distinct()
     query = query.where(table.c.round == number, table.c.score >= _CERTAIN)
@@ -93,7 +96,7 @@ def _suspects(workspace: Workspace, number: int, frames: Mapping[str, int]) -> M
 def _repeated(workspace: Workspace, frame: str, boxes: np.ndarray) -> np.ndarray:
     try:
         return copied_boxes(boxes, workspace.dataset.annotations(frame))
-    except DataError:  # a label file that nobody reads may be of any form
+    except DataError:  # label files of X_u are not used, so they may be invalid
         return np.zeros(len(boxes), dtype=bool)
 
 

@@ -1,4 +1,4 @@
--- The age parameter lambda and the losses it was held against, per round and policy (Eq. 4).
+-- Age parameter lambda (Eq. 4) and the range of the losses, per round and policy.
 SELECT round, policy, count(*) AS labels, count(loss) AS matched,
        min(loss) AS least_loss, avg(loss) AS mean_loss, max(loss) AS greatest_loss,
        min(lambda_u) AS least_lambda, max(lambda_u) AS greatest_lambda

@@ -1,4 +1,4 @@
--- How many labels each policy has weighed, kept and trusts, at once for any number (working database).
+-- Number of labels that each policy weighted, keeps and trusts; fast for any number of labels (working database).
 SELECT round, policy, category, labels, kept, trusted, weight
 FROM label_count
 ORDER BY round, policy, category

@@ -1,4 +1,4 @@
--- Labels that the detector is sure of and the weight is not: high score, low weight.
+-- Labels with a high score and a low weight.
 SELECT round, policy, frame, k, category, score, loss, points, rho_diff, rho_anno, weight
 FROM weighted_labels
 WHERE score >= 0.5 AND weight < 0.2

@@ -1,4 +1,4 @@
--- Labels with hardly a LiDAR point inside, although the detector gives them a score above 0.3.
+-- Labels with a score above 0.3 and fewer than five LiDAR points inside.
 SELECT DISTINCT round, frame, k, category, score, points, points_threshold, x, y
 FROM weighted_labels
 WHERE points < 5 AND score > 0.3

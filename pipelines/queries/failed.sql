@@ -1,2 +1,2 @@
--- Frames that a stage could not do, with the error (working database).
+-- Frames that a stage could not process, with the error (working database).
 SELECT round, stage, frame, split, error FROM failed_frames ORDER BY round, stage, frame

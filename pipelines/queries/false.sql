@@ -1,4 +1,4 @@
--- False detections of val frames, the surest first, after `curate evaluate --store` (working database).
+-- False positives on val frames, highest score first, after `curate evaluate --store` (working database).
 SELECT source, frame, k, category, score, iou, x, y, length, width
 FROM evaluation
 WHERE side = 'detection' AND outcome = 'fp'

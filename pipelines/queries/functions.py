@@ -1,7 +1,7 @@
 """SQL functions that SQLite lacks: median, quantile, corr, stddev and iou_bev.
 
-Nulls do not count, as in SQLite's own aggregates; without enough values the result is null. The
-results are those of numpy.median, numpy.quantile, numpy.corrcoef, numpy.std with ddof=1, and of
+Nulls are skipped, as by SQLite's own aggregates; with too few values the result is null. The
+results equal those of numpy.median, numpy.quantile, numpy.corrcoef, numpy.std with ddof=1, and of
 `curate.geometry.overlap.bev_iou`. Nothing heavy is imported before a function is called.
 """
 
@@ -15,19 +15,19 @@ from typing import Any
 from curate.errors import CurateError
 
 MOST_VALUES = 1 << 25
-"""Values that one median or quantile may hold in memory: 256 MiB of numbers."""
+"""Maximum number of values of one median or quantile: 256 MiB of memory."""
 _BOX = ("x", "y", "length", "width", "yaw")
 
 
 @dataclass(frozen=True)
 class SqlFunction:
-    """A function.
+    """An SQL function.
 
     Attributes:
-        name: in SQL.
-        arguments: as they are written.
+        name: its name.
+        arguments: names of its arguments.
         meaning: what it returns.
-        postgresql: what to write on a PostgreSQL server.
+        postgresql: the equivalent on a PostgreSQL server.
     """
 
     name: str
@@ -46,7 +46,7 @@ FUNCTIONS = (
     SqlFunction(
         "quantile",
         "x, q",
-        "Value below which a share q of x lies, interpolated linearly; q from 0 to 1.",
+        "Quantile q of x, interpolated linearly; q from 0 to 1.",
         "`percentile_cont(q) WITHIN GROUP (ORDER BY x)`",
     ),
     SqlFunction("corr", "x, y", "Pearson correlation of x and y.", "built in"),
@@ -54,27 +54,27 @@ FUNCTIONS = (
     SqlFunction(
         "iou_bev",
         ", ".join(f"{name}{i}" for i in (1, 2) for name in _BOX),
-        "Overlap of two boxes seen from above, 0 to 1; metres and radians.",
-        "none: export the labels and query the file",
+        "BEV IoU of two boxes, 0 to 1; metres and radians.",
+        "not available: export the labels and query the file",
     ),
 )
 
 
 class ArgumentError(CurateError):
-    """An SQL function got an argument that it cannot work with."""
+    """An SQL function got an invalid argument."""
 
 
 def register_functions(connection: sqlite3.Connection) -> list[str]:
     """Add the functions to a connection.
 
     Returns:
-        A list with the message of the last call that could not work with its arguments, empty
-        without one. Such a call returns null, as SQLite's own mathematical functions do.
+        A list that will contain the message of the last call with invalid arguments. Such a call
+        returns null, as SQLite's own mathematical functions do.
     """
-    faults: list[str] = []
+    errors: list[str] = []
 
     def aggregate(name: str, count: int, kind: Callable[[], Any]) -> None:
-        connection.create_aggregate(name, count, lambda: _Reporting(kind(), faults))
+        connection.create_aggregate(name, count, lambda: _Reporting(kind(), errors))
 
     aggregate("median", 1, lambda: _Quantile("median", 0.5))
     aggregate("quantile", 2, lambda: _Quantile("quantile"))
@@ -85,27 +85,27 @@ def register_functions(connection: sqlite3.Connection) -> list[str]:
         try:
             return _iou_bev(*numbers)
         except ArgumentError as error:
-            faults[:] = [str(error)]
+            errors[:] = [str(error)]
             return None
 
     connection.create_function("iou_bev", 2 * len(_BOX), iou_bev, deterministic=True)
-    return faults
+    return errors
 
 
 class _Reporting:
-    """An aggregate that reports an argument it cannot work with, and is null from then on."""
+    """An aggregate that reports an invalid argument and then returns null."""
 
-    def __init__(self, aggregate: Any, faults: list[str]) -> None:
-        self._aggregate, self._faults = aggregate, faults
+    def __init__(self, aggregate: Any, errors: list[str]) -> None:
+        self._aggregate, self._errors = aggregate, errors
 
     def step(self, *arguments: Any) -> None:
-        """Take a row."""
+        """Add a row."""
         if self._aggregate is None:
             return
         try:
             self._aggregate.step(*arguments)
         except ArgumentError as error:
-            self._faults[:] = [str(error)]
+            self._errors[:] = [str(error)]
             self._aggregate = None
 
     def finalize(self) -> Any:
@@ -114,7 +114,7 @@ class _Reporting:
 
 
 class _Quantile:
-    """The values as doubles, until numpy finds the quantile among them."""
+    """Collects the values as doubles; numpy computes the quantile."""
 
     def __init__(self, name: str, q: float | None = None) -> None:
         self._name, self._q = name, q
@@ -122,7 +122,7 @@ class _Quantile:
         self._values = array("d")
 
     def step(self, x: Any, q: Any = None) -> None:
-        """Take a row."""
+        """Add a row."""
         if x is None:
             return
         if not self._fixed:
@@ -146,20 +146,20 @@ class _Quantile:
 
 
 class _Deviation:
-    """Mean and sum of squared differences from it, updated by each value (Welford)."""
+    """Updates the mean and the sum of squared differences with each value (Welford)."""
 
     def __init__(self) -> None:
         self._count, self._mean, self._squares = 0, 0.0, 0.0
 
     def step(self, x: Any) -> None:
-        """Take a row."""
+        """Add a row."""
         if x is None:
             return
         value = _number("stddev", x)
         self._count += 1
-        former = value - self._mean
-        self._mean += former / self._count
-        self._squares += former * (value - self._mean)
+        delta = value - self._mean
+        self._mean += delta / self._count
+        self._squares += delta * (value - self._mean)
 
     def finalize(self) -> float | None:
         """Return the standard deviation."""
@@ -167,27 +167,27 @@ class _Deviation:
 
 
 class _Correlation:
-    """Means, squares and products of the differences from them, updated by each pair."""
+    """Updates the means and the sums of squares and products with each pair (Welford)."""
 
     def __init__(self) -> None:
         self._count, self._mean_x, self._mean_y = 0, 0.0, 0.0
         self._xx, self._yy, self._xy = 0.0, 0.0, 0.0
 
     def step(self, x: Any, y: Any) -> None:
-        """Take a row."""
+        """Add a row."""
         if x is None or y is None:
             return
         x, y = _number("corr", x), _number("corr", y)
         self._count += 1
-        former_x, former_y = x - self._mean_x, y - self._mean_y
-        self._mean_x += former_x / self._count
-        self._mean_y += former_y / self._count
-        self._xx += former_x * (x - self._mean_x)
-        self._yy += former_y * (y - self._mean_y)
-        self._xy += former_x * (y - self._mean_y)
+        delta_x, delta_y = x - self._mean_x, y - self._mean_y
+        self._mean_x += delta_x / self._count
+        self._mean_y += delta_y / self._count
+        self._xx += delta_x * (x - self._mean_x)
+        self._yy += delta_y * (y - self._mean_y)
+        self._xy += delta_x * (y - self._mean_y)
 
     def finalize(self) -> float | None:
-        """Return the correlation; null where x or y does not vary."""
+        """Return the correlation; None if x or y is constant."""
         if not (self._xx > 0 and self._yy > 0):
             return None
         return max(-1.0, min(1.0, self._xy / math.sqrt(self._xx) / math.sqrt(self._yy)))

@@ -1,4 +1,4 @@
--- What people decided in reviews, per category: objects weigh 1, rejected predictions 0.
+-- Human decisions from reviews, per category: objects have weight 1, rejected predictions 0.
 SELECT round, policy, category, sum(CASE WHEN weight > 0 THEN 1 ELSE 0 END) AS objects,
        sum(CASE WHEN weight > 0 THEN 0 ELSE 1 END) AS rejected
 FROM weighted_labels

@@ -1,7 +1,7 @@
 """Queries that ship with curate: pipelines/queries/NAME.sql, described by their first line.
 
-They use what SQLite and PostgreSQL have in common. Those with a description that ends in "(working
-database)" need tables that an exported file does not have.
+They use only SQL that both SQLite and PostgreSQL understand. A description that ends in "(working
+database)" marks a query of tables that an exported file does not have.
 """
 
 import re
@@ -22,9 +22,9 @@ class NamedQuery:
     """A query that ships with curate.
 
     Attributes:
-        name: after `--named`.
+        name: the value of `--named`.
         description: one sentence.
-        exported: whether it runs on an exported label file too.
+        exported: whether it also runs on an exported label file.
         sql: one SELECT.
     """
 
@@ -35,21 +35,21 @@ class NamedQuery:
 
     @property
     def filters(self) -> tuple[str, ...]:
-        """Return which of "policy" and "round" can select among the rows that it reads."""
+        """The columns "policy" and "round", as far as the tables of the query have them."""
         return tuple(
             name
             for name in ("policy", "round")
             if any(name in columns for columns in self._sources().values())
         )
 
-    def selecting(
+    def filtered(
         self, policy: str | None, round_number: int | None, *, postgresql: bool = False
     ) -> str:
-        """Return the SQL that reads only the rows of a policy and a round.
+        """Return the query restricted to the rows of a policy and a round.
 
-        Each table or view with such a column is replaced by a selection of the same name:
+        A common table expression of the same name replaces each table or view with such a column:
         `WITH weighted_labels AS (SELECT * FROM main.weighted_labels WHERE policy = 'pspsl') ...`.
-        SQLite needs the `main.`, or the selection would read itself; a server must not have it.
+        SQLite needs `main.`, or else the expression refers to itself; PostgreSQL does not know it.
 
         Args:
             policy: None for all.
@@ -57,24 +57,24 @@ class NamedQuery:
             postgresql: whether a PostgreSQL server runs it.
 
         Raises:
-            ConfigError: if nothing that the query reads belongs to a policy, or to a round.
+            ConfigError: if no table of the query has a policy, or a round.
         """
-        wanted = {"policy": _quoted(policy), "round": round_number}
-        wanted = {name: value for name, value in wanted.items() if value is not None}
-        for name in wanted:
+        given = {"policy": _quoted(policy), "round": round_number}
+        values = {name: value for name, value in given.items() if value is not None}
+        for name in values:
             if name not in self.filters:
-                raise ConfigError(f"--{name}: the query '{self.name}' has no {name} to select")
+                raise ConfigError(f"--{name}: the query '{self.name}' has no column {name}")
         selections = []
         for source, columns in self._sources().items():
-            conditions = [f"{name} = {wanted[name]}" for name in wanted if name in columns]
+            conditions = [f"{name} = {value}" for name, value in values.items() if name in columns]
             if conditions:
                 table = source if postgresql else f"main.{source}"
                 chosen = f"SELECT * FROM {table} WHERE {' AND '.join(conditions)}"  # noqa: S608
                 selections.append(f"{source} AS ({chosen})")
         if not selections:
             return self.sql
-        own = self.sql.removeprefix("WITH ")
-        return f"WITH {', '.join(selections)}{' ' if own == self.sql else ', '}{own}"
+        rest = self.sql.removeprefix("WITH ")
+        return f"WITH {', '.join(selections)}{' ' if rest == self.sql else ', '}{rest}"
 
     def _sources(self) -> Mapping[str, frozenset[str]]:
         """Return the columns of each table and view that the query reads."""
@@ -87,7 +87,7 @@ class NamedQuery:
 
 
 def named_queries() -> Mapping[str, NamedQuery]:
-    """Return all of them, by name."""
+    """Return all queries that ship with curate, by name."""
     found = {}
     for path in sorted(
         files("pipelines").joinpath("queries").iterdir(), key=lambda each: each.name
@@ -102,12 +102,12 @@ def find_query(name: str) -> NamedQuery:
     """Return the query of that name.
 
     Raises:
-        ConfigError: if there is none.
+        ConfigError: if the name is unknown.
     """
     queries = named_queries()
     if name not in queries:
         raise ConfigError(
-            f"no query is named '{name}'{did_you_mean(name, queries)}; "
+            f"--named {name}: unknown query{did_you_mean(name, queries)}; "
             f"use one of {', '.join(queries)}"
         )
     return queries[name]

@@ -1,4 +1,4 @@
--- The policies of a round side by side: how much each keeps of the same labels.
+-- Policies of a round side by side: how many of the same labels each keeps and trusts.
 SELECT round, policy, category, count(*) AS labels,
        sum(CASE WHEN weight > 0 THEN 1 ELSE 0 END) AS kept,
        sum(CASE WHEN weight > 0.5 THEN 1 ELSE 0 END) AS trusted, sum(weight) AS weight

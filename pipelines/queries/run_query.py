@@ -18,23 +18,23 @@ from pipelines.queries.functions import FUNCTIONS, register_functions
 Names = Mapping[str, Sequence[str]]
 """The columns of each table and view."""
 
-# What SQLite may do for a query: read tables and call functions, nothing else. ATTACH would read
-# other files, PRAGMA could switch the protection off.
+# A query may only read tables and call functions. ATTACH would read other files, and PRAGMA could
+# switch the protection off.
 ALLOWED = frozenset(
     {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
 )
-SERVER_ROWS = 1000  # that a server sends at once
+SERVER_ROWS = 1000  # rows that a server sends at once
 FORBIDDEN_FUNCTIONS = frozenset(
     {"load_extension", "readfile", "writefile", "edit", "fts3_tokenizer"}
 )
-# Of a text or blob: randomblob, printf, replace and group_concat could ask for a gigabyte.
+# Of a text or blob: randomblob, printf, replace and group_concat could request a gigabyte.
 LONGEST_VALUE = 1 << 22
 MOST_COLUMNS = 500
 LONGEST_SQL = 1 << 20
-# SQLite looks at the clock after so many steps of its machine.
+# SQLite checks the time limit after this number of steps of its virtual machine.
 _STEPS = 10_000
-# The first rows are what somebody waits for: a server compiles nothing, hashes no table before the
-# first row, tries the orders of the view's first four tables only, and seeks as memory does.
+# Settings of PostgreSQL for an early first row: no compilation; no table is hashed before the first
+# row; only orders of four tables of a view are tried; random access costs little, as in memory.
 _FIRST_ROWS = (
     "jit = off",
     "cursor_tuple_fraction = 0.0001",
@@ -42,9 +42,9 @@ _FIRST_ROWS = (
     "join_collapse_limit = 4",
     "random_page_cost = 1.1",
 )
-# SQLSTATE query_canceled, in every language of the server.
+# SQLSTATE query_canceled; the message depends on the language of the server.
 _TIMED_OUT = "57014"
-# How SQLite and PostgreSQL name what does not exist: its kind and its name.
+# Messages of SQLite and PostgreSQL about something unknown: its kind and its name.
 _UNKNOWN = re.compile(
     r"no such (?P<kind>column|table|function): \"?(?P<name>[\w.]+)"
     r"|(?P<kind_>column|relation|function) \"?(?P<name_>[\w.]+).* does not exist"
@@ -63,10 +63,10 @@ def run_query(
     Args:
         url: of the database.
         sql: one SELECT.
-        seconds: after which the query is stopped, also while its rows are read.
+        seconds: time after which the query is stopped, even while its rows are read.
 
     Raises:
-        ConfigError: if the SQL is invalid, does more than read, or takes too long or too much.
+        ConfigError: if the SQL is invalid, does more than read, or takes too much time or memory.
         DatabaseError: if the database cannot be opened.
     """
     if url.get_backend_name() == "sqlite":
@@ -91,20 +91,20 @@ def _run_on_sqlite(
         connection.setlimit(category, limit)
     connection.execute("PRAGMA query_only = ON")
     connection.execute("PRAGMA trusted_schema = OFF")
-    faults = register_functions(connection)
+    function_errors = register_functions(connection)
     connection.set_authorizer(may_read)
     end = time.monotonic() + seconds
     connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS)
     try:
         cursor = connection.execute(sql)
     except (sqlite3.Error, sqlite3.Warning, UnicodeEncodeError, ValueError) as error:
-        own = _sqlite_error_message(path, error, seconds, connection)
+        converted = _sqlite_error_message(path, error, seconds, connection)
         connection.close()
-        raise own from error
+        raise converted from error
     if cursor.description is None:
         connection.close()
-        raise ConfigError("query: this returns no rows; write a SELECT")
-    rows = _rows(connection, cursor, path, seconds, faults)
+        raise ConfigError("query: this statement returns no rows; write a SELECT")
+    rows = _rows(connection, cursor, path, seconds, function_errors)
     return [column[0] for column in cursor.description], rows
 
 
@@ -113,23 +113,23 @@ def _rows(
     cursor: sqlite3.Cursor,
     path: Path,
     seconds: float,
-    faults: Sequence[str],
+    function_errors: Sequence[str],
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows as they are found; an error among them is reported as one of ours."""
+    """Yield the rows; an error between them is raised as an error of curate."""
     with closing(connection):
         try:
             for row in cursor:
-                _check_faults(faults)
+                _check_functions(function_errors)
                 yield row
-            _check_faults(faults)
+            _check_functions(function_errors)
         except sqlite3.Error as error:
             raise _sqlite_error_message(path, error, seconds, connection) from error
 
 
-def _check_faults(faults: Sequence[str]) -> None:
-    """Raise ConfigError where a function reports an argument that it cannot work with."""
-    if faults:
-        raise ConfigError(f"query: {faults[-1]}")
+def _check_functions(errors: Sequence[str]) -> None:
+    """Raise ConfigError if an SQL function has reported an invalid argument."""
+    if errors:
+        raise ConfigError(f"query: {errors[-1]}")
 
 
 def _sqlite_error_message(
@@ -139,7 +139,7 @@ def _sqlite_error_message(
     if "file is not a database" in message or "malformed" in message:
         return DatabaseError(f"{path}: {message}; restore a backup of the file")
     if "interrupted" in message:
-        return _given_up(seconds)
+        return _timeout(seconds)
     return ConfigError(_explain(message) + _suggestion(message, lambda: _sqlite_names(connection)))
 
 
@@ -152,7 +152,7 @@ def _sqlite_names(connection: sqlite3.Connection) -> Names:
     )
     try:
         return _grouped(connection.execute(query))
-    except sqlite3.Error:  # a view of a file that anyone may have made
+    except sqlite3.Error:  # a file from elsewhere may contain an invalid view
         return {}
 
 
@@ -174,7 +174,7 @@ def _grouped(rows: Iterable[tuple[str, str]]) -> Names:
 
 
 def _suggestion(message: str, read_names: Callable[[], Names]) -> str:
-    """Return what to write in place of an unknown name, and where the known ones are listed."""
+    """Suggest a known name for an unknown one, and say where the known names are listed."""
     found = _UNKNOWN.search(message)
     if found is None:
         return ""
@@ -206,10 +206,10 @@ def may_read(action: int, _first: str | None, second: str | None, *_: str | None
 def _run_on_server(
     url: URL, sql: str, seconds: float
 ) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
-    """Return columns and rows of a PostgreSQL server, which sends a part of them at a time.
+    """Return columns and rows from a PostgreSQL server, which sends some rows at a time.
 
-    The query becomes DECLARE ... CURSOR FOR, in the protocol that takes one statement only, in a
-    read-only transaction: whatever is not a query is invalid SQL there.
+    The query becomes DECLARE ... CURSOR FOR in a read-only transaction, in a protocol that accepts
+    only one statement. Anything that is not a query is invalid SQL there.
     """
     engine = create_engine(url, poolclass=NullPool)
     try:
@@ -225,24 +225,24 @@ def _run_on_server(
         reading = reading.execution_options(stream_results=True, max_row_buffer=SERVER_ROWS)
         result = reading.exec_driver_sql(sql)
     except DBAPIError as error:
-        own = _server_error_message(error, seconds, connection)
+        converted = _server_error_message(error, seconds, connection)
         connection.close()
-        raise own from error
+        raise converted from error
     return list(result.keys()), _server_rows(reading, result, end, seconds)
 
 
 def _server_rows(
     connection: Connection, result: CursorResult[Any], end: float, seconds: float
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows as they come.
+    """Yield the rows as they arrive.
 
-    The server's clock starts anew with each part, hence the one here.
+    The time limit of the server applies to each part, so the total time is checked here.
     """
     with connection, closing(result):
         try:
             for row in result:
                 if time.monotonic() > end:
-                    raise _given_up(seconds)
+                    raise _timeout(seconds)
                 if any(isinstance(v, str | bytes) and len(v) > LONGEST_VALUE for v in row):
                     raise ConfigError("query: string or blob too big")
                 yield tuple(row)
@@ -252,14 +252,14 @@ def _server_rows(
 
 def _server_error_message(error: DBAPIError, seconds: float, connection: Connection) -> ConfigError:
     if getattr(error.orig, "sqlstate", None) == _TIMED_OUT:
-        return _given_up(seconds)
+        return _timeout(seconds)
     message = joined_lines(error.orig)
     return ConfigError(_explain(message) + _suggestion(message, lambda: _server_names(connection)))
 
 
-def _given_up(seconds: float) -> ConfigError:
+def _timeout(seconds: float) -> ConfigError:
     return ConfigError(
-        f"query: given up after {seconds:g} seconds; select less, or allow more with --seconds"
+        f"query: stopped after {seconds:g} seconds; select less, or allow more with --seconds"
     )
 
 
@@ -267,5 +267,5 @@ def _explain(message: str) -> str:
     if "not authorized" in message or "readonly" in message or "prohibited" in message:
         return "query: only SELECT is allowed, the connection is read-only"
     if "one statement" in message or "multiple commands" in message:
-        return "query: one statement at a time"
+        return "query: only one statement is allowed"
     return f"query: {message}"

@@ -28,23 +28,22 @@ from pipelines.queries.run_query import run_query
 _VIEWS = {
     "weighted_labels": "Every label of an unlabeled frame with its evidence, a row per policy.",
     "evaluation": (
-        "What became of every object and detection of val frames; `curate evaluate --store` "
-        "fills it."
+        "Outcome of every object and detection of val frames; `curate evaluate --store` fills it."
     ),
     "failed_frames": "Frames that a stage could not process, with the error.",
 }
 _EXPORTED = {
     "weighted_labels": _VIEWS["weighted_labels"],
-    "meta": "What the file was made from: data set, categories, round, policy, code version.",
-    "frame": "The labeled and unlabeled frames, and where their files lie below meta.root.",
-    "ground_truth": "What annotators wrote, for labeled frames only.",
+    "meta": "Origin of the file: data set, categories, round, policy, code version.",
+    "frame": "The labeled and unlabeled frames, with the paths of their files below meta.root.",
+    "ground_truth": "Ground truth of the labeled frames.",
     "label": "The weighted labels; query them through the view weighted_labels.",
 }
 _EXPORTED_COLUMNS = {
     "split": "labeled | unlabeled",
     "frame": "frame id",
-    "key": "of an entry",
-    "value": "of the entry, as text",
+    "key": "name of an entry",
+    "value": "value of the entry, as text",
     "points": "path of the point cloud",
     "image": "path of the image",
     "calibration": "path of the calibration",
@@ -56,11 +55,11 @@ _COLUMN_NOTE = re.compile(r"^\s*(\w+) [A-Z]+.*?-- (.*?)(?: \[(.*)\])?$", re.MULT
 
 @dataclass(frozen=True)
 class ColumnDescription:
-    """A column.
+    """A column of a table or view.
 
     Attributes:
-        name: of the column.
-        type: in SQL.
+        name: its name.
+        type: its SQL type.
         unit: "m", "rad", "px", "s", "%", "1" for a number without unit, "" for other values.
         meaning: in a few words.
         key: whether it belongs to the primary key.
@@ -80,7 +79,7 @@ class Relation:
     """A table or view.
 
     Attributes:
-        name: of the table or view.
+        name: its name.
         kind: "table" or "view".
         meaning: in one or more sentences.
         columns: in their order.
@@ -121,7 +120,7 @@ def exported_schema(path: Path) -> tuple[Relation, ...]:
                     kind,
                     _EXPORTED[name],
                     tuple(
-                        _of_file(row, notes | _known(name))
+                        _of_file(row, notes | _fixed_columns(name))
                         for row in opened.execute(f"PRAGMA table_info({name})")
                     ),
                 )
@@ -131,7 +130,7 @@ def exported_schema(path: Path) -> tuple[Relation, ...]:
                 if name in _EXPORTED
             ]
     except sqlite3.Error as error:
-        raise DatabaseError(f"{path}: {one_line(error)}; give a label file of curate") from error
+        raise DatabaseError(f"{path}: {one_line(error)}; specify a label file of curate") from error
     return tuple(sorted(relations, key=lambda each: list(_EXPORTED).index(each.name)))
 
 
@@ -150,7 +149,7 @@ def read_schema(url: URL, *, exported: bool) -> tuple[Relation, ...]:
     query = "SELECT name, source, columns, rho_column FROM evidence_source ORDER BY name"
     try:
         _, rows = run_query(url, query)
-    except ConfigError:  # the database of an older curate, which the next command migrates
+    except ConfigError:  # a database of an older version of curate; the next command migrates it
         rows = iter(())
     return working_schema(
         tuple(
@@ -164,12 +163,12 @@ def find_relation(schema: Iterable[Relation], name: str) -> Relation:
     """Return the table or view of that name.
 
     Raises:
-        ConfigError: if there is none.
+        ConfigError: if the name is unknown.
     """
     by_name = {relation.name: relation for relation in schema}
     if name not in by_name:
         raise ConfigError(
-            f"query --schema: no table or view is named '{name}'{did_you_mean(name, by_name)}; "
+            f"query --schema: unknown table or view '{name}'{did_you_mean(name, by_name)}; "
             f"use one of {', '.join(by_name)}"
         )
     return by_name[name]
@@ -215,14 +214,14 @@ def _view(name: str, columns: Iterable[ColumnDescription]) -> Relation:
 
 
 def _column(relation: Relation, name: str) -> ColumnDescription:
-    """Return a table's column as a view has it: without a key, null where nothing was joined."""
+    """Return a table's column as part of a view: not a key, and null if no row was joined."""
     [found] = (column for column in relation.columns if column.name == name)
     joined = relation.name == "ground_truth"
     return replace(found, key=False, optional=found.optional or joined)
 
 
 def _notes(opened: sqlite3.Connection) -> dict[str, tuple[str, str]]:
-    """Return meaning and unit of each column of the labels, as the file says them."""
+    """Return meaning and unit of each column of the labels, from comments in the file's schema."""
     query = "SELECT sql FROM sqlite_master WHERE name = 'label'"
     row = opened.execute(query).fetchone()
     return {
@@ -231,7 +230,7 @@ def _notes(opened: sqlite3.Connection) -> dict[str, tuple[str, str]]:
     }
 
 
-def _known(table: str) -> dict[str, tuple[str, str]]:
+def _fixed_columns(table: str) -> dict[str, tuple[str, str]]:
     """Return meaning and unit of the columns that every label file has in a table or view."""
     if table in {"meta", "frame"}:
         return {name: (meaning, "") for name, meaning in _EXPORTED_COLUMNS.items()}
@@ -239,7 +238,7 @@ def _known(table: str) -> dict[str, tuple[str, str]]:
     return {column.name: (column.meaning, column.unit) for column in columns}
 
 
-def _of_file(row: tuple[Any, ...], known: dict[str, tuple[str, str]]) -> ColumnDescription:
+def _of_file(row: tuple[Any, ...], described: dict[str, tuple[str, str]]) -> ColumnDescription:
     _, name, kind, required, _, key = row
-    meaning, unit = known.get(name, ("", ""))
+    meaning, unit = described.get(name, ("", ""))
     return ColumnDescription(name, kind, unit, meaning, bool(key), not required)

@@ -1,2 +1,2 @@
--- How many frames each split has.
+-- Number of frames of each split.
 SELECT split, count(*) AS frames FROM frame GROUP BY split ORDER BY split

@@ -1,4 +1,4 @@
--- The curves of every training: loss and its terms, learning rate, gradient norm (working database).
+-- Training curves: loss and its terms, learning rate, gradient norm (working database).
 SELECT round, policy, name, step, value
 FROM training_statistics
 ORDER BY round, policy, name, step

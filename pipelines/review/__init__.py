@@ -1,1 +1,1 @@
-"""Labels on their way to an editor and back: which are asked about, what comes of the answer."""
+"""Reviews: labels are selected and exported for an editor, and decisions imported from it."""

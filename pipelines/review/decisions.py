@@ -1,4 +1,4 @@
-"""What people decided about a label, in words."""
+"""Descriptions of what people decided about labels."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +15,9 @@ class LabelDecision:
     """A decision about a label of `weighted_labels`.
 
     Attributes:
-        lines: it in words.
-        policy_weight: of the prediction that it speaks for, by the policy alone; None without one.
+        lines: its description.
+        policy_weight: weight that the policy alone gives to the prediction that the label replaces;
+            None if it replaces none.
     """
 
     lines: tuple[str, ...]
@@ -24,11 +25,11 @@ class LabelDecision:
 
 
 def describe_decision(workspace: Workspace, label: dict[str, Any]) -> LabelDecision:
-    """Who decided what, and what the policy would have said.
+    """Describe who decided what, and the weight that the policy alone would give.
 
     Args:
         workspace: see `Workspace`.
-        label: a row of `weighted_labels` whose provenance is human.
+        label: a row of `weighted_labels` with the provenance human.
     """
     human, match, frame, weight = (
         bulk.table(name) for name in ("human_label", "human_match", "frame", "weight")
@@ -42,12 +43,14 @@ def describe_decision(workspace: Workspace, label: dict[str, Any]) -> LabelDecis
     with workspace.database.reading() as connection:
         number = connection.execute(n).scalar()
         policy_weight = connection.execute(v).scalar()
-        mine = (
+        this_label = (
             human.c.frame_id == key,
             human.c.n == (label["k"] - FIRST_K if number is None else number),
         )
         names = ("decision", "reviewer", "decided_at", "review", "item")
-        row = connection.execute(select(*(human.c[name] for name in names)).where(*mine)).one()
+        row = connection.execute(
+            select(*(human.c[name] for name in names)).where(*this_label)
+        ).one()
     box = "a new box" if row.item is None else f"box {row.item}"
     who = f"by {row.reviewer} at {row.decided_at}, {box} of review {row.review}"
     lines = [f"  human          {row.decision} {who}: weight {label['weight']:g}"]

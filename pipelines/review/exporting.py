@@ -1,4 +1,4 @@
-"""curate review export: a folder with boxes, pictures and a table, whole or not there."""
+"""curate review export: write a folder of boxes, images and a table, completely or not at all."""
 
 import shutil
 from collections.abc import Sequence
@@ -17,29 +17,29 @@ from pipelines.workspace.workspace import Workspace
 
 PICTURES = "pictures"
 _HOW_TO = """Review {id}: round {round}, weights by {policy}, {frames} frames, {asked} of {boxes} \
-boxes asked about.
+boxes to review.
 
-pictures/FRAME.png shows every frame with its numbered boxes; those asked about are marked "?".
+pictures/FRAME.png shows a frame with its numbered boxes; the boxes to review are marked "?".
 {editor}
-review.csv, column decision: accept or reject for a box; accept in the row `all` for every box of
-the frame that you leave as it is.
+review.csv: write accept or reject into the column decision of a box. accept in the row `all` of a
+frame accepts all its boxes that you leave unchanged.
 
-A box that you leave unchanged without a word counts as not looked at, and so does a frame whose
-file you take away. A box that you delete is rejected, one that you move, turn, resize or rename is
-corrected, one that you draw is added.
+A box that you leave unchanged without a decision counts as not reviewed, and so do the boxes of a
+frame if you delete its file. A box that you delete is rejected; one that you move, turn, resize or
+rename is corrected; one that you draw is added.
 
-Then: curate review import THIS_FOLDER --dry-run
+Then run: curate review import THIS_FOLDER --dry-run
 """
 _EDITORS = {
-    "kitti": "label_2/FRAME.txt holds them as KITTI label lines; line i is box i.\n",
+    "kitti": "label_2/FRAME.txt has the boxes as KITTI label lines; line i is box i.\n",
     "labelcloud": (
-        "Start `labelCloud` in this folder: it finds pointclouds/ and labels/ there, the labels in "
-        "the\nformat centroid_abs.\n"
+        "Start `labelCloud` in this folder: it finds pointclouds/ and labels/ there. The labels "
+        "have the\nformat centroid_abs.\n"
     ),
     "cvat": (
-        "In CVAT make a task with labels.json (tab Raw) and task.zip, then upload annotations.zip "
-        "into\nit as `Datumaro 3D 1.0`. When done, export in that format and put the file in place "
-        "of\nannotations.zip, or name it: curate review import THIS_FOLDER --answer FILE.zip\n"
+        "In CVAT create a task with labels.json (tab Raw) and task.zip, then upload annotations.zip"
+        "\nto it as `Datumaro 3D 1.0`. When done, export in that format and replace annotations.zip"
+        "\nwith the export, or specify it: curate review import THIS_FOLDER --answer FILE.zip\n"
     ),
 }
 
@@ -47,22 +47,20 @@ _EDITORS = {
 def write_review(
     workspace: Workspace, folder: Path, sheet: Sheet, editor: Editor, progress: Progress
 ) -> None:
-    """Write the folder of a review and remembers it.
+    """Write the folder of a review and store the review in the database.
 
     Raises:
-        ConfigError: if the folder holds something: it may be a review with answers in it.
+        ConfigError: if the folder is not empty: it may contain an edited review.
         DataError: if a frame cannot be read.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(
-            f"{folder}: is there already, and may hold answers; name a folder that is not there"
-        )
+        raise ConfigError(f"{folder}: already exists and may contain edits; specify a new folder")
     partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of an export that was killed
+    shutil.rmtree(partial, ignore_errors=True)  # left by an export that was killed
     try:
         partial.mkdir(parents=True)
         _fill(workspace, partial, sheet, editor, progress)
-        _remember(workspace, sheet)
+        _store_review(workspace, sheet)
         if folder.exists():
             folder.rmdir()
         partial.rename(folder)
@@ -71,7 +69,7 @@ def write_review(
 
 
 def reviews(workspace: Workspace) -> Sequence[bulk.Row]:
-    """The rows of `review`, the oldest first, each with its number of human labels by decision."""
+    """Return the rows of `review`, oldest first, with the number of human labels by decision."""
     review, label = bulk.table("review"), bulk.table("human_label")
     query = review.select().order_by(review.c.exported_at, review.c.id)
     with workspace.database.reading() as connection:
@@ -105,15 +103,15 @@ def _fill(
     (folder / "README.txt").write_text(text.replace("review.csv", TABLE), encoding="utf-8")
 
 
-def _remember(workspace: Workspace, sheet: Sheet) -> None:
-    """Store the review; one that was handed out before keeps its row."""
+def _store_review(workspace: Workspace, sheet: Sheet) -> None:
+    """Store the review; one that was exported before keeps its row."""
     table = bulk.table("review")
     now = datetime.now(UTC).isoformat(timespec="seconds")
     row = (sheet.id, sheet.round, sheet.policy, sheet.editor, len(sheet.frames), sheet.boxes,
            sheet.asked, now, None)  # fmt: skip
     with workspace.database.writing() as connection:
-        same = table.select().where(table.c.id == sheet.id)
-        if not bulk.select(connection, same):
+        earlier = table.select().where(table.c.id == sheet.id)
+        if not bulk.select(connection, earlier):
             # `bulk` leaves surrogate keys named id to the database; this one is a hash.
             names = [column.name for column in table.columns]
             connection.execute(table.insert().values(dict(zip(names, row, strict=True))))

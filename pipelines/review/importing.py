@@ -1,4 +1,4 @@
-"""curate review import: what people decided, stored in one transaction or not at all."""
+"""curate review import: store what people decided, in one transaction or not at all."""
 
 import getpass
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -33,8 +33,8 @@ from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace
 
 ALL_FRAMES = "all"
-# How many faults an error names.
-_NAMED = 5
+# Number of overlaps that an error message lists.
+_LISTED = 5
 _SHARED = ("frame_id", "item", "decision", "category", "from_round", *BOX_COLUMNS, *SEEN_COLUMNS)
 
 LabelRow = dict[str, Any]
@@ -47,19 +47,19 @@ class ReviewImport:
 
     Attributes:
         review: its id.
-        frames: with an answer.
-        without_answer: frames of the review that did not come back.
-        accepted, rejected, moved, added: decisions.
-        untouched: boxes on which nothing was said; they stay what they were.
-        replaced: earlier decisions of other reviews about the same objects.
-        changed: whether anything is different from what was stored before.
+        frames: number of frames with edits or decisions.
+        missing: number of frames of the review without either.
+        accepted, rejected, moved, added: numbers of decisions.
+        untouched: number of boxes without a decision; they do not change.
+        replaced: number of earlier decisions of other reviews about the same objects.
+        changed: whether the decisions differ from those stored before.
         from_round: the decisions count in this round and later ones.
-        dry_run: nothing was stored.
+        dry_run: whether nothing was stored.
     """
 
     review: str
     frames: int
-    without_answer: int
+    missing: int
     accepted: int
     rejected: int
     moved: int
@@ -75,53 +75,53 @@ def apply_review(
     workspace: Workspace,
     folder: Path,
     *,
-    answer: Path | None = None,
+    edited: Path | None = None,
     accept: Collection[str] = (),
     reviewer: str | None = None,
     from_round: int | None = None,
     dry_run: bool = False,
 ) -> ReviewImport:
-    """Read an answer and stores its decisions in place of those of an earlier import of it.
+    """Read an edited review and store its decisions; they replace those of its earlier import.
 
     Args:
         workspace: see `Workspace`.
-        folder: as it was exported.
-        answer: what the editor wrote, where that lies elsewhere.
-        accept: frames whose unchanged boxes are accepted; "all" for all of them.
+        folder: the exported folder.
+        edited: file or folder that the editor wrote, if it is elsewhere.
+        accept: frames with unchanged boxes to accept; "all" for all of them.
         reviewer: who decided; None for the name of the user.
         from_round: first round in which the decisions count; None for the reviewed one.
-        dry_run: only says what would be stored.
+        dry_run: whether to store nothing and only return the numbers.
 
     Raises:
-        DataError: if something is missing, damaged, or of another workspace or review.
+        DataError: if something is missing or damaged, or belongs to another workspace or review.
         LeakageError: if a frame is not unlabeled.
-        ConfigError: `accept` names no frame of the review.
+        ConfigError: if `accept` contains a frame that is not in the review.
     """
     sheet = read_sheet(folder)
     keys = _keys(workspace, folder, sheet)
-    answers = _answers(workspace, folder, sheet, answer or folder, accept)
+    edits = _read_edits(workspace, folder, sheet, edited or folder, accept)
     first = sheet.round if from_round is None else from_round
     rows = [
-        _row(keys[each.frame], decision, first) for each in answers for decision in each.decisions
+        _row(keys[each.frame], decision, first) for each in edits for decision in each.decisions
     ]
     who = reviewer or _user()
     with workspace.database.reading() as connection:
         changed = _stored(connection, sheet.id) != sorted(rows, key=repr)
-        gone = _superseded(connection, sheet.id, rows)
+        replaced = _superseded(connection, sheet.id, rows)
     if changed and not dry_run:
         with workspace.database.writing() as connection:
             _store(connection, sheet.id, rows, who)
-    decided = [decision.decision for each in answers for decision in each.decisions]
+    decided = [decision.decision for each in edits for decision in each.decisions]
     return ReviewImport(
         review=sheet.id,
-        frames=len(answers),
-        without_answer=len(sheet.frames) - len(answers),
+        frames=len(edits),
+        missing=len(sheet.frames) - len(edits),
         accepted=decided.count(ACCEPTED),
         rejected=decided.count(REJECTED),
         moved=decided.count(MOVED),
         added=decided.count(ADDED),
-        untouched=sum(each.untouched for each in answers),
-        replaced=len(gone),
+        untouched=sum(each.untouched for each in edits),
+        replaced=len(replaced),
         changed=changed,
         from_round=first,
         dry_run=dry_run,
@@ -129,65 +129,65 @@ def apply_review(
 
 
 def _keys(workspace: Workspace, folder: Path, sheet: Sheet) -> dict[str, int]:
-    """Return the keys of the frames of a review that this workspace has handed out."""
+    """Return the keys of unlabeled frames, if this workspace exported the review."""
     table = bulk.table("review")
-    known = workspace.database.rows(select(table.c.id).where(table.c.id == sheet.id))
-    if not known:
+    exported = workspace.database.rows(select(table.c.id).where(table.c.id == sheet.id))
+    if not exported:
         raise DataError(
             f"{folder / MANIFEST}: review {sheet.id} was not exported from the workspace "
-            f"{workspace.root}; name its own with --workspace"
+            f"{workspace.root}; specify its workspace with --workspace"
         )
     everywhere, unlabeled = workspace.frames(*SPLITS), workspace.frames("unlabeled")
     for shown in sheet.frames:
         if shown.frame not in everywhere:
-            raise DataError(f"{folder / MANIFEST}: no frame is named '{shown.frame}' here")
+            raise DataError(f"{folder / MANIFEST}: frame '{shown.frame}' is not in this workspace")
         if shown.frame not in unlabeled:
             raise LeakageError(
-                f"{folder / MANIFEST}: frame {shown.frame} is not unlabeled any more; "
+                f"{folder / MANIFEST}: frame {shown.frame} is no longer unlabeled; "
                 "human labels are for unlabeled frames only"
             )
     return unlabeled
 
 
-def _answers(
-    workspace: Workspace, folder: Path, sheet: Sheet, answer: Path, accept: Collection[str]
+def _read_edits(
+    workspace: Workspace, folder: Path, sheet: Sheet, path: Path, accept: Collection[str]
 ) -> list[FrameEdits]:
     editor = EDITORS.build(sheet.editor, offered={}, options={})
-    edited = editor.read(answer, sheet, partial(workspace.dataset.read, points=False))
-    words = read_table(folder, sheet)
+    edited = editor.read(path, sheet, partial(workspace.dataset.read, points=False))
+    table = read_table(folder, sheet)
     names = {shown.frame for shown in sheet.frames}
     for name in accept:
         if name not in {*names, ALL_FRAMES}:
             raise ConfigError(f"--accept: frame '{name}' is not in this review")
-    answers = []
+    edits = []
     for shown in sheet.frames:
-        said = words.get(shown.frame, ExplicitDecisions())
-        if shown.frame not in edited and not (said.boxes or said.accept_rest):
+        explicit = table.get(shown.frame, ExplicitDecisions())
+        if shown.frame not in edited and not (explicit.boxes or explicit.accept_rest):
             continue
         boxes = edited.get(shown.frame, _as_shown(shown))
         check_boxes(boxes, sheet.categories)
-        rest = said.accept_rest or not {shown.frame, ALL_FRAMES}.isdisjoint(accept)
-        answers.append(compare_frame(shown, boxes, said.boxes, accept_rest=rest))
-    _check_overlaps(answers)
-    return answers
+        rest = explicit.accept_rest or not {shown.frame, ALL_FRAMES}.isdisjoint(accept)
+        edits.append(compare_frame(shown, boxes, explicit.boxes, accept_rest=rest))
+    _check_overlaps(edits)
+    return edits
 
 
-def _check_overlaps(answers: Sequence[FrameEdits]) -> None:
-    """Raise DataError if two objects of an answer lie in each other."""
+def _check_overlaps(edits: Sequence[FrameEdits]) -> None:
+    """Raise DataError if two objects of a frame overlap."""
     found = []
-    for answer in answers:
-        rows = [_row(0, decision, 1) for decision in answer.decisions]
+    for each in edits:
+        rows = [_row(0, decision, 1) for decision in each.decisions]
         for pair in overlapping_objects(_by_frame(rows)[0]) if rows else ():
-            one, other = (_called(answer.decisions[place]) for place in pair)
-            found.append(f"{one} and {other} of frame {answer.frame}")
+            one, other = (_name(each.decisions[place]) for place in pair)
+            found.append(f"{one} and {other} of frame {each.frame}")
     if found:
-        more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
         raise DataError(
-            f"two objects cannot lie in each other: reject one of {'; '.join(found[:_NAMED])}{more}"
+            f"two objects cannot overlap: reject one of {'; '.join(found[:_LISTED])}{more}"
         )
 
 
-def _called(decision: Decision) -> str:
+def _name(decision: Decision) -> str:
     number = "new box" if decision.number is None else f"box {decision.number}"
     return f"{number} ({decision.category})"
 
@@ -204,7 +204,7 @@ def _row(frame_id: int, decision: Decision, from_round: int) -> LabelRow:
 
 
 def _stored(connection: Connection, review: str) -> list[LabelRow]:
-    """What is stored of a review, without who and when."""
+    """Return the stored decisions of a review, without reviewer and time."""
     table = bulk.table("human_label")
     query = select(*(table.c[name] for name in _SHARED)).where(table.c.review == review)
     rows = bulk.select(connection, query)
@@ -214,7 +214,7 @@ def _stored(connection: Connection, review: str) -> list[LabelRow]:
 def _superseded(
     connection: Connection, review: str, rows: Sequence[LabelRow]
 ) -> list[tuple[int, int]]:
-    """Keys of the decisions of other reviews that new ones take the place of."""
+    """Return the keys of the decisions of other reviews that the new ones replace."""
     later = _by_frame(rows)
     former = read_human_labels(connection, later.keys(), but_of=review)
     return [
@@ -225,57 +225,57 @@ def _superseded(
 
 
 def _store(connection: Connection, review: str, rows: Sequence[LabelRow], reviewer: str) -> None:
-    """Put decisions in place of those of the review's earlier import, and what they overrule."""
+    """Replace the review's earlier decisions, and those that the new ones supersede."""
     label, table = bulk.table("human_label"), bulk.table("review")
-    mine = label.c.review == review
-    before = bulk.select(connection, select(label.c.frame_id).where(mine).distinct())
-    gone = _superseded(connection, review, rows)
-    connection.execute(label.delete().where(mine))
-    for frame_id, n in gone:
+    of_review = label.c.review == review
+    before = bulk.select(connection, select(label.c.frame_id).where(of_review).distinct())
+    replaced = _superseded(connection, review, rows)
+    connection.execute(label.delete().where(of_review))
+    for frame_id, n in replaced:
         connection.execute(label.delete().where(label.c.frame_id == frame_id, label.c.n == n))
     now = datetime.now(UTC).isoformat(timespec="seconds")
     frame_ids = {row["frame_id"] for row in rows}
     kept = read_human_labels(connection, frame_ids)
     taken = {frame_id: set(stored.n.tolist()) for frame_id, stored in kept.items()}
-    everywhere = {
+    common = {
         "split": "unlabeled", "review": review, "reviewer": reviewer, "decided_at": now
     }  # fmt: skip
-    numbers = [_free(taken.setdefault(row["frame_id"], set())) for row in rows]
-    new = [{**row, "n": n, **everywhere} for row, n in zip(rows, numbers, strict=True)]
+    numbers = [_free_number(taken.setdefault(row["frame_id"], set())) for row in rows]
+    new = [{**row, "n": n, **common} for row, n in zip(rows, numbers, strict=True)]
     bulk.insert_rows(connection, "human_label", new)
     refresh_all_matches(
-        connection, {row[0] for row in before} | {key for key, _ in gone} | frame_ids
+        connection, {row[0] for row in before} | {key for key, _ in replaced} | frame_ids
     )
     connection.execute(table.update().where(table.c.id == review).values(imported_at=now))
 
 
 def clear(workspace: Workspace, reviews: Collection[str] = (), frames: Collection[str] = ()) -> int:
-    """Forget human labels, of reviews or of frames or all; the policies' weights count again.
+    """Delete human labels of reviews, of frames, or all; the weights of the policies count again.
 
     Returns:
-        How many labels there were.
+        The number of deleted labels.
 
     Raises:
-        ConfigError: if no such review or frame.
+        ConfigError: if a review or a frame is unknown.
     """
     label, review = bulk.table("human_label"), bulk.table("review")
     with workspace.database.writing() as connection:
         known = {row[0] for row in bulk.select(connection, select(review.c.id))}
         keys = workspace.frames("unlabeled")
         for name in {*reviews} - known:
-            raise ConfigError(f"no review {name} here; `curate review list` lists them")
+            raise ConfigError(f"unknown review {name}; `curate review list` shows the reviews")
         for name in {*frames} - keys.keys():
-            raise ConfigError(f"--frames: no unlabeled frame is named '{name}' here")
+            raise ConfigError(f"--frames: '{name}' is not an unlabeled frame of this workspace")
         query = select(label.c.frame_id, label.c.n)
         if reviews:
             query = query.where(label.c.review.in_(reviews))
         if frames:
             query = query.where(label.c.frame_id.in_([keys[name] for name in frames]))
-        gone = bulk.select(connection, query)
-        for frame_id, n in gone:
+        deleted = bulk.select(connection, query)
+        for frame_id, n in deleted:
             connection.execute(label.delete().where(label.c.frame_id == frame_id, label.c.n == n))
-        refresh_all_matches(connection, {frame_id for frame_id, _ in gone})
-    return len(gone)
+        refresh_all_matches(connection, {frame_id for frame_id, _ in deleted})
+    return len(deleted)
 
 
 def _by_frame(rows: Iterable[LabelRow]) -> Mapping[int, HumanLabels]:
@@ -285,17 +285,17 @@ def _by_frame(rows: Iterable[LabelRow]) -> Mapping[int, HumanLabels]:
         found.setdefault(row["frame_id"], []).append(row)
     return {
         frame_id: HumanLabels(
-            as_categories([row["decision"] for row in own]),
-            as_categories([row["category"] for row in own]),
-            np.array([[row[name] for name in BOX_COLUMNS] for row in own], dtype=np.float64),
-            np.array([[row[name] for name in SEEN_COLUMNS] for row in own], dtype=np.float64),
+            as_categories([row["decision"] for row in of_frame]),
+            as_categories([row["category"] for row in of_frame]),
+            np.array([[row[name] for name in BOX_COLUMNS] for row in of_frame], dtype=np.float64),
+            np.array([[row[name] for name in SEEN_COLUMNS] for row in of_frame], dtype=np.float64),
         )
-        for frame_id, own in found.items()
+        for frame_id, of_frame in found.items()
     }
 
 
-def _free(taken: set[int]) -> int:
-    """Return the least number that is not taken; takes it."""
+def _free_number(taken: set[int]) -> int:
+    """Return the smallest number that is not taken, and add it to the taken ones."""
     n = next(n for n in range(len(taken) + 1) if n not in taken)
     taken.add(n)
     return n

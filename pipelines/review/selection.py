@@ -1,4 +1,4 @@
-"""Which labels of a round people are asked about, and what they are shown around them."""
+"""Select the labels of a round to review, with other labels of their frames as context."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
@@ -19,24 +19,24 @@ from pipelines.workspace.workspace import Workspace
 
 ORDERS = ("uncertain", "lowest", "changed")
 EVEN_ODDS = 0.5
-"""The least certain label is the one whose weight is nearest to this."""
+"""The nearer a weight is to this, the less certain the label is."""
 CONTEXT_WEIGHT = 0.1
-"""Labels of the same frames are shown as context from this weight on."""
+"""Other labels of the same frames are shown as context if their weight is at least this."""
 
-Asked = Collection[tuple[str, int]]
-"""Frames and numbers of labels."""
+LabelKeys = Collection[tuple[str, int]]
+"""Labels by frame name and number k."""
 
 
 @dataclass(frozen=True)
 class ReviewRequest:
-    """Which labels are wanted.
+    """Which labels to review.
 
     Attributes:
-        count: how many at most.
-        order: uncertain: weight nearest to 0.5 first; lowest: lowest weight first, of equal ones
-            the highest score; changed: largest change of the weight since the round before.
-        frames: only in these, which are shown in any case; none for all.
-        categories: only of these; none for all.
+        count: maximum number of labels.
+        order: what comes first. uncertain: weight nearest to 0.5; lowest: lowest weight, ties by
+            highest score; changed: largest change of the weight since the previous round.
+        frames: only labels of these frames, which are exported even without labels; empty for all.
+        categories: only labels of these categories; empty for all.
     """
 
     count: int = 100
@@ -48,74 +48,74 @@ class ReviewRequest:
 def make_sheet(
     workspace: Workspace, round_number: int | None, policy: str, editor: str, request: ReviewRequest
 ) -> Sheet:
-    """Return the wanted labels with the other kept labels of their frames around them.
+    """Return the selected labels, with other labels of their frames as context.
 
     Args:
         workspace: see `Workspace`.
         round_number: None for the last that the policy has weighted.
-        policy: whose weights.
-        editor: name of the format.
+        policy: policy of the weights.
+        editor: name of the file format.
         request: see `ReviewRequest`.
 
     Raises:
-        ConfigError: if no such order, frame or category.
+        ConfigError: if the order, a frame or a category is unknown.
         LeakageError: if a frame is not unlabeled.
-        WorkspaceError: if the policy has weighted nothing, or no label is wanted.
+        WorkspaceError: if the policy has weighted nothing, or no label is selected.
     """
     _check(workspace, request)
     number = _weighted_round(workspace, round_number, policy)
-    asked = _changed(workspace, number, policy, request) if request.order == "changed" else None
+    selected = _changed(workspace, number, policy, request) if request.order == "changed" else None
     with workspace.database.reading() as connection:
-        if asked is None:
-            asked = _first(connection, number, policy, request)
-        names = sorted({*request.frames, *(frame for frame, _ in asked)})
+        if selected is None:
+            selected = _first(connection, number, policy, request)
+        names = sorted({*request.frames, *(frame for frame, _ in selected)})
         frames = tuple(
-            ShownFrame(name, tuple(_shown(connection, number, policy, name, asked)))
+            ShownFrame(name, tuple(_shown(connection, number, policy, name, selected)))
             for name in names
         )
     if not frames:
         raise WorkspaceError(
-            f"round {number}: {policy} has no such label to ask about; people have decided on all "
-            "of them, or --category is too narrow"
+            f"round {number}: {policy} has no such label to review; all of them have a human "
+            "decision, or --category is too narrow"
         )
-    known = {*workspace.config.dataset.categories}
-    others = {box.category for frame in frames for box in frame.boxes} - known
-    categories = (*workspace.config.dataset.categories, *sorted(others))
+    configured = workspace.config.dataset.categories
+    others = {box.category for frame in frames for box in frame.boxes} - {*configured}
+    categories = (*configured, *sorted(others))
     return Sheet(number, policy, editor, categories, frames)
 
 
 def _check(workspace: Workspace, request: ReviewRequest) -> None:
     if request.order not in ORDERS:
         raise ConfigError(f"--by {request.order}: use one of {', '.join(ORDERS)}")
-    known = workspace.config.dataset.categories
+    categories = workspace.config.dataset.categories
     for category in request.categories:
-        if category not in known:
-            raise ConfigError(f"--category {category}: use some of {', '.join(known)}")
+        if category not in categories:
+            raise ConfigError(f"--category {category}: use one or more of {', '.join(categories)}")
     everywhere, unlabeled = workspace.frames(*SPLITS), workspace.frames("unlabeled")
     for frame in request.frames:
         if frame not in everywhere:
-            raise ConfigError(f"--frames: no frame is named '{frame}' here")
+            raise ConfigError(f"--frames: frame '{frame}' is not in this workspace")
         if frame not in unlabeled:
             raise LeakageError(
-                f"--frames: frame {frame} is not unlabeled; ground truth of labeled and val frames "
-                "is what labels are held against, only labels of unlabeled frames are reviewed"
+                f"--frames: frame {frame} is not unlabeled; only labels of unlabeled frames can "
+                "be reviewed"
             )
 
 
 def _weighted_round(workspace: Workspace, number: int | None, policy: str) -> int:
-    """Return the round asked for, or the last one; it must have weights of the policy."""
+    """Return the requested round, or the last one with weights of the policy."""
     found = weighted_round(workspace, policy, number)
     if found is None:
-        where = "" if number is None else f" --round {number}"
+        option = "" if number is None else f" --round {number}"
         raise WorkspaceError(
-            f"{policy} has weighted no labels{where and f' of round {number}'} yet; "
-            f"run `curate solve{where} --policy {policy}`"
+            f"{policy} has weighted no labels{option and f' of round {number}'} yet; "
+            f"run `curate solve{option} --policy {policy}`"
         )
     return found
 
 
-def _first(connection: Connection, number: int, policy: str, request: ReviewRequest) -> Asked:
-    """Return the labels that come first in the wanted order."""
+def _first(connection: Connection, number: int, policy: str, request: ReviewRequest) -> LabelKeys:
+    """Return the labels that come first in the requested order."""
     labels = WEIGHTED_LABELS.c
     orders: dict[str, list[ColumnElement]] = {
         "uncertain": [func.abs(labels.weight - EVEN_ODDS)],
@@ -132,29 +132,29 @@ def _first(connection: Connection, number: int, policy: str, request: ReviewRequ
     return {(str(frame), int(k)) for frame, k in bulk.select(connection, query)}
 
 
-def _changed(workspace: Workspace, number: int, policy: str, request: ReviewRequest) -> Asked:
-    """Return the labels whose weight changed most since the round before."""
+def _changed(workspace: Workspace, number: int, policy: str, request: ReviewRequest) -> LabelKeys:
+    """Return the labels with the largest change of the weight since the previous round."""
     if number < 2:
-        raise ConfigError("--by changed: round 1 has no round before it; use --by uncertain")
+        raise ConfigError("--by changed: round 1 has no previous round; use --by uncertain")
     before, after = (read_columns(workspace, each, policy) for each in (number - 1, number))
     changes = compare_labels(*as_rounds(before, after))
     rows = changes.largest(len(changes.before) + len(changes.after))[0][:, 1]
     human = _human_labels(workspace, number, policy)
-    asked: dict[tuple[str, int], None] = {}
+    selected: dict[tuple[str, int], None] = {}
     for row in rows[rows >= 0].tolist():
         key = after.frame_names[after.frames[row]], int(after.k[row])
         category = after.category_names[after.categories[row]]
-        wanted = (not request.frames or key[0] in request.frames) and (
+        matches = (not request.frames or key[0] in request.frames) and (
             not request.categories or category in request.categories
         )
-        if wanted and key not in human:
-            asked[key] = None
-        if len(asked) == request.count:
+        if matches and key not in human:
+            selected[key] = None
+        if len(selected) == request.count:
             break
-    return asked.keys()
+    return selected.keys()
 
 
-def _human_labels(workspace: Workspace, number: int, policy: str) -> Asked:
+def _human_labels(workspace: Workspace, number: int, policy: str) -> LabelKeys:
     labels = WEIGHTED_LABELS.c
     query = select(labels.frame, labels.k).where(
         labels.round == number, labels.policy == policy, labels.provenance == "human"
@@ -163,9 +163,9 @@ def _human_labels(workspace: Workspace, number: int, policy: str) -> Asked:
 
 
 def _shown(
-    connection: Connection, number: int, policy: str, name: str, asked: Asked
+    connection: Connection, number: int, policy: str, name: str, selected: LabelKeys
 ) -> list[ShownBox]:
-    """Return the boxes of a frame: those asked about, others of some weight, and human labels."""
+    """Return the selected boxes of a frame, and the others with at least `CONTEXT_WEIGHT`."""
     labels = WEIGHTED_LABELS.c
     names = ("k", "category", *BOX_COLUMNS, "score", "weight", "provenance")
     query = (
@@ -175,11 +175,11 @@ def _shown(
     )
     shown = []
     for k, category, *box, score, weight, provenance in bulk.select(connection, query):
-        wanted = (name, k) in asked
-        if wanted or weight >= CONTEXT_WEIGHT:
+        asked = (name, k) in selected
+        if asked or weight >= CONTEXT_WEIGHT:
             human = provenance == "human"
             place = tuple(np.array(box, dtype=np.float64).tolist())
             shown.append(
-                ShownBox(int(k), str(category), place, float(score), float(weight), wanted, human)
+                ShownBox(int(k), str(category), place, float(score), float(weight), asked, human)
             )
     return shown

@@ -1,4 +1,4 @@
-"""The pages as one ASGI application."""
+"""The pages of `curate serve` as one ASGI application."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,14 +24,14 @@ _SETTINGS = {
 
 @dataclass(frozen=True)
 class Served:
-    """What is served.
+    """The databases to serve.
 
     Attributes:
         title: of the pages.
         files: SQLite files by the name under which they are shown.
-        working: the name of the one that is a workspace's database, None for none of them.
-        workspace: for pictures; None for no pictures.
-        time_limit_s: of a question.
+        working: name of the file that is a workspace's database; None if there is none.
+        workspace: workspace for the pages of frames; None for no such pages.
+        time_limit_s: time limit of a query.
     """
 
     title: str
@@ -43,11 +43,11 @@ class Served:
 
 @contextmanager
 def application(served: Served, host: str) -> Iterator[Any]:
-    """The ASGI application; until the end of the block curate's hooks are in Datasette.
+    """Yield the ASGI application; curate's plugin is registered in Datasette until the block ends.
 
     Raises:
-        ConfigError: Datasette is not installed.
-        DatabaseError: if a file is no database.
+        ConfigError: if Datasette is not installed.
+        DatabaseError: if a file is not a database.
     """
     try:
         from datasette.app import Datasette
@@ -60,11 +60,11 @@ def application(served: Served, host: str) -> Iterator[Any]:
     from pipelines.serving.read_only import ReadOnlyDatabase, connect_read_only
     from pipelines.serving.shown_frames import FramePages
 
-    # Whatever plugins a user has installed for other servers: some of them write.
-    for foreign, _ in pm.list_plugin_distinfo():
-        pm.unregister(foreign)
-    # Its own pages of errors come with a trace in the terminal, all local values included.
-    talkative = pm.unregister(name="datasette.handle_exception")
+    # Plugins that a user installed for other servers may write.
+    for installed, _ in pm.list_plugin_distinfo():
+        pm.unregister(installed)
+    # Datasette's own error handler prints a traceback with all local values.
+    default_handler = pm.unregister(name="datasette.handle_exception")
     frames = None if served.workspace is None else FramePages(served.workspace)
     plugin = CuratePlugin(host, frames)
     pm.register(plugin, name=NAME)
@@ -78,11 +78,11 @@ def application(served: Served, host: str) -> Iterator[Any]:
         yield datasette.app()
     finally:
         pm.unregister(plugin)
-        pm.register(talkative, name="datasette.handle_exception")
+        pm.register(default_handler, name="datasette.handle_exception")
 
 
 def _metadata(served: Served) -> dict[str, Any]:
-    """What Datasette says of all of it."""
+    """Return Datasette's metadata of all files."""
     declared: Sequence[Declaration] = ()
     if served.working and served.workspace:
         with served.workspace.database.reading() as connection:

@@ -1,4 +1,4 @@
-"""What the pages say of databases, tables, columns and named queries, from the schema."""
+"""Descriptions of databases, tables, columns and named queries for the pages, from the schema."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,8 +13,8 @@ from pipelines.queries.schema import (
     working_schema,
 )
 
-# What a page adds to the meaning of a column of the weighted labels.
-_LEADS_TO = {"frame": "its picture", "k": "why it has its weight"}
+# Where the links in a column of the weighted labels lead.
+_LINKS_TO = {"frame": "the page of the frame", "k": "the explanation of the weight"}
 
 
 def working_database(declared: Sequence[Declaration] = ()) -> dict[str, Any]:
@@ -27,7 +27,7 @@ def working_database(declared: Sequence[Declaration] = ()) -> dict[str, Any]:
     tables["alembic_version"] = {"hidden": True}
     tables["frame"]["label_column"] = "frame"
     return {
-        "description": "Predictions, their evidence, their weights, and what was done",
+        "description": "Predictions with their evidence and weights, and the tasks that ran",
         "tables": tables,
         "queries": _queries(exported=False),
     }
@@ -36,7 +36,7 @@ def working_database(declared: Sequence[Declaration] = ()) -> dict[str, Any]:
 def exported_file(path: Path) -> dict[str, Any]:
     """Return Datasette's metadata of an exported label file."""
     return {
-        "description": "The exported weighted labels that a training reads",
+        "description": "Exported weighted labels for a training",
         "tables": _tables(exported_schema(path)),
         "queries": _queries(exported=True),
     }
@@ -56,15 +56,15 @@ def _tables(schema: Iterable[Relation]) -> dict[str, Any]:
 
 
 def _meaning(relation: Relation, column: ColumnDescription) -> str:
-    """Return what a column means, with its unit and where its values lead to."""
+    """Return what a column means, with its unit and where its values link to."""
     unit = f" [{column.unit}]" if column.unit not in ("", "1") else ""
     shows_labels = relation.name in {"label", "weighted_labels"}
-    leads = _LEADS_TO.get(column.name) if shows_labels else None
-    return column.meaning + unit + (f"; leads to {leads}" if leads else "")
+    target = _LINKS_TO.get(column.name) if shows_labels else None
+    return column.meaning + unit + (f"; links to {target}" if target else "")
 
 
 def _queries(*, exported: bool) -> dict[str, Any]:
-    """Return the named queries that a database can answer."""
+    """Return the named queries that run on a database."""
     return {
         name: {"title": name, "description": f"{query.description}.", "sql": query.sql}
         for name, query in named_queries().items()

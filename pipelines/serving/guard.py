@@ -1,4 +1,4 @@
-"""What stands before the pages: who may ask, what may be asked, and what a browser may load."""
+"""Protection of the pages: which requests are accepted, and what a browser may load."""
 
 from collections.abc import Awaitable, Callable, MutableMapping
 from ipaddress import ip_address
@@ -10,15 +10,15 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 Application = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 _METHODS = frozenset({"GET", "HEAD"})
-# Datasette's own pages about itself tell paths of the machine; these are what is left of them.
-_INNER = ("/-/static/", "/-/static-plugins/", "/-/frame", "/-/picture")
-_MAY_LOAD = (
+# Datasette's pages under /-/ show paths of this machine; only these are served.
+_SERVED_PATHS = ("/-/static/", "/-/static-plugins/", "/-/frame", "/-/picture")
+_CONTENT_POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data:; connect-src 'self'; form-action 'self'; base-uri 'none'; "
     "frame-ancestors 'none'"
 )
 _HEADERS = (
-    (b"content-security-policy", _MAY_LOAD.encode()),
+    (b"content-security-policy", _CONTENT_POLICY.encode()),
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
     (b"referrer-policy", b"same-origin"),
@@ -27,7 +27,7 @@ _HEADERS = (
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach a server that listens there."""
+    """Return whether a server that listens on this host is reachable from this machine only."""
     if host == "localhost":
         return True
     try:
@@ -37,15 +37,15 @@ def is_loopback(host: str) -> bool:
 
 
 def guard(application: Application, host: str) -> Application:
-    """Return the application behind its guard.
+    """Return the application with checks of every request and security headers.
 
-    A page of some other site that is open in the same browser can send requests to this machine.
-    Where the server listens on loopback, requests under a foreign name (DNS rebinding) are refused;
-    requests that another site's page makes are refused everywhere, except for a followed link.
+    A page of another site that is open in the same browser can send requests to this machine. If
+    the server listens on loopback, requests with an unexpected host name (DNS rebinding) are
+    rejected. Requests by pages of other sites are always rejected, unless the user follows a link.
 
     Args:
         application: an ASGI application.
-        host: on which it listens.
+        host: name or address on which it listens.
     """
     names = frozenset({"localhost", "127.0.0.1", "[::1]", host}) if is_loopback(host) else None
 
@@ -53,9 +53,9 @@ def guard(application: Application, host: str) -> Application:
         if scope["type"] != "http":
             await application(scope, receive, send)
             return
-        refusal = _rejection(scope, names)
-        if refusal is not None:
-            await _reject(_with_headers(send), *refusal)
+        rejection = _rejection(scope, names)
+        if rejection is not None:
+            await _reject(_with_headers(send), *rejection)
             return
         await application(scope, receive, _with_headers(send))
 
@@ -63,18 +63,18 @@ def guard(application: Application, host: str) -> Application:
 
 
 def _rejection(scope: Scope, names: frozenset[str] | None) -> tuple[int, str] | None:
-    """Status and reason where a request is refused."""
+    """Return status and reason if a request is rejected."""
     headers = {name.lower(): value.decode("latin-1") for name, value in scope["headers"]}
     if scope["method"] not in _METHODS:
-        return 405, "these pages are for reading"
+        return 405, "these pages are read-only"
     if names is not None and _host_name(headers.get(b"host", "")) not in names:
-        return 403, "ask under the name that curate serve printed"
-    foreign = headers.get(b"sec-fetch-site", "none") in {"cross-site", "same-site"}
-    if foreign and headers.get(b"sec-fetch-dest") != "document":
-        return 403, "not for pages of other sites"
+        return 403, "use the address that curate serve printed"
+    other_site = headers.get(b"sec-fetch-site", "none") in {"cross-site", "same-site"}
+    if other_site and headers.get(b"sec-fetch-dest") != "document":
+        return 403, "requests by pages of other sites are rejected"
     path = scope["path"]
-    # Two slashes would begin another site's name where such a path were redirected to.
-    if path.startswith(("//", "/-/", "/_internal")) and not path.startswith(_INNER):
+    # A redirect to a path with two slashes at its start would lead to another site.
+    if path.startswith(("//", "/-/", "/_internal")) and not path.startswith(_SERVED_PATHS):
         return 404, "no such page"
     return None
 
@@ -93,7 +93,7 @@ async def _reject(send: Send, status: int, reason: str) -> None:
 
 
 def _with_headers(send: Send) -> Send:
-    """Add the headers of every answer."""
+    """Return a `send` that adds the security headers to every response."""
 
     async def sending(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":

@@ -1,4 +1,4 @@
-"""What curate adds to Datasette: a page per frame, links to it, and the guard."""
+"""curate's plugin for Datasette: a page per frame, links to it, and the guard."""
 
 import asyncio
 import logging
@@ -14,7 +14,7 @@ from curate.errors import ConfigError, CurateError
 from pipelines.serving.guard import Application, guard
 from pipelines.serving.shown_frames import FramePages, ShownFrame
 
-# Also the package whose folders `templates` and `static` Datasette finds by this name.
+# The package in which Datasette finds the folders `templates` and `static`.
 NAME = "pipelines.serving"
 _LOG = logging.getLogger(__name__)
 _STYLE = f"/-/static-plugins/{NAME}/curate.css"
@@ -24,8 +24,8 @@ class CuratePlugin:
     """The hooks of one server.
 
     Args:
-        host: on which it listens.
-        frames: None where no workspace is at hand: then there are no pictures.
+        host: name or address on which it listens.
+        frames: the pages of frames; None without a workspace.
     """
 
     __name__ = NAME
@@ -35,7 +35,7 @@ class CuratePlugin:
 
     @hookimpl
     def asgi_wrapper(self) -> Any:
-        """Put the guard before the pages."""
+        """Wrap the application in the guard."""
 
         def wrap(application: Application) -> Application:
             return guard(application, self._host)
@@ -44,12 +44,12 @@ class CuratePlugin:
 
     @hookimpl
     def extra_css_urls(self) -> list[str]:
-        """Return the style, from this server as everything else."""
+        """Return the URL of the style sheet, on this server."""
         return [_STYLE]
 
     @hookimpl
     def register_routes(self) -> list[tuple[str, Any]]:
-        """Return the pages of frames."""
+        """Return the routes of the pages and images of frames."""
         if self._frames is None:
             return []
 
@@ -63,23 +63,25 @@ class CuratePlugin:
 
     @hookimpl
     def handle_exception(self, datasette: Any, request: Any, exception: Exception) -> Any:
-        """An error as a page or as JSON, in one line, and without a trace in the terminal."""
+        """Return an error as a page or as JSON, in one line; no traceback is logged."""
 
         async def page() -> Response:
             wrong_sql = isinstance(exception, sqlite3.Error | sqlite3.Warning)
             status = int(getattr(exception, "status", 400 if wrong_sql else 500))
-            told = getattr(exception, "message", None) or str(exception) or type(exception).__name__
+            message = (
+                getattr(exception, "message", None) or str(exception) or type(exception).__name__
+            )
             if getattr(exception, "title", None) == "SQL Interrupted":
-                told = (
-                    f"this takes longer than {datasette.sql_time_limit_ms / 1000:g} s: ask for "
-                    "less, or start curate serve with a greater --time-limit"
+                message = (
+                    f"the query takes longer than {datasette.sql_time_limit_ms / 1000:g} s: select "
+                    "less, or start curate serve with a larger --time-limit"
                 )
             if status >= 500:
-                _LOG.warning("%s: %s", type(exception).__name__, told)
+                _LOG.warning("%s: %s", type(exception).__name__, message)
             if request.path.endswith(".json"):
-                return Response.json({"ok": False, "error": told}, status=status)
+                return Response.json({"ok": False, "error": message}, status=status)
             text = await datasette.render_template(
-                ["error.html"], {"status": status, "error": told}
+                ["error.html"], {"status": status, "error": message}
             )
             return Response.html(text, status=status)
 
@@ -87,24 +89,24 @@ class CuratePlugin:
 
     @hookimpl
     def render_cell(self, row: Any, value: Any, column: str) -> Markup | None:
-        """Numbers that can be read, and links from frames and labels to the page of the frame."""
+        """Show a number with four digits, and a frame or label as a link to the frame's page."""
         if isinstance(value, float):
             return Markup('<span class="number" title="{}">{:.4g}</span>').format(value, value)
         if self._frames is None or column not in {"frame", "frame_id", "k"}:
             return None
-        own = dict(zip(row.keys(), row, strict=False))
-        wanted = _address(own, with_label=column == "k")
-        if wanted is None or value is None:
+        cells = dict(zip(row.keys(), row, strict=False))
+        parameters = _parameters(cells, with_label=column == "k")
+        if parameters is None or value is None:
             return None
-        shown = value["label"] if isinstance(value, Mapping) else value
+        text = value["label"] if isinstance(value, Mapping) else value
         link = Markup('<a href="/-/frame?{}" title="picture and labels">{}</a>')
-        return link.format(urlencode(wanted), shown)
+        return link.format(urlencode(parameters), text)
 
     async def _page(self, datasette: Any, request: Any) -> Response:
-        """Return the page of a frame, with the explanation of a label where one is asked for."""
+        """Return the page of a frame, with the explanation of a label if one is requested."""
         try:
             shown, k = await asyncio.to_thread(self._requested, request)
-            told = await asyncio.to_thread(self._explanation, shown, k)
+            explanation = await asyncio.to_thread(self._explanation, shown, k)
         except CurateError as error:
             page = await datasette.render_template(
                 ["error.html"], {"status": 404, "error": str(error)}, request=request
@@ -114,7 +116,7 @@ class CuratePlugin:
             "shown": shown,
             "columns": shown.columns,
             "k": k,
-            "explanation": told,
+            "explanation": explanation,
             "picture": _link("/-/picture", shown),
             "link": lambda **other: _link("/-/frame", shown, **other),
         }
@@ -134,16 +136,16 @@ class CuratePlugin:
     @property
     def _pages(self) -> FramePages:
         if self._frames is None:
-            raise ConfigError("no workspace at hand")
+            raise ConfigError("no workspace is open; images of frames need one")
         return self._frames
 
     def _requested(self, request: Any) -> tuple[ShownFrame, int | None]:
-        """The frame and the label that a request names; every part is looked up, none is a path."""
-        wanted = {name: request.args.get(name) or None for name in ("frame", "policy")}
+        """Return the requested frame and label; they are looked up, never used as paths."""
+        names = {name: request.args.get(name) or None for name in ("frame", "policy")}
         numbers = {name: _number(request.args.get(name)) for name in ("id", "round", "k")}
-        if wanted["frame"] is None and numbers["id"] is None:
-            raise ConfigError("name a frame, as in /-/frame?frame=000008")
-        shown = self._pages.find(wanted["frame"], numbers["id"], numbers["round"], wanted["policy"])
+        if names["frame"] is None and numbers["id"] is None:
+            raise ConfigError("specify a frame, as in /-/frame?frame=000008")
+        shown = self._pages.find(names["frame"], numbers["id"], numbers["round"], names["policy"])
         return shown, numbers["k"]
 
     def _explanation(self, shown: ShownFrame, k: int | None) -> str | None:
@@ -153,8 +155,8 @@ class CuratePlugin:
         return self._pages.explanation(shown, k)
 
 
-def _address(row: Mapping[str, Any], *, with_label: bool) -> dict[str, Any] | None:
-    """Return the parameters of the page of the frame that a row belongs to; None for no frame."""
+def _parameters(row: Mapping[str, Any], *, with_label: bool) -> dict[str, Any] | None:
+    """Return the URL parameters of the page of a row's frame; None if the row has no frame."""
     plain = {
         name: each["value"] if isinstance(each, Mapping) else each for name, each in row.items()
     }
@@ -169,19 +171,19 @@ def _address(row: Mapping[str, Any], *, with_label: bool) -> dict[str, Any] | No
 
 
 def _link(path: str, shown: ShownFrame, **other: Any) -> str:
-    """Return the address of a frame's page or picture, with some of its parts changed."""
-    wanted = {"frame": shown.name, "round": shown.round, "policy": shown.policy} | other
-    return f"{path}?{urlencode(wanted)}"
+    """Return the address of a frame's page or image, with some parameters replaced."""
+    parameters = {"frame": shown.name, "round": shown.round, "policy": shown.policy} | other
+    return f"{path}?{urlencode(parameters)}"
 
 
 def _number(text: str | None) -> int | None:
-    """Return a small number of a request; None where none is given.
+    """Return a small number of a request; None if it is absent.
 
     Raises:
-        ConfigError: if it is none.
+        ConfigError: if it is not a number of at most nine digits.
     """
     if not text:
         return None
     if not text.isascii() or not text.isdigit() or len(text) > 9:
-        raise ConfigError("id, round and k are numbers")
+        raise ConfigError("id, round and k must be numbers of at most nine digits")
     return int(text)

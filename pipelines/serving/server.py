@@ -1,4 +1,4 @@
-"""The server: a port of this machine, until Ctrl-C."""
+"""The HTTP server, which runs until Ctrl-C."""
 
 import socket
 import webbrowser
@@ -9,14 +9,14 @@ from curate.errors import ConfigError
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a socket that takes connections already.
+    """Return a socket that accepts connections.
 
     Args:
         host: name or address.
-        port: 0 for any that is free.
+        port: TCP port; 0 for any free one.
 
     Raises:
-        ConfigError: if it is in use, or not to be had.
+        ConfigError: if the port is in use or the address is not available.
     """
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
@@ -24,15 +24,15 @@ def listen(host: str, port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(
-            f"serve: cannot listen on {host}:{port}: {reason}; name another with --port "
-            "(0 takes any that is free)"
+            f"serve: cannot listen on {host}:{port}: {reason}; choose another one with "
+            "--port (0 takes any free one)"
         ) from error
 
 
 def make_server(application: Any) -> Any:
     """Return the server of an ASGI application; its `run` takes the sockets.
 
-    It says nothing of single requests, and gives slow readers three seconds at the end.
+    It does not log requests, and gives open connections three seconds when it stops.
     """
     import uvicorn
 
@@ -49,30 +49,30 @@ def make_server(application: Any) -> Any:
     return uvicorn.Server(config)
 
 
-def address(taken: socket.socket) -> str:
-    """Return the URL of what a socket listens to."""
-    host, port = taken.getsockname()[:2]
+def address(listener: socket.socket) -> str:
+    """Return the URL of a listening socket."""
+    host, port = listener.getsockname()[:2]
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
 def serve(
-    application: Any, taken: socket.socket, told: Callable[[str], None], *, browse: bool
+    application: Any, listener: socket.socket, announce: Callable[[str], None], *, browse: bool
 ) -> None:
-    """Answers until Ctrl-C or SIGTERM.
+    """Serve until Ctrl-C or SIGTERM.
 
     Args:
         application: an ASGI application.
-        taken: where it listens; closed at the end.
-        told: is given the address.
-        browse: whether to show it in a browser.
+        listener: the listening socket; it is closed at the end.
+        announce: called with the URL.
+        browse: whether to open the URL in a browser.
     """
-    told(address(taken))
+    announce(address(listener))
     if browse:
-        # The socket listens already: the first request waits until the server runs.
-        webbrowser.open(address(taken))
-    with taken:
+        # The socket already listens: the first request waits until the server runs.
+        webbrowser.open(address(listener))
+    with listener:
         try:
-            make_server(application).run(sockets=[taken])
+            make_server(application).run(sockets=[listener])
         except KeyboardInterrupt:
-            # uvicorn has ended in good order and passes the signal on.
+            # uvicorn has shut down and passes the signal on.
             return

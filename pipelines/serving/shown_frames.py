@@ -1,4 +1,4 @@
-"""What the page of a frame shows: its picture, its labels, its neighbours, the other weights."""
+"""The content of the page of a frame: image, labels, neighbouring frames, other weights."""
 
 import threading
 from collections import OrderedDict
@@ -27,12 +27,12 @@ class ShownFrame:
         name: of the frame.
         split: of the frame.
         round: number.
-        policy: whose weights.
-        columns: of the labels.
+        policy: policy of the weights.
+        columns: names of the columns of the labels.
         labels: a row per label.
         choices: (round, policy) of all weights that the frame has.
-        before: the frame of the same split before this one, None at the start.
-        after: the one after it, None at the end.
+        before: the previous frame of the same split; None at the start.
+        after: the next frame of the same split; None at the end.
     """
 
     name: str
@@ -47,9 +47,9 @@ class ShownFrame:
 
 
 class FramePages:
-    """Frames of a workspace as they are asked for; nothing is written.
+    """Frames of a workspace with their images; nothing is written.
 
-    Pictures are drawn one at a time, and the last ones are kept in memory.
+    Images are drawn one at a time, and the last ones are kept in memory.
 
     Args:
         workspace: see `Workspace`.
@@ -66,13 +66,13 @@ class FramePages:
         """Return a frame by name or by key.
 
         Args:
-            name: None where the key is given.
-            key: frame.id.
-            round_number: None for the last that has predictions.
+            name: None if the key is given.
+            key: frame.id; None if the name is given.
+            round_number: None for the last with predictions.
             policy: None for the configured one.
 
         Raises:
-            ConfigError: if there is no such frame, or nothing of it in such a round.
+            ConfigError: if the frame is unknown, or has no weights of the policy in the round.
             WorkspaceError: if no round has predictions yet.
         """
         number = chosen_round(self._workspace, round_number)
@@ -86,18 +86,18 @@ class FramePages:
         return ShownFrame(name, split, number, policy, columns, labels, choices, before, after)
 
     def picture(self, shown: ShownFrame) -> bytes:
-        """Return the picture of a frame as JPEG."""
-        wanted = (shown.name, shown.round, shown.policy)
+        """Return the image of a frame as JPEG."""
+        key = (shown.name, shown.round, shown.policy)
         with self._drawing:
-            if wanted not in self._pictures:
-                self._pictures[wanted] = jpeg(frame_picture(self._workspace, *wanted), quality=88)
-            self._pictures.move_to_end(wanted)
+            if key not in self._pictures:
+                self._pictures[key] = jpeg(frame_picture(self._workspace, *key), quality=88)
+            self._pictures.move_to_end(key)
             if len(self._pictures) > _KEPT_PICTURES:
                 self._pictures.popitem(last=False)
-            return self._pictures[wanted]
+            return self._pictures[key]
 
     def explanation(self, shown: ShownFrame, k: int) -> str:
-        """What `curate explain` says of a label.
+        """Return the output of `curate explain` for a label.
 
         Raises:
             WorkspaceError: if the policy has not weighted it.
@@ -118,7 +118,7 @@ class FramePages:
 
     def _choices(self, key: int) -> tuple[tuple[int, str], ...]:
         weight, number = bulk.table("weight"), bulk.table("round").c.number
-        # Round by round: the key of `weight` starts with it.
+        # The round is in the condition because the key of `weight` starts with it.
         query = (
             select(weight.c.round, weight.c.policy)
             .where(weight.c.round.in_(select(number)), weight.c.frame_id == key)
@@ -137,7 +137,7 @@ class FramePages:
     def _labels(
         self, key: int, number: int, policy: str
     ) -> tuple[tuple[str, ...], tuple[bulk.Row, ...]]:
-        """Return the columns of the labels, and a row each; frames of any split have them."""
+        """Return the columns and the rows of the labels of a frame, of whatever split."""
         prediction, weight = bulk.table("prediction"), bulk.table("weight")
         with self._workspace.database.reading() as connection:
             declared = read_declarations(connection)
@@ -150,9 +150,11 @@ class FramePages:
         joined: Any = prediction
         columns = {**prediction.c}
         for table in (*tables, weight):
-            same = [table.c[name] == prediction.c[name] for name in ("round", "frame_id", "k")]
-            own = [weight.c.policy == policy] if table is weight else []
-            joined = joined.outerjoin(table, and_(*same, *own))
+            same_label = [
+                table.c[name] == prediction.c[name] for name in ("round", "frame_id", "k")
+            ]
+            of_policy = [weight.c.policy == policy] if table is weight else []
+            joined = joined.outerjoin(table, and_(*same_label, *of_policy))
             columns = {**table.c, **columns}
         query = (
             select(*(columns[name] for name in names))

@@ -1,4 +1,4 @@
-"""Which databases a server shows."""
+"""Choose the databases that a server shows."""
 
 from pathlib import Path
 
@@ -10,19 +10,19 @@ WORKING, EXPORTED = "workspace", "labels"
 
 
 def choose(argument: Path | None, option: Path | None, file: Path | None) -> Served:
-    """What the command line asks for.
+    """Return what the command line selects.
 
     Args:
         argument: the workspace as an argument.
         option: the workspace as an option.
-        file: an exported label file; then a workspace only adds pictures.
+        file: an exported label file; then a workspace only adds images.
 
     Raises:
-        ConfigError: if both name a workspace, or there is no such file.
-        WorkspaceError: if there is no workspace, or nothing of it can be served.
+        ConfigError: if both specify a workspace, or there is no such file.
+        WorkspaceError: if there is no workspace, or it has nothing to serve.
     """
     if argument is not None and option is not None:
-        raise ConfigError("serve: name the workspace once, as an argument or with --workspace")
+        raise ConfigError("serve: specify the workspace once, as an argument or with --workspace")
     folder = argument or option
     if file is None:
         return _of_workspace(Workspace.open(folder))
@@ -40,7 +40,7 @@ def _of_workspace(workspace: Workspace) -> Served:
         files[EXPORTED] = exported
     if not files:
         raise WorkspaceError(
-            f"serve: Datasette reads SQLite, and {workspace.root} keeps its rows in "
+            f"serve: Datasette reads SQLite, and {workspace.root} stores its rows in "
             f"{url.get_backend_name()}; write exports/labels.sqlite with `curate export`"
         )
     working = WORKING if WORKING in files else None
@@ -48,7 +48,7 @@ def _of_workspace(workspace: Workspace) -> Served:
 
 
 def _find_workspace(folder: Path | None) -> Workspace | None:
-    """Return the workspace, for pictures; none is needed unless it is named."""
+    """Return the workspace for images; None if none is specified and none is found."""
     if folder is not None:
         return Workspace.open(folder)
     try:

@@ -23,7 +23,7 @@ from curate.detections import CATEGORIES
 from curate.errors import ConfigError, one_line
 from curate.files.toml_text import parse_toml
 from pipelines import registry
-from pipelines.workspace.config_faults import describe_faults
+from pipelines.workspace.config_errors import describe_errors
 from pipelines.workspace.names import KnownClassSet, KnownName
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -48,25 +48,25 @@ DEFAULT_PRIORS = ("points", "semantic")
 
 
 def _unit(unit: str) -> dict[str, Any]:
-    """Return the unit of a field; "1" for a number without dimension."""
+    """Return the JSON Schema entry for the unit of a field; "1" for a dimensionless number."""
     return {"unit": unit}
 
 
 def _each_once(names: tuple[str, ...]) -> tuple[str, ...]:
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise ValueError(f"'{repeated[0]}' is named twice")
+        raise ValueError(f"'{repeated[0]}' is listed twice")
     return names
 
 
 def _rising(limits: tuple[float, float]) -> tuple[float, float]:
     if limits[0] > limits[1]:
-        raise ValueError("the lower limit comes first")
+        raise ValueError("the lower limit must come first")
     return limits
 
 
 class Section(BaseModel):
-    """A table of settings that rejects keys it does not know."""
+    """A table of settings; unknown keys are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -84,8 +84,8 @@ class DatasetSection(Section):
     )
     split_by: Literal["sequence", "frame"] = Field(
         default="sequence",
-        description="What goes into one split as a whole. With 'frame', near-duplicate frames of a "
-        "sequence end up in several splits.",
+        description="Unit of the split: whole sequences or single frames. With 'frame', "
+        "near-duplicate frames of a sequence end up in several splits.",
     )
     follow_links: bool = Field(
         default=False, description="Whether links in the data set may lead out of its folder."
@@ -109,7 +109,7 @@ class DetectorSection(Section):
     )
     device: Literal["auto", "cpu", "cuda"] = Field(
         default="auto",
-        description="Where the detector runs and trains. 'auto' uses a GPU where there is one.",
+        description="Where the detector runs and trains. 'auto' uses a GPU if there is one.",
     )
     minimum_score: Share = Field(
         default=0.1,
@@ -127,7 +127,7 @@ class DetectorSection(Section):
 
 
 class SegmenterSection(Section):
-    """The segmenter whose semantic maps the semantic prior reads."""
+    """The segmenter that computes the semantic maps for the semantic prior."""
 
     name: SegmenterName = Field(
         default="none",
@@ -141,7 +141,7 @@ class SegmenterSection(Section):
     )
     classes: Annotated[str, KnownClassSet()] | None = Field(
         default=None,
-        description="Class set that says what the segmenter's class numbers mean; see "
+        description="Class set that gives the segmenter's class ids their meaning; see "
         "docs/segmenters.md.",
         examples=["cityscapes"],
     )
@@ -156,7 +156,8 @@ class RepredictSection(Section):
 
     views: AtLeastOne = Field(
         default=1,
-        description="Augmented copies of each frame. L is the mean over those that matched.",
+        description="Number of augmented copies of each frame. L is the mean over the copies that "
+        "matched.",
         json_schema_extra=_unit("copies"),
     )
     flip_probability: Share = Field(
@@ -166,7 +167,7 @@ class RepredictSection(Section):
     )
     rotation_limit_rad: Annotated[float, Field(ge=0, le=math.pi)] = Field(
         default=0.7853981633974483,
-        description="A copy is rotated about z by at most this angle, either way.",
+        description="A copy is rotated about z by at most this angle, in either direction.",
         json_schema_extra=_unit("rad"),
     )
     scale_range: Annotated[tuple[Scale, Scale], AfterValidator(_rising)] = Field(
@@ -186,7 +187,7 @@ class RepredictSection(Section):
     )
     beta: Positive = Field(
         default=1 / 9,
-        description="Residual at which smooth L1 turns from a parabola into a line.",
+        description="Residual at which smooth L1 changes from quadratic to linear.",
         json_schema_extra=_unit("1"),
     )
     minimum_iou: Annotated[float, Field(ge=0, lt=1)] = Field(
@@ -197,12 +198,12 @@ class RepredictSection(Section):
 
 
 class PointsSection(Section):
-    """The point prior rho_diff (Eq. 8): how many LiDAR points a label of a category should hold."""
+    """The point prior rho_diff (Eq. 8): how many LiDAR points a label of a category needs."""
 
     statistic: Literal["median", "mean", "quantile", "fixed"] = Field(
         default="median",
-        description="How m_th follows from the points in the ground-truth boxes of X_l. 'fixed' "
-        "uses points.fixed instead.",
+        description="How m_th is computed from the point counts of the ground-truth boxes of X_l. "
+        "'fixed' uses points.fixed instead.",
     )
     quantile: Share = Field(
         default=0.5,
@@ -235,23 +236,23 @@ class SemanticSection(Section):
 
 
 class SolveSection(Section):
-    """How policies weigh the labels. Which policy weighs is set by run.method."""
+    """How policies weight the labels. run.method selects the policy."""
 
     scope: Literal["round", "category", "frame"] = Field(
         default="round",
-        description="Labels that share one lambda (Eq. 4). Read by spsl and pspsl.",
+        description="Labels that share one lambda (Eq. 4). Used by spsl and pspsl.",
     )
     quantile: Annotated[float, Field(gt=0, le=1)] | None = Field(
         default=None,
-        description="Quantile of the losses that takes the place of max(L) in Eq. 4. Without it, "
-        "the maximum is used. Read by spsl and pspsl.",
+        description="Quantile of the losses that replaces max(L) in Eq. 4. Without it, the maximum "
+        "is used. Used by spsl and pspsl.",
         json_schema_extra=_unit("1"),
         examples=[0.95],
     )
     self_paced: bool = Field(
         default=True,
-        description="Whether pspsl uses the factor 1 - L / lambda. With false, the priors alone "
-        "weigh, and no repredictions are needed.",
+        description="Whether pspsl uses the factor 1 - L / lambda. With false, the weight is the "
+        "product of the priors, and no repredictions are needed.",
     )
     options: dict[PolicyName, Options] = Field(
         default={},
@@ -272,7 +273,8 @@ class TrainSection(Section):
 
     preset: str = Field(
         default="auto",
-        description="Preset of the detector's network. 'auto' is its first; see docs/config.md.",
+        description="Preset of the detector's network. 'auto' selects its first; see "
+        "docs/config.md.",
     )
     pretrain_steps: AtLeastOne = Field(
         default=1200,
@@ -307,16 +309,16 @@ class TrainSection(Section):
     )
     zero_weight: Literal["method", "ignore", "background"] = Field(
         default="method",
-        description="What a label of weight 0 is to the student. 'method': what the policy says; "
-        "see docs/methods.md.",
+        description="How a student is trained on a label of weight 0. 'method': as the policy "
+        "defines; see docs/methods.md.",
     )
     start: Literal["teacher", "scratch"] = Field(
-        default="teacher", description="What the student of a round starts from."
+        default="teacher", description="Initial weights of the student of a round."
     )
     teacher: Literal["method", "student", "ema"] = Field(
         default="method",
-        description="What teaches the next round: the student or the moving average of its "
-        "weights. 'method': as the method has it.",
+        description="Teacher of the next round: the student or the moving average of its weights. "
+        "'method': as the method defines.",
     )
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = Field(
         default=0.999,
@@ -325,7 +327,7 @@ class TrainSection(Section):
     )
     statistics_steps: AtLeastOne = Field(
         default=20,
-        description="Steps between two points of the training's curves.",
+        description="Steps between two points of the training curves.",
         json_schema_extra=_unit("steps"),
     )
     pasted: Count = Field(
@@ -340,7 +342,7 @@ class TrainSection(Section):
         examples=["python train.py {labels} {output}"],
     )
     labels_format: ExporterName = Field(
-        default="sqlite", description="Format in which your own trainer gets the labels."
+        default="sqlite", description="Format of the labels for your own trainer."
     )
     options: Options = Field(
         default={},
@@ -352,7 +354,7 @@ class RunSection(Section):
     """Which method is used, and how the work is organised."""
 
     method: PolicyName = Field(
-        default="pspsl", description="Method that weighs the labels; see docs/methods.md."
+        default="pspsl", description="Method that weights the labels; see docs/methods.md."
     )
     rounds: AtLeastOne = Field(
         default=3, description="Number of rounds E.", json_schema_extra=_unit("rounds")
@@ -370,7 +372,7 @@ class RunSection(Section):
         default={}, description="Arguments of each prior by its name."
     )
     executor: ExecutorName = Field(
-        default="serial", description="Executor that works on the frames; see docs/scale.md."
+        default="serial", description="Executor that processes the frames; see docs/scale.md."
     )
     executor_options: dict[ExecutorName, Options] = Field(
         default={},
@@ -378,8 +380,8 @@ class RunSection(Section):
     )
     workers: AtLeastOne = Field(
         default=1,
-        description="Workers, each with a model of its own. More than one need an executor other "
-        "than serial.",
+        description="Number of workers, each with its own copy of the model. More than one "
+        "requires an executor other than serial.",
         json_schema_extra=_unit("workers"),
     )
     database: str | None = Field(
@@ -407,16 +409,19 @@ def read_config(path: Path) -> Config:
     """Return the configuration in a TOML file.
 
     Raises:
-        ConfigError: if the file is not TOML or some settings are wrong; all of them are listed.
+        ConfigError: if the file is not TOML or settings are invalid; the message lists all of them.
     """
     if path.exists() and not path.is_file():
         raise ConfigError(f"{path}: is not a file but a folder, a pipe or a device; remove it")
     try:
         document = parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; `curate init` makes a workspace") from error
-    except (RecursionError, ValueError) as error:  # ValueError: also of absurdly long numbers
-        raise ConfigError(f"{path}: not TOML: {one_line(error, 200)}") from error
+        raise ConfigError(f"{path}: no such file; `curate init` creates a workspace") from error
+    except (
+        RecursionError,
+        ValueError,
+    ) as error:  # ValueError also covers numbers that are too long
+        raise ConfigError(f"{path}: invalid TOML: {one_line(error, 200)}") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     return make_config(document, str(path))
@@ -426,19 +431,19 @@ def make_config(document: Mapping[str, Any], source: str) -> Config:
     """Return the configuration in a document.
 
     Raises:
-        ConfigError: if some settings are wrong; all of them are listed, after the source.
+        ConfigError: if settings are invalid; the message lists all of them, after the source.
     """
     try:
         return Config.model_validate(document)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {describe_faults(error, Config)}") from error
+        raise ConfigError(f"{source}: {describe_errors(error, Config)}") from error
 
 
 def change_setting(document: dict[str, Any], setting: str) -> None:
-    """Set section.key=value in a document. A value that is not TOML is a string.
+    """Set section.key=value in a document. A value that is not valid TOML becomes a string.
 
     Raises:
-        ConfigError: if it is not of that form, or there is no such key or value.
+        ConfigError: if the setting does not have this form, or its key or value is invalid.
     """
     place, equals, text = setting.partition("=")
     *sections, key = place.strip().split(".")
@@ -454,7 +459,7 @@ def change_setting(document: dict[str, Any], setting: str) -> None:
     try:
         Config.model_validate(alone)
     except ValidationError as error:
-        raise ConfigError(f"--set {describe_faults(error, Config)}") from error
+        raise ConfigError(f"--set {describe_errors(error, Config)}") from error
 
 
 def _put(document: dict[str, Any], sections: list[str], key: str, value: Any) -> None:

@@ -62,33 +62,33 @@ def _comment(text: str) -> list[str]:
 
 
 def change_settings(path: Path, section: str, changes: Mapping[str, str]) -> None:
-    """Write settings into a section of a TOML file; all else stays as it was typed.
+    """Write settings into a section of a TOML file; all other text stays unchanged.
 
     Raises:
-        ConfigError: if the file cannot be changed in this way; it is left as it was.
+        ConfigError: if the file cannot be changed in this way; it stays unchanged.
     """
     lines = [f"{key} = {toml(value)}" for key, value in changes.items()]
-    fault = "cannot be changed line by line"
+    reason = "cannot be changed line by line"
     try:
         text = path.read_text(encoding="utf-8-sig")
         before = parse_toml(text)
         changed = "\n".join(_changed(text.splitlines(), section, lines)) + "\n"
-        wanted = {**before, section: {**before.get(section, {}), **changes}}
-        if parse_toml(changed) == wanted:
+        expected = {**before, section: {**before.get(section, {}), **changes}}
+        if parse_toml(changed) == expected:
             replace_file(path, changed.encode())
             return
     except ValueError:
-        pass  # the result is not TOML: before was a table in braces, or a text over several lines
+        pass  # invalid TOML: the file has an inline table or a multi-line string there
     except OSError as error:
-        fault = f"cannot be changed: {error.strerror}"
-    raise ConfigError(f"{path}: {fault}; write into its [{section}] yourself: {'; '.join(lines)}")
+        reason = f"cannot be changed: {error.strerror}"
+    raise ConfigError(f"{path}: {reason}; add to its section [{section}]: {'; '.join(lines)}")
 
 
 def _changed(lines: Sequence[str], section: str, settings: Sequence[str]) -> list[str]:
-    """Return the lines with each setting in its place.
+    """Return the lines with each setting written.
 
-    That is the line that sets it, else the comment that shows it as unset, else the top of its
-    section.
+    A setting replaces the line that sets it, or the comment that shows it as unset. If there is
+    neither, it is inserted at the top of its section.
     """
     found = list(lines)
     header = re.compile(rf"\s*\[\s*{re.escape(section)}\s*\]\s*(#.*)?")

@@ -12,7 +12,7 @@ CONFIG_NAME = "curate.toml"
 
 
 def find_workspace(folder: Path | None) -> Path:
-    """Return a workspace's folder: `folder`, else the current one or the nearest one above it.
+    """Return the folder of a workspace: `folder`, or else the nearest one at or above the current.
 
     Raises:
         WorkspaceError: if there is no workspace.
@@ -20,15 +20,15 @@ def find_workspace(folder: Path | None) -> Path:
     if folder is not None:
         root = folder.resolve()
         if not (root / CONFIG_NAME).is_file():
-            raise WorkspaceError(f"{root}: no workspace here; make one with `curate init {root}`")
+            raise WorkspaceError(f"{root}: no workspace here; create one with `curate init {root}`")
         return root
     here = Path.cwd()
     for root in (here, *here.parents):
         if (root / CONFIG_NAME).is_file():
             return root
     raise WorkspaceError(
-        f"no {CONFIG_NAME} in {here} or above it; make a workspace with `curate init DIR`, "
-        "or name one with --workspace DIR"
+        f"no {CONFIG_NAME} in {here} or above it; create a workspace with `curate init "
+        "DIR`, or specify one with --workspace DIR"
     )
 
 
@@ -36,7 +36,7 @@ def url_of(root: Path, config: Config) -> URL:
     """Return the URL of the database of a workspace with this configuration."""
     if config.run.database is not None:
         return parse_url(config.run.database)
-    # Made from its parts: in a string, a ? or % of the folder's name would mean something else.
+    # Built from parts: in a URL string, a ? or % in the folder's name has a special meaning.
     return URL.create("sqlite", database=str(root / "curate.db"))
 
 

@@ -15,12 +15,11 @@ from pipelines.registry import Registry
 class KnownName:
     """Marks a text as the name of an extension, or as `module:Class`.
 
-    Whether a class can be imported is checked where it is used: a command that does not need it
-    does not import it.
+    A class is imported, and thereby checked, only by commands that use it.
 
     Attributes:
         registry: the registered extensions.
-        others: names with a meaning of their own.
+        others: further valid names, such as "none".
     """
 
     registry: Registry
@@ -28,7 +27,7 @@ class KnownName:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names that can be used."""
+        """The valid names."""
         return (*self.registry.classes, *self.others)
 
     def __get_pydantic_core_schema__(
@@ -52,7 +51,7 @@ class KnownClassSet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names that can be used; they are loaded here, as they need numpy."""
+        """The valid names. They are imported here because they need numpy."""
         from curate.segmenters.classes import CLASS_MAPS
 
         return tuple(CLASS_MAPS)
@@ -74,7 +73,7 @@ class KnownClassSet:
 
 
 def _as_value_error(check: Callable[[], object], name: str) -> str:
-    """Return a name that passes a check; ValueError, which pydantic collects, if it does not."""
+    """Return the name, or raise ValueError, which pydantic collects, if the check fails."""
     try:
         check()
     except ConfigError as error:

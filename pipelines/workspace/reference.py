@@ -1,4 +1,4 @@
-"""What the fields of the configuration accept, in words: for pages, comments and error messages."""
+"""Descriptions of what configuration fields accept, for pages, comments and error messages."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ class Accepted:
     """The values that a setting accepts.
 
     Attributes:
-        type: in words.
-        range: of a number, in words; "" without limits.
-        choices: names to choose from; () where any value of the type will do.
-        open: whether `module:Class` is accepted beside the choices.
+        type: name of the type, such as "whole number".
+        range: limits of a number, such as "at least 1"; "" without limits.
+        choices: the valid names; () if any value of the type is valid.
+        open: whether `module:Class` is valid, too.
     """
 
     type: str
@@ -46,13 +46,13 @@ class Accepted:
 
 @dataclass(frozen=True)
 class Setting:
-    """One key of a section, with all that is to be said about it.
+    """One key of a section, with its documentation.
 
     Attributes:
         key: its name.
         accepted: the values that it accepts.
         default: its value in TOML; None if the setting is required, "" if it is unset by default.
-        unit: "1" for a number without dimension, "" for what is not a number.
+        unit: "1" for a dimensionless number, "" for other values.
         meaning: its description.
         example: a value in TOML, for a setting that is unset by default.
     """

@@ -15,7 +15,7 @@ from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
 from curate.files.batches import batched
-from curate.firewall.sequences import choose_sequences, group_by_sequence, straddling
+from curate.firewall.sequences import choose_sequences, group_by_sequence, shared_sequences
 from curate.segmenters.classes import CLASS_MAPS
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
@@ -58,7 +58,7 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
         val: the same for val frames; "" for the data set's own val list.
 
     Raises:
-        ConfigError: if a share or a list is wrong, or a class or file is not there.
+        ConfigError: if a share or a list is invalid, or a class or file is missing.
         DataError: if a label or calibration file of X_l or val is damaged.
         WorkspaceError: if the workspace exists with other frames or settings.
     """
@@ -84,7 +84,7 @@ def _check_files(config: Config) -> None:
     """Check the files of detector and segmenter.
 
     Raises:
-        ConfigError: if a file is missing, or nothing says what the segmenter's class numbers mean.
+        ConfigError: if a file is missing, or the meaning of the segmenter's class ids is not given.
     """
     needs_path = {"detector": ("onnx", "recorded"), "segmenter": tuple(registry.SEGMENTERS.classes)}
     for section, names in needs_path.items():
@@ -101,8 +101,8 @@ def _check_files(config: Config) -> None:
         and "classes" not in segmenter.options
     ):
         raise ConfigError(
-            f"segmenter '{name}': say what its class numbers mean: --segmenter-classes "
-            f"{', '.join(CLASS_MAPS)}; or a table of your own: --set "
+            f"segmenter '{name}': its class ids have no meaning yet: give --segmenter-classes "
+            f"(one of {', '.join(CLASS_MAPS)}) or your own table, such as --set "
             '"segmenter.options.classes={Car=[7]}"'
         )
 
@@ -110,36 +110,36 @@ def _check_files(config: Config) -> None:
 def choose_split(
     dataset: Dataset, labeled: str, val: str, seed: int, split_by: str = "sequence"
 ) -> Split:
-    """Return which frames are labeled, unlabeled and val.
+    """Choose which frames are labeled, unlabeled and val.
 
     If the data set has sequences, each goes into one split as a whole, unless `split_by` is
     "frame".
 
     Raises:
-        ConfigError: if a share or a list is wrong.
+        ConfigError: if a share or a list is invalid.
         DataError: if the data set has no frames.
-        LeakageError: if lists of the user put a sequence into two splits.
+        LeakageError: if user-supplied lists put a sequence into two splits.
     """
     lists = dataset.splits()
     frames = lists.get("train") or dataset.frame_ids()
     if not frames:
-        raise DataError("the data set holds no frames; --root should hold velodyne/ or training/")
-    known = sequences_of(dataset, {*frames, *lists.get("val", ())})
-    sequences = known if split_by == "sequence" else {}
-    if known and not sequences:
+        raise DataError("the data set has no frames; --root must contain velodyne/ or training/")
+    all_sequences = sequences_of(dataset, {*frames, *lists.get("val", ())})
+    sequences = all_sequences if split_by == "sequence" else {}
+    if all_sequences and not sequences:
         _log.warning(
-            "splitting by frame: near-duplicate frames of one sequence will be in several splits, "
-            "and figures on val frames will look better than they are"
+            "splitting by frame: several splits will contain near-duplicate frames of one "
+            "sequence, and results on val frames will be too optimistic"
         )
     generator = np.random.default_rng(seed)
     held_out: Sequence[str] = lists.get("val", ())
     if val:
         held_out = _choose(dataset, frames, val, generator, "val", sequences)
-    bare = [frame for frame in held_out if not dataset.files(frame).label]
-    if bare:
+    without_label = [frame for frame in held_out if not dataset.files(frame).label]
+    if without_label:
         raise ConfigError(
-            f"val frame {bare[0]} has no label file; give --val 0 for no val frames, or a list of "
-            "frames that have one"
+            f"val frame {without_label[0]} has no label file; give --val 0 for no val "
+            "frames, or a list of frames that have one"
         )
     pool = [frame for frame in frames if frame not in set(held_out)]
     chosen = _choose(dataset, pool, labeled, generator, "labeled", sequences)
@@ -153,11 +153,11 @@ def choose_split(
 
 def _check_sequences(sequences: Mapping[str, str], split: Split) -> None:
     """Raise LeakageError if a sequence is in two splits."""
-    shared = straddling(sequences, {name: getattr(split, name) for name in SPLITS})
+    shared = shared_sequences(sequences, {name: getattr(split, name) for name in SPLITS})
     for (one, other), names in shared.items():
         raise LeakageError(
             f"{len(names)} sequences ({named(names)}) have frames in both {one} and {other}, which "
-            "are near-duplicates of each other: give whole sequences (a list may hold their "
+            "are near-duplicates of each other: give whole sequences (a list may contain sequence "
             "names), or split by frame with --split-by frame"
         )
 
@@ -170,7 +170,7 @@ def _choose(
     split: str,
     sequences: Mapping[str, str],
 ) -> list[str]:
-    """Return frames with a label file, by share or by list, in whole sequences if there are any."""
+    """Choose frames with a label file, by share or from a list; by sequence if there are any."""
     if Path(selection).is_file():
         return _listed(dataset, pool, Path(selection), split)
     try:
@@ -187,24 +187,24 @@ def _choose(
     count = max(1, round(share * len(pool)))
     if count > len(with_label):
         raise ConfigError(
-            f"--{split} {selection} asks for {count} frames, but only {len(with_label)} of "
+            f"--{split} {selection} needs {count} frames, but only {len(with_label)} of "
             f"{len(pool)} have a label file; give a smaller share (0 for none)"
         )
     if sequences:
         groups = group_by_sequence(sequences, pool)
         whole = {name for name, frames in groups.items() if set(frames) <= set(with_label)}
-        of = [frame for name in sorted(whole) for frame in groups[name]]
-        if not of:
+        candidates = [frame for name in sorted(whole) for frame in groups[name]]
+        if not candidates:
             raise ConfigError(
                 f"--{split} {selection}: no sequence has a label file for each of its frames; give "
                 "a list of frames, or split by frame with --split-by frame"
             )
-        return choose_sequences(sequences, of, count, generator)
+        return choose_sequences(sequences, candidates, count, generator)
     return list(generator.permutation(with_label)[:count].tolist())
 
 
 def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
-    """Return the frames that a file lists, each once; a sequence stands for its frames."""
+    """Return the frames that a file lists, without repetition; a sequence means all its frames."""
     try:
         names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
     except (OSError, UnicodeDecodeError) as error:
@@ -214,9 +214,9 @@ def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> li
     unknown = sorted(set(names) - set(pool))
     if unknown:
         raise ConfigError(f"--{split} {path}: frame {unknown[0]} is not among the training frames")
-    bare = [name for name in names if not dataset.files(name).label]
-    if bare:
-        raise ConfigError(f"--{split} {path}: frame {bare[0]} has no label file")
+    without_label = [name for name in names if not dataset.files(name).label]
+    if without_label:
+        raise ConfigError(f"--{split} {path}: frame {without_label[0]} has no label file")
     return names
 
 
@@ -230,13 +230,13 @@ def _store(
     table = bulk.table("frame")
     with workspace.database.writing() as connection:
         if connection.execute(select(func.count()).select_from(table)).scalar_one():
-            raise WorkspaceError(f"{workspace.root}: another command has just set it up")
+            raise WorkspaceError(f"{workspace.root}: another command has just initialised it")
         for rows in batched(_frame_rows(workspace, dataset, split), FRAMES_AT_ONCE):
             bulk.insert_rows(connection, "frame", rows)
         chosen = {name: getattr(split, name) for name in SPLITS}
         bulk.insert_rows(connection, "split_list", split_rows(chosen, dataset.splits(), files))
         query = select(table.c.frame, table.c.id, table.c.split).where(table.c.split != "unlabeled")
-        keys = {frame: (key, of) for frame, key, of in bulk.select(connection, query)}
+        keys = {frame: (key, name) for frame, key, name in bulk.select(connection, query)}
         truth_rows = [
             row for frame, found in truth.items() for row in _truth_rows(*keys[frame], found)
         ]

@@ -1,4 +1,4 @@
-"""The lists of frames as `curate init` found and chose them, and whether they are still so."""
+"""The split lists that `curate init` recorded, and what has changed since."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,45 +8,49 @@ from typing import Any
 from sqlalchemy import select
 
 from curate.errors import ConfigError
-from curate.firewall.split_lists import SplitList, changes
+from curate.firewall.split_lists import SplitList, describe_changes
 from db import bulk
 from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace
 
-# Of a data set's own lists, those that decide who may learn from what.
-_OWN_LISTS = ("train", "val")
+# The lists of a data set that decide which frames may be used for training.
+_DATASET_LISTS = ("train", "val")
 
 
 def split_rows(
     chosen: Mapping[str, Iterable[str]],
-    own: Mapping[str, Iterable[str]],
+    dataset_lists: Mapping[str, Iterable[str]],
     files: Mapping[str, Path],
 ) -> list[dict[str, Any]]:
     """Return the rows of `split_list`.
 
     Args:
         chosen: the frames of each split.
-        own: the data set's lists.
-        files: the lists that were given by file, by split.
+        dataset_lists: the data set's lists, by name.
+        files: the files that init was given, by split.
     """
     rows: list[tuple[str, str, str | None, Iterable[str]]]
     rows = [("chosen", name, None, chosen[name]) for name in SPLITS]
-    rows += [("dataset", name, None, own[name]) for name in _OWN_LISTS if name in own]
+    rows += [
+        ("dataset", name, None, dataset_lists[name])
+        for name in _DATASET_LISTS
+        if name in dataset_lists
+    ]
     rows += [("file", name, str(path.resolve()), _read(path)) for name, path in files.items()]
     return [_row(source, name, path, SplitList.of(names)) for source, name, path, names in rows]
 
 
 @dataclass(frozen=True)
 class RecordedList:
-    """A list of frames as init recorded it.
+    """A list of frames that init recorded.
 
     Attributes:
         source: "chosen" for a split of the workspace, "dataset" for a list of the data set, "file"
-            for one that init was given.
+            for a file that init was given.
         name: of the split or list.
-        path: of the file.
-        sha256: what the frames hashed to.
-        frames: see `SplitList`.
+        path: of the file; None for other sources.
+        sha256: the recorded hash of the frames.
+        frames: the recorded frames.
     """
 
     source: str
@@ -58,11 +62,11 @@ class RecordedList:
 
 @dataclass(frozen=True)
 class SplitRecord:
-    """The splits as they are, and the lists as init recorded them.
+    """The current splits, and the lists that init recorded.
 
     Attributes:
-        splits: names and keys of the frames of each split.
-        lists: what init recorded.
+        splits: names and keys of the frames of each split, now.
+        lists: the recorded lists.
     """
 
     splits: Mapping[str, Mapping[str, int]]
@@ -70,7 +74,7 @@ class SplitRecord:
 
     @classmethod
     def read(cls, workspace: Workspace) -> "SplitRecord":
-        """Both from the database."""
+        """Read both from the database."""
         table = bulk.table("split_list")
         columns = (table.c[name] for name in ("source", "name", "path", "sha256", "names"))
         rows = workspace.database.rows(select(*columns))
@@ -87,7 +91,7 @@ class SplitRecord:
 
     @property
     def damaged(self) -> Sequence[str]:
-        """The recorded lists that do not fit their own hash."""
+        """The recorded lists that do not match their recorded hash."""
         return [
             f"{found.source} {found.name}"
             for found in self.lists
@@ -96,7 +100,7 @@ class SplitRecord:
 
     @property
     def changed(self) -> Mapping[str, str]:
-        """What changed in each split since init; nothing where all is as it was."""
+        """Descriptions of the changes since init, by split; unchanged splits are absent."""
         return _describe_changes(
             (found.name, found.frames, self.splits.get(found.name, ()))
             for found in self.lists
@@ -105,10 +109,10 @@ class SplitRecord:
 
 
 def changed_lists(workspace: Workspace, record: SplitRecord) -> Mapping[str, str]:
-    """What changed in each list outside the workspace; a file that is gone has not changed."""
-    own = workspace.dataset.splits()
+    """Describe the changed lists outside the workspace; a missing file counts as unchanged."""
+    current = workspace.dataset.splits()
     return _describe_changes(
-        (f"the data set's {found.name}", found.frames, own.get(found.name, ()))
+        (f"the data set's {found.name}", found.frames, current.get(found.name, ()))
         if found.path is None
         else (str(found.path), found.frames, _read(found.path))
         for found in record.lists
@@ -117,9 +121,9 @@ def changed_lists(workspace: Workspace, record: SplitRecord) -> Mapping[str, str
 
 
 def _describe_changes(lists: Iterable[tuple[str, SplitList, Iterable[str]]]) -> Mapping[str, str]:
-    """What changed in the lists that did change, by name."""
-    told = {name: changes(before, SplitList.of(now)) for name, before, now in lists}
-    return {name: what for name, what in told.items() if what}
+    """Describe the changes by list name; unchanged lists are absent."""
+    described = {name: describe_changes(before, SplitList.of(now)) for name, before, now in lists}
+    return {name: what for name, what in described.items() if what}
 
 
 def _row(source: str, name: str, path: str | None, names: SplitList) -> dict[str, Any]:
@@ -134,8 +138,8 @@ def _row(source: str, name: str, path: str | None, names: SplitList) -> dict[str
 
 
 def _read(path: Path) -> list[str]:
-    """Return the frames that a file names."""
+    """Return the frames that a file lists."""
     try:
         return path.read_text(encoding="utf-8").split()
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: no list of frame ids: {error}") from error
+        raise ConfigError(f"{path}: is not a list of frame ids: {error}") from error

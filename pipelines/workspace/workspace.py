@@ -1,4 +1,4 @@
-"""A workspace: the folder that holds one project's configuration, database and products."""
+"""A workspace: the folder with the configuration, the database and the results of a project."""
 
 import hashlib
 from collections.abc import Sequence
@@ -28,8 +28,8 @@ class Workspace:
 
     Attributes:
         root: its folder, absolute.
-        config: the settings of `curate.toml`, changed by the options of the command line.
-        database: the memory.
+        config: the settings of `curate.toml`, with the options of the command line applied.
+        database: its database.
     """
 
     root: Path
@@ -38,11 +38,11 @@ class Workspace:
 
     @classmethod
     def open(cls, folder: Path | None = None) -> "Workspace":
-        """Return the workspace in `folder`, else in the current folder or the nearest one above it.
+        """Return the workspace in `folder`, or else the nearest one at or above the current folder.
 
         Raises:
             WorkspaceError: if there is none.
-            ConfigError: if its configuration is wrong.
+            ConfigError: if its configuration is invalid.
         """
         root = find_workspace(folder)
         config = _anchored(root, read_config(root / CONFIG_NAME))
@@ -50,15 +50,15 @@ class Workspace:
 
     @classmethod
     def create(cls, root: Path, config: Config) -> "Workspace":
-        """Return a new workspace with an empty database; one with the same settings is opened.
+        """Create a workspace with an empty database, or open one with the same settings.
 
         Raises:
-            WorkspaceError: if the folder holds a workspace with other settings.
+            WorkspaceError: if the folder is a workspace with other settings.
         """
         root = root.resolve()
         path = root / CONFIG_NAME
         if path.exists() and read_config(path) != config:
-            raise WorkspaceError(f"{path}: holds other settings; edit it, or choose another folder")
+            raise WorkspaceError(f"{path}: has other settings; edit it, or choose another folder")
         for folder in ("checkpoints", "exports", "pictures", "reports"):
             (root / folder).mkdir(parents=True, exist_ok=True)
         if path.exists():
@@ -71,7 +71,7 @@ class Workspace:
         """Return the same workspace with other settings in a section, for this command only.
 
         Raises:
-            ConfigError: if a setting is wrong.
+            ConfigError: if a setting is invalid.
         """
         changed = {**dict(getattr(self.config, section)), **changes}
         config = make_config({**dict(self.config), section: changed}, "command line")
@@ -83,18 +83,18 @@ class Workspace:
         return open_dataset(self.config)
 
     def relative(self, path: Path) -> str:
-        """A path as it is stored: relative inside the workspace, so that a workspace can move."""
+        """Return a path as it is stored: relative inside the workspace, so that it can be moved."""
         path = path.resolve()
         return str(path.relative_to(self.root) if path.is_relative_to(self.root) else path)
 
     def frames(self, *splits: str) -> dict[str, int]:
-        """Frame names and their keys, in the order of the names."""
+        """Return frame names with their keys, ordered by name."""
         frame = bulk.table("frame")
         query = select(frame.c.frame, frame.c.id).where(frame.c.split.in_(splits))
         return dict(self.database.rows(query.order_by(frame.c.frame)))
 
     def ground_truth(self, *splits: str) -> dict[str, Annotations]:
-        """Return the stored ground truth per frame; there is none of unlabeled frames."""
+        """Return the stored ground truth by frame name; unlabeled frames have none."""
         truth, frame = bulk.table("ground_truth"), bulk.table("frame")
         names = ("category", *BOX_COLUMNS, "truncated", "occluded", "alpha", *RECTANGLE_COLUMNS)
         query = (
@@ -124,7 +124,7 @@ class Workspace:
 
 
 def open_dataset(config: Config) -> Dataset:
-    """Return the data set that a configuration names."""
+    """Return the data set that a configuration specifies."""
     section = config.dataset
     dataset: Dataset = registry.DATASETS.build(
         section.kind,
@@ -139,12 +139,12 @@ def sha256(path: Path) -> str:
     """Return the hash of a file, or of the files in a folder with their names.
 
     Raises:
-        ConfigError: if there is no such file, or it is a pipe or a device, which may have no end.
+        ConfigError: if there is no such file, or it is a pipe or a device, which may never end.
     """
     if not path.exists():
         raise ConfigError(f"{path}: no such file")
     if not (path.is_file() or path.is_dir()):
-        raise ConfigError(f"{path}: is a pipe or a device, no file; name a file or a folder")
+        raise ConfigError(f"{path}: is a pipe or a device; specify a file or a folder")
     digest = hashlib.sha256()
     for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
         if file != path:
@@ -155,20 +155,20 @@ def sha256(path: Path) -> str:
 
 
 def stat_fingerprint(path: Path) -> str:
-    """What tells that a folder of many large files was changed, without reading them.
+    """Return a hash of the names, sizes and modification times of the files in a folder.
 
-    Names, sizes and times of change: files that were copied count as changed.
+    It detects changes without reading large files. Copied files count as changed.
     """
     digest = hashlib.sha256()
     for file in sorted(p for p in path.rglob("*") if p.is_file()):
         state = file.stat()
-        told = f"{file.relative_to(path)}\0{state.st_size} {state.st_mtime_ns}\n"
-        digest.update(told.encode())
+        entry = f"{file.relative_to(path)}\0{state.st_size} {state.st_mtime_ns}\n"
+        digest.update(entry.encode())
     return digest.hexdigest()
 
 
 def _anchored(root: Path, config: Config) -> Config:
-    """The configuration with relative paths taken from the workspace, not the current folder."""
+    """Return the configuration with relative paths resolved against the workspace folder."""
     changes: dict[str, Any] = {}
     for name, key in (("dataset", "root"), ("detector", "path"), ("segmenter", "path")):
         section = getattr(config, name)

@@ -168,7 +168,7 @@ def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> Non
     ("former", "later", "message"),
     [
         ('priors = ["points", "semantic"]', 'priors = ["pointz"]', "unknown prior 'pointz'"),
-        ('priors = ["points", "semantic"]', 'priors = ["points", "points"]', "named twice"),
+        ('priors = ["points", "semantic"]', 'priors = ["points", "points"]', "listed twice"),
         ('categories = ["Car", "Pedestrian", "Cyclist"]', "categories = []", "dataset.categories"),
         ("scale_range = [0.95, 1.05]", "scale_range = [1.2, 0.8]", "lower limit"),
         ("scale_range = [0.95, 1.05]", "scale_range = [1e308, 1e308]", "repredict.scale_range"),

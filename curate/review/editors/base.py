@@ -18,7 +18,7 @@ class Editor(Protocol):
     name: ClassVar[str]
 
     def write(self, folder: Path, sheet: Sheet, read: Reader) -> None:
-        """Write the boxes and the point clouds or images they lie in into an existing folder."""
+        """Write the boxes with their point clouds or images into an existing folder."""
         ...
 
     def read(self, edited: Path, sheet: Sheet, read: Reader) -> Mapping[str, Sequence[EditedBox]]:

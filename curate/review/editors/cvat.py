@@ -7,7 +7,7 @@ rotation (Euler angles, radians) and scale (the sides along the box's own x, y a
 the frame of an item by its id, the name of the point file without its ending.
 
 task.zip creates the task, labels.json goes into its tab Raw, annotations.zip is uploaded to it. The
-export of CVAT as "Datumaro 3D 1.0" holds the edits: save it as annotations.zip, or pass its path
+export of CVAT as "Datumaro 3D 1.0" contains the edits: save it as annotations.zip, or pass its path
 with `--answer`.
 """
 

@@ -67,8 +67,7 @@ def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[Edited
         if line.strip()
     ]
     scored = bool(lines) and all(len(line.split()) == RESULT_FIELDS for _, line in lines)
-    known = {*sheet.categories, DONT_CARE}
-    objects = read_objects(path, scored=scored, categories=known)
+    objects = read_objects(path, scored=scored, categories={*sheet.categories, DONT_CARE})
     places = [number for number, line in lines if line.split()[0] != DONT_CARE]
     found = to_detections(objects, read(name).calibration)
     return [
@@ -80,5 +79,5 @@ def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[Edited
 
 
 def _text(path: Path) -> str:
-    """Return the text; the reader of KITTI files reports what is not text."""
+    """Return the text; `read_objects` reports bytes that are not text."""
     return path.read_bytes().decode("utf-8-sig", errors="replace")

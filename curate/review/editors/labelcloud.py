@@ -5,7 +5,7 @@ its example labels: `labels/FRAME.json` holds objects with name, centroid, dimen
 width, height; the length along x before the turn) and rotations, which in the format centroid_abs
 are degrees, counter-clockwise, 0 to 360; `labels/_classes.json` holds the classes and the format;
 `pointclouds/` and `labels/` are the folders that it opens by default. A .bin is read as float32
-rows of four; a .pcd gives it trouble on Linux, as its own log says.
+rows of four values. According to its own log, labelCloud has problems with .pcd files on Linux.
 """
 
 from collections.abc import Mapping, Sequence

@@ -8,7 +8,7 @@ from curate.review.sheet import Sheet
 
 
 def check_frame_names(place: Path, names: Iterable[str], sheet: Sheet) -> None:
-    """Raise DataError if edited files hold a frame that the review does not."""
+    """Raise DataError if edited files contain a frame that is not in the review."""
     shown = {frame.frame for frame in sheet.frames}
     unexpected = sorted(set(names) - shown)
     if unexpected:

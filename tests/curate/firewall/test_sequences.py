@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from curate.errors import ConfigError
-from curate.firewall.sequences import choose_sequences, straddling
+from curate.firewall.sequences import choose_sequences, shared_sequences
 
 
 @given(st.dictionaries(st.integers(0, 200).map(str), st.integers(0, 9).map(str), min_size=1),
@@ -23,7 +23,7 @@ def test_a_choice_holds_whole_sequences(sequences: dict, share: float, seed: int
     chosen = choose_sequences(sequences, sequences, count, generator)
     rest = set(sequences) - set(chosen)
     assert len(chosen) == len(set(chosen)) > 0
-    assert straddling(sequences, {"labeled": chosen, "unlabeled": rest}) == {}
+    assert shared_sequences(sequences, {"labeled": chosen, "unlabeled": rest}) == {}
     assert abs(len(chosen) - count) <= max(sizes)
 
 
@@ -37,6 +37,6 @@ def test_shared_sequences_are_named_by_pair() -> None:
     """Every pair of splits by itself."""
     sequences = {"a1": "a", "a2": "a", "b1": "b", "c1": "c", "a3": "a"}
     splits = {"labeled": ["a1"], "unlabeled": ["b1", "a2"], "val": ["c1", "a3"]}
-    assert straddling(sequences, splits) == {
+    assert shared_sequences(sequences, splits) == {
         ("labeled", "unlabeled"): ["a"], ("labeled", "val"): ["a"], ("unlabeled", "val"): ["a"],
     }  # fmt: skip

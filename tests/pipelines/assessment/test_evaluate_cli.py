@@ -84,7 +84,7 @@ def test_a_first_evaluation_says_that_it_is_compiled(
     """In one line beside the figures, which stay JSON."""
     monkeypatch.setattr("curate.geometry.compiled.is_compiled", lambda _kernel: False)
     code, out, err = evaluate(curate, folders, "--json")
-    assert (code, err) == (0, "compiling the evaluation, once: this takes some ten seconds\n")
+    assert (code, err) == (0, "compiling the evaluation code (first use only, about ten seconds)\n")
     assert json.loads(out)["objects"]["Car"]
 
 
@@ -267,7 +267,7 @@ def test_a_checkpoint_is_stored_under_its_path(
     curate("evaluate", "--round", "1", "--store", "-w", workspace.root)
     code, _, err = curate("evaluate", "--store", "-w", workspace.root)
     # The kernels are compiled by whichever test comes first.
-    once = "compiling the evaluation, once: this takes some ten seconds\n"
+    once = "compiling the evaluation code (first use only, about ten seconds)\n"
     assert (code, err.removeprefix(once)) == (0, "")
     sql = "SELECT source, count(*) AS n FROM evaluation GROUP BY source ORDER BY source"
     rows = ask(curate, workspace, sql)

@@ -189,7 +189,7 @@ def test_changed_settings_are_refused_in_one_line(
         (("--ratios", "few"), "--ratios few"),
         (("--set", "train.nothing=1"), "train.nothing"),
         (("--data", "nowhere"), "no such folder"),
-        (("--frames", "10"), "--frames: only simulated data"),
+        (("--frames", "10"), "--frames: only for simulated data"),
         (("--overlaps", "strict"), "--overlaps strict"),
     ],
 )

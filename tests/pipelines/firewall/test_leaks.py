@@ -96,7 +96,7 @@ def test_a_clean_workspace_passes(curate: Curate, work: Path) -> None:
     assert "18 predictions compared" in out
     code, out, _ = curate("check", "--json", "-w", work)
     assert code == 0
-    assert all(finding["held"] for finding in json.loads(out))
+    assert all(finding["passed"] for finding in json.loads(out))
     code, _, err = curate("train-round", "--command", TRAINER, "-w", work)
     assert code == 0, err
 
@@ -147,9 +147,9 @@ def test_a_tampered_record_of_the_splits(curate: Curate, work: Path) -> None:
     change(
         work / "curate.db", "UPDATE split_list SET names = names || '999999\n' WHERE name = 'val'"
     )
-    assert_caught(curate, work, "does not fit its hash")
+    assert_caught(curate, work, "does not match its hash")
     change(work / "curate.db", "DELETE FROM split_list")
-    assert_caught(curate, work, "the record is gone")
+    assert_caught(curate, work, "the record is missing")
 
 
 def test_ground_truth_of_an_unlabeled_frame_in_the_database(curate: Curate, work: Path) -> None:
@@ -180,7 +180,7 @@ def test_a_frame_smuggled_into_the_label_file(curate: Curate, work: Path, split:
     code, out, err = curate("check", "-w", work)
     assert code == LeakageError.exit_code
     assert leaked in err
-    assert "the object bank is of X_l" in out
+    assert "the object bank is from X_l" in out
     assert f"objects of frames outside X_l: {leaked}" in out
     for command in (["export"], ["train-round", "--command", TRAINER]):
         code, _, err = curate(*command, "-w", work)
@@ -237,7 +237,7 @@ def test_label_files_that_pass_for_detections(
     )  # fmt: skip
     assert code == 0, err
     assert curate("predict", "-w", work)[0] == 0
-    assert_caught(curate, work, "18 predictions are equal to label files")
+    assert_caught(curate, work, "18 predictions equal labels")
 
 
 def test_an_object_bank_of_unlabeled_frames(curate: Curate, work: Path) -> None:
@@ -267,7 +267,7 @@ def test_the_same_recording_under_two_names(
     for _ in range(2):  # the second time from remembered hashes
         code, _, err = curate("check", "-w", work)
         assert code == LeakageError.exit_code
-        assert "2 pairs are the same" in err
+        assert "2 pairs are identical" in err
         assert "000002 and val 000009 (points)" in err
         assert "000003 and val 000010 (image)" in err
     write_toy_kitti(toy_kitti, frames=12, val=4)

@@ -71,7 +71,7 @@ def test_splitting_by_frame_is_wished_and_warned_of(
     settings.write_text(settings.read_text().replace('"frame"', '"sequence"'))
     code, _, err = curate("check", "-w", work)
     assert code == LeakageError.exit_code
-    assert "sequences are in one split" in err
+    assert "each sequence is in one split" in err
 
 
 def test_a_list_that_cuts_a_drive_is_refused(curate: Curate, drives: Path, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_the_heaviest_labels_come_by_their_index(workspace: Workspace, columns: 
 
 def test_a_named_query_of_one_policy_seeks_its_labels(workspace: Workspace) -> None:
     """The selection of the policy and round reaches the index of the policy's weights."""
-    sql = find_query("trusted-frames").selecting("pspsl", 1)
+    sql = find_query("trusted-frames").filtered("pspsl", 1)
     steps = [step for _, step in _plan(workspace, sql)]
     assert any("ix_weight_v_pspsl (round=? AND v>?)" in step for step in steps), steps
 

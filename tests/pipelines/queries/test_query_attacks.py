@@ -55,8 +55,8 @@ ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
 @pytest.mark.parametrize(
     ("sql", "word"),
     [
-        (ENDLESS + "SELECT count(*) FROM n", "given up after 0.5 seconds"),
-        (ENDLESS + "SELECT i FROM n WHERE i < 0", "given up after 0.5 seconds"),
+        (ENDLESS + "SELECT count(*) FROM n", "stopped after 0.5 seconds"),
+        (ENDLESS + "SELECT i FROM n WHERE i < 0", "stopped after 0.5 seconds"),
         ("SELECT length(randomblob(1000000000))", "too big"),
         ("SELECT length(zeroblob(900000000))", "too big"),
         ("SELECT hex(zeroblob(4000000))", "too big"),
@@ -83,5 +83,5 @@ def test_rows_without_end_are_given_up_as_they_come(curate: Curate, workspace: W
             "query", sql, "--seconds", "0.2", "--format", form, "-w", workspace.root
         )
         assert code == ConfigError.exit_code
-        assert "given up" in err
+        assert "stopped" in err
         assert len(out.splitlines()) > 100

@@ -116,7 +116,7 @@ def test_named_queries_take_a_policy_and_a_round(
 def test_what_the_audit_stores_can_be_selected() -> None:
     """Evidence stands there beside the policies."""
     assert tuple(EVIDENCE) == AUDITED
-    sql = QUERIES["kept"].selecting("it's", None)
+    sql = QUERIES["kept"].filtered("it's", None)
     assert "policy = 'it''s'" in sql
 
 
@@ -138,8 +138,8 @@ def test_the_list_names_every_query(curate: Curate) -> None:
         ([], "give one of"),
         (["--named", "kepd"], "did you mean 'kept'?"),
         (["--named", "kept", "--policy", "pspls"], "did you mean 'pspsl'?"),
-        (["--named", "splits", "--policy", "pspsl"], "the query 'splits' has no policy"),
-        (["--named", "false", "--round", "1"], "the query 'false' has no round"),
+        (["--named", "splits", "--policy", "pspsl"], "the query 'splits' has no column policy"),
+        (["--named", "false", "--round", "1"], "the query 'false' has no column round"),
         (["SELECT 1", "--policy", "pspsl"], "go with --named"),
         (["--schema", "--named", "kept"], "give one of"),
         (["SELECT 1", "--named", "age"], "give one of"),

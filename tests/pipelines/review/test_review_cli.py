@@ -128,7 +128,7 @@ def test_lowest_and_changed_ask_for_other_labels(
     code, _, err = curate(
         "review", "export", tmp_path / "c", "-w", weighted.root, "--round", 1, "--by", "changed"
     )
-    assert (code, "no round before it" in err) == (2, True)
+    assert (code, "no previous round" in err) == (2, True)
 
 
 def test_a_dry_run_stores_nothing(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
@@ -358,7 +358,7 @@ def spoil_both(folder: Path, frame: str) -> None:
 FAULTS = (
     (lambda folder, frame: (folder / "review.json").unlink(), (), "review.json: no such file"),
     (spoil_text, (), "fields, but a label line"),
-    (spoil_both, (), "cannot lie in each other: reject one of box 1 ("),
+    (spoil_both, (), "cannot overlap: reject one of box 1 ("),
     (lambda folder, frame: decide(folder, frame, 1, "perhaps"), (), "decision 'perhaps'"),
     (lambda folder, frame: None, ("--answer", "nowhere"), "nowhere: no such folder"),
     (lambda folder, frame: None, ("--accept", "000099"), "'000099' is not in this review"),
@@ -380,7 +380,7 @@ def test_a_bad_answer_is_one_line_and_stores_nothing(
         assert (code in {2, 3}, fault in err, err.count("\n")) == (True, True, 1), err
     assert rows(weighted, "SELECT count(*) FROM human_label") == [(0,)]
     code, _, err = curate("review", "export", whole, "-w", weighted.root)
-    assert (code, "may hold answers" in err) == (2, True)
+    assert (code, "may contain edits" in err) == (2, True)
     change(weighted, "DELETE FROM review")
     code, _, err = curate("review", "import", whole, "-w", weighted.root)
     assert (code, "was not exported from the workspace" in err) == (3, True)

@@ -103,7 +103,7 @@ def test_a_command_given_by_hand_trains_later_rounds_too(
     assert path.read_text() == before
     code, _, err = curate("train-round", "--command", command, "-w", exported.root)
     assert code == 0
-    assert err.splitlines()[-1] == ("curate.toml: [train] now says command, for later rounds too")
+    assert err.splitlines()[-1] == ("curate.toml: stored command in [train] for later rounds")
     assert path.read_text().startswith("# mine\n")
     told = Workspace.open(exported.root)
     assert told.config == exported.with_settings("train", command=command).config
@@ -123,7 +123,7 @@ def test_a_student_that_teaches_nobody_is_trained_by_any_command(
     code, _, err = curate(
         "train-round", "--policy", "uniform", "--command", command, "-w", exported.root
     )
-    assert (code, "now says" in err) == (0, False)
+    assert (code, "for later rounds" in err) == (0, False)
     assert (exported.root / "curate.toml").read_text() == before
 
 

@@ -113,12 +113,15 @@ def test_registered_names_and_classes_of_the_user_are_accepted(
         ("dataset.root=3", "dataset.root = 3: use a path"),
         ("dataset.categories=Car", 'dataset.categories = "Car": use a list of strings'),
         ("dataset.categories=[1, 2]", "dataset.categories: 1 in the list: use a list of strings"),
-        ('dataset.categories=["Car", "Car"]', "dataset.categories: 'Car' is named twice"),
+        ('dataset.categories=["Car", "Car"]', "dataset.categories: 'Car' is listed twice"),
         (
             "repredict.scale_range=[1, 101]",
             "repredict.scale_range: 101 in the list: use a list of two numbers, above 0 and at",
         ),
-        ("repredict.scale_range=[1.2, 0.8]", "repredict.scale_range: the lower limit comes first"),
+        (
+            "repredict.scale_range=[1.2, 0.8]",
+            "repredict.scale_range: the lower limit must come first",
+        ),
         ("train.options=3", "train.options = 3: use a table"),
         ("solve.options.threshold=3", "solve.options.threshold = 3: use a table"),
         (

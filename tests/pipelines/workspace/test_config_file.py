@@ -63,6 +63,6 @@ def test_a_file_that_cannot_be_changed_stays(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     with pytest.raises(ConfigError, match="cannot be changed line by line") as caught:
         change_settings(path, "train", {"command": "new"})
-    assert str(caught.value).endswith('write into its [train] yourself: command = "new"')
+    assert str(caught.value).endswith('add to its section [train]: command = "new"')
     assert "\n" not in str(caught.value)
     assert path.read_text() == text

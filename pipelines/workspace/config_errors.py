@@ -1,4 +1,4 @@
-"""Faults in a configuration in words: which key, what it accepts, and what was probably meant."""
+"""Error messages for a configuration: which key is wrong, what it accepts, what was meant."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,20 +14,20 @@ from pipelines.workspace.reference import Accepted, accepted_by
 _LONGEST = 80  # characters of a wrong value that are shown
 
 
-def describe_faults(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return all faults that pydantic found in a document, as one line in our words."""
+def describe_errors(error: ValidationError, model: type[BaseModel]) -> str:
+    """Return one line that describes all errors that pydantic found in a document."""
     found: dict[str, str] = {}
-    for fault in error.errors(include_url=False):
-        place, words = _describe(fault, model)
-        found.setdefault(place, words)  # a list with three wrong items is one fault
-    return "; ".join(f"{place}{words}" for place, words in found.items())
+    for detail in error.errors(include_url=False):
+        place, message = _describe(detail, model)
+        found.setdefault(place, message)  # a list with three wrong items is one error
+    return "; ".join(f"{place}{message}" for place, message in found.items())
 
 
-def _describe(fault: ErrorDetails, model: type[BaseModel]) -> tuple[str, str]:
-    """Return the place of a fault, and what is wrong there."""
-    path = [str(part) for part in fault["loc"] if part != "[key]"]
+def _describe(error: ErrorDetails, model: type[BaseModel]) -> tuple[str, str]:
+    """Return the key with an error, and the message to append to it."""
+    path = [str(part) for part in error["loc"] if part != "[key]"]
     known, field, depth = _walk(model, path)
-    if fault["type"] == "extra_forbidden":
+    if error["type"] == "extra_forbidden":
         return _unknown_key(path, model, known)
     accepted = Accepted("table") if field is None or _model_of(field) else accepted_by(field)
     if accepted.type != "table":
@@ -35,14 +35,14 @@ def _describe(fault: ErrorDetails, model: type[BaseModel]) -> tuple[str, str]:
     else:
         inside = []
     place = ".".join(map(toml_key, path)) or "the configuration"
-    if fault["type"] == "missing" and not inside:
+    if error["type"] == "missing" and not inside:
         meaning = field.description if field else None
         return place, f" is missing{f': {meaning}' if meaning else ''}".rstrip(".")
-    if fault["type"] == "value_error":
-        return place, f": {fault['ctx']['error']}"
-    value = fault["input"]
+    if error["type"] == "value_error":
+        return place, f": {error['ctx']['error']}"
+    value = error["input"]
     meant = did_you_mean(value, accepted.choices) if isinstance(value, str) else ""
-    finite = "; it must be finite" if fault["type"] == "finite_number" else ""
+    finite = "; it must be finite" if error["type"] == "finite_number" else ""
     wrong = f": {_shown(value)} in the list" if inside else f" = {_shown(value)}"
     return place, f"{wrong}: use {accepted}{finite}{meant}"
 
@@ -50,17 +50,17 @@ def _describe(fault: ErrorDetails, model: type[BaseModel]) -> tuple[str, str]:
 def _unknown_key(
     path: Sequence[str], model: type[BaseModel], known: Sequence[str]
 ) -> tuple[str, str]:
-    """Return the place and the message for a key or a section that does not exist."""
+    """Return the key and the message for a key or a section that does not exist."""
     *section, key = path
     owner = f"[{'.'.join(section)}]" if section else "the configuration"
     noun = "key" if section else "section"
     meant = did_you_mean(key, known) or _elsewhere(key, model)
-    words = f": unknown {noun}{meant}; {owner} has {', '.join(known)}"
-    return ".".join(map(toml_key, path)), words
+    message = f": unknown {noun}{meant}; {owner} has {', '.join(known)}"
+    return ".".join(map(toml_key, path)), message
 
 
 def _elsewhere(key: str, model: type[BaseModel]) -> str:
-    """Return a hint to the sections that do have a key of this name."""
+    """Suggest the sections that have a key of this name."""
     found = [
         f"{name}.{key}"
         for name, field in model.model_fields.items()
@@ -72,7 +72,7 @@ def _elsewhere(key: str, model: type[BaseModel]) -> str:
 def _walk(
     model: type[BaseModel], path: Sequence[str]
 ) -> tuple[Sequence[str], FieldInfo | None, int]:
-    """Return where a path leads: the keys of its innermost section, its field, and their depth."""
+    """Return the keys of the innermost section on a path, its last field, and the depth of it."""
     field, depth = None, 0
     for part in path:
         found = model.model_fields.get(part)
