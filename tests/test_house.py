@@ -74,7 +74,7 @@ def import_graph() -> dict[str, set[str]]:
 
 
 def test_no_module_imports_itself_through_others() -> None:
-    """There is no circle, imports inside functions included."""
+    """There is not a circle, imports inside functions included."""
     try:
         TopologicalSorter(import_graph()).prepare()
     except CycleError as circle:

@@ -64,7 +64,7 @@ def test_a_table_says_what_its_times_are(timer: str, shown: str) -> None:
 
 
 @pytest.mark.parametrize(("seconds", "verdict"), [(1e-3, "met"), (1.1e-3, "**not met**")])
-def test_targets_are_judged_honestly(seconds: float, verdict: str) -> None:
+def test_targets_are_evaluated_honestly(seconds: float, verdict: str) -> None:
     """A target that is reached is met; one that is missed by a tenth is not."""
     page = render(summarise(measured(line("NMS", OURS, seconds, target=1e-3)), {}, 1.0))
     [row] = [row for row in page.splitlines() if "1 ms |" in row and row.startswith("| NMS")]

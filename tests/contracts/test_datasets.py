@@ -140,7 +140,7 @@ def test_a_frame_without_label_file_is_a_frame(dataset, root: Path) -> None:
     assert len(dataset.read(name).points) > 0
 
 
-def test_a_folder_that_holds_no_data_set_is_refused(
+def test_a_folder_that_holds_no_data_set_is_rejected(
     request: pytest.FixtureRequest, dataset, tmp_path: Path
 ) -> None:
     """DataError in one line that names the folder."""

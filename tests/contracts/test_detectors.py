@@ -144,7 +144,7 @@ def test_a_frame_is_left_as_it_is(detector, frames) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_a_sweep_of_hardly_any_points_is_no_failure(detector, frames, count: int) -> None:
+def test_a_sweep_of_hardly_any_points_is_not_a_failure(detector, frames, count: int) -> None:
     """Dropouts happen; the answer has the usual form."""
     check(detector.predict(frames[0].with_points(frames[0].points[:count])))
 
@@ -173,7 +173,9 @@ def test_recorded_views_name_their_similarity(detector, frames) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no detector \x00\xff\n"])
-def test_a_file_that_is_no_detector_is_named(made, tmp_path: Path, content: bytes | None) -> None:
+def test_a_file_that_is_not_a_detector_is_named(
+    made, tmp_path: Path, content: bytes | None
+) -> None:
     """Missing, empty or garbage: one line of the right class, never another exception."""
     name, path = made
     broken = tmp_path / f"broken{path.suffix}"

@@ -115,7 +115,7 @@ def test_a_frame_that_did_not_come_back_was_not_looked_at(exported) -> None:
     assert list(came_back(editor, folder, sheet)) == ["000001"]
 
 
-def test_an_unknown_frame_is_refused(exported) -> None:
+def test_an_unknown_frame_is_rejected(exported) -> None:
     """By name, in one line."""
     editor, sheet, folder = exported
     sample(editor.name)[2](folder)
@@ -145,7 +145,7 @@ def test_a_damaged_answer_is_one_line(exported, edit: Callable[[str], str]) -> N
     assert_one_line(error.value)
 
 
-def test_a_missing_answer_is_refused(exported, tmp_path: Path) -> None:
+def test_a_missing_answer_is_rejected(exported, tmp_path: Path) -> None:
     """It names what is not there."""
     editor, sheet, _ = exported
     with pytest.raises(DataError, match="nowhere") as error:

@@ -71,7 +71,7 @@ def test_every_job_has_one_outcome(executor: Executor) -> None:
 
 
 def test_a_broken_model_ends_the_run_in_its_own_words(executor: Executor) -> None:
-    """It is no fault of any frame."""
+    """It is not a fault of any frame."""
     with pytest.raises(ModelError, match=r"model.onnx: broken"):
         list(executor.map(Square(broken=True), iter(JOBS)))
 
@@ -127,7 +127,7 @@ def test_a_frame_that_kills_every_worker_fails_alone(crew: Executor, tmp_path: P
 
 
 def test_workers_that_die_while_loading_end_the_run(crew: Executor) -> None:
-    """A model for which there is no memory is not tried for every frame."""
+    """A model for which there is not a memory is not tried for every frame."""
     with pytest.raises(CurateError, match=r"died while they loaded their models.*fewer workers"):
         list(crew.map(Deadly(opening=True), iter(JOBS)))
 

@@ -280,7 +280,7 @@ def test_the_same_labels_make_the_same_files(exporter, labels, tmp_path) -> None
 
 
 def test_no_labels_make_an_export_without_labels(exporter, read_back, labels, tmp_path) -> None:
-    """Of X_l alone, and of nothing at all; an unlabeled frame without labels is no failure."""
+    """Of X_l alone, and of nothing at all; an unlabeled frame without labels is not a failure."""
     path = place(exporter, tmp_path)
     for frames in (labels.frames, labels.frames[:1], []):
         own = labels.ground_truth if frames else truth_block()
@@ -307,7 +307,7 @@ def test_an_export_that_fails_leaves_the_former_as_it_was(
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
-def test_what_is_no_former_export_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
+def test_what_is_not_a_former_export_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
     """A file or a folder with something in it is named and kept."""
     path = place(exporter, tmp_path)
     precious = path if kind == "file" else path / "thesis.tex"
@@ -343,7 +343,7 @@ def test_the_labels_are_left_as_they_are(exporter, labels, tmp_path) -> None:
     assert (labels.frames, labels.ground_truth, labels.labels) == before
 
 
-def test_background_is_no_object_to_a_reader_of_objects(exporter, labels, tmp_path) -> None:
+def test_background_is_not_an_object_to_a_reader_of_objects(exporter, labels, tmp_path) -> None:
     """A label of weight 0 is found among no format's objects where it is background."""
     background = replace(labels, description=replace(labels.description, zero_weight="background"))
     path = place(exporter, tmp_path)
@@ -433,7 +433,7 @@ def test_an_export_walks_the_labels_once(exporter, labels, tmp_path, fault: str)
 def test_no_exporter_can_be_given_ground_truth_of_unlabeled_frames(
     exporter, labels, tmp_path
 ) -> None:
-    """The label set itself refuses it, as well as other splits and labels of labeled frames."""
+    """The label set itself rejects it, as well as other splits and labels of labeled frames."""
     first, second, *_ = [each.frame for each in labels.frames]
     with pytest.raises(LeakageError, match=second):
         replace(labels, ground_truth=labels.ground_truth | {"frame": [second]})

@@ -153,7 +153,7 @@ def test_frame_and_labels_are_left_as_they_are(prior, frames) -> None:
     assert_same(found, labels(30))
 
 
-def test_a_sweep_without_points_is_no_failure(prior, frames) -> None:
+def test_a_sweep_without_points_is_not_a_failure(prior, frames) -> None:
     """Every label has its evidence."""
     found = prior.score(frames[0].with_points(frames[0].points[:0]), labels(9))
     assert list(check_evidence(prior, found, 9)) == [column.name for column in prior.columns]

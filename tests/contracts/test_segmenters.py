@@ -154,7 +154,7 @@ def test_a_frame_without_what_is_needed_is_named(segmenter, frames) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"no model \x00\xff\n"])
-def test_what_is_no_segmenter_is_named(made, tmp_path: Path, content: bytes | None) -> None:
+def test_what_is_not_a_segmenter_is_named(made, tmp_path: Path, content: bytes | None) -> None:
     """Missing, or a file of garbage: one line of the right class."""
     broken = tmp_path / "broken.onnx"
     if content is not None:

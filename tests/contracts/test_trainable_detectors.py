@@ -222,7 +222,7 @@ def test_a_detector_from_outside_goes_through_the_whole_command_line(
 ) -> None:
     """Killed in pretrain and in a round, it ends like an undisturbed run: two rounds, their curves.
 
-    Then its checkpoint is brought to another workspace, and one of another detector is refused.
+    Then its checkpoint is brought to another workspace, and one of another detector is rejected.
     """
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
@@ -274,7 +274,7 @@ def test_a_detector_from_outside_goes_through_the_whole_command_line(
     assert "curate.toml: not a readable safetensors file" in ran.stderr
 
 
-def test_an_unknown_preset_is_refused_before_any_work(toy_kitti: Path, tmp_path: Path) -> None:
+def test_an_unknown_preset_is_rejected_before_any_work(toy_kitti: Path, tmp_path: Path) -> None:
     """One line names those that the configured detector knows."""
     made = init(toy_kitti, tmp_path / "work", "--set", "train.preset=huge")
     assert made.returncode == ConfigError.exit_code

@@ -235,7 +235,7 @@ def test_a_box_without_height_is_the_detectors_fault():
 @pytest.mark.parametrize(
     "wrong", [{"score_weight": -1}, {"box_weight": -1}, {"beta": 0}, {"minimum_iou": 1}]
 )
-def test_settings_without_meaning_are_refused(wrong):
+def test_settings_without_meaning_are_rejected(wrong):
     """A setting out of its range is named."""
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         ConsistencySettings(**wrong)

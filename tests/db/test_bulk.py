@@ -167,7 +167,7 @@ def test_parameters_of_a_query_stay_values(database: Database) -> None:
         assert _column(connection, query.where(table.category == names[0])).tolist() == []
 
 
-def test_a_null_where_integers_are_asked_for_is_no_number(database: Database) -> None:
+def test_a_null_where_integers_are_asked_for_is_not_a_number(database: Database) -> None:
     """It would shift all that come after it."""
     table = bulk.table("prediction").c
     with database.reading() as connection, pytest.raises((TypeError, ValueError)):
@@ -197,7 +197,7 @@ def test_an_error_in_mid_answer_is_one_line(tmp_path: Path, database: Database) 
         {"k": [1, 2], "policy": ["spsl", None]},
     ],
 )
-def test_rows_that_the_table_refuses_are_one_line(database: Database, wrong: dict) -> None:
+def test_rows_that_the_table_rejects_are_one_line(database: Database, wrong: dict) -> None:
     """And none of the rows is stored."""
     if wrong.get("v") == [0.5, "heavy"] and database.engine.dialect.name == "sqlite":
         pytest.skip("SQLite's columns take values of any type")
@@ -208,7 +208,7 @@ def test_rows_that_the_table_refuses_are_one_line(database: Database, wrong: dic
 
 
 @pytest.mark.parametrize("k", [2**31, -(2**31) - 1, 2**63, 0.5, "one", "x" * 9])
-def test_a_server_says_what_is_no_integer_of_its_own(database: Database, k: object) -> None:
+def test_a_server_says_what_is_not_an_integer_of_its_own(database: Database, k: object) -> None:
     """Nothing is cut to the bytes that it would have."""
     if database.engine.dialect.name == "sqlite":
         pytest.skip("SQLite's columns take values of any type")

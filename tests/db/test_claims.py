@@ -29,7 +29,7 @@ def pair(tmp_path: Path, new_url: Callable[[], str | None]) -> tuple[Database, D
         ((1, "pspsl"), (1, "pspsl"), "round 1 of pspsl is being worked on by predict"),
     ],
 )
-def test_what_is_claimed_is_refused_with_its_owner(
+def test_what_is_claimed_is_rejected_with_its_owner(
     pair: tuple[Database, Database], mine: tuple, theirs: tuple, word: str
 ) -> None:
     """One line: what, by whom, since when, what to do; afterwards it is free."""

@@ -1,4 +1,4 @@
-"""The database: its schema, its refusals, and its errors in our own words."""
+"""The database: its schema, its rejections, and its errors in our own words."""
 
 import os
 import shutil
@@ -199,7 +199,7 @@ def test_ground_truth_of_an_unlabeled_frame_cannot_be_stored(
         store(connection, "ground_truth", [_truth(frame_id, claimed)])
 
 
-def test_ground_truth_is_refused_with_foreign_keys_switched_off(
+def test_ground_truth_is_rejected_with_foreign_keys_switched_off(
     sqlite_database: Database, tmp_path: Path
 ) -> None:
     """The sqlite3 shell, which does not check foreign keys, cannot do it either."""
@@ -266,7 +266,7 @@ def test_a_dropped_table_is_missed(database: Database) -> None:
         Database(database.url)
 
 
-def test_a_database_of_a_newer_curate_is_refused(database: Database) -> None:
+def test_a_database_of_a_newer_curate_is_rejected(database: Database) -> None:
     """Its schema is unknown here."""
     with database.writing() as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
@@ -275,7 +275,7 @@ def test_a_database_of_a_newer_curate_is_refused(database: Database) -> None:
         Database(database.url)
 
 
-def test_a_database_of_two_schemas_is_refused(tmp_path: Path) -> None:
+def test_a_database_of_two_schemas_is_rejected(tmp_path: Path) -> None:
     """A second row in alembic's table, written by hand, is told in one line."""
     path = tmp_path / "curate.db"
     Database(f"sqlite:///{path}").close()

@@ -64,7 +64,7 @@ class Target:
     read: Callable[[Path], object]
 
     def attempt(self, path: Path) -> CurateError | None:
-        """Reads the file; the error where it is refused, which must be one line."""
+        """Reads the file; the error where it is rejected, which must be one line."""
         try:
             self.read(path)
         except CurateError as error:

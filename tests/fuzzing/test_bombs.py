@@ -13,7 +13,7 @@ from support.process_tree import forget_peak, peak
 MOST_KIB = 300 << 10
 
 
-def test_every_bomb_is_refused_and_none_fills_the_memory(tmp_path: Path) -> None:
+def test_every_bomb_is_rejected_and_none_fills_the_memory(tmp_path: Path) -> None:
     """All in one process, whose greatest size tells."""
     ended = subprocess.run(
         [sys.executable, "-m", "fuzzing.test_bombs", tmp_path],

@@ -1,4 +1,4 @@
-"""No file, however damaged, does more than be refused in one line."""
+"""No file, however damaged, does more than be rejected in one line."""
 
 import random
 import warnings
@@ -59,7 +59,7 @@ def test_a_valid_file_is_read(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_a_damaged_file_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, name) -> None:
+def test_a_damaged_file_is_read_or_rejected(tmp_path_factory: pytest.TempPathFactory, name) -> None:
     """A result, or a CurateError of one line."""
     target = TARGETS[name]
     path, content = prepared(target, tmp_path_factory.mktemp("damaged"))
@@ -81,7 +81,7 @@ def test_a_damaged_file_is_read_or_refused(tmp_path_factory: pytest.TempPathFact
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
-def test_many_damaged_files_are_read_or_refused(tmp_path: Path, name: str) -> None:
+def test_many_damaged_files_are_read_or_rejected(tmp_path: Path, name: str) -> None:
     """The same, longer."""
     target = TARGETS[name]
     path, content = prepared(target, tmp_path)

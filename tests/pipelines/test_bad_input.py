@@ -50,7 +50,7 @@ def begin(curate: Curate, work: Path, root: Path, results: Path) -> tuple[int, s
 def test_names_in_other_letters_fail_every_frame_with_the_remedy(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """Lower case would leave no label at all; the setting that mends it is printed, and works."""
+    """Lower case would leave no label at all; the setting that fixes it is printed, and works."""
     results = write_results(tmp_path / "a.pkl", toy_kitti, name=np.char.lower)
     work = tmp_path / "w"
     code, _, err = begin(curate, work, toy_kitti, results)

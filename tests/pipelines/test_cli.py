@@ -1,4 +1,4 @@
-"""The command line as a person uses it: what it prints, how it ends, what it refuses."""
+"""The command line as a person uses it: what it prints, how it ends, what it rejects."""
 
 import csv
 import io
@@ -180,7 +180,7 @@ def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> Non
         ("[run]", '[run]\ndatabase = "oracle9://x"', "oracle9"),
     ],
 )
-def test_a_setting_without_meaning_is_refused_before_any_work(
+def test_a_setting_without_meaning_is_rejected_before_any_work(
     curate: Curate, made: Path, former: str, later: str, message: str
 ) -> None:
     """It costs one line, not a failed frame each."""
@@ -217,7 +217,7 @@ def test_frames_that_an_earlier_stage_lost_are_not_counted_as_done(
     assert [report["kept"] for report in reports if report["stage"] == "repredict"] == [0]
 
 
-def test_status_leaves_out_what_never_happens_to_a_brought_detector(
+def test_status_leaves_out_what_never_happens_to_a_external_detector(
     curate: Curate, made: Path
 ) -> None:
     """Only a detector that curate trains waits for a training."""
@@ -270,7 +270,9 @@ def test_a_bad_list_of_frames_is_one_line(
     assert not (tmp_path / "w").exists()
 
 
-def test_a_workspace_whose_init_was_killed_is_no_empty_success(curate: Curate, made: Path) -> None:
+def test_a_workspace_whose_init_was_killed_is_not_an_empty_success(
+    curate: Curate, made: Path
+) -> None:
     """Settings without frames: the remedy is named, and no empty export passes for labels."""
     for path in made.glob("curate.db*"):
         path.unlink()
@@ -371,7 +373,7 @@ def test_the_label_of_an_unlabeled_frame_is_never_opened(
     assert (code, err) == (0, "")
 
 
-def test_init_again_keeps_the_workspace_and_refuses_another_split(
+def test_init_again_keeps_the_workspace_and_rejects_another_split(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
     """The same call is harmless; another share would mix the splits."""

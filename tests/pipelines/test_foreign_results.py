@@ -124,7 +124,7 @@ def test_a_folder_of_results_is_taught_by_a_folder_of_results(
         ("run.seed.first=3", "run.seed"),
     ],
 )
-def test_a_wrong_setting_is_refused(
+def test_a_wrong_setting_is_rejected(
     curate: Curate, tmp_path: Path, toy_kitti: Path, setting: str, message: str
 ) -> None:
     """Before a workspace is made."""

@@ -154,7 +154,7 @@ def test_the_shell_completes_commands_and_registered_names(words: str, expected:
     assert found == expected, ended.stderr
 
 
-def test_python_runs_the_package_beside_strangers(tmp_path: Path, workspace: Workspace) -> None:
+def test_python_runs_the_package_beside_unexpected(tmp_path: Path, workspace: Workspace) -> None:
     """`python -m curate`, in a folder with packages `db` and `pipelines` of another project."""
     for name in ("db", "pipelines"):
         (tmp_path / "project" / name).mkdir(parents=True)

@@ -77,7 +77,7 @@ def test_a_share_takes_whole_scenes(root: Path, tmp_path: Path) -> None:
     )
 
 
-def test_a_list_that_cuts_a_scene_is_refused(root: Path, tmp_path: Path) -> None:
+def test_a_list_that_cuts_a_scene_is_rejected(root: Path, tmp_path: Path) -> None:
     """Neighbours show the same objects; who wants it all the same can say so."""
     chosen = sample_token("scene-0001", 1)
     (tmp_path / "labeled.txt").write_text(chosen)

@@ -32,7 +32,7 @@ def test_a_module_that_cannot_be_used_is_named(
     assert "\n" not in str(found.value)
 
 
-def test_a_class_without_what_the_pipeline_asks_for_is_refused(
+def test_a_class_without_what_the_pipeline_asks_for_is_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Methods and class attributes; what an instance brings may be made later."""

@@ -79,7 +79,7 @@ def curate(command: list[str], project: Path, *arguments: object) -> subprocess.
     )
 
 
-def test_help_and_status_work_beside_strangers(
+def test_help_and_status_work_beside_unexpected(
     command: list[str], project: Path, workspace: Workspace
 ) -> None:
     """In the current folder and on PYTHONPATH, as packages, modules and bare folders."""
@@ -89,7 +89,7 @@ def test_help_and_status_work_beside_strangers(
 
 
 @pytest.mark.parametrize("executor", EXECUTORS)
-def test_a_stage_runs_beside_strangers(
+def test_a_stage_runs_beside_unexpected(
     command: list[str], project: Path, workspace: Workspace, executor: str
 ) -> None:
     """Two workers, each of them a process that looks for its modules anew."""

@@ -17,7 +17,7 @@ from pipelines.engine.executors.serial import SerialExecutor
 
 @dataclass
 class Square:
-    """Squares the key of a frame; refuses some, cannot even start if told so."""
+    """Squares the key of a frame; rejects some, cannot even start if told so."""
 
     broken: bool = False
 

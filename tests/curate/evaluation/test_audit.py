@@ -149,7 +149,7 @@ def test_the_order_of_frames_does_not_change_a_figure():
             assert values[0] == pytest.approx(values[1], nan_ok=True)
 
 
-def test_no_labels_and_no_objects_are_no_failure():
+def test_no_labels_and_no_objects_are_not_failure():
     """Counts of 0 and figures that are undefined."""
     nothing = JudgedLabels.no_frames()
     found = small_audit({name: np.zeros(0) for name in WEIGHTS}, nothing).whole()["good"]

@@ -52,7 +52,7 @@ def test_evidence_that_judges_better_than_every_policy_is_not_hidden():
     assert "fair: AUROC" in text
 
 
-def test_evidence_without_a_policy_is_judged_too():
+def test_evidence_without_a_policy_is_evaluated_too():
     """As if each piece were a policy."""
     assert "good judges best" in words(*many_labels(), (), ("good", "blind"))
 

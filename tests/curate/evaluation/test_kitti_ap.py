@@ -195,7 +195,7 @@ def test_difficulty_decides_what_counts(change, counted):
 
 
 @pytest.mark.parametrize("change", [{"category": "Van"}, {"occluded": 3}, {"truncated": 0.9}])
-def test_finding_what_is_ignored_is_no_false_positive(change):
+def test_finding_what_is_ignored_is_not_a_false_positive(change):
     """A detection on a van or a hidden car neither helps nor hurts."""
     labels = [[car(), car(x=6, **change)]]
     results = [[car(score=0.5), car(x=6, score=0.9)]]
@@ -260,7 +260,7 @@ def test_nothing_gives_zeros():
         json.dumps(evaluation.as_dict(), allow_nan=False)
 
 
-def test_without_orientation_there_is_no_aos():
+def test_without_orientation_there_is_not_an_aos():
     """One detection without an observation angle (-10): null, as the devkit prints none."""
     results = [[car(), car(x=6, alpha=-10.0)]]
     evaluation = evaluate(objects_of([[car()]]), objects_of(results))
@@ -283,7 +283,7 @@ def test_chosen_categories_and_overlaps_are_used():
     }
 
 
-def test_results_without_scores_or_frames_are_refused():
+def test_results_without_scores_or_frames_are_rejected():
     """One line that says what is missing."""
     labels = objects_of([[car()]])
     with pytest.raises(DataError, match="results of frame 0, object 1: no score"):

@@ -44,7 +44,7 @@ def test_only_the_named_frames_are_read(folders):
     assert read_folders(*folders, ["000002"])[0] == ("000002",)
 
 
-def test_hidden_files_are_no_frames(folders):
+def test_hidden_files_are_not_frames(folders):
     """Those beginning with ._ that macOS leaves beside the files that it copies."""
     (folders[0] / "._000002.txt").write_bytes(b"\x00\x05\x16\x07")
     assert read_folders(*folders)[0] == ("000001", "000002", "000007")
@@ -84,7 +84,7 @@ def test_bad_result_lines_are_named(folders, line, fault):
         read_folders(*folders)
 
 
-def test_folders_without_text_files_are_refused(folders, tmp_path):
+def test_folders_without_text_files_are_rejected(folders, tmp_path):
     """A wrong path is told from an empty folder."""
     with pytest.raises(DataError, match="no such folder"):
         read_folders(tmp_path / "absent", folders[1])

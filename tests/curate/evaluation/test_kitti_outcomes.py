@@ -142,7 +142,7 @@ def test_no_frames_and_no_objects_have_no_outcomes():
 
 
 @pytest.mark.parametrize("wrong", [{"metric": "4d"}, {"difficulty": "harder"}])
-def test_unknown_names_are_refused(wrong):
+def test_unknown_names_are_rejected(wrong):
     """The message lists what there is."""
     with pytest.raises(ConfigError, match="image, bev, 3d"):
         outcomes_of([], [], **wrong)

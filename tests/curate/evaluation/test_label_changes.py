@@ -17,7 +17,7 @@ def labels(rows):
 
 
 def test_labels_are_matched_within_frame_and_category():
-    """The nearer of two; another frame or category is no match."""
+    """The nearer of two; another frame or category is not a match."""
     before = labels([(0, 0, 10, 0.5), (0, 0, 30, 0.2), (1, 0, 10, 0.9), (2, 1, 5, 0.3)])
     after = labels([(0, 0, 11, 0.4), (0, 0, 10.5, 0.7), (1, 1, 10, 1.0), (2, 1, 5, 0.3)])
     found = compare_labels(before, after)
@@ -69,7 +69,7 @@ def test_greedy_against_a_plain_loop():
     assert len(expected) > 20
 
 
-def test_an_overlap_without_meaning_is_refused():
+def test_an_overlap_without_meaning_is_rejected():
     """At 1 nothing could match."""
     with pytest.raises(ConfigError, match="least overlap"):
         compare_labels(labels([]), labels([]), 1.0)

@@ -24,7 +24,7 @@ def test_objects_are_counted_by_difficulty_occlusion_truncation_and_distance() -
     assert np.isnan(found["Pedestrian"].occluded)
 
 
-def test_a_van_is_no_car() -> None:
+def test_a_van_is_not_a_car() -> None:
     """KITTI ignores it in the evaluation, so it makes nothing harder."""
     found = object_statistics([to_objects([car(category="Van")])], ("Car",))
     assert found["Car"].objects == 0

@@ -90,7 +90,7 @@ def test_a_label_takes_the_object_that_fits_best():
     assert found.matched.tolist() == [1, 0]
 
 
-def test_another_category_is_no_match():
+def test_another_category_is_not_a_match():
     """A perfect box with the wrong name is wrong."""
     found = judge(labels([car_at(0)], categories=["Cyclist"]), truth([car_at(0)]))
     assert not found.right[0]
@@ -133,7 +133,7 @@ def test_labels_in_dont_care_regions_are_neutral():
 
 @pytest.mark.parametrize("n", [0, 2])
 @pytest.mark.parametrize("m", [0, 2])
-def test_empty_frames_are_judged(n, m):
+def test_empty_frames_are_evaluated(n, m):
     """No labels, no objects, or neither."""
     boxes = [car_at(0), car_at(20)]
     found = judge(labels(boxes[:n]), truth(boxes[:m]), rectangles=np.zeros((n, 4)))
@@ -149,7 +149,7 @@ def test_a_category_without_minimum_iou_is_named():
 
 
 @pytest.mark.parametrize("wrong", [{"overlap": "image"}, {"neighbors_are": "wrong"}])
-def test_unknown_options_are_refused(wrong):
+def test_unknown_options_are_rejected(wrong):
     """The error names the option."""
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         JudgeSettings(**wrong)

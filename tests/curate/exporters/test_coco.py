@@ -48,7 +48,7 @@ def test_a_box_is_the_rectangle_around_its_corners(document):
     assert (car["weight"], car["iscrowd"], "score" in car) == (1.0, 0, False)
 
 
-def test_what_is_background_is_no_annotation(tmp_path):
+def test_what_is_background_is_not_an_annotation(tmp_path):
     """It is beside the annotations, where COCO's readers do not look; the info says so."""
     document = written(tmp_path / "labels.json", toy_labels(zero_weight="background"))
     assert document["info"]["zero_weight"] == "background"

@@ -63,7 +63,7 @@ def _plain(value):
 
 
 def test_every_value_comes_back(tmp_path, exporter, library):
-    """To the last bit, in order, and "000001" is no number."""
+    """To the last bit, in order, and "000001" is not a number."""
     labels = toy_labels()
     path = tmp_path / f"labels{exporter.suffix}"
     exporter.write(path, labels)

@@ -130,7 +130,7 @@ def test_an_export_that_fails_leaves_the_former_as_it_was(tmp_path):
 
 
 @pytest.mark.parametrize("marker", [None, "{}", "[]", "no json", '{"format": "other"}'])
-def test_folders_that_are_no_former_export_are_left_alone(tmp_path, marker):
+def test_folders_that_are_not_former_export_are_left_alone(tmp_path, marker):
     """A data set's own labels are never overwritten."""
     label = tmp_path / "training" / "label_2" / "000001.txt"
     label.parent.mkdir(parents=True)
@@ -157,13 +157,13 @@ def test_an_empty_folder_is_taken(tmp_path):
 
 
 @pytest.mark.parametrize("weights", [(0.5, np.nan, 0.5), (0.5, 1.1, 0.5), (0.5, -0.1, 0.5)])
-def test_weights_out_of_range_are_refused(tmp_path, weights):
+def test_weights_out_of_range_are_rejected(tmp_path, weights):
     """The error names the frame."""
     with pytest.raises(DataError, match="frame 000001: needs one weight in"):
         export_kitti(tmp_path / "out", [weighted_frame(weights=weights)])
 
 
-def test_a_frame_that_occurs_twice_is_refused(tmp_path):
+def test_a_frame_that_occurs_twice_is_rejected(tmp_path):
     """Otherwise the first would be lost in silence."""
     with pytest.raises(DataError, match="frame 000001 occurs twice"):
         export_kitti(tmp_path / "out", [weighted_frame(), weighted_frame()])

@@ -14,7 +14,7 @@ from curate.exporters.objects import frame_objects
 
 
 @pytest.mark.parametrize("weight", ["abc", b"\x00\xff", None])
-def test_weights_that_are_no_numbers_are_refused(weight):
+def test_weights_that_are_not_numbers_are_rejected(weight):
     """SQLite keeps what another program writes into a column of numbers."""
     rows = rows_of(toy_labels())
     labels = with_rows(toy_labels(), [*rows[:2], rows[2] | {"weight": weight}])
@@ -42,7 +42,7 @@ def test_columns_may_be_arrays_in_any_order():
         lambda columns: columns.update(k=columns["k"][:-1]),
     ],
 )
-def test_a_block_with_other_columns_is_refused(change):
+def test_a_block_with_other_columns_is_rejected(change):
     """One is missing, one is more than was declared, or one is shorter."""
     [columns] = toy_labels().labels
     change(columns)
@@ -61,7 +61,7 @@ def test_a_frame_may_continue_in_the_next_block():
             np.testing.assert_array_equal(one.weights, other.weights)
 
 
-def test_labels_out_of_the_order_of_their_frames_are_refused():
+def test_labels_out_of_the_order_of_their_frames_are_rejected():
     """Otherwise those of a frame would be lost, or all would have to be held."""
     names = ("000001", "000002")
     frames = [FrameFiles(name, "unlabeled", "p", "i", "c") for name in names]

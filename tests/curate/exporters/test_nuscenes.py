@@ -80,14 +80,14 @@ def test_our_results_are_a_record(dataset, tmp_path):
     assert found.categories.tolist() == ["Car", "Car"]
 
 
-def test_another_data_set_is_refused(tmp_path):
+def test_another_data_set_is_rejected(tmp_path):
     """It has no map."""
     with pytest.raises(ConfigError, match="need the vehicle's poses"):
         NuScenesExporter().write(tmp_path / "a.json", toy_labels())
     assert toy_frame("000001").calibration.lidar_to_map is None
 
 
-def test_a_category_that_nuscenes_does_not_have_is_refused(dataset, tmp_path):
+def test_a_category_that_nuscenes_does_not_have_is_rejected(dataset, tmp_path):
     """Its tools would stop at it."""
     labels = labels_of(dataset)
     rows = [row | {"category": "Tram"} for row in rows_of(labels)]

@@ -1,4 +1,4 @@
-"""The label file: its schema, what it refuses, and that it is whole or absent."""
+"""The label file: its schema, what it rejects, and that it is whole or absent."""
 
 import json
 import sqlite3
@@ -98,7 +98,7 @@ def test_meta_says_what_the_labels_are_about(tmp_path):
     }
 
 
-def test_ground_truth_of_an_unlabeled_frame_is_refused_by_name(tmp_path):
+def test_ground_truth_of_an_unlabeled_frame_is_rejected_by_name(tmp_path):
     """The leak is an error that names the frames, and no file is left."""
     path = tmp_path / "labels.sqlite"
     with pytest.raises(LeakageError, match=r"ground truth of .* split: b, zz;"):
@@ -106,19 +106,19 @@ def test_ground_truth_of_an_unlabeled_frame_is_refused_by_name(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_val_frames_are_refused(tmp_path):
+def test_val_frames_are_rejected(tmp_path):
     """A frame of a third split cannot be written at all."""
     with pytest.raises(LeakageError, match="val"):
         write(tmp_path / "labels.sqlite", frames=[frame("a", "val")])
 
 
-def test_labels_of_labeled_frames_are_refused(tmp_path):
+def test_labels_of_labeled_frames_are_rejected(tmp_path):
     """Where there is ground truth there are no pseudo-labels."""
     with pytest.raises(DataError, match="labels of frames outside the unlabeled split: a"):
         write(tmp_path / "labels.sqlite", labels=[label("a")])
 
 
-def test_the_finished_file_refuses_ground_truth_of_unlabeled_frames_too(tmp_path):
+def test_the_finished_file_rejects_ground_truth_of_unlabeled_frames_too(tmp_path):
     """The schema itself ties ground truth to the labeled split, for whoever writes later."""
     path = tmp_path / "labels.sqlite"
     write(path)
@@ -143,14 +143,14 @@ def test_the_finished_file_refuses_ground_truth_of_unlabeled_frames_too(tmp_path
         label("b", points="many"),
     ],
 )
-def test_a_row_that_does_not_fit_is_refused(tmp_path, row):
+def test_a_row_that_does_not_fit_is_rejected(tmp_path, row):
     """Weights outside [0, 1], NaN, sides below zero, and text for a number."""
     with pytest.raises(DataError, match=r"labels\.sqlite: a row|label 0 has weight (1\.5|None)"):
         write(tmp_path / "labels.sqlite", labels=[row])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_same_label_twice_is_refused(tmp_path):
+def test_the_same_label_twice_is_rejected(tmp_path):
     """Frame and k name a label."""
     with pytest.raises(DataError, match="UNIQUE"):
         write(tmp_path / "labels.sqlite", labels=[label("b"), label("b")])
@@ -213,7 +213,7 @@ def test_further_evidence_stands_behind_the_core_columns(tmp_path):
 
 
 @pytest.mark.parametrize("value", ["many", None])
-def test_further_evidence_that_does_not_fit_is_refused(tmp_path, value):
+def test_further_evidence_that_does_not_fit_is_rejected(tmp_path, value):
     """Text for a number, nothing where something was declared."""
     rows = [label("b", visible_faces=2, density=value)]
     with pytest.raises(DataError, match=r"labels\.sqlite: a row was refused: .*label.density"):

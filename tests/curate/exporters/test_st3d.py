@@ -35,7 +35,7 @@ def test_background_is_left_out(tmp_path):
     assert len(frame["cls_scores"]) == len(frame["memory_counter"]) == 2
 
 
-def test_a_category_without_a_number_is_refused(tmp_path):
+def test_a_category_without_a_number_is_rejected(tmp_path):
     """The error names the frame and what is configured."""
     labels = toy_labels()
     fewer = replace(labels, description=replace(labels.description, categories=("Car",)))

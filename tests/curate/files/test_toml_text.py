@@ -1,4 +1,4 @@
-"""TOML that would take the memory or the time is refused; everything else is read as it is."""
+"""TOML that would take the memory or the time is rejected; everything else is read as it is."""
 
 import tomllib
 
@@ -16,7 +16,7 @@ from curate.files.toml_text import MOST_CHARACTERS, MOST_PARTS, parse_toml, toml
         "#" * (MOST_CHARACTERS + 1),
     ],
 )
-def test_what_grows_by_its_square_is_refused(text: str) -> None:
+def test_what_grows_by_its_square_is_rejected(text: str) -> None:
     """Keys of many parts, however they are written, and texts without end."""
     with pytest.raises(ValueError, match="more than"):
         parse_toml(text)
@@ -43,7 +43,7 @@ def test_the_look_itself_takes_no_time(text: str) -> None:
         parse_toml(text)
 
 
-def test_a_mark_in_front_of_the_text_is_no_part_of_it() -> None:
+def test_a_mark_in_front_of_the_text_is_not_a_part_of_it() -> None:
     """Some editors write one."""
     assert parse_toml("\ufeffa = 1\n") == {"a": 1}
 

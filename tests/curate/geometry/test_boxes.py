@@ -34,7 +34,7 @@ def test_the_cuboid_stands_on_the_footprint(boxes):
 
 
 @pytest.mark.wrong_shapes
-def test_arrays_that_are_no_boxes_are_refused():
+def test_arrays_that_are_not_boxes_are_rejected():
     """Another number of columns is an error that names the shape."""
     with pytest.raises(ValueError, match=r"\(3, 6\)"):
         bev_corners(np.zeros((3, 6)))

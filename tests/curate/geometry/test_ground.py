@@ -33,7 +33,7 @@ def test_one_stray_point_below_does_not_lower_it():
 
 
 def test_where_nothing_was_seen_the_height_is_unknown():
-    """Far from all points, also off the map, there is no height."""
+    """Far from all points, also off the map, there is not a height."""
     heights = GroundMap.of(plane()).at(np.array([[500.0, 0.0], [-500.0, -500.0], [20.0, 0.0]]))
     assert np.isnan(heights).tolist() == [True, True, False]
 
@@ -56,7 +56,7 @@ def test_unseen_ground_is_as_high_as_most_of_the_rest():
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_hardly_any_points_are_no_fault(count):
+def test_hardly_any_points_are_not_fault(count):
     """Without points the ground is unknown and nothing moves; one point is its own ground."""
     points = np.full((count, 4), 3.0)
     assert GroundMap.of(points).lowered(np.full((1, 7), 3.0))[0, 2] == (0.0 if count else 3.0)

@@ -45,7 +45,7 @@ def test_equal_scores_are_ranked_by_index():
 
 
 def test_no_boxes_stay_no_boxes():
-    """An empty frame is no error."""
+    """An empty frame is not an error."""
     assert nms_bev(np.zeros((0, 7)), np.zeros(0), 0.1).tolist() == []
 
 

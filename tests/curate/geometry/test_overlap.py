@@ -155,6 +155,6 @@ def test_pairs_of_groups_are_the_matrices_of_each_group():
 
 
 def test_pairs_of_no_groups_are_none():
-    """No group at all is no error."""
+    """No group at all is not an error."""
     none, starts = np.zeros((0, 7)), np.zeros(1, dtype=np.int64)
     assert [len(part) for part in overlapping_pairs(none, starts, none, starts)] == [0, 0, 0, 0]

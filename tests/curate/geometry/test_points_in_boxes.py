@@ -92,7 +92,7 @@ def test_nothing_in_nothing():
     assert box_of_points(np.zeros((2, 4)), box[:0]).tolist() == [-1, -1]
 
 
-def test_points_without_three_columns_are_refused():
+def test_points_without_three_columns_are_rejected():
     """A wrong array is an error that names its shape."""
     with pytest.raises(ValueError, match=r"\(5, 2\)"):
         count_points_in_boxes(np.zeros((5, 2)), np.zeros((0, 7)))

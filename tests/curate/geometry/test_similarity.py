@@ -96,7 +96,7 @@ def test_a_draw_depends_on_the_generator_only():
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
-def test_a_similarity_without_inverse_is_refused(scale):
+def test_a_similarity_without_inverse_is_rejected(scale):
     """Scale 0, negative or not finite is a one-line error."""
     with pytest.raises(ConfigError, match="positive scale"):
         Similarity(scale=scale)

@@ -79,7 +79,7 @@ def test_a_box_that_is_mostly_hidden_is_trusted_less() -> None:
     assert strict["rho_density"][0] == pytest.approx(sparse["rho_density"][0] / 2)
 
 
-def test_nothing_expected_is_no_doubt() -> None:
+def test_nothing_expected_is_not_a_doubt() -> None:
     """An empty sweep, a cone without points, a box around the sensor."""
     around, behind = [0.1, 0.0, 0.0, 4.0, 2.0, 1.5, 0.3], [-20.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.3]
     for points in (np.zeros((0, 3)), wall(20.0)):
@@ -100,7 +100,7 @@ def test_the_cone_is_as_wide_as_it_says() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, -1.0, float("nan")])
-def test_a_share_without_meaning_is_refused(share: float) -> None:
+def test_a_share_without_meaning_is_rejected(share: float) -> None:
     """It divides the density."""
     with pytest.raises(ConfigError, match="share must be above 0"):
         DensityPrior(share=share)

@@ -149,7 +149,7 @@ def test_a_category_without_a_threshold_is_named():
 
 
 @pytest.mark.parametrize("wrong", [{"statistic": "mode"}, {"quantile": 1.5}, {"fallback": 0.0}])
-def test_settings_without_meaning_are_refused(wrong):
+def test_settings_without_meaning_are_rejected(wrong):
     """A setting out of its range is named."""
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         PointSettings(**wrong)
@@ -157,6 +157,6 @@ def test_settings_without_meaning_are_refused(wrong):
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_a_threshold_must_be_a_positive_number(value):
-    """What cannot divide is refused before it does."""
+    """What cannot divide is rejected before it does."""
     with pytest.raises(ConfigError, match="Car"):
         PointPrior({"Car": value})

@@ -163,14 +163,14 @@ def test_an_empty_frame_is_not_segmented():
     assert [len(column) for column in found.values()] == [0, 0, 0]
 
 
-def test_a_map_of_another_size_is_refused():
+def test_a_map_of_another_size_is_rejected():
     """The error names the frame and both sizes."""
     prior = SemanticPrior(Painted(np.zeros((HEIGHT, WIDTH - 1), np.uint8)))
     with pytest.raises(ModelError, match=r"000007.*79 x 40.*80 x 40"):
         prior.score(frame(), labels([AHEAD], [0.5]))
 
 
-def test_a_category_without_classes_is_refused():
+def test_a_category_without_classes_is_rejected():
     """The error names the category."""
     prior = SemanticPrior(Painted(np.zeros((HEIGHT, WIDTH), np.uint8)))
     with pytest.raises(ConfigError, match="Tram"):
@@ -178,7 +178,7 @@ def test_a_category_without_classes_is_refused():
 
 
 @pytest.mark.parametrize("wrong", [{"mean": "harmonic"}, {"outside": "guess"}])
-def test_unknown_options_are_refused(wrong):
+def test_unknown_options_are_rejected(wrong):
     """The error names the option and what there is."""
     with pytest.raises(ConfigError, match=r"choose one of"):
         SemanticSettings(**wrong)

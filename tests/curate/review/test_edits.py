@@ -32,7 +32,7 @@ def test_an_unchanged_box_has_not_been_looked_at() -> None:
     assert (said(answer), answer.untouched) == ([], 3)
 
 
-def test_rounding_is_no_change() -> None:
+def test_rounding_is_not_a_change() -> None:
     """A millimetre, and yaw by a whole turn."""
     rounded = (*(round(value, 3) for value in CAR[:6]), CAR[6] + 6.28319)
     assert said(compare_frame(FRAME, back(box1=rounded)[::-1])) == []
@@ -90,7 +90,7 @@ def test_a_human_label_may_be_corrected() -> None:
         (back(box1=(CAR[0] + 0.4, *CAR[1:])), {1: "rejected"}, "file:1.*marked as rejected"),
     ],
 )
-def test_words_against_deeds_are_refused(
+def test_words_against_deeds_are_rejected(
     edited: list[EditedBox], words: dict[int, str], fault: str
 ) -> None:
     """Which of both was meant is not guessed."""
@@ -108,7 +108,7 @@ def test_words_against_deeds_are_refused(
         ("Car", (481_000.0, *CAR[1:]), "another frame of reference"),
     ],
 )
-def test_boxes_that_cannot_be_are_refused(
+def test_boxes_that_cannot_be_are_rejected(
     category: str, box: tuple[float, ...], fault: str
 ) -> None:
     """With the place where they stand."""

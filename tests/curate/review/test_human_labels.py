@@ -42,7 +42,7 @@ def test_an_object_takes_whatever_overlaps_it() -> None:
     np.testing.assert_allclose(spoken.iou, [SAME_OBJECT_IOU + 0.02, 0.8, 0], atol=1e-9)
 
 
-def test_a_refusal_holds_for_its_category_and_place() -> None:
+def test_a_rejection_holds_for_its_category_and_place() -> None:
     """From an IoU of 0.3 on; the same place with another category is a claim of its own."""
     boxes = np.stack([along(REJECTED_IOU + 0.02), along(REJECTED_IOU - 0.02), BOX])
     names = as_categories(["Car", "Car", "Pedestrian"])
@@ -51,7 +51,7 @@ def test_a_refusal_holds_for_its_category_and_place() -> None:
     assert not spoken.leads.any()
 
 
-def test_objects_come_before_refusals() -> None:
+def test_objects_come_before_rejections() -> None:
     """Where both could speak for a prediction, it is the object that does."""
     both = labels(("rejected", "Car", BOX), ("accepted", "Car", along(0.4)))
     assert match_human_labels(BOX[None], as_categories(["Car"]), both).label.tolist() == [1]
@@ -85,7 +85,7 @@ def test_every_object_leads_at_most_one_prediction(places: list[tuple[float, flo
 
 
 def test_a_later_decision_takes_the_place_of_an_earlier_one() -> None:
-    """About the same object; a refusal only of one of its own category."""
+    """About the same object; a rejection only of one of its own category."""
     former = labels(("accepted", "Car", BOX))
     assert superseded(former, labels(("moved", "Van", along(0.7)))).tolist() == [True]
     assert superseded(former, labels(("rejected", "Car", BOX))).tolist() == [True]
@@ -94,7 +94,7 @@ def test_a_later_decision_takes_the_place_of_an_earlier_one() -> None:
 
 
 def test_objects_in_each_other_are_found() -> None:
-    """A refused box may lie in an object."""
+    """A rejected box may lie in an object."""
     assert overlapping_objects(
         labels(("accepted", "Car", BOX), ("accepted", "Van", along(0.9)))
     ) == [(0, 1)]

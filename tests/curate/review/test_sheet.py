@@ -29,7 +29,7 @@ def test_a_manifest_comes_back(tmp_path: Path) -> None:
         ("{", "", "invalid JSON"),
     ],
 )
-def test_a_manifest_that_is_not_as_it_was_is_refused(
+def test_a_manifest_that_is_not_as_it_was_is_rejected(
     tmp_path: Path, before: str, after: str, fault: str
 ) -> None:
     """In one line that names it."""
@@ -41,7 +41,7 @@ def test_a_manifest_that_is_not_as_it_was_is_refused(
     assert "\n" not in str(error.value)
 
 
-def test_a_folder_without_manifest_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_manifest_is_rejected(tmp_path: Path) -> None:
     """It says which folder to name."""
     with pytest.raises(DataError, match=r"no such file; import the folder that"):
         read_sheet(tmp_path)
@@ -96,7 +96,7 @@ def test_what_spreadsheets_do_to_a_table_does_no_harm(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_rows_without_meaning_are_refused(
+def test_rows_without_meaning_are_rejected(
     tmp_path: Path, key: str, word: str, before: str, after: str, fault: str
 ) -> None:
     """With file and line."""

@@ -23,7 +23,7 @@ def test_the_simulated_classes_are_those_of_the_simulator():
     assert class_map("simulated") == {name: (one,) for name, one in SEMANTIC_CLASSES.items()}
 
 
-def test_people_on_bicycles_are_no_pedestrians_where_the_classes_tell_them_apart():
+def test_people_on_bicycles_are_not_pedestrians_where_the_classes_tell_them_apart():
     """Cityscapes has riders; VOC and COCO only persons, who count for both."""
     for name in ("cityscapes", "cityscapes-label-ids"):
         riders = class_map(name)
@@ -39,7 +39,7 @@ def test_an_unknown_table_is_named_with_the_known_ones():
 
 
 @pytest.mark.parametrize("one", [-1, 256, 1.5, "7"])
-def test_ids_that_no_map_can_hold_are_refused(one):
+def test_ids_that_no_map_can_hold_are_rejected(one):
     """A semantic map has 8 bits per pixel."""
     with pytest.raises(ConfigError, match="of Car: an id is 0 to 255"):
         checked_classes({"Car": [one]})

@@ -126,7 +126,7 @@ def test_the_default_errs_but_not_wildly(folder, truth):
     "rates",
     [{"confused": 1.5}, {"blobs": -1}, {"patch_px": 2.5}, {"missed": 0.1}, {"blobs": "many"}],
 )
-def test_impossible_rates_are_refused(folder, rates):
+def test_impossible_rates_are_rejected(folder, rates):
     """One line that names the option."""
     with pytest.raises(ConfigError, match=next(iter(rates))) as caught:
         DegradedSegmenter(folder, **rates)

@@ -134,7 +134,7 @@ def test_malformed_masks_are_named(tmp_path: Path, held: object, message: str) -
     assert "\n" not in str(caught.value)
 
 
-def test_a_score_out_of_range_is_refused(tmp_path: Path) -> None:
+def test_a_score_out_of_range_is_rejected(tmp_path: Path) -> None:
     """Before any frame."""
     with pytest.raises(ConfigError, match=r"minimum_score 1\.5"):
         InstanceSegmenter(save(tmp_path / "a.json", []), COCO, minimum_score=1.5)

@@ -96,7 +96,7 @@ def test_neighbours_share_no_pixel_and_polygons_unite() -> None:
         ("mask", "run lengths {size, counts} or a list of polygons"),
     ],
 )
-def test_what_is_no_mask_is_one_line(segmentation, message) -> None:
+def test_what_is_not_a_mask_is_one_line(segmentation, message) -> None:
     """With what was expected."""
     with pytest.raises(DataError) as caught:
         decode_mask(segmentation, (9, 6))

@@ -199,7 +199,7 @@ def test_an_unexpected_input_is_named_with_what_was_expected(tmp_path, shape, ki
     assert "\n" not in str(caught.value)
 
 
-def test_an_answer_that_is_no_map_is_refused(tmp_path):
+def test_an_answer_that_is_not_a_map_is_rejected(tmp_path):
     """A wrong rank is seen at the start, a wrong content with the first frame."""
     nodes = [helper.make_node("ReduceMax", ["image", "axes"], ["answer"], keepdims=0)]
     constants = [("axes", np.array([1, 2]))]
@@ -218,7 +218,7 @@ def test_an_answer_that_is_no_map_is_refused(tmp_path):
         OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
 
 
-def test_scores_that_are_nan_are_refused(tmp_path):
+def test_scores_that_are_nan_are_rejected(tmp_path):
     """They would be class 0 in every pixel, and no frame would fail."""
     node = helper.make_node("Log", ["image"], ["answer"])
     path = one_step_model(tmp_path / "a.onnx", node, TensorProto.FLOAT)
@@ -226,7 +226,7 @@ def test_scores_that_are_nan_are_refused(tmp_path):
         OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
 
 
-def test_names_of_classes_are_no_scores(tmp_path):
+def test_names_of_classes_are_not_scores(tmp_path):
     """Text cannot be compared with numbers."""
     node = helper.make_node("Cast", ["image"], ["answer"], to=TensorProto.STRING)
     path = one_step_model(tmp_path / "a.onnx", node, TensorProto.STRING)
@@ -235,7 +235,7 @@ def test_names_of_classes_are_no_scores(tmp_path):
 
 
 @pytest.mark.parametrize("shape", [[1, 3, 200_000, 200_000], [1, 3, 0, 8], [1, "h", 1 << 26, 3]])
-def test_an_absurd_input_is_refused_before_a_frame_fills_the_memory(tmp_path, shape):
+def test_an_absurd_input_is_rejected_before_a_frame_fills_the_memory(tmp_path, shape):
     """Every frame would be resized to what the model declares."""
     path = brightest_channel_model(tmp_path / "a.onnx", shape)
     with pytest.raises(ModelError, match=r"a\.onnx: takes image .*images of 1 to 33554432 pixels"):
@@ -249,7 +249,7 @@ def test_a_model_of_one_column_has_crops_of_one(tmp_path):
     np.testing.assert_array_equal(found, banded(8, 16, [7, 15])[..., 0])
 
 
-def test_ids_beyond_a_map_are_refused(tmp_path):
+def test_ids_beyond_a_map_are_rejected(tmp_path):
     """Class 300 does not fit into 8 bits and is not silently another class."""
     path = constant_model(tmp_path / "a.onnx", np.full((8, 8), 300))
     with pytest.raises(ModelError, match="expected class ids"):
@@ -257,7 +257,7 @@ def test_ids_beyond_a_map_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"no model"])
-def test_a_file_that_is_no_model_is_named(tmp_path, content):
+def test_a_file_that_is_not_a_model_is_named(tmp_path, content):
     """ONNX Runtime's own errors do not leak."""
     path = tmp_path / "a.onnx"
     path.write_bytes(content)
@@ -273,7 +273,7 @@ def test_a_missing_model_is_named(tmp_path):
         OnnxSegmenter(tmp_path / "a.onnx", CLASSES)
 
 
-def test_a_frame_without_its_image_is_refused(tmp_path):
+def test_a_frame_without_its_image_is_rejected(tmp_path):
     """The segmenter says that it needs the image."""
     segmenter = OnnxSegmenter(red_channel_model(tmp_path / "a.onnx", [1, 8, 8, 3]), CLASSES)
     assert segmenter.needs_image
@@ -286,7 +286,7 @@ def test_a_frame_without_its_image_is_refused(tmp_path):
     ("options", "message"),
     [({"scaling": "caffe"}, "use one of imagenet, unit, none"), ({"tiles": 0}, "at least 1")],
 )
-def test_options_out_of_range_are_refused(tmp_path, options, message):
+def test_options_out_of_range_are_rejected(tmp_path, options, message):
     """The error names what can be used."""
     path = red_channel_model(tmp_path / "a.onnx", [1, 8, 8, 3])
     with pytest.raises(ConfigError, match=message):

@@ -189,7 +189,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_other_answers_are_refused_in_one_line(tmp_path, name):
+def test_other_answers_are_rejected_in_one_line(tmp_path, name):
     """With what was answered."""
     changed, message = BAD[name]
     path = constant_model(tmp_path / "a.onnx", GOOD | changed)
@@ -200,7 +200,7 @@ def test_other_answers_are_refused_in_one_line(tmp_path, name):
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_prototypes_that_are_nan_are_refused(tmp_path):
+def test_prototypes_that_are_nan_are_rejected(tmp_path):
     """They would leave the object without a single pixel."""
     found = {"predictions": np.full((1, 6, 1), 0.9, np.float32)}
     found["prototypes"] = np.full((1, 1, 4, 4), np.nan, np.float32)
@@ -209,7 +209,7 @@ def test_prototypes_that_are_nan_are_refused(tmp_path):
         asked(path, {"Car": (0,)}, outputs={name: name for name in found})
 
 
-def test_wrong_prototypes_are_refused(tmp_path):
+def test_wrong_prototypes_are_rejected(tmp_path):
     """No classes are left between box and coefficients."""
     found = {"a": np.zeros((1, 6, 9), np.float32), "b": np.zeros((1, 2, 4, 4), np.float32)}
     path = constant_model(tmp_path / "a.onnx", found)

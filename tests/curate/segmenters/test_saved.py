@@ -38,7 +38,7 @@ def test_reads_the_map_of_a_frame(tmp_path):
         (np.zeros((5, 12), np.uint16), "expected one channel of 8 bits"),
     ],
 )
-def test_a_map_that_does_not_fit_is_refused(tmp_path, class_ids, message):
+def test_a_map_that_does_not_fit_is_rejected(tmp_path, class_ids, message):
     """Wrong size, colours or depth: the error names the file."""
     save(tmp_path, class_ids)
     with pytest.raises(DataError, match=message) as caught:
@@ -69,7 +69,7 @@ def test_instances_are_told_by_the_divisor(tmp_path):
         ("cityscapes-label-ids", 90, "class 90, .* cityscapes-label-ids are 0 to 33$"),
     ],
 )
-def test_maps_of_another_class_set_are_refused(tmp_path, declared, present, message):
+def test_maps_of_another_class_set_are_rejected(tmp_path, declared, present, message):
     """Cityscapes' label ids read as train ids would make every car a bus or nothing."""
     class_ids = np.zeros((5, 12), np.uint8)
     class_ids[0, :2] = present, 255

@@ -59,7 +59,7 @@ def test_actors_have_plausible_and_different_sizes(category, low, high):
 
 @pytest.mark.parametrize("kind", scenery.CLUTTER)
 def test_clutter_stands_on_the_ground(kind):
-    """It begins at or just below z = 0 and is no taller than what it is mistaken for."""
+    """It begins at or just below z = 0 and is not a taller than what it is mistaken for."""
     for number in range(scenery.VARIANTS):
         low, high = scenery.scenery_mesh(kind, number).bounds
         assert -0.4 <= low[2] <= 0.05

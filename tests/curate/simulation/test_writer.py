@@ -1,4 +1,4 @@
-"""Tests of the simulated data set on disk: determinism, resuming, refusals."""
+"""Tests of the simulated data set on disk: determinism, resuming, rejections."""
 
 import os
 import signal
@@ -116,7 +116,7 @@ def test_a_script_without_main_guard_is_told_so(tmp_path):
 
 
 def test_a_frame_that_lost_a_file_is_made_again(simulated, tmp_path):
-    """A label without its image is no whole frame."""
+    """A label without its image is not a whole frame."""
     simulate(tmp_path / "data", 1, SEED, workers=1)
     (tmp_path / "data" / "training" / "image_2" / "000000.png").unlink()
     simulate(tmp_path / "data", 1, SEED, workers=1)
@@ -124,7 +124,7 @@ def test_a_frame_that_lost_a_file_is_made_again(simulated, tmp_path):
 
 
 @pytest.mark.parametrize("change", [{"seed": SEED + 1}, {"frames": FRAMES + 1}, {"val_frames": 1}])
-def test_a_directory_of_another_simulation_is_refused(simulated, change):
+def test_a_directory_of_another_simulation_is_rejected(simulated, change):
     """One line that names both settings, and nothing is written."""
     settings = {"frames": FRAMES, "seed": SEED} | change
     with pytest.raises(ConfigError, match=f"seed={SEED}") as caught:
@@ -164,7 +164,7 @@ def test_a_damaged_settings_file_is_reported(tmp_path, text):
         ({"workers": 0}, "workers must be"),
     ],
 )
-def test_numbers_out_of_range_are_refused(tmp_path, arguments, message):
+def test_numbers_out_of_range_are_rejected(tmp_path, arguments, message):
     """Before anything is written."""
     with pytest.raises(ConfigError, match=message):
         simulate(tmp_path / "data", **({"frames": 4, "seed": 0, "workers": 1} | arguments))
@@ -180,7 +180,7 @@ def wait_until(happened, seconds=600):
 
 
 def is_running(pid):
-    """Whether a process exists and is no zombie."""
+    """Whether a process exists and is not a zombie."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:

@@ -70,7 +70,7 @@ def test_what_a_person_rejected_is_background_under_every_policy(make_labels):
     assert WeightedLabels(path)[1].boxes.shape == (0, 7)
 
 
-def test_another_meaning_of_weight_zero_is_refused(make_labels):
+def test_another_meaning_of_weight_zero_is_rejected(make_labels):
     """A file that somebody has changed."""
     path = make_labels(labeled=1)
     change(path, "UPDATE meta SET value = 'perhaps' WHERE key = 'zero_weight'")
@@ -78,7 +78,7 @@ def test_another_meaning_of_weight_zero_is_refused(make_labels):
         WeightedLabels(path)
 
 
-def test_neighbour_categories_are_ignored_and_strangers_left_out(make_labels):
+def test_neighbour_categories_are_ignored_and_unexpected_left_out(make_labels):
     """A Van is neither Car nor background, a Tram is nothing to a detector of cars."""
     path = make_labels(labeled=1, categories=("Car",))
     change(path, "UPDATE ground_truth SET category = 'Van' WHERE category = 'Pedestrian'")
@@ -118,7 +118,7 @@ def test_the_data_set_may_have_moved(make_labels, toy_kitti, tmp_path):
     assert len(WeightedLabels(path, root=tmp_path / "moved")[0].points)
 
 
-def test_smuggled_ground_truth_is_refused(make_labels):
+def test_smuggled_ground_truth_is_rejected(make_labels):
     """A file whose ground truth reaches an unlabeled frame is not read, and the frame is named."""
     path = make_labels(labeled=1, unlabeled=1)
     change(path, "UPDATE ground_truth SET frame = '000001' WHERE k = 0")
@@ -126,7 +126,7 @@ def test_smuggled_ground_truth_is_refused(make_labels):
         WeightedLabels(path)
 
 
-def test_files_that_are_no_label_files(tmp_path, make_labels):
+def test_files_that_are_not_label_files(tmp_path, make_labels):
     """Missing, not SQLite, without the tables, of another version: one line that says so."""
     with pytest.raises(DataError, match=r"none\.sqlite: no such label file"):
         WeightedLabels(tmp_path / "none.sqlite")

@@ -60,7 +60,7 @@ def test_the_bank_holds_objects_with_their_points(bank):
 
 
 def test_objects_with_few_points_or_weight_zero_are_left_out():
-    """What can hardly be seen, or is not sure to be an object, is no example."""
+    """What can hardly be seen, or is not sure to be an object, is not an example."""
     few = sample_of(car_points(4), [CAR])
     ignored = sample_of(car_points(), [CAR], weights=np.zeros(1))
     assert ObjectBank.build([few, ignored], ("Car",), 5).objects["Car"] == ()
@@ -215,7 +215,7 @@ def test_one_pasted_object_hides_another():
 
 
 def test_a_place_of_weight_zero_is_taken_even_where_it_counts_as_background(bank):
-    """The ignored label is no target, and yet nothing is pasted onto it."""
+    """The ignored label is not a target, and yet nothing is pasted onto it."""
     standing = [[15.0, y, -0.9, 4.0, 4.0, 1.5, 0.0] for y in np.arange(-9, 10, 4.5)]
     sample = sample_of(wall(40), standing, labeled=False, weights=np.zeros(5))
     for zero, boxes in (("ignore", 5), ("background", 0)):
@@ -243,7 +243,7 @@ def test_a_pasted_object_stands_on_the_ground(bank):
 
 
 def test_nothing_is_pasted_onto_a_roof(bank):
-    """Where the lowest points are metres above the ground there is no place to stand."""
+    """Where the lowest points are metres above the ground there is not a place to stand."""
     roof = wall(40)
     roof[:, 0] = np.random.default_rng(0).uniform(8, 40, len(roof))
     roof[:, 2] = 3.0

@@ -1,4 +1,4 @@
-"""Training: it learns, it goes on after a kill, and it refuses what it cannot use."""
+"""Training: it learns, it goes on after a kill, and it rejects what it cannot use."""
 
 import logging
 import pickle
@@ -75,7 +75,7 @@ def test_a_training_learns_its_frames(make_labels, tiny, toy_kitti, tmp_path):
 
 
 def test_a_labeled_frame_without_objects_is_all_background(make_labels, tiny, tmp_path):
-    """It takes its turns in the batches, and every cell of it says that there is no object."""
+    """It takes its turns in the batches, and every cell of it says that there is not an object."""
     labels, settings = make_labels(labeled=2), quick(tiny, pasted=0)
     with closing(sqlite3.connect(labels)) as connection:
         connection.execute("DELETE FROM ground_truth WHERE frame = '000001'")
@@ -170,7 +170,7 @@ def test_the_average_of_the_student_is_what_is_left(make_labels, tiny, tmp_path)
         np.testing.assert_allclose(array, expected, rtol=1e-4, atol=1e-6)
 
 
-def test_a_start_that_does_not_fit_is_refused(make_labels, tiny, tmp_path):
+def test_a_start_that_does_not_fit_is_rejected(make_labels, tiny, tmp_path):
     """A teacher of other categories or of another preset is an error of one line."""
     teacher = tmp_path / "teacher.safetensors"
     train(make_labels(labeled=2), teacher, quick(tiny, steps=1))
@@ -239,8 +239,8 @@ def test_frames_that_do_not_fit_into_memory_are_read_again(make_labels, tiny):
     assert torch.equal(with_room.targets.heatmap, without.targets.heatmap)
 
 
-def test_without_labeled_frames_there_is_no_training(make_labels, tiny, tmp_path):
-    """A label file of pseudo-labels alone is refused."""
+def test_without_labeled_frames_there_is_not_a_training(make_labels, tiny, tmp_path):
+    """A label file of pseudo-labels alone is rejected."""
     with pytest.raises(DataError, match="no labeled frame"):
         train(make_labels(0, 2), tmp_path / "out.safetensors", quick(tiny))
 

@@ -68,7 +68,7 @@ def test_circles_have_their_radius(canvas):
     assert picture[20, 30] == 0
 
 
-def test_text_is_as_wide_as_foretold(canvas):
+def test_text_is_as_wide_as_predicted(canvas):
     """Nothing is written beyond the width that layout reckons with."""
     wide = Canvas(200, 40, BLACK)
     wide.text(10, 30, "Car 0.87", WHITE, 14)

@@ -54,7 +54,7 @@ def test_a_label_without_weight_has_its_own_colour():
     assert weight_colours(np.array([np.nan]))[0].tolist() == list(UNWEIGHTED)
 
 
-def test_without_an_image_there_is_no_picture():
+def test_without_an_image_there_is_not_a_picture():
     """The error names the frame."""
     with pytest.raises(DataError, match="000000"):
         draw_frame(frame(image=False), shown(0.5))

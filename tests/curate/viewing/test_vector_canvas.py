@@ -48,7 +48,7 @@ def test_it_draws_what_the_raster_canvas_draws():
     assert not vector[18:29].any()
 
 
-def test_text_is_as_wide_as_foretold():
+def test_text_is_as_wide_as_predicted():
     """And stands on its baseline."""
     canvas = VectorCanvas(200, 40, BLACK)
     canvas.text(10, 30, "Car $0.87", WHITE, 14)

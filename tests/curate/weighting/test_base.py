@@ -29,7 +29,7 @@ def test_rho_det_is_the_product_of_the_priors():
 
 
 def test_rho_det_leaves_out_a_prior_that_has_not_scored():
-    """NaN is no opinion, and not a veto."""
+    """NaN is not an opinion, and not a veto."""
     half = {"rho_diff": np.array([0.5, np.nan]), "rho_anno": np.array([np.nan, np.nan])}
     assert evidence(rho=half).rho_det.tolist() == [0.5, 1.0]
 
@@ -52,7 +52,7 @@ def test_matched_is_where_there_is_a_loss():
         ({"rho": {"rho_anno": np.array([-1.0, 0.5])}}, "rho_anno of label 0"),
     ],
 )
-def test_evidence_out_of_shape_or_range_is_refused(changes, said):
+def test_evidence_out_of_shape_or_range_is_rejected(changes, said):
     """The error names the column and the label."""
     with pytest.raises(DataError, match=said):
         evidence(**changes)
@@ -65,7 +65,7 @@ def test_age_is_the_share_of_rounds():
 
 
 @pytest.mark.parametrize(("e", "rounds"), [(0, 3), (4, 3), (-1, 3), (1, 0)])
-def test_rounds_that_do_not_exist_are_refused(e, rounds):
+def test_rounds_that_do_not_exist_are_rejected(e, rounds):
     """Rounds count from 1 to E."""
     with pytest.raises(ConfigError, match=f"round {e} of {rounds}"):
         Age(e, rounds)

@@ -85,7 +85,7 @@ def test_a_rare_category_is_in_doubt():
     assert weights.dropped.tolist() == [False, False, True]
 
 
-def test_an_unknown_setting_is_refused():
+def test_an_unknown_setting_is_rejected():
     """The error names what there is."""
     with pytest.raises(ConfigError, match=r"hssda.*hard.*soft or ignore"):
         HSSDA("hard")

@@ -214,7 +214,7 @@ def test_a_tiny_lambda_does_not_overflow():
     [({"scope": "batch"}, "batch"), ({"quantile": 0.0}, "quantile"), ({"quantile": 1.1}, "1.1")],
 )
 @pytest.mark.parametrize("policy", [SPSL, PSPSL])
-def test_settings_without_meaning_are_refused(policy, wrong, said):
+def test_settings_without_meaning_are_rejected(policy, wrong, said):
     """The error names the policy and the setting."""
     with pytest.raises(ConfigError, match=rf"{policy.name}.*{said}"):
         policy(**wrong)

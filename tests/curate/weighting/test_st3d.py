@@ -84,7 +84,7 @@ def test_an_empty_memory_is_none():
 
 
 def test_the_confidence_can_be_the_estimated_iou():
-    """As in the paper; a detector without estimates is refused."""
+    """As in the paper; a detector without estimates is rejected."""
     policy = ST3D(keep=0.5, ignore=0.2, confidence="iou")
     assert bands([car(0), car(20)], [0.0, 0.9], policy=policy, ious=[0.5, 0.1]) == [KEEP, DROP]
     with pytest.raises(ConfigError, match="st3d: the detector estimates no IoU"):
@@ -107,7 +107,7 @@ def test_a_memory_without_boxes_beside_it_is_an_error():
         ({"minimum_iou": 0.0}, "minimum_iou"),
     ],
 )
-def test_settings_without_meaning_are_refused(wrong, said):
+def test_settings_without_meaning_are_rejected(wrong, said):
     """The error names the policy and the setting."""
     with pytest.raises(ConfigError, match=f"st3d.*{said}"):
         ST3D(**wrong)

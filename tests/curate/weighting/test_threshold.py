@@ -34,7 +34,7 @@ def test_a_category_can_have_its_own_threshold():
     ("wrong", "said"),
     [({"threshold": 1.5}, "1.5"), ({"per_category": {"Cyclist": -0.1}}, "Cyclist")],
 )
-def test_a_threshold_that_is_no_score_is_refused(wrong, said):
+def test_a_threshold_that_is_not_a_score_is_rejected(wrong, said):
     """The error names what is wrong."""
     with pytest.raises(ConfigError, match=said):
         Threshold(**wrong)

@@ -128,7 +128,7 @@ def test_the_labeled_frames_can_be_audited_with_a_detector_that_never_saw_them(
         ({"names": ("nonsense",)}, ConfigError, "unknown policy 'nonsense'"),
     ],
 )
-def test_what_cannot_be_audited_is_refused_before_anything_runs(
+def test_what_cannot_be_audited_is_rejected_before_anything_runs(
     workspace: Workspace, request_of: dict, error: type, message: str
 ) -> None:
     """In one line."""
@@ -137,7 +137,7 @@ def test_what_cannot_be_audited_is_refused_before_anything_runs(
     assert count(workspace, "SELECT count(*) FROM task") == 0
 
 
-def test_the_frames_that_a_teacher_learned_from_are_refused(workspace: Workspace) -> None:
+def test_the_frames_that_a_teacher_learned_from_are_rejected(workspace: Workspace) -> None:
     """A detector that curate trains knows the labeled frames; the remedy is named."""
     trained = workspace.with_settings("detector", name="pillars")
     with pytest.raises(LeakageError, match="--folds"):
@@ -229,7 +229,7 @@ def test_an_audit_without_the_point_prior_has_no_point_slices(
     assert count(workspace, sql) == 0
 
 
-def test_an_unknown_overlap_is_refused(curate: Curate, workspace: Workspace) -> None:
+def test_an_unknown_overlap_is_rejected(curate: Curate, workspace: Workspace) -> None:
     """The message lists what there is."""
     code, _, err = curate("audit", "-w", workspace.root, "--overlap", "2d")
     assert (code, err) == (ConfigError.exit_code, "error: --overlap 2d: use bev or 3d\n")

@@ -101,7 +101,7 @@ def test_a_list_names_the_frames_to_compare(
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff\x00"])
-def test_a_list_of_frames_without_frames_is_refused(
+def test_a_list_of_frames_without_frames_is_rejected(
     curate: Curate, folders: tuple[Path, Path], tmp_path: Path, content: bytes
 ) -> None:
     """In one line that names the file."""
@@ -150,7 +150,9 @@ def test_bad_files_end_in_one_line_that_names_the_place(
     assert err.count("\n") == 1
 
 
-def test_a_missing_result_file_is_no_empty_one(curate: Curate, folders: tuple[Path, Path]) -> None:
+def test_a_missing_result_file_is_not_an_empty_one(
+    curate: Curate, folders: tuple[Path, Path]
+) -> None:
     """A partial run is not scored as a whole one; the remedy is named."""
     (folders[1] / "000002.txt").unlink()
     code, _, err = evaluate(curate, folders)
@@ -193,7 +195,7 @@ def test_equal_scores_enter_together(curate: Curate, folders: tuple[Path, Path])
         (("--round", "1", "--checkpoint", "x"), "--round or --checkpoint"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(
+def test_options_that_do_not_fit_are_rejected(
     curate: Curate, arguments: tuple[str, ...], message: str
 ) -> None:
     """Before anything is opened."""

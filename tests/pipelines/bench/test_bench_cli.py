@@ -1,4 +1,4 @@
-"""curate bench from the command line: a grid that is killed and goes on, and what is refused."""
+"""curate bench from the command line: a grid that is killed and goes on, and what is rejected."""
 
 import json
 import os
@@ -149,7 +149,7 @@ def test_methods_share_the_teacher_and_its_evidence(toy_kitti: Path, tmp_path: P
 def test_a_report_of_what_is_finished_runs_nothing(
     curate: Curate, toy_kitti: Path, tmp_path: Path
 ) -> None:
-    """Tables on the terminal, the same as JSON; a folder without a bench is refused."""
+    """Tables on the terminal, the same as JSON; a folder without a bench is rejected."""
     code, _, err = curate("bench", tmp_path / "none", "--report")
     assert (code, err.count("\n")) == (WorkspaceError.exit_code, 1)
     bench = make_bench(tmp_path, toy_kitti)
@@ -168,7 +168,7 @@ def test_a_report_of_what_is_finished_runs_nothing(
     assert not (tmp_path / "shared").exists()
 
 
-def test_changed_settings_are_refused_in_one_line(
+def test_changed_settings_are_rejected_in_one_line(
     curate: Curate, toy_kitti: Path, tmp_path: Path
 ) -> None:
     """Nothing of the folder is touched."""
@@ -193,7 +193,7 @@ def test_changed_settings_are_refused_in_one_line(
         (("--overlaps", "strict"), "--overlaps strict"),
     ],
 )
-def test_wrong_options_are_refused_before_anything_is_made(
+def test_wrong_options_are_rejected_before_anything_is_made(
     curate: Curate, toy_kitti: Path, tmp_path: Path, options: tuple, message: str
 ) -> None:
     """In one line."""
@@ -204,7 +204,7 @@ def test_wrong_options_are_refused_before_anything_is_made(
     assert not (tmp_path / "bench").exists()
 
 
-def test_a_folder_without_val_frames_is_refused(
+def test_a_folder_without_val_frames_is_rejected(
     curate: Curate, toy_kitti: Path, tmp_path: Path
 ) -> None:
     """Before a cell is started."""

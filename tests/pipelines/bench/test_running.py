@@ -111,7 +111,7 @@ def test_the_bar_ends_full(toy_kitti: Path, tmp_path: Path) -> None:
 
 
 def test_two_benches_do_not_work_in_one_folder(tmp_path: Path) -> None:
-    """The second is refused, until the first is gone."""
+    """The second is rejected, until the first is gone."""
     refused = pytest.raises(WorkspaceError, match="another `curate bench`")
     with alone(tmp_path), refused, alone(tmp_path):
         pass

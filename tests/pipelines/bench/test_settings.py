@@ -1,4 +1,4 @@
-"""What a bench's cells share: how it is read, merged, refused and kept."""
+"""What a bench's cells share: how it is read, merged, rejected and kept."""
 
 from pathlib import Path
 
@@ -49,7 +49,7 @@ def test_overrides_reach_every_methods_configuration(toy_kitti: Path, tmp_path: 
         ("detector.name=recorded", "trains its detector"),
     ],
 )
-def test_wrong_overrides_are_refused(
+def test_wrong_overrides_are_rejected(
     toy_kitti: Path, tmp_path: Path, override: str, message: str
 ) -> None:
     """The configuration's own model checks them; the grid keeps what is its own."""
@@ -67,7 +67,7 @@ def test_wrong_overrides_are_refused(
         ({"seeds": (-1,)}, "--seeds -1"),
     ],
 )
-def test_wrong_axes_are_refused(axes: dict, message: str) -> None:
+def test_wrong_axes_are_rejected(axes: dict, message: str) -> None:
     """In one line that names the option."""
     with pytest.raises(ConfigError, match=message):
         check_axes(AXES.model_copy(update=axes))

@@ -87,7 +87,7 @@ def test_labels_and_times(finished: Finished) -> None:
     assert row(times, "pspsl") == ["3", "2.0±0.0"]
 
 
-def test_without_a_baseline_there_are_no_gains() -> None:
+def test_without_a_baseline_there_are_not_gains() -> None:
     """And nothing breaks."""
     tables = all_tables(Finished([made_up(Job(0.1, 0, "pspsl"), 50.0)]))
     assert not any(each.title.startswith("differences") for each in tables)

@@ -168,7 +168,7 @@ def test_a_locked_database_says_who_holds_it(
 
 
 def test_a_locked_database_is_waited_for(curate: Curate, workspace: Workspace) -> None:
-    """A lock that is given up within half a minute is no error."""
+    """A lock that is given up within half a minute is not an error."""
     with _lock(workspace, 1) as holder:
         assert curate("predict", "-w", workspace.root)[0] == 0
         assert holder.wait() == 0

@@ -10,7 +10,7 @@ from support.process_tree import peaks, start
 pytestmark = pytest.mark.slow
 
 COMMANDS = ("predict", "repredict", "score")
-# CURATE_PROOF_FRAMES takes fewer where there is no time for all.
+# CURATE_PROOF_FRAMES takes fewer where there is not a time for all.
 FEW, MANY = 1_000, int(os.environ.get("CURATE_PROOF_FRAMES", "100000"))
 
 

@@ -157,8 +157,8 @@ def test_a_frame_whose_model_raises_is_recorded_and_costs_no_other_frame(
     assert (again.failed, again.kept) == (1, 5)
 
 
-def test_a_mended_frame_joins_the_others(workspace: Workspace, toy_kitti: Path) -> None:
-    """A damaged file fails its frame; after it is mended only that frame is worked on."""
+def test_a_fixed_frame_joins_the_others(workspace: Workspace, toy_kitti: Path) -> None:
+    """A damaged file fails its frame; after it is fixed only that frame is worked on."""
     name = next(iter(workspace.frames("unlabeled")))
     path = toy_kitti / "training" / "velodyne" / f"{name}.bin"
     whole = path.read_bytes()
@@ -207,7 +207,7 @@ def test_an_empty_sweep_is_empty_in_every_stage(workspace: Workspace, toy_kitti:
     assert count(workspace, "weight") == 15
 
 
-def test_solve_refuses_to_weigh_half_a_round(workspace: Workspace) -> None:
+def test_solve_rejects_to_weigh_half_a_round(workspace: Workspace) -> None:
     """It says which command is missing."""
     run_stage(workspace, "predict")
     with pytest.raises(WorkspaceError, match=r"repredict: 6 frames.*curate repredict"):

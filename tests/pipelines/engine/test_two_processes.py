@@ -71,7 +71,7 @@ def labels(workspace: Workspace, number: int) -> list[tuple]:
 def test_stages_of_one_round_do_not_collide(
     workspace: Workspace, curate: Curate, gate: Path
 ) -> None:
-    """The second is refused in one line that names the first; a killed owner is none any more."""
+    """The second is rejected in one line that names the first; a killed owner is none any more."""
     first = started(workspace, gate, "predict")
     wait_until(arrival(gate, first.pid).exists, first)
     assert f"process {first.pid} " in (owner(workspace, 1) or "")

@@ -114,7 +114,7 @@ def test_a_changed_list_of_the_data_set(curate: Curate, work: Path, toy_kitti: P
 def test_a_changed_list_that_init_was_given(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """The file of labeled frames grows; one that is gone is no matter, its frames are recorded."""
+    """The list of labeled frames grows; when it is gone, the recorded frames count."""
     (tmp_path / "detector.txt").touch()
     listed = tmp_path / "ids.txt"
     listed.write_text("000001\n000003\n")
@@ -201,7 +201,7 @@ def test_labels_changed_after_the_export(curate: Curate, work: Path) -> None:
 
 
 def test_a_damaged_label_file(curate: Curate, work: Path) -> None:
-    """Half a file is no leak, but nothing to train on."""
+    """Half a file is not a leak, but nothing to train on."""
     path = work / "exports" / "round-01-pspsl.sqlite"
     path.write_bytes(path.read_bytes()[:5000])
     code, _, err = curate("train-round", "--command", TRAINER, "-w", work)

@@ -74,7 +74,7 @@ def test_splitting_by_frame_is_wished_and_warned_of(
     assert "sequences are in one split" in err
 
 
-def test_a_list_that_cuts_a_drive_is_refused(curate: Curate, drives: Path, tmp_path: Path) -> None:
+def test_a_list_that_cuts_a_drive_is_rejected(curate: Curate, drives: Path, tmp_path: Path) -> None:
     """With its name and the option."""
     (tmp_path / "ids.txt").write_text(f"{DRIVE}_0000000000\n")
     arguments = ("init", tmp_path / "w", "--dataset", "kitti-raw", "--root", drives, "--labeled")

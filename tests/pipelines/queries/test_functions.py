@@ -59,7 +59,7 @@ def test_a_value_is_that_of_numpy(
 
 
 @pytest.mark.parametrize("sql", ["median(x)", "quantile(x, 0.5)", "stddev(x)", "corr(x, y)"])
-def test_without_values_there_is_no_result(connection: sqlite3.Connection, sql: str) -> None:
+def test_without_values_there_is_not_a_result(connection: sqlite3.Connection, sql: str) -> None:
     """A group without rows, one with nulls alone; a single value has no deviation."""
     assert connection.execute(f"SELECT {sql} FROM t WHERE g = 2").fetchone() == (None,)
     assert connection.execute(f"SELECT {sql} FROM t WHERE x IS NULL").fetchone() == (None,)

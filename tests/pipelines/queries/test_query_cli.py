@@ -164,7 +164,7 @@ def test_the_exported_file_can_only_be_read(curate: Curate, weighted: Path) -> N
     assert "read-only" in err
 
 
-def test_a_huge_value_is_refused(curate: Curate, workspace: Workspace, engine: str) -> None:
+def test_a_huge_value_is_rejected(curate: Curate, workspace: Workspace, engine: str) -> None:
     """A server, too, would make a gigabyte where it is asked to."""
     huge = {
         "sqlite": "replace(hex(zeroblob(999999)), '0', 'long')",

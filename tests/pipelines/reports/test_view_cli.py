@@ -1,4 +1,4 @@
-"""curate view: what it draws, where it leaves it, what it refuses."""
+"""curate view: what it draws, where it leaves it, what it rejects."""
 
 import json
 from dataclasses import replace
@@ -191,7 +191,7 @@ def test_a_recording_has_a_time_line_over_the_frames(
         (["--all", "--output", "a.png"], "--output"),
     ],
 )
-def test_options_that_exclude_each_other_are_refused(
+def test_options_that_exclude_each_other_are_rejected(
     curate: Curate, weighted: Workspace, arguments: list[str], word: str
 ) -> None:
     """One line that names them."""
@@ -214,7 +214,7 @@ def test_a_round_that_is_not_there_is_named(curate: Curate, weighted: Workspace)
 
 
 def test_without_predictions_the_remedy_is_named(curate: Curate, workspace: Workspace) -> None:
-    """There is no round yet."""
+    """There is not a round yet."""
     code, _, err = curate("view", "000000", "-w", workspace.root)
     assert code == WorkspaceError.exit_code
     assert "curate predict" in err

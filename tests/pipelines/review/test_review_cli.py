@@ -176,7 +176,7 @@ def test_policies_do_not_see_decisions(curate: Curate, weighted: Workspace, tmp_
 def test_decisions_survive_later_rounds(
     curate: Curate, reviewed: tuple[Workspace, Path, str]
 ) -> None:
-    """The next teacher's boxes lie elsewhere; no object is labeled twice, the refused one stays."""
+    """After the teacher changes, no object is labeled twice, and the rejected one stays."""
     workspace, _, frame = reviewed
     for command in ("predict", "repredict", "score"):
         assert curate(command, "-w", workspace.root, "--round", 2)[0] == 0
@@ -387,7 +387,7 @@ def test_a_bad_answer_is_one_line_and_stores_nothing(
 
 
 def test_frames_that_are_not_unlabeled_cannot_have_human_labels(weighted: Workspace) -> None:
-    """The table itself refuses."""
+    """The table itself rejects."""
     change(weighted, "INSERT INTO review VALUES ('r', 1, 'pspsl', 'kitti', 1, 1, 1, 'now', NULL)")
     for split in ("labeled", "val"):
         key = next(iter(weighted.frames(split).values()))

@@ -140,7 +140,7 @@ def test_a_connection_only_reads(connection: sqlite3.Connection, tmp_path: Path,
     assert connection.execute("SELECT count(*) FROM weight").fetchone()[0] > 0
 
 
-def test_sql_that_writes_is_refused_in_one_line(pages: Pages) -> None:
+def test_sql_that_writes_is_rejected_in_one_line(pages: Pages) -> None:
     """Some of each kind, as page and as JSON; no file of the workspace changes."""
     before = content(pages)
     for sql in (*WRITES[::6], *READS_ELSEWHERE[::4], *TOO_MUCH[::4]):
@@ -163,7 +163,7 @@ def test_an_endless_question_ends(pages: Pages, sql: str) -> None:
 
 
 @pytest.mark.parametrize("name", NO_FRAMES)
-def test_a_frame_is_looked_up_and_is_no_path(pages: Pages, name: str) -> None:
+def test_a_frame_is_looked_up_and_is_not_a_path(pages: Pages, name: str) -> None:
     """Wherever the name is written."""
     for parameters in (
         {"frame": name},
@@ -199,7 +199,7 @@ def test_only_reading_methods_are_answered(pages: Pages, method: str) -> None:
 @pytest.mark.parametrize(
     "host", ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8001", "", "[::2]"]
 )
-def test_a_foreign_name_is_refused(pages: Pages, host: str) -> None:
+def test_a_foreign_name_is_rejected(pages: Pages, host: str) -> None:
     """A name that its owner points to this machine reads nothing (DNS rebinding)."""
     assert pages.get("/labels/weighted_labels.json", headers={"Host": host}).status == 403
     assert pages.get("/", headers={"Host": f"localhost:{pages.port}"}).status == 200
@@ -215,7 +215,7 @@ def test_a_page_of_another_site_can_only_link(pages: Pages) -> None:
 
 
 def test_every_answer_says_what_a_browser_may_load(pages: Pages) -> None:
-    """Refusals too; no other site is named."""
+    """Rejections too; no other site is named."""
     for path in ("/", "/nowhere", "/-/databases", "/-/picture?frame=000003", "/-/static/app.css"):
         headers = pages.get(path).headers
         assert headers["content-security-policy"].startswith("default-src 'none'")

@@ -75,7 +75,7 @@ def test_a_host_that_is_not_here_is_told_in_one_line(curate: Curate, weighted: W
 
 
 @needs_datasette
-def test_a_file_that_is_no_database_is_told_in_one_line(
+def test_a_file_that_is_not_a_database_is_told_in_one_line(
     curate: Curate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Missing, empty of sense, or a folder."""

@@ -88,7 +88,7 @@ def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_pa
     assert "unknown exporter 'yolo': use one of coco, csv, kitti," in err
 
 
-def test_what_is_no_export_is_not_overwritten(
+def test_what_is_not_an_export_is_not_overwritten(
     curate: Curate, workspace: Workspace, tmp_path: Path
 ) -> None:
     """A file of the user's in the place, or a policy that has weighted nothing."""

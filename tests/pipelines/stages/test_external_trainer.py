@@ -216,7 +216,7 @@ def test_a_killed_training_goes_on_from_what_it_left(curate: Curate, exported: W
     assert (exported.root / "checkpoints" / "round-01-pspsl.txt").read_text() == "half half "
 
 
-def test_labels_that_are_not_exported_are_refused(
+def test_labels_that_are_not_exported_are_rejected(
     curate: Curate, workspace: Workspace, command: str
 ) -> None:
     """Before the trainer starts; so are those that are older than their weights."""
@@ -235,7 +235,7 @@ def test_labels_that_are_not_exported_are_refused(
         ("no-such-program {labels}", "no-such-program cannot be started"),
     ],
 )
-def test_a_command_that_is_none_is_refused(
+def test_a_command_that_is_none_is_rejected(
     curate: Curate, exported: Workspace, command: str, fault: str
 ) -> None:
     """In one line."""

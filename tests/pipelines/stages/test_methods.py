@@ -220,7 +220,7 @@ def trained(
     config = make_config(document | {"run": {"rounds": 2, "method": name}}, "test")
     own = initialise(tmp_path / f"{name}-{len(train)}", config, "0.25", "")
     settings = {"preset": tiny, "pretrain_steps": 5, "round_steps": 3} | train
-    section = own.config.train.model_copy(update=settings)  # the tiny preset is no user's
+    section = own.config.train.model_copy(update=settings)  # the tiny preset is not a user's
     return run(replace(own, config=own.config.model_copy(update={"train": section})))
 
 

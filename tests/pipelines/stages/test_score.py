@@ -80,7 +80,7 @@ def test_a_prior_from_outside_has_its_columns_everywhere(
 
 
 def test_a_source_of_sequences_sees_whole_sequences(workspace: Workspace) -> None:
-    """Its columns are in the view; it is no prior, so the weights are those without it."""
+    """Its columns are in the view; it is not a prior, so the weights are those without it."""
     sequenced = workspace.with_settings(
         "dataset", kind="support.toys:ToySequences", split_by="frame"
     )
@@ -163,7 +163,7 @@ COLUMN = ToyPrior.columns[0]
         ({"name": "points"}, "the name 'points' is taken"),
     ],
 )
-def test_a_wrong_declaration_is_refused_before_any_work(
+def test_a_wrong_declaration_is_rejected_before_any_work(
     monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], message: str
 ) -> None:
     """In one line that names the source and the column."""
@@ -227,13 +227,13 @@ def test_other_maps_in_the_same_folder_are_looked_at_anew(
     assert run(own)["semantic"] == 0
 
 
-def test_two_sources_of_one_name_are_refused() -> None:
+def test_two_sources_of_one_name_are_rejected() -> None:
     """The error names both."""
     with pytest.raises(ConfigError, match=r"ToyPrior and .*ToyPriorAgain have the same name 'toy'"):
         round_graph((OWN, "support.toys:ToyPriorAgain"))
 
 
-def test_an_unknown_prior_is_refused() -> None:
+def test_an_unknown_prior_is_rejected() -> None:
     """A misspelt name is not passed over."""
     known = ", ".join(sorted(PRIORS.classes))
     with pytest.raises(ConfigError, match=f"unknown prior 'pionts': use one of {known}"):

@@ -32,7 +32,7 @@ def test_a_wrong_setting_of_a_command_is_named(workspace: Workspace) -> None:
         workspace.with_settings("run", workers=0)
 
 
-def test_a_pipe_in_the_place_of_a_file_is_refused(tmp_path: Path) -> None:
+def test_a_pipe_in_the_place_of_a_file_is_rejected(tmp_path: Path) -> None:
     """Reading it would never end; nor would a device's."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)

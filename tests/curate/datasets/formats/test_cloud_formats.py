@@ -110,7 +110,7 @@ def test_ply_of_bytes(tmp_path: Path, order: str) -> None:
     ["element vertex 999999999999", "element vertex 41", "element vertex -1", "element x 1"],
 )
 def test_a_header_that_lies_costs_nothing(tmp_path: Path, claim: str) -> None:
-    """It is refused by the bytes that are there."""
+    """It is rejected by the bytes that are there."""
     names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
     for form in ("ascii", "binary_little_endian"):
         head = f"ply\nformat {form} 1.0\n{claim}\n{names}end_header\n".encode()

@@ -49,7 +49,7 @@ def test_no_name_leads_out(tmp_path: Path, layout: str, name: str) -> None:
 
 @pytest.mark.parametrize("line", ["../../secret", "/etc/passwd", "a\\b", "\0"])
 def test_a_list_of_frames_names_frames(tmp_path: Path, line: str) -> None:
-    """A split list with a path in it is refused by its line."""
+    """A split list with a path in it is rejected by its line."""
     write_toy_kitti(tmp_path, 4)
     (tmp_path / "ImageSets" / "train.txt").write_text(f"000000\n{line}\n")
     with pytest.raises(DataError, match=r"train\.txt:2: .* no frame id"):
@@ -86,7 +86,7 @@ def test_a_link_that_leads_out_is_not_followed(tmp_path: Path, layout: str, part
 
 
 @pytest.mark.parametrize("key", ["points", "images", "labels", "splits", "calibration"])
-def test_a_description_that_leads_out_is_refused(tmp_path: Path, key: str) -> None:
+def test_a_description_that_leads_out_is_rejected(tmp_path: Path, key: str) -> None:
     """By dots or from the root of the disk."""
     for where in ("../outside", "/etc"):
         told = {"points": "lidar", "images": "camera", "calibration": "calib.txt", key: where}
@@ -98,7 +98,7 @@ def test_a_description_that_leads_out_is_refused(tmp_path: Path, key: str) -> No
 
 @pytest.mark.parametrize("follow_links", [False, True])
 @pytest.mark.parametrize("key", ["points", "images", "labels", "splits", "calibration"])
-def test_a_name_that_no_file_could_have_is_refused(
+def test_a_name_that_no_file_could_have_is_rejected(
     tmp_path: Path, key: str, *, follow_links: bool
 ) -> None:
     """In one short line, also where links may lead out."""

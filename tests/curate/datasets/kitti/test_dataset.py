@@ -50,7 +50,7 @@ def test_lists_the_frames_that_have_points(toy_kitti):
     assert list(KittiDataset(toy_kitti).frame_ids()) == expected
 
 
-def test_hidden_files_are_no_frames_and_no_lists(toy_kitti):
+def test_hidden_files_are_not_frames_and_no_lists(toy_kitti):
     """Those beginning with ._ that macOS leaves beside the files that it copies."""
     (toy_kitti / "training" / "velodyne" / "._000003.bin").write_bytes(b"\x00\x05\x16\x07")
     (toy_kitti / "ImageSets" / "._train.txt").write_bytes(b"\x00\x05/\x07")
@@ -93,7 +93,7 @@ def test_a_flat_folder_without_labels(flat_kitti):
     assert one_line(caught) == f"{flat_kitti}/label_2/000001.txt: no such label file"
 
 
-def test_a_root_without_points_is_refused(tmp_path):
+def test_a_root_without_points_is_rejected(tmp_path):
     """The error names the root and what should be in it."""
     with pytest.raises(DataError, match="holds neither training/velodyne nor velodyne"):
         KittiDataset(tmp_path)
@@ -127,7 +127,7 @@ def test_a_frame_id_cannot_leave_the_data_set(toy_kitti, name):
         KittiDataset(toy_kitti).read(name)
 
 
-def test_a_list_with_a_path_in_it_is_refused_with_its_place(toy_kitti):
+def test_a_list_with_a_path_in_it_is_rejected_with_its_place(toy_kitti):
     """The error names the list and the line."""
     (toy_kitti / "ImageSets" / "train.txt").write_text("000001\n../../secret\n")
     with pytest.raises(DataError, match=r"train\.txt:2: '\.\./\.\./secret' is no frame id"):
@@ -170,7 +170,7 @@ def test_an_empty_sweep_is_valid(tmp_path):
 
 
 @pytest.mark.parametrize("size", [1, 15, 17, 16 * 5 + 4])
-def test_truncated_points_are_refused(tmp_path, size):
+def test_truncated_points_are_rejected(tmp_path, size):
     """The error names the file and its size."""
     path = tmp_path / "a.bin"
     path.write_bytes(bytes(size))
@@ -257,7 +257,7 @@ def test_an_unreadable_image_is_named(toy_kitti, image, content):
     assert one_line(caught).startswith(f"{path}: ")
 
 
-def test_a_truncated_png_is_refused(toy_kitti):
+def test_a_truncated_png_is_rejected(toy_kitti):
     """Its header is whole, but not its pixels."""
     path = toy_kitti / "training" / "image_2" / "000000.png"
     path.write_bytes(path.read_bytes()[:-40])
@@ -274,7 +274,7 @@ def test_a_missing_image_is_named(toy_kitti):
     assert one_line(caught) == f"{path}: no such image file"
 
 
-def test_jpeg_images_are_read_where_there_is_no_png(toy_kitti):
+def test_jpeg_images_are_read_where_there_is_not_a_png(toy_kitti):
     """The size comes from the decoded image."""
     folder = toy_kitti / "training" / "image_2"
     pixels = np.full((30, 50, 3), 128, np.uint8)

@@ -274,7 +274,7 @@ def test_numbers_that_are_not_finite_are_not_written(tmp_path, field, value, mes
     assert not path.exists()
 
 
-def test_scores_for_some_objects_only_are_refused(tmp_path):
+def test_scores_for_some_objects_only_are_rejected(tmp_path):
     """A file has scores or has none."""
     objects = read_objects(write(tmp_path / "a.txt", CAR, CAR))
     objects.scores[0] = 0.5

@@ -56,7 +56,7 @@ class Bomb:
         return (pytest.fail, ("a pickle was executed",))
 
 
-def test_a_pickle_is_refused_and_never_executed(tmp_path):
+def test_a_pickle_is_rejected_and_never_executed(tmp_path):
     """A pickle named like a checkpoint is an error of one line."""
     path = tmp_path / "foreign.safetensors"
     path.write_bytes(pickle.dumps(Bomb()))
@@ -71,7 +71,7 @@ def test_a_pickle_is_refused_and_never_executed(tmp_path):
     ("content", "message"),
     [(b"", "not a readable safetensors"), (b"\x00" * 100, "not a readable safetensors")],
 )
-def test_garbage_is_refused(tmp_path, content, message):
+def test_garbage_is_rejected(tmp_path, content, message):
     """Files that are no safetensors are named."""
     path = tmp_path / "bad.safetensors"
     path.write_bytes(content)
@@ -79,7 +79,7 @@ def test_garbage_is_refused(tmp_path, content, message):
         load_checkpoint(path)
 
 
-def test_a_truncated_checkpoint_is_refused(tmp_path, checkpoint):
+def test_a_truncated_checkpoint_is_rejected(tmp_path, checkpoint):
     """Half a download is not taken for a model."""
     path = tmp_path / "half.safetensors"
     save_checkpoint(path, checkpoint)
@@ -109,7 +109,7 @@ def test_a_missing_checkpoint_says_what_to_do(tmp_path):
         ({**META, "categories": '["Car"]'}, "damaged checkpoint"),
     ],
 )
-def test_foreign_tensors_are_refused(tmp_path, metadata, message):
+def test_foreign_tensors_are_rejected(tmp_path, metadata, message):
     """Safetensors of something else, or of another version, are told apart in one line."""
     path = tmp_path / "foreign.safetensors"
     save_file({"weight": np.zeros(3, dtype=np.float32)}, path, metadata)
@@ -118,7 +118,7 @@ def test_foreign_tensors_are_refused(tmp_path, metadata, message):
     assert "\n" not in str(info.value)
 
 
-def test_tensors_of_another_size_are_refused(checkpoint):
+def test_tensors_of_another_size_are_rejected(checkpoint):
     """A network is not built from tensors that do not fit it."""
     weights = {**checkpoint.weights, "answer.bias": np.zeros(99, dtype=np.float32)}
     with pytest.raises(ModelError, match=r"answer\.bias"):
@@ -126,7 +126,7 @@ def test_tensors_of_another_size_are_refused(checkpoint):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_weights_that_are_no_numbers_are_refused(tmp_path, checkpoint, value):
+def test_weights_that_are_not_numbers_are_rejected(tmp_path, checkpoint, value):
     """They would find nothing in any frame, which looks like empty frames."""
     path = tmp_path / "teacher.safetensors"
     weights = {name: array.copy() for name, array in checkpoint.weights.items()}

@@ -145,7 +145,7 @@ def test_the_cells_of_an_object_share_its_weight():
 
 
 def test_objects_off_the_grid_are_left_out():
-    """A box whose centre lies beside the grid is no target."""
+    """A box whose centre lies beside the grid is not a target."""
     targets = targets_of(np.concatenate([car(-3, 0), car(70, 0), car(10, 40)]))
     assert len(targets.centres) == len(targets.codes) == 0
     assert not targets.heatmap.any()

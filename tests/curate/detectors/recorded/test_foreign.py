@@ -204,7 +204,7 @@ def test_without_a_second_pass_the_user_is_told_once(tmp_path, caplog):
     ],
 )
 def test_a_pass_says_what_was_done_to_the_points(tmp_path, one, message):
-    """Exactly, or it is refused."""
+    """Exactly, or it is rejected."""
     with pytest.raises(ConfigError, match=message):
         RecordedDetector(write_openpcdet(tmp_path / "a.pkl"), passes=[one])
 
@@ -273,14 +273,14 @@ def test_numbered_labels_need_their_names(tmp_path):
         ("a.feather", [], "no known record of detections; expected a .csv or .parquet file"),
     ],
 )
-def test_other_contents_are_refused_by_name(tmp_path, name, held, message):
+def test_other_contents_are_rejected_by_name(tmp_path, name, held, message):
     """With what would be read."""
     (tmp_path / name).write_text(json.dumps(held))
     with pytest.raises(DataError, match=message):
         RecordedDetector(tmp_path / name)
 
 
-def test_boxes_of_the_camera_are_refused(tmp_path):
+def test_boxes_of_the_camera_are_rejected(tmp_path):
     """mmdetection3d says so in its files."""
     entry = {"frame_id": "1", "bboxes_3d": [], "scores_3d": [], "labels_3d": []}
     (tmp_path / "a.json").write_text(json.dumps([entry | {"box_type_3d": "Camera"}]))
@@ -289,7 +289,7 @@ def test_boxes_of_the_camera_are_refused(tmp_path):
 
 
 def test_the_format_can_be_named(tmp_path):
-    """An unknown name is refused, and so is a folder without results."""
+    """An unknown name is rejected, and so is a folder without results."""
     path = write_openpcdet(tmp_path / "a.pkl")
     assert len(RecordedDetector(path, kind="openpcdet").frame_ids()) == 2
     with pytest.raises(
@@ -345,7 +345,7 @@ def test_usual_mistakes_in_nuscenes_results_are_named(tmp_path, boxes, message):
     assert "\n" not in str(caught.value)
 
 
-def test_nuscenes_results_in_the_lidar_frame_are_refused(tmp_path):
+def test_nuscenes_results_in_the_lidar_frame_are_rejected(tmp_path):
     """They would lie hundreds of metres from the vehicle."""
     path = written_results(tmp_path, [BOX | {"translation": [12.0, 4.0, -0.8]}])
     with pytest.raises(DataError, match="they are in the frame of the LiDAR or vehicle") as caught:
@@ -398,7 +398,7 @@ def test_results_are_read_a_frame_at_a_time_or_whole(tmp_path):
         ('{"meta": {}}', "holds a dict, not a list of frames, and no nuScenes results"),
     ],
 )
-def test_damaged_results_are_refused_in_one_line(tmp_path, text, message):
+def test_damaged_results_are_rejected_in_one_line(tmp_path, text, message):
     """By whichever reader."""
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(DataError, match=message) as caught:
@@ -406,7 +406,7 @@ def test_damaged_results_are_refused_in_one_line(tmp_path, text, message):
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_what_is_no_nuscenes_result_is_said(tmp_path):
+def test_what_is_not_a_nuscenes_result_is_said(tmp_path):
     """Where the kind was named."""
     (tmp_path / "a.json").write_text("[]")
     with pytest.raises(DataError, match="no nuScenes results: an object with meta and results"):

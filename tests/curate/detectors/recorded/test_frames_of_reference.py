@@ -164,7 +164,7 @@ answers = st.lists(
     st.tuples(boxes, st.floats(0.01, 1), st.sampled_from(NAMES)),
     min_size=1,
     max_size=5,
-    unique_by=lambda row: round(row[0][0], 6),  # a box that comes twice is refused
+    unique_by=lambda row: round(row[0][0], 6),  # a box that comes twice is rejected
 ).map(
     lambda rows: Detections(
         np.array([row[0] for row in rows]),

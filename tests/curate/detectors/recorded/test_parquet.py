@@ -98,7 +98,7 @@ def test_without_views_the_user_is_told_once(tmp_path, caplog):
         ({"frame": ["a", None, "b"]}, "row group 0: 1 rows have no frame"),
     ],
 )
-def test_a_file_that_cannot_be_a_record_is_refused(tmp_path, changes, message):
+def test_a_file_that_cannot_be_a_record_is_rejected(tmp_path, changes, message):
     """At once, in one line."""
     path = write(tmp_path / "a.parquet", **changes)
     with pytest.raises(DataError, match=message) as caught:

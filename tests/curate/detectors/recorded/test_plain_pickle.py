@@ -65,8 +65,8 @@ def test_names_of_numpy_1_are_known(tmp_path):
 
 
 @pytest.mark.parametrize("protocol", range(5))
-def test_a_pickle_that_tries_to_run_code_is_refused_and_nothing_runs(tmp_path, protocol):
-    """The usual reader would make the folder; here the refused name is given, in one line."""
+def test_a_pickle_that_tries_to_run_code_is_rejected_and_nothing_runs(tmp_path, protocol):
+    """The usual reader would make the folder; here the rejected name is given, in one line."""
     path = written(tmp_path / "evil.pkl", [Runs(os.mkdir, str(tmp_path / "pwned"))], protocol)
     with pytest.raises(DataError) as caught:
         read_plain_pickle(path)
@@ -100,7 +100,7 @@ def test_a_module_that_a_pickle_names_is_not_even_imported(tmp_path, monkeypatch
         b"\x80\x04\x8c\x05numpy\x8c\x11ndarray.__class__\x93.",
     ],
 )
-def test_other_names_are_refused(tmp_path, content):
+def test_other_names_are_rejected(tmp_path, content):
     """Those of numpy that do more than hold values too, and ways through an admitted one."""
     (tmp_path / "a.pkl").write_bytes(content)
     with pytest.raises(DataError, match="refused, the pickle names"):

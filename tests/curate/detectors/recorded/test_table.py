@@ -36,7 +36,7 @@ def test_answers_what_was_recorded(tmp_path):
     assert isinstance(detector, RecordedViews)
 
 
-def test_a_mark_in_front_of_a_spreadsheets_file_is_no_part_of_it(tmp_path):
+def test_a_mark_in_front_of_a_spreadsheets_file_is_not_a_part_of_it(tmp_path):
     """The first column keeps its name, and every row its place."""
     path = write(tmp_path / "a.csv", PLAIN, MOVED)
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
