@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.bench_results import made_up, make_bench
+from support.bench_results import make_bench, synthetic_result
 from support.pipelines_cli import Curate, with_option
 
 from curate.errors import FramesFailed
@@ -76,7 +76,7 @@ def test_every_command_with_the_option_prints_one_document(
     monkeypatch.setattr("curate.simulation.simulate", lambda *_, **__: None)
     job = Job(0.25, 0, "pspsl")
     bench = make_bench(tmp_path / "bench", toy_kitti)
-    write_result(bench.root, made_up(job, 50.0))
+    write_result(bench.root, synthetic_result(job, 50.0))
     steps = walk(tmp_path, toy_kitti)
     assert with_option("--json") == set(steps)
     frame = ""

@@ -1,4 +1,4 @@
-"""A headless Chromium without a network, and what it says of a page."""
+"""A headless Chromium without a network."""
 
 import shutil
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable
 
 
 class Viewer:
-    """Opens pages; every request that leaves this machine, every error and failure is a fault.
+    """Open pages; every request to another host, every error and failure is recorded as a fault.
 
     Args:
         browser: of Playwright.
@@ -32,16 +32,16 @@ class Viewer:
         self.page.on("response", self._answered)
 
     def open(self, url: str) -> Any:
-        """The page, with all that it loads."""
+        """Return the page, completely loaded."""
         self.page.goto(url, wait_until="load")
         return self.page
 
     def overflow(self) -> int:
-        """By how many pixels the page is wider than the window."""
+        """Return by how many pixels the page is wider than the window."""
         return int(self.page.evaluate("document.documentElement.scrollWidth")) - self.width
 
     def undecoded(self) -> list[str]:
-        """The pictures of the page that are none."""
+        """Return the images of the page that could not be decoded."""
         script = "[...document.images].filter(i => !(i.complete && i.naturalWidth > 0))"
         found: list[str] = self.page.evaluate(f"{script}.map(i => i.alt)")
         return found
@@ -63,7 +63,7 @@ class Viewer:
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """A browser; the test is skipped where none can be had."""
+    """Return a browser; skip the test if none is installed."""
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="the extra [browser] is not installed"
     )

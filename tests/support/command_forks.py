@@ -1,4 +1,4 @@
-"""Commands forked from a process that has loaded everything, so that a kill meets their work."""
+"""Commands forked from a process that has loaded everything, so that a kill hits their work."""
 
 import contextlib
 import multiprocessing
@@ -13,7 +13,7 @@ from support.rounds import run_workspace
 
 
 class CommandForks:
-    """A process that forks a child for every command; it never opens a database that is tested."""
+    """A process that forks a child for every command; it never opens a database under test."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -24,17 +24,17 @@ class CommandForks:
         self._connection.recv()
 
     def start(self, arguments: Sequence[object], environment: Mapping[str, str]) -> int:
-        """`curate ARGUMENTS`, started; the key of its process."""
+        """Start `curate ARGUMENTS` and return the key of its process."""
         self._connection.send((list(map(str, arguments)), dict(environment)))
         return self._connection.recv()
 
     def end(self, pid: int) -> int:
-        """Waits for a command: its exit code, -9 where it was killed."""
+        """Wait for a command and return its exit code, -9 if it was killed."""
         self._connection.send(pid)
         return self._connection.recv()
 
     def close(self) -> None:
-        """Ends the process."""
+        """End the process."""
         self._connection.close()
         self._process.join()
 
@@ -54,7 +54,7 @@ def _serve(connection: Connection) -> None:
 
 
 def _warm_up() -> None:
-    """Runs all stages once: modules are loaded then, and kernels compiled."""
+    """Run all stages once, so that modules are loaded and kernels compiled."""
     from pipelines.workspace.config import make_config
     from pipelines.workspace.setup import initialise
     from support.toys import toy_document, write_toy_kitti
@@ -70,7 +70,7 @@ def _warm_up() -> None:
 
 
 def _become(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
-    """Is the command from here on, with nobody to listen to it."""
+    """Turn this process into the command, without a parent that listens."""
     from pipelines.cli import main
 
     nowhere = os.open(os.devnull, os.O_RDWR)

@@ -19,7 +19,7 @@ def tiny_detector(
     scores: np.ndarray | None = None,
     labels: np.ndarray | None = None,
 ) -> None:
-    """Writes it.
+    """Write the ONNX file.
 
     Args:
         path: of the .onnx file.
@@ -28,7 +28,7 @@ def tiny_detector(
         shape: of the input.
         rows: (n, 7) what is added to the mean of the points, sizes and yaw included.
         scores: (n,) or (n, classes).
-        labels: (n,); left out where scores are per class.
+        labels: (n,); left out if scores are per class.
     """
     sizes = np.repeat(SIZES, boxes_per_category, axis=0)
     count = len(sizes)

@@ -185,9 +185,12 @@ def test_a_file_that_another_program_writes_is_not_taken_for_a_foreign_one(tmp_p
     SqliteExporter().write(path, toy_labels())
     with closing(sqlite3.connect(path, isolation_level=None, timeout=0)) as other:
         other.execute("BEGIN EXCLUSIVE")
-        for look in (lambda: SqliteExporter().write(path, toy_labels()), lambda: read_frames(path)):
+        for cell_features in (
+            lambda: SqliteExporter().write(path, toy_labels()),
+            lambda: read_frames(path),
+        ):
             with pytest.raises(DataError, match="another program writes into it"):
-                look()
+                cell_features()
         other.execute("ROLLBACK")
     SqliteExporter().write(path, toy_labels())
 

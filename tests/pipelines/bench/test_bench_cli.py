@@ -10,7 +10,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
-from support.bench_results import made_up, make_bench
+from support.bench_results import make_bench, synthetic_result
 from support.paths import ROOT
 from support.pipelines_cli import Curate
 
@@ -156,7 +156,7 @@ def test_a_report_of_what_is_finished_runs_nothing(
     code, out, err = curate("bench", tmp_path, "--report")
     assert (code, out, err) == (0, "", "no cell is finished yet\n")
     for method, car in (("baseline", 40.0), ("pspsl", 58.0)):
-        write_result(bench.root, made_up(Job(0.25, 0, method), car))
+        write_result(bench.root, synthetic_result(Job(0.25, 0, method), car))
     code, out, _ = curate("bench", tmp_path, "--report")
     assert code == 0
     assert "+6.0" in out

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
-from support.bench_results import made_up, make_bench
+from support.bench_results import make_bench, synthetic_result
 
 from pipelines.bench.costs import FIRST_GUESS, OVERHEAD_S, Costs
 from pipelines.bench.grid import Job, Sizes, jobs, waiting, work
@@ -36,19 +36,19 @@ def test_every_job_has_its_own_folder(tmp_path: Path) -> None:
 def test_finished_jobs_are_not_waiting(tmp_path: Path) -> None:
     """Nor is shared work whose cells are all finished."""
     done = Job(0.1, 0, "pspsl")
-    write_result(tmp_path, made_up(done, 50.0))
+    write_result(tmp_path, synthetic_result(done, 50.0))
     left = waiting(AXES, tmp_path)
     assert done not in left
     assert Job(0.1, 0) in left
-    write_result(tmp_path, made_up(Job(0.1, 0, "baseline"), 50.0))
+    write_result(tmp_path, synthetic_result(Job(0.1, 0, "baseline"), 50.0))
     assert Job(0.1, 0) not in waiting(AXES, tmp_path)
 
 
 def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
     """Undefined figures included."""
     for job in (Job(0.5, 0, "pspsl"), Job(0.1, 1), Job(0.1, 0, "baseline")):
-        write_result(tmp_path, made_up(job, 60.0))
-        assert read_result(tmp_path, job) == made_up(job, 60.0)
+        write_result(tmp_path, synthetic_result(job, 60.0))
+        assert read_result(tmp_path, job) == synthetic_result(job, 60.0)
     assert [result.job.ratio for result in read_results(tmp_path)] == [0.1, 0.1, 0.5]
 
 
@@ -73,10 +73,10 @@ def test_costs_follow_what_was_measured() -> None:
     assert costs.seconds({"train": 10}) == OVERHEAD_S + 10 * FIRST_GUESS["train"]
     assert not costs.measured
     # 120 s, of which 20 s were steps and 2 s were frames: 98 s of overhead.
-    costs.learn(made_up(Job(0.1, 0), 50.0))
+    costs.learn(synthetic_result(Job(0.1, 0), 50.0))
     assert costs.measured
     assert costs.seconds({"train": 10, "evaluate": 2}) == pytest.approx(98 + 20 + 1)
-    costs.learn(made_up(Job(0.1, 1), 50.0, timings={"train": (10, 40.0)}, seconds=42.0))
+    costs.learn(synthetic_result(Job(0.1, 1), 50.0, timings={"train": (10, 40.0)}, seconds=42.0))
     assert costs.rate("train") == 3.0
     assert costs.seconds({"train": 10}) == pytest.approx((98 + 2) / 2 + 30)
     assert costs.rate("predict") == FIRST_GUESS["predict"]

@@ -5,7 +5,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from support.bench_results import ToyJobs, made_up, make_bench
+from support.bench_results import ToyJobs, make_bench, synthetic_result
 from support.silent import Silent
 
 from curate.errors import CellsFailed, WorkspaceError
@@ -51,7 +51,7 @@ def test_finished_cells_are_never_redone(toy_kitti: Path, tmp_path: Path) -> Non
 def test_a_jobs_cost_is_told_before_it_starts(toy_kitti: Path, tmp_path: Path) -> None:
     """From the times of those that are finished: 98 s, 2 s per step, 0.5 s per val frame."""
     bench = make_bench(tmp_path, toy_kitti, steps=60)
-    write_result(tmp_path, made_up(Job(0.25, 0), 50.0))
+    write_result(tmp_path, synthetic_result(Job(0.25, 0), 50.0))
     said = run(bench, ToyJobs(tmp_path))
     assert said[1] == "ratio 0.25, seed 0, baseline: about 3.7 min (60 steps, 4 frame passes)"
     assert said[2].startswith("ratio 0.25, seed 0, baseline: mean 3D AP 13.3")

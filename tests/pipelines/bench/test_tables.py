@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
-from support.bench_results import made_up, make_bench
+from support.bench_results import make_bench, synthetic_result
 
 from pipelines.bench.grid import Job
 from pipelines.bench.report import BenchReport, shown
@@ -23,8 +23,11 @@ CARS = {
 @pytest.fixture
 def finished() -> Finished:
     """Two methods, two ratios, two seeds, of which one is not finished at the second ratio."""
-    cells = [made_up(Job(ratio, seed, method), car) for (method, ratio, seed), car in CARS.items()]
-    return Finished([made_up(Job(0.25, 0), 30.0), *cells])
+    cells = [
+        synthetic_result(Job(ratio, seed, method), car)
+        for (method, ratio, seed), car in CARS.items()
+    ]
+    return Finished([synthetic_result(Job(0.25, 0), 30.0), *cells])
 
 
 def row(table: Table, name: str) -> list[str]:
@@ -71,7 +74,7 @@ def test_differences_are_paired_by_seed(finished: Finished) -> None:
 def test_the_papers_methods_are_compared_with_all_others() -> None:
     """The others with the baseline alone; no pair twice."""
     methods = ("baseline", "uda", "spsl", "pspsl")
-    cells = [made_up(Job(0.1, 0, method), 50.0) for method in methods]
+    cells = [synthetic_result(Job(0.1, 0, method), 50.0) for method in methods]
     found = table(Finished(cells), "differences of mean BEV AP")
     assert [name for name, *_ in found.rows] == [
         "uda - baseline", "spsl - baseline", "pspsl - baseline",
@@ -89,7 +92,7 @@ def test_labels_and_times(finished: Finished) -> None:
 
 def test_without_a_baseline_there_are_not_gains() -> None:
     """And nothing breaks."""
-    tables = all_tables(Finished([made_up(Job(0.1, 0, "pspsl"), 50.0)]))
+    tables = all_tables(Finished([synthetic_result(Job(0.1, 0, "pspsl"), 50.0)]))
     assert not any(each.title.startswith("differences") for each in tables)
     assert row(tables[0], "pspsl") == ["13.3"]
     assert all_tables(Finished([])) == []
@@ -99,7 +102,7 @@ def test_the_report_leaves_markdown_numbers_and_a_picture(toy_kitti: Path, tmp_p
     """Markdown with gains in every cell, JSON without NaN, the command that repeats it."""
     bench = make_bench(tmp_path, toy_kitti, ratios=(0.25, 0.5), seeds=(0, 1))
     for (method, ratio, seed), car in CARS.items():
-        write_result(tmp_path, made_up(Job(ratio, seed, method), car))
+        write_result(tmp_path, synthetic_result(Job(ratio, seed, method), car))
     assert [path.name for path in BenchReport(bench).write()] == [
         "results.md", "results.json", "curve.png",
     ]  # fmt: skip

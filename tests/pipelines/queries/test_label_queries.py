@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from sqlalchemy import text
-from support.label_questions import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRUSTED, solved
+from support.label_queries import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRUSTED, solved
 from support.labels_at_scale import filled_workspace
 
 from db import weight_index

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from sqlalchemy import text
-from support.label_questions import solved
+from support.label_queries import solved
 from support.labels_at_scale import EACH, filled_workspace
 
 from db import bulk
