@@ -1,4 +1,4 @@
-"""Synthetic KITTI frames, as dicts for the slow oracle and as `KittiObjects` for the tested code."""
+"""Synthetic KITTI frames: dicts for the slow oracle, `KittiObjects` for the tested code."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""curate serve: every table, question and frame has its page."""
+"""`curate serve`: every table, query and frame has its page."""
 
 import json
 import sqlite3
@@ -17,8 +17,8 @@ from pipelines.reports.pictures import frame_picture
 pytest.importorskip("datasette", reason="the extra [serve] is not installed")
 
 
-def test_the_first_page_leads_to_both_databases(pages: Pages) -> None:
-    """And lists the questions with their sense."""
+def test_the_first_page_links_to_both_databases(pages: Pages) -> None:
+    """It lists the queries with their descriptions."""
     answer = pages.get("/")
     assert answer.status == 200
     assert 'href="/workspace"' in answer.text
@@ -28,16 +28,16 @@ def test_the_first_page_leads_to_both_databases(pages: Pages) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(Base.metadata.tables))
-def test_a_table_says_what_it_is(pages: Pages, name: str) -> None:
-    """In the words of its model."""
+def test_a_table_shows_its_description(pages: Pages, name: str) -> None:
+    """The text comes from its model."""
     answer = pages.get(f"/workspace/{name}")
     assert answer.status == 200
     assert "metadata-description" in answer.text
 
 
 @pytest.mark.parametrize("name", named_queries())
-def test_a_named_query_answers_as_curate_query_does(pages: Pages, name: str) -> None:
-    """As many rows, the same columns; those of the working database only there."""
+def test_a_named_query_gives_the_same_rows_as_curate_query(pages: Pages, name: str) -> None:
+    """The same columns, too; those of the working database only there."""
     query = named_queries()[name]
     columns, rows = run_query(pages.workspace.database.url, query.sql)
     answer = json.loads(pages.get(f"/workspace/{name}.json", _shape="array").text)
@@ -47,8 +47,8 @@ def test_a_named_query_answers_as_curate_query_does(pages: Pages, name: str) -> 
     assert pages.get(f"/labels/{name}").status == (200 if query.exported else 404)
 
 
-def test_a_label_leads_to_its_frame(pages: Pages) -> None:
-    """From its row, with round and policy; the number of the label to its explanation."""
+def test_a_label_links_to_its_frame(pages: Pages) -> None:
+    """From its row, with round and policy; the number of the label links to its explanation."""
     text = pages.get("/labels/weighted_labels").text
     name = next(iter(pages.workspace.frames("unlabeled")))
     link = f"/-/frame?frame={name}&amp;round=1&amp;policy=pspsl"
@@ -60,8 +60,8 @@ def test_a_label_leads_to_its_frame(pages: Pages) -> None:
     assert "recomputed" in page.text
 
 
-def test_a_picture_is_the_one_of_curate_view(pages: Pages) -> None:
-    """Nearly: it travels as JPEG."""
+def test_an_image_is_the_one_of_curate_view(pages: Pages) -> None:
+    """Nearly equal, because it is sent as JPEG."""
     answer = pages.get("/-/picture", frame="000003")
     assert (answer.status, answer.headers["content-type"]) == (200, "image/jpeg")
     shown = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
@@ -73,7 +73,7 @@ def test_a_picture_is_the_one_of_curate_view(pages: Pages) -> None:
 
 @pytest.mark.parametrize("split", ["labeled", "unlabeled", "val"])
 def test_every_split_has_pages(pages: Pages, split: str) -> None:
-    """Neighbours are of the same split; by name and by key it is the same frame."""
+    """Neighbours are of the same split; name and key lead to the same frame."""
     names = pages.workspace.frames(split)
     first, second = list(names)[:2]
     answer = pages.get("/-/frame", frame=first)
@@ -82,7 +82,7 @@ def test_every_split_has_pages(pages: Pages, split: str) -> None:
     assert answer.body == pages.get("/-/frame", id=names[first]).body
 
 
-def test_a_new_export_is_seen_without_a_new_start(pages: Pages) -> None:
+def test_a_new_export_is_served_without_a_restart(pages: Pages) -> None:
     """The file has been replaced, not changed."""
     path = pages.workspace.root / "exports" / "labels.sqlite"
     before = pages.get("/labels.json", sql="SELECT count(*) FROM label", _shape="arrayfirst").text
