@@ -1,4 +1,4 @@
-"""Tests of the checks of one frame."""
+"""The checks of one frame."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ QUARTER = np.array([0, 0, 0, 0, 0, 0, np.pi / 2])
 
 
 def street(boxes=BOXES, seed=0):
-    """A frame with points in boxes and on the ground."""
+    """Return a frame with points in boxes and on the ground."""
     rng = np.random.default_rng(seed)
     ground = np.column_stack([rng.uniform([2, -20], [40, 20], (2000, 2)), np.full(2000, -1.6)])
     points = [ground]
@@ -38,22 +38,22 @@ def street(boxes=BOXES, seed=0):
 
 
 def answer(boxes, names=("Car", "Car", "Car")):
-    """A detector's answer."""
+    """Return detections."""
     return Detections(np.array(boxes), np.linspace(0.9, 0.5, len(boxes)), as_categories(names))
 
 
 def states(frame, found):
-    """The state of each check."""
+    """Return the state of each check."""
     return {one.check: one.state for one in examine_detections(frame, found, CATEGORIES)}
 
 
 def convention(frame, found, boxes):
-    """What is said of the convention of boxes in place of the found ones."""
+    """Return the message of the convention check for other boxes."""
     found = examine_detections(frame, replace(found, boxes=boxes), CATEGORIES)
     return next(one for one in found if one.check == "convention")
 
 
-def test_a_sound_frame_is_ok():
+def test_a_correct_frame_passes():
     """Every check, of data and of boxes."""
     frame = street()
     assert {one.state for one in examine_frame(frame)} == {"ok"}
@@ -77,8 +77,8 @@ def test_a_sound_frame_is_ok():
         ),
     ],
 )
-def test_a_wrong_convention_is_named(change, message):
-    """Whichever of the usual ones it is."""
+def test_a_wrong_convention_is_reported(change, message):
+    """Each of the common ones."""
     finding = convention(street(), answer(BOXES), change(BOXES))
     assert finding.state == "wrong"
     assert message in finding.message
@@ -97,8 +97,8 @@ def test_names_points_and_projections_are_checked():
     assert states(frame, Detections.empty()) == {"detections": "suspect"}
 
 
-def test_data_that_cannot_be_is_seen():
-    """No points, a camera that looks elsewhere, intensities of 255, z that is not up."""
+def test_impossible_data_is_reported():
+    """No points, a camera that looks elsewhere, intensities of 255, z not up."""
     frame = street()
     assert [one.state for one in examine_frame(frame.with_points(frame.points[:0]))] == ["wrong"]
     behind = frame.with_points(frame.points * np.float32([-1, 1, 1, 1]))
@@ -111,8 +111,8 @@ def test_data_that_cannot_be_is_seen():
 
 
 @pytest.mark.kitti
-def test_real_boxes_are_sound_and_wrong_ones_are_found(kitti_root):
-    """A weak detector's cars on real sweeps: right, turned, too low and too high."""
+def test_real_boxes_pass_and_wrong_ones_fail(kitti_root):
+    """A weak detector's cars on real sweeps: correct, rotated, too low and too high."""
     dataset = KittiDataset(kitti_root)
     record = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv")
     changes = {

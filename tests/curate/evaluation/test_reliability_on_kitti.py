@@ -1,4 +1,4 @@
-"""The whole chain from recorded detections to judged weights, on real frames of KITTI."""
+"""The whole chain from recorded detections to evaluated weights, on real frames of KITTI."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ VAL = {f"{number:06d}" for number in (1, 4, 5, 8, 20, 23, 25, 28, 35)}
 
 @dataclass(frozen=True)
 class Judged:
-    """Evidence of all labels of the weak teacher, and which of them are right."""
+    """Evidence of all labels of the weak teacher, and which of them are correct."""
 
     evidence: Evidence
     right: np.ndarray
@@ -42,7 +42,10 @@ class Judged:
     ],
 )
 def judged(request, kitti_root):
-    """Cars of the weak teacher on labeled frames; right = BEV IoU > 0.7 with a Car or a Van."""
+    """Return cars of the weak teacher on labeled frames.
+
+    Correct = BEV IoU > 0.7 with a Car or a Van.
+    """
     split, labels, rights = request.param
     dataset = KittiDataset(kitti_root)
     detector = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv")
@@ -74,23 +77,23 @@ def judged(request, kitti_root):
     return Judged(evidence, right, labels, rights)
 
 
-def test_a_few_labels_are_right_and_most_have_evidence(judged):
-    """Counts that a change of matching, judging or reading would move."""
+def test_a_few_labels_are_correct_and_most_have_evidence(judged):
+    """Counts that a change of matching, evaluation or reading would change."""
     assert len(judged.evidence) == judged.labels
     assert judged.right.sum() == judged.rights
     assert judged.evidence.matched.mean() == pytest.approx(0.775, abs=0.02)
 
 
-def test_right_labels_have_smaller_losses(judged):
-    """Score and consistency loss each tell right from wrong well on their own."""
+def test_correct_labels_have_smaller_losses(judged):
+    """Score and consistency loss each separate correct from wrong labels well."""
     trust = -np.nan_to_num(judged.evidence.loss, nan=np.inf)
     assert 0.95 < auroc(judged.evidence.score, judged.right) < 0.98
     assert 0.95 < auroc(trust, judged.right) < 0.98
 
 
 @pytest.mark.parametrize("age", AGES)
-def test_the_prior_is_what_makes_the_weights_precise(judged, age):
-    """PSPSL puts over twice as much of its weight on right labels as the score does."""
+def test_the_prior_makes_the_weights_precise(judged, age):
+    """PSPSL puts over twice as much of its weight on correct labels as the score does."""
     evidence, right = judged.evidence, judged.right
     by_score = weighted_precision(evidence.score, right)
     spsl = weighted_precision(SPSL().weigh(evidence, age).v, right)

@@ -44,7 +44,7 @@ def test_a_line_shows_throughput_time_left_and_failures(
 
 
 def test_the_warm_up_of_the_first_frame_does_not_count(clock: Callable[[float], None]) -> None:
-    """After 30 s for the first frame and then 2 per second, the second frame already shows the right time left."""
+    """The first frame takes 30 s, then 2 per second; the second one gives the right time left."""
     pace = progress.Pace(101)
     assert pace.rate is None
     clock(30.0)
