@@ -1,4 +1,4 @@
-"""Tests of the segmenter of instance models with graphs of a few constants."""
+"""The segmenter of instance models with graphs of a few constants."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,7 @@ KINDS = {"f": TensorProto.FLOAT, "i": TensorProto.INT64, "b": TensorProto.BOOL}
 
 
 def constant_model(path, answers: Mapping[str, np.ndarray], shape=(1, 3, HEIGHT, WIDTH)):
-    """A float model that answers the same arrays whatever the image."""
+    """Save a float model that returns the same arrays for every image."""
     outputs = [
         helper.make_tensor_value_info(name, KINDS[values.dtype.kind], [None] * values.ndim)
         for name, values in answers.items()
@@ -40,7 +40,7 @@ def constant_model(path, answers: Mapping[str, np.ndarray], shape=(1, 3, HEIGHT,
 
 
 def answers(boxes, labels, scores, masks) -> dict[str, np.ndarray]:
-    """Answers of Mask R-CNN's kind."""
+    """Return outputs like those of Mask R-CNN."""
     return {
         "boxes": np.array(boxes, np.float32).reshape(-1, 4),
         "labels": np.array(labels, np.int64),
@@ -50,28 +50,28 @@ def answers(boxes, labels, scores, masks) -> dict[str, np.ndarray]:
 
 
 def frame(width=WIDTH, height=HEIGHT) -> Frame:
-    """A frame of which only the image matters."""
+    """Return a frame with an image and nothing else."""
     image = np.zeros((height, width, 3), np.uint8)
     return Frame("000001", np.zeros((0, 4), np.float32), toy_calibration(), (width, height), image)
 
 
 def asked(path, classes=COCO, *, of=None, **options) -> np.ndarray:
-    """The class ids that a model gives."""
+    """Return the class ids of a model."""
     return OnnxInstanceSegmenter(path, classes, **options).segment(of or frame()).class_ids
 
 
 def rectangle(left, top, right, bottom, value, nothing=0, size=(HEIGHT, WIDTH)) -> np.ndarray:
-    """A map with one rectangle of a class."""
+    """Return a map with one rectangle of a class."""
     found = np.full(size, nothing, np.uint8)
     found[top:bottom, left:right] = value
     return found
 
 
-def test_a_mask_of_a_box_is_pasted_into_it(tmp_path):
+def test_a_mask_of_a_box_is_resized_into_it(tmp_path):
     """2 x 2 cells over 4 x 4 pixels: bilinear between the centres of the cells, by hand.
 
-    A pixel's place is (i + 0.5) / 2 - 0.5 cells: -0.25, 0.25, 0.75, 1.25. Along one axis the first
-    cell counts 0.75, 0.75, 0.25, 0, the second 0, 0.25, 0.75, 0.75.
+    A pixel's position is (i + 0.5) / 2 - 0.5 cells: -0.25, 0.25, 0.75, 1.25. Along one axis the
+    first cell counts 0.75, 0.75, 0.25, 0, the second 0, 0.25, 0.75, 0.75.
     """
     mask = np.array([[1.0, 0], [0, 0]])
     first = np.array([0.75, 0.75, 0.25, 0])
@@ -86,8 +86,8 @@ def test_a_mask_of_a_box_is_pasted_into_it(tmp_path):
 
 @pytest.mark.parametrize("form", [(1, 28, 28), (1, 1, 28, 28)])
 @pytest.mark.parametrize("batched", [False, True])
-def test_a_box_beyond_the_image_is_cut(tmp_path, form, batched):
-    """In each of the shapes in which masks come."""
+def test_a_box_beyond_the_image_is_clipped(tmp_path, form, batched):
+    """For each shape of masks."""
     found = answers([[-6, 4, 6, 20]], [3], [0.9], np.ones(form))
     if batched:
         found = {name: values[None] for name, values in found.items()}
@@ -106,8 +106,8 @@ def test_masks_of_the_whole_input(tmp_path, kind):
     np.testing.assert_array_equal(asked(path), rectangle(5, 1, 9, 3, 1))
 
 
-def test_the_higher_score_is_on_top_and_other_classes_hide(tmp_path):
-    """Low scores are left out; a truck before a car hides it."""
+def test_higher_scores_are_on_top_and_other_classes_hide(tmp_path):
+    """Low scores are dropped; a truck in front of a car hides it."""
     ones = np.ones((4, 4, 4))
     boxes = [[0, 0, 8, 8], [4, 0, 12, 8], [6, 0, 8, 8], [0, 0, 12, 8]]
     path = constant_model(
@@ -119,20 +119,20 @@ def test_the_higher_score_is_on_top_and_other_classes_hide(tmp_path):
     np.testing.assert_array_equal(asked(path), expected)
 
 
-def test_scores_behind_the_boxes(tmp_path):
-    """As mmdetection's exports have them."""
+def test_scores_can_follow_the_boxes(tmp_path):
+    """As in mmdetection's exports."""
     found = answers([[0, 0, 4, 8]] * 2, [2, 0], [0, 0], np.ones((2, 4, 4)))
     del found["scores"]
     found["boxes"] = np.column_stack([found["boxes"], np.float32([0.9, 0.2])])[None]
     path = constant_model(tmp_path / "a.onnx", found)
     outputs = {"boxes": "boxes", "labels": "labels", "masks": "masks"}
     class_ids = asked(path, FROM_0, outputs=outputs)
-    # Class 0 is a person, so that nothing is another number.
+    # Class 0 is a person, so that a 0 elsewhere is detected.
     np.testing.assert_array_equal(class_ids, rectangle(0, 0, 4, 8, 2, nothing=3))
 
 
-def test_a_larger_image_is_fitted_with_its_proportions(tmp_path):
-    """36 x 12 into 12 x 8: a third, in the upper left corner; boxes come back thrice as large."""
+def test_a_larger_image_is_scaled_with_its_proportions(tmp_path):
+    """36 x 12 into 12 x 8: a third, in the upper left corner; boxes become three times as large."""
     path = constant_model(
         tmp_path / "a.onnx", answers([[1, 1, 3, 4]], [3], [0.9], np.ones((1, 4, 4)))
     )
@@ -145,8 +145,8 @@ def test_a_larger_image_is_fitted_with_its_proportions(tmp_path):
     np.testing.assert_array_equal(found, rectangle(18, 0, 36, 12, 3, size=(12, 36)))
 
 
-def test_prototypes_are_added_up_and_cut_to_their_boxes(tmp_path):
-    """Two prototypes, left and right half; the same object twice is one after suppression."""
+def test_prototypes_are_combined_and_cropped_to_their_boxes(tmp_path):
+    """Two prototypes, left and right half; the same object twice is one after NMS."""
     prototypes = np.full((1, 2, HEIGHT, WIDTH), -5, np.float32)
     prototypes[0, 0, :, :6] = prototypes[0, 1, :, 6:] = 5
     rows = [
@@ -165,8 +165,8 @@ def test_prototypes_are_added_up_and_cut_to_their_boxes(tmp_path):
 
 
 @pytest.mark.parametrize("shape", [(3, HEIGHT, WIDTH), ("n", 3, "h", "w"), (1, HEIGHT, WIDTH, 3)])
-def test_no_objects_in_any_input(tmp_path, shape):
-    """An empty answer is an empty map."""
+def test_no_objects_in_any_input_format(tmp_path, shape):
+    """An empty output is an empty map."""
     path = constant_model(tmp_path / "a.onnx", answers([], [], [], np.zeros((0, 1, 28, 28))), shape)
     assert not asked(path).any()
 
@@ -189,8 +189,8 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_other_answers_are_rejected_in_one_line(tmp_path, name):
-    """With what was answered."""
+def test_other_outputs_are_rejected_in_one_line(tmp_path, name):
+    """With the shapes of the outputs."""
     changed, message = BAD[name]
     path = constant_model(tmp_path / "a.onnx", GOOD | changed)
     with pytest.raises(ModelError) as caught:
@@ -210,7 +210,7 @@ def test_prototypes_that_are_nan_are_rejected(tmp_path):
 
 
 def test_wrong_prototypes_are_rejected(tmp_path):
-    """No classes are left between box and coefficients."""
+    """No columns are left for the classes."""
     found = {"a": np.zeros((1, 6, 9), np.float32), "b": np.zeros((1, 2, 4, 4), np.float32)}
     path = constant_model(tmp_path / "a.onnx", found)
     with pytest.raises(
@@ -231,15 +231,15 @@ def test_wrong_prototypes_are_rejected(tmp_path):
         ({"minimum_score": 2}, "0 to 1"),
     ],
 )
-def test_wrong_options_are_named(tmp_path, options, message):
+def test_wrong_options_are_reported(tmp_path, options, message):
     """Before the first frame."""
     path = constant_model(tmp_path / "a.onnx", GOOD)
     with pytest.raises(ConfigError, match=message):
         OnnxInstanceSegmenter(path, COCO, **options)
 
 
-def test_an_empty_box_shows_nothing():
-    """Nor does one beside the image."""
+def test_an_empty_box_has_no_pixels():
+    """Nor does one outside the image."""
     for box in ((3, 3, 3, 5), (5, 3, 4, 6), (20, 20, 30, 30), (3.6, 3.6, 4.4, 4.4)):
         _, mask = paste_mask(np.ones((4, 4)), box, box, (WIDTH, HEIGHT), 0.5)
         assert mask.size == 0
