@@ -1,4 +1,4 @@
-"""Claims: who may work on a round beside whom, on either engine."""
+"""Claims: which processes can work on a round at the same time, with either engine."""
 
 import os
 import shutil
@@ -15,7 +15,10 @@ ENGINES = ("sqlite", "postgresql")
 
 @pytest.fixture
 def pair(tmp_path: Path, new_url: Callable[[], str | None]) -> tuple[Database, Database]:
-    """One database as two processes see it; a claim belongs to an open file or to a session."""
+    """Return one database as two processes see it.
+
+    A claim belongs to an open file or to a session.
+    """
     url = new_url() or f"sqlite:///{tmp_path / 'curate.db'}"
     return Database(url), Database(url)
 
@@ -29,7 +32,7 @@ def pair(tmp_path: Path, new_url: Callable[[], str | None]) -> tuple[Database, D
         ((1, "pspsl"), (1, "pspsl"), "round 1 of pspsl is being worked on by predict"),
     ],
 )
-def test_what_is_claimed_is_rejected_with_its_owner(
+def test_a_claimed_round_is_rejected_with_its_owner(
     pair: tuple[Database, Database], mine: tuple, theirs: tuple, word: str
 ) -> None:
     """One line: what, by whom, since when, what to do; afterwards it is free."""
@@ -49,7 +52,7 @@ def test_what_is_claimed_is_rejected_with_its_owner(
     ("mine", "theirs"),
     [((1, None), (2, None)), ((1, "spsl"), (1, "pspsl")), ((1, "spsl"), (11, None))],
 )
-def test_what_does_not_collide_runs_side_by_side(
+def test_independent_claims_are_granted_in_parallel(
     pair: tuple[Database, Database], mine: tuple, theirs: tuple
 ) -> None:
     """Different rounds, and the policies of one round."""
@@ -72,7 +75,7 @@ def test_a_link_to_the_file_is_claimed_with_it(tmp_path: Path) -> None:
 
 
 def test_an_error_ends_the_claim(pair: tuple[Database, Database]) -> None:
-    """Whatever went wrong while it was held."""
+    """Any error while it was held."""
     with pytest.raises(ZeroDivisionError), pair[0].claiming_round(1, None, "predict"):
         raise ZeroDivisionError
     with pair[1].claiming_round(1, None, "predict"):
@@ -80,7 +83,7 @@ def test_an_error_ends_the_claim(pair: tuple[Database, Database]) -> None:
 
 
 def lose_claims(database: Database) -> None:
-    """Ends the session that holds them, or deletes the locked files."""
+    """End the session that holds the claims, or delete the locked files."""
     if database.engine.dialect.name == "sqlite":
         shutil.rmtree(f"{database.url.database}-locks")
         return
@@ -92,8 +95,8 @@ def lose_claims(database: Database) -> None:
         assert list(ended) == [True]
 
 
-def test_who_lost_a_claim_writes_nothing_more(pair: tuple[Database, Database]) -> None:
-    """Another process may have got it in the meantime; what was written before is kept."""
+def test_a_process_that_lost_its_claim_writes_nothing_more(pair: tuple[Database, Database]) -> None:
+    """Another process may have claimed it; what was written before is kept."""
     mine, theirs = pair
     add = "INSERT INTO label_file (path, round, policy, sha256) VALUES ('{}', 1, 'p', '')"
 
@@ -113,10 +116,10 @@ def test_who_lost_a_claim_writes_nothing_more(pair: tuple[Database, Database]) -
         assert list(stored) == ["before"]
 
 
-def test_a_server_that_is_lost_in_the_midst_is_told_in_one_line(
+def test_a_lost_server_gives_one_line(
     new_url: Callable[[], str | None],
 ) -> None:
-    """The claim is lost as well; giving it back must not speak in place of what failed."""
+    """The claim is lost as well; releasing it must not hide the original error."""
     url = new_url()
     if url is None:
         pytest.skip("a file is not lost like this")

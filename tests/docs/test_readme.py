@@ -1,4 +1,4 @@
-"""The README's commands, run as they stand there."""
+"""The README's commands, run as printed."""
 
 import os
 import re
@@ -21,7 +21,7 @@ README = (ROOT / "README.md").read_text()
 
 
 def commands(under: str) -> list[list[str]]:
-    """The command lines of the shell block under a heading, one list of words each."""
+    """Return the command lines of the shell block under a heading, one list of words each."""
     block = re.search(rf"## {under}\n.*?```sh\n(.*?)```", README, re.DOTALL)
     assert block, f"README.md has no shell block under '{under}'"
     text = block[1].replace("\\\n", " ").replace(" && ", "\n")
@@ -30,7 +30,7 @@ def commands(under: str) -> list[list[str]]:
 
 
 def run_all(lines: list[list[str]], folder: Path, replace: dict[str, str], edit=None) -> str:
-    """Runs command lines one after the other as a shell would; gives what they print."""
+    """Run command lines one after the other as a shell would; return their output."""
     printed = []
     for line in lines:
         words = [replace.get(word, word) for word in line]
@@ -56,7 +56,7 @@ def run_all(lines: list[list[str]], folder: Path, replace: dict[str, str], edit=
 
 
 def short_training(path: Path) -> None:
-    """Trainings of a few steps: the commands are tested here, not the detector."""
+    """Limit trainings to a few steps: the commands are tested here, not the detector."""
     text = path.read_text()
     for name in ("pretrain_steps", "round_steps"):
         text, found = re.subn(rf"{name} = \d+", f"{name} = 60", text)
@@ -64,8 +64,8 @@ def short_training(path: Path) -> None:
     path.write_text(text.replace('executor = "serial"', 'executor = "process"'))
 
 
-def test_the_commands_on_your_data(tmp_path: Path) -> None:
-    """From nothing to the weight of one label explained."""
+def test_the_commands_on_user_data(tmp_path: Path) -> None:
+    """From nothing to the explained weight of one label."""
     lines = commands("On your data")
     explain = [line for line in lines if line[1] == "explain"]
     printed = run_all(
@@ -81,8 +81,8 @@ def test_the_commands_on_your_data(tmp_path: Path) -> None:
 
 
 @pytest.mark.kitti
-def test_the_commands_with_your_detector(tmp_path: Path, kitti_root: Path) -> None:
-    """From a real detector's KITTI result files to weights, a picture and a report."""
+def test_the_commands_with_a_user_detector(tmp_path: Path, kitti_root: Path) -> None:
+    """From a real detector's KITTI result files to weights, a plot and a report."""
     frames, results = tmp_path / "few", tmp_path / "results"
     for folder in ("velodyne", "image_2", "calib", "label_2"):
         (frames / folder).mkdir(parents=True)
@@ -115,7 +115,7 @@ def test_the_commands_with_your_detector(tmp_path: Path, kitti_root: Path) -> No
 
 
 def write_results(folder: Path, root: Path, record: Path) -> None:
-    """Result files as KITTI's benchmark takes them, of what a detector answered."""
+    """Write the predictions of a detector as KITTI result files."""
     dataset, detector = KittiDataset(root), RecordedDetector(record)
     folder.mkdir()
     for name in dataset.frame_ids():

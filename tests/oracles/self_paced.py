@@ -6,19 +6,19 @@ GRID = np.linspace(0.0, 1.0, 10_001)
 
 
 def spsl_weight(loss, lambda_u):
-    """The v in [0, 1] with the least v L + lambda (v^2 / 2 - v), to 1e-4."""
+    """Return the v in [0, 1] with the least v L + lambda (v^2 / 2 - v), to 1e-4."""
     return GRID[np.argmin(GRID * loss + lambda_u * (GRID**2 / 2 - GRID))]
 
 
 def pspsl_weight(loss, lambda_u, rho):
-    """The v in [0, rho] with the least (v/rho) L + lambda ((v/rho)^2 / 2 - v/rho), to 1e-4."""
+    """Return the v in [0, rho] with the least r L + lambda (r^2 / 2 - r), r = v / rho, to 1e-4."""
     v = GRID * rho
     share = v / rho
     return v[np.argmin(share * loss + lambda_u * (share**2 / 2 - share))]
 
 
 def age_parameters(losses, groups, share):
-    """Lambda of each label, group by group in plain Python; None where no label matched."""
+    """Return lambda of each label, group by group in plain Python; None if no label matched."""
     answers = []
     for own in groups:
         seen = [

@@ -55,7 +55,7 @@ def frame(width=WIDTH, height=HEIGHT) -> Frame:
     return Frame("000001", np.zeros((0, 4), np.float32), toy_calibration(), (width, height), image)
 
 
-def asked(path, classes=COCO, *, of=None, **options) -> np.ndarray:
+def classes_of(path, classes=COCO, *, of=None, **options) -> np.ndarray:
     """Return the class ids of a model."""
     return OnnxInstanceSegmenter(path, classes, **options).segment(of or frame()).class_ids
 
@@ -79,8 +79,8 @@ def test_a_mask_of_a_box_is_resized_into_it(tmp_path):
     expected[2:6, 3:7] = 3 * (np.outer(first, first) > 0.5)
     assert (expected > 0).sum() == 4
     path = constant_model(tmp_path / "a.onnx", answers([[3, 2, 7, 6]], [3], [0.9], [mask]))
-    np.testing.assert_array_equal(asked(path), expected)
-    lower = asked(path, mask_threshold=0.1)
+    np.testing.assert_array_equal(classes_of(path), expected)
+    lower = classes_of(path, mask_threshold=0.1)
     np.testing.assert_array_equal(lower[2:6, 3:7] > 0, np.outer(first, first) > 0.1)
 
 
@@ -93,7 +93,7 @@ def test_a_box_beyond_the_image_is_clipped(tmp_path, form, batched):
         found = {name: values[None] for name, values in found.items()}
         found["masks"] = found["masks"].reshape(1, 1, 28, 28)
     path = constant_model(tmp_path / "a.onnx", found)
-    np.testing.assert_array_equal(asked(path), rectangle(0, 4, 6, 8, 3))
+    np.testing.assert_array_equal(classes_of(path), rectangle(0, 4, 6, 8, 3))
 
 
 @pytest.mark.parametrize("kind", [np.float32, bool, np.int64])
@@ -103,7 +103,7 @@ def test_masks_of_the_whole_input(tmp_path, kind):
     found["masks"][0, 0, 1:3, 5:9] = 1
     found["masks"] = found["masks"].astype(kind)
     path = constant_model(tmp_path / "a.onnx", found)
-    np.testing.assert_array_equal(asked(path), rectangle(5, 1, 9, 3, 1))
+    np.testing.assert_array_equal(classes_of(path), rectangle(5, 1, 9, 3, 1))
 
 
 def test_higher_scores_are_on_top_and_other_classes_hide(tmp_path):
@@ -116,7 +116,7 @@ def test_higher_scores_are_on_top_and_other_classes_hide(tmp_path):
     expected = rectangle(0, 0, 4, 8, 3)
     expected[:, 4:12] = 1
     expected[:, 6:8] = 0
-    np.testing.assert_array_equal(asked(path), expected)
+    np.testing.assert_array_equal(classes_of(path), expected)
 
 
 def test_scores_can_follow_the_boxes(tmp_path):
@@ -126,7 +126,7 @@ def test_scores_can_follow_the_boxes(tmp_path):
     found["boxes"] = np.column_stack([found["boxes"], np.float32([0.9, 0.2])])[None]
     path = constant_model(tmp_path / "a.onnx", found)
     outputs = {"boxes": "boxes", "labels": "labels", "masks": "masks"}
-    class_ids = asked(path, FROM_0, outputs=outputs)
+    class_ids = classes_of(path, FROM_0, outputs=outputs)
     # Class 0 is a person, so that a 0 elsewhere is detected.
     np.testing.assert_array_equal(class_ids, rectangle(0, 0, 4, 8, 2, nothing=3))
 
@@ -136,12 +136,12 @@ def test_a_larger_image_is_scaled_with_its_proportions(tmp_path):
     path = constant_model(
         tmp_path / "a.onnx", answers([[1, 1, 3, 4]], [3], [0.9], np.ones((1, 4, 4)))
     )
-    found = asked(path, of=frame(36, 12))
+    found = classes_of(path, of=frame(36, 12))
     np.testing.assert_array_equal(found, rectangle(3, 3, 9, 12, 3, size=(12, 36)))
     whole = np.zeros((1, HEIGHT, WIDTH))
     whole[0, :, 6:] = 1
     path = constant_model(tmp_path / "b.onnx", answers([[0, 0, 1, 1]], [3], [0.9], whole))
-    found = asked(path, of=frame(36, 12))
+    found = classes_of(path, of=frame(36, 12))
     np.testing.assert_array_equal(found, rectangle(18, 0, 36, 12, 3, size=(12, 36)))
 
 
@@ -161,14 +161,14 @@ def test_prototypes_are_combined_and_cropped_to_their_boxes(tmp_path):
     outputs = {"predictions": "output0", "prototypes": "output1"}
     expected = rectangle(2, 2, 6, 6, 2, nothing=3)
     expected[:, 9:11] = 0
-    np.testing.assert_array_equal(asked(path, FROM_0, outputs=outputs), expected)
+    np.testing.assert_array_equal(classes_of(path, FROM_0, outputs=outputs), expected)
 
 
 @pytest.mark.parametrize("shape", [(3, HEIGHT, WIDTH), ("n", 3, "h", "w"), (1, HEIGHT, WIDTH, 3)])
 def test_no_objects_in_any_input_format(tmp_path, shape):
     """An empty output is an empty map."""
     path = constant_model(tmp_path / "a.onnx", answers([], [], [], np.zeros((0, 1, 28, 28))), shape)
-    assert not asked(path).any()
+    assert not classes_of(path).any()
 
 
 GOOD = answers([[0, 0, 4, 4]], [3], [0.9], np.ones((1, 28, 28)))
@@ -194,7 +194,7 @@ def test_other_outputs_are_rejected_in_one_line(tmp_path, name):
     changed, message = BAD[name]
     path = constant_model(tmp_path / "a.onnx", GOOD | changed)
     with pytest.raises(ModelError) as caught:
-        asked(path)
+        classes_of(path)
     assert_one_line(caught.value)
     assert message in str(caught.value)
     assert str(caught.value).startswith(f"{path}: ")
@@ -206,7 +206,7 @@ def test_prototypes_that_are_nan_are_rejected(tmp_path):
     found["prototypes"] = np.full((1, 1, 4, 4), np.nan, np.float32)
     path = constant_model(tmp_path / "a.onnx", found)
     with pytest.raises(ModelError, match=r"a\.onnx: answers a mask that holds NaN"):
-        asked(path, {"Car": (0,)}, outputs={name: name for name in found})
+        classes_of(path, {"Car": (0,)}, outputs={name: name for name in found})
 
 
 def test_wrong_prototypes_are_rejected(tmp_path):
@@ -216,7 +216,7 @@ def test_wrong_prototypes_are_rejected(tmp_path):
     with pytest.raises(
         ModelError, match=r"predictions \[1, 6, 9\].*expected predictions \[1, 4 \+"
     ):
-        asked(path, outputs={"predictions": "a", "prototypes": "b"})
+        classes_of(path, outputs={"predictions": "a", "prototypes": "b"})
 
 
 @pytest.mark.parametrize(

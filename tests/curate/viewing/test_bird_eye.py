@@ -1,4 +1,4 @@
-"""Tests of the bird's eye view."""
+"""The bird's eye view."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ REGION = Region(0, 40, -20, 20, 10)
 
 
 def near(picture, place, colour, reach=2):
-    """Whether a colour is seen close to a place (x, y in metres)."""
+    """Return whether a colour appears near a position (x, y in metres)."""
     column, row = np.rint(REGION.to_pixels(np.array(place, dtype=np.float64))).astype(int)
     around = picture[row - reach : row + reach + 1, column - reach : column + reach + 1]
     return (np.abs(around.astype(int) - colour).max(axis=2) < 40).any()
@@ -28,7 +28,7 @@ def test_forward_is_up_and_left_is_left():
 
 
 def test_footprints_have_the_colour_of_their_weight():
-    """The outline of a turned box is where its corners are."""
+    """The outline of a rotated box is at its corners."""
     box = [20, 5, 0, 4, 2, 1.5, np.pi / 2]
     picture = draw_bird_eye(np.zeros((0, 4)), labels([box], [0.6]), region=REGION)
     colour = weight_colours(np.array([0.6]))[0].astype(int)
@@ -37,8 +37,8 @@ def test_footprints_have_the_colour_of_their_weight():
     assert not near(picture, (22, 5), colour)
 
 
-def test_ground_truth_is_white_and_may_be_unknown():
-    """Regions without a box are left out."""
+def test_ground_truth_is_white_and_can_be_nan():
+    """DontCare regions without a box are left out."""
     truth = np.array([[30.0, 0, 0, 4, 2, 1.5, 0], [np.nan] * 7])
     with_truth = draw_bird_eye(np.zeros((0, 4)), labels([], []), truth, region=REGION)
     without = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
@@ -46,8 +46,8 @@ def test_ground_truth_is_white_and_may_be_unknown():
     assert not near(without, (32, 1), np.array(GROUND_TRUTH))
 
 
-def test_points_are_seen():
-    """Points in the region brighten their place; those outside do no harm."""
+def test_points_are_drawn():
+    """Points in the region brighten their position; those outside are ignored."""
     points = np.array([[15.3, -7.2, 1.0, 0], [500, 500, 0, 0], [-5, 0, 0, 0]])
     empty = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
     picture = draw_bird_eye(points, labels([], []), region=REGION)
@@ -57,16 +57,16 @@ def test_points_are_seen():
     assert np.hypot(columns - place[0], rows - place[1]).max() < 3
 
 
-def test_titles_are_written():
-    """The strip above the picture changes with the title."""
+def test_titles_are_drawn():
+    """The strip above the plot changes with the title."""
     plain = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
     titled = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION, title="frame 000008")
     assert (plain[:TITLE_HEIGHT] != titled[:TITLE_HEIGHT]).any()
     assert (plain[TITLE_HEIGHT:] == titled[TITLE_HEIGHT:]).all()
 
 
-def test_the_region_grows_to_where_labels_are():
-    """Behind the LiDAR, far ahead, and at the sides; without need it is the usual one."""
+def test_the_region_grows_to_contain_all_labels():
+    """Behind the LiDAR, far ahead, and at the sides; otherwise it is the default."""
     usual = Region()
     ahead = np.array([[30.0, 5, 0, 4, 2, 1.5, 0]])
     width = usual.size[0]
@@ -97,7 +97,7 @@ def test_labels_behind_the_vehicle_are_drawn():
     assert (picture != without).any()
 
 
-def test_the_paper_style_has_a_white_ground():
+def test_the_paper_style_has_a_white_background():
     """And its own colours."""
     shown = labels([[20, 5, 0, 4, 2, 1.5, 0]], [0.6])
     picture = draw_bird_eye(np.zeros((0, 4)), shown, region=REGION, style=PAPER)
@@ -107,7 +107,7 @@ def test_the_paper_style_has_a_white_ground():
 
 @pytest.mark.parametrize("frame_id", ["000008", "000023"])
 def test_real_frames(kitti_root, frame_id):
-    """A crowded and a usual frame are drawn whole."""
+    """A crowded and a usual frame are drawn completely."""
     from curate.datasets.kitti.dataset import KittiDataset
     from curate.detectors.recorded import RecordedDetector
 

@@ -1,4 +1,4 @@
-"""Evidence, age and weights: what policies share."""
+"""Evidence, age and weights, which policies share."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from curate.weighting.base import Age, Evidence, Weights
 
 
 def evidence(**changes):
-    """Two labels with evidence in order, but for the changes."""
+    """Return two labels with valid evidence, except for the changes."""
     columns = {
         "frame_index": np.array([0, 4]),
         "category": as_categories(["Car", "Cyclist"]),
@@ -29,12 +29,12 @@ def test_rho_det_is_the_product_of_the_priors():
 
 
 def test_rho_det_leaves_out_a_prior_that_has_not_scored():
-    """NaN is not an opinion, and not a veto."""
+    """NaN neither raises nor lowers the product."""
     half = {"rho_diff": np.array([0.5, np.nan]), "rho_anno": np.array([np.nan, np.nan])}
     assert evidence(rho=half).rho_det.tolist() == [0.5, 1.0]
 
 
-def test_matched_is_where_there_is_a_loss():
+def test_labels_with_a_loss_are_matched():
     """NaN means that no reprediction matched."""
     assert evidence().matched.tolist() == [True, False]
 
@@ -53,7 +53,7 @@ def test_matched_is_where_there_is_a_loss():
     ],
 )
 def test_evidence_out_of_shape_or_range_is_rejected(changes, said):
-    """The error names the column and the label."""
+    """The error contains the column and the label."""
     with pytest.raises(DataError, match=said):
         evidence(**changes)
 
