@@ -30,7 +30,7 @@ LAYERS = {
         "commands", "cli", "__main__",
     ),
 }  # fmt: skip
-HOUSE = sorted(path for folder in MAY_IMPORT for path in (ROOT / folder).rglob("*.py"))
+MODULES = sorted(path for folder in MAY_IMPORT for path in (ROOT / folder).rglob("*.py"))
 
 
 def imports(path: Path) -> Iterator[str]:
@@ -43,7 +43,7 @@ def imports(path: Path) -> Iterator[str]:
             yield node.module or ""
 
 
-@pytest.mark.parametrize("path", HOUSE, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_imports_go_one_way(path: Path) -> None:
     """A module imports only from its own package and those below it."""
     folder = path.relative_to(ROOT).parts[0]
@@ -58,7 +58,7 @@ def module_name(path: Path) -> str:
 
 def import_graph() -> dict[str, set[str]]:
     """Return the modules that each module imports, deferred imports included."""
-    modules = {module_name(path): path for path in HOUSE}
+    modules = {module_name(path): path for path in MODULES}
     graph: dict[str, set[str]] = {name: set() for name in modules}
     for name, path in modules.items():
         for node in ast.walk(ast.parse(path.read_text())):
@@ -86,16 +86,20 @@ def test_subpackages_import_only_lower_ones() -> None:
     upward = []
     for name, imported in import_graph().items():
         for other in imported:
-            package, room, other_room = (
+            package, subpackage, other_subpackage = (
                 name.split(".")[0],
                 subpackage_of(name),
                 subpackage_of(other),
             )
-            if package != other.split(".")[0] or package not in LAYERS or room == other_room:
+            if (
+                package != other.split(".")[0]
+                or package not in LAYERS
+                or subpackage == other_subpackage
+            ):
                 continue
             # The package itself collects the public names, so it is above all of its subpackages.
             layers = (*LAYERS[package], "")
-            if layers.index(other_room) > layers.index(room):
+            if layers.index(other_subpackage) > layers.index(subpackage):
                 upward.append(f"{name} -> {other}")
     assert upward == []
 
@@ -108,7 +112,7 @@ def subpackage_of(module: str) -> str:
 def test_every_subpackage_is_in_the_layers() -> None:
     """A new file or folder at the top of a package must be added to LAYERS."""
     for package, layers in LAYERS.items():
-        own = [path for path in HOUSE if path.relative_to(ROOT).parts[0] == package]
+        own = [path for path in MODULES if path.relative_to(ROOT).parts[0] == package]
         assert {subpackage_of(module_name(path)) for path in own} - {""} == set(layers)
 
 
@@ -116,7 +120,7 @@ def test_curate_works_without_db_and_pipelines() -> None:
     """A user's own db.py does no harm then."""
     modules = [
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-        for path in HOUSE
+        for path in MODULES
         if path.relative_to(ROOT).parts[0] == "curate"
     ]
     code = (
@@ -135,7 +139,7 @@ def test_curate_works_without_db_and_pipelines() -> None:
 def test_only_the_label_file_format_uses_sql_in_curate() -> None:
     users = {
         str(path.relative_to(ROOT))
-        for path in HOUSE
+        for path in MODULES
         if {"sqlite3", "sqlalchemy"} & {name.split(".")[0] for name in imports(path)}
         and path.relative_to(ROOT).parts[0] == "curate"
     }
@@ -147,8 +151,10 @@ def test_only_the_label_file_format_uses_sql_in_curate() -> None:
 
 
 def test_every_module_has_a_docstring() -> None:
-    silent = [str(path) for path in HOUSE if not ast.get_docstring(ast.parse(path.read_text()))]
-    assert silent == []
+    undocumented = [
+        str(path) for path in MODULES if not ast.get_docstring(ast.parse(path.read_text()))
+    ]
+    assert undocumented == []
 
 
 # Calls that run code from a file, unpack archives, or start a shell.
@@ -167,13 +173,15 @@ def foreign_calls(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue
-        said = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+        arguments = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
         name = ast.unparse(node.func)
-        harmless = said.get("weights_only") == "True" or said.get("allow_pickle") == "False"
-        shell = said.get("shell", "False") != "False"
+        harmless = (
+            arguments.get("weights_only") == "True" or arguments.get("allow_pickle") == "False"
+        )
+        shell = arguments.get("shell", "False") != "False"
         if (name in RUNS_FOREIGN_CODE and not harmless) or shell:
             yield name
-        if said.get("allow_pickle", "False") != "False":
+        if arguments.get("allow_pickle", "False") != "False":
             yield name
 
 
@@ -181,23 +189,23 @@ def test_no_code_from_a_file_is_run() -> None:
     """The process executor unpickles bytes of its parent; the plain pickle reader runs nothing."""
     calls = {
         (str(path.relative_to(ROOT)), call)
-        for path in HOUSE
+        for path in MODULES
         for call in foreign_calls(ast.parse(path.read_text()))
     }
     assert calls == {
         ("pipelines/engine/executors/base.py", "pickle.loads"),
         ("curate/review/editors/cvat.py", "zipfile.ZipFile"),
     }
-    readers = {str(path.relative_to(ROOT)) for path in HOUSE if "Unpickler" in path.read_text()}
+    readers = {str(path.relative_to(ROOT)) for path in MODULES if "Unpickler" in path.read_text()}
     assert readers == {"curate/detectors/recorded/plain_pickle.py"}
-    strangers = {
+    unexpected = {
         (path.name, name)
-        for path in HOUSE
+        for path in MODULES
         for name in imports(path)
         if name.split(".")[0] in FOREIGN_MODULES
     }
     # CVAT exports are archives; they are read in memory, with a limited size, never unpacked.
-    assert strangers == {("cvat.py", "zipfile")}
+    assert unexpected == {("cvat.py", "zipfile")}
 
 
 @pytest.mark.parametrize(
@@ -229,8 +237,8 @@ def test_every_dependency_is_pinned() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     made = ("test", "lint", "bench", "serve", "browser")  # the extras that `make` installs
-    wanted = {
+    required = {
         requirement.split(">")[0].split(";")[0].split("[")[0].strip().lower()
         for requirement in (*project["dependencies"], *chain(*map(extras.get, made)))
     }
-    assert wanted - {"open3d"} <= pinned
+    assert required - {"open3d"} <= pinned

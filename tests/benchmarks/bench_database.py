@@ -163,8 +163,8 @@ def bench_read_column(benchmark, name, copies, predictions):
             return bulk.select_columns(connection, query)["score"]
 
     def driver():
-        asked = "SELECT score FROM prediction WHERE round = 1 ORDER BY frame_id, k"
-        return np.array(bare.execute(asked).fetchall(), dtype=np.float64)[:, 0]
+        sql = "SELECT score FROM prediction WHERE round = 1 ORDER BY frame_id, k"
+        return np.array(bare.execute(sql).fetchall(), dtype=np.float64)[:, 0]
 
     read = ours if name == OURS else driver
     found = measure(benchmark, read, group=COLUMN, name=name, amount=ROWS, unit="values")

@@ -185,11 +185,11 @@ def shapely_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.n
     for i, j in zip(rows[over].tolist(), others[over].tolist(), strict=True):
         rivals[i].append(j)
         rivals[j].append(i)
-    kept, gone = [], np.zeros(len(boxes), dtype=bool)
+    kept, suppressed = [], np.zeros(len(boxes), dtype=bool)
     for i in np.argsort(-scores, kind="stable").tolist():
-        if not gone[i]:
+        if not suppressed[i]:
             kept.append(i)
-            gone[rivals[i]] = True
+            suppressed[rivals[i]] = True
     return np.array(kept)
 
 
@@ -198,18 +198,18 @@ def torch_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.nda
     order = np.argsort(-scores, kind="stable")
     ranked = boxes[order]
     radius, areas = np.hypot(ranked[:, 3], ranked[:, 4]) / 2, ranked[:, 3] * ranked[:, 4]
-    kept, gone = [], np.zeros(len(boxes), dtype=bool)
+    kept, suppressed = [], np.zeros(len(boxes), dtype=bool)
     for i in range(len(boxes)):
-        if gone[i]:
+        if suppressed[i]:
             continue
         kept.append(i)
         away = ((ranked[i + 1 :, :2] - ranked[i, :2]) ** 2).sum(axis=1)
-        near = (away < (radius[i + 1 :] + radius[i]) ** 2) & ~gone[i + 1 :]
+        near = (away < (radius[i + 1 :] + radius[i]) ** 2) & ~suppressed[i + 1 :]
         rest = i + 1 + np.flatnonzero(near)
         if len(rest):
             one = np.broadcast_to(ranked[i], (len(rest), 7))
             common = torch_common_areas(one, ranked[rest])
-            gone[rest[common / (areas[i] + areas[rest] - common) > threshold]] = True
+            suppressed[rest[common / (areas[i] + areas[rest] - common) > threshold]] = True
     return np.asarray(order[kept])
 
 

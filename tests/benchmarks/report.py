@@ -63,19 +63,19 @@ def render(summary: Mapping[str, Any]) -> str:
 
 
 def _line(benchmark: Mapping[str, Any]) -> dict[str, Any]:
-    told, stats = benchmark["extra_info"], benchmark["stats"]
-    target = told["target_s"]
+    info, stats = benchmark["extra_info"], benchmark["stats"]
+    target = info["target_s"]
     by_cpu = benchmark["options"]["timer"] in CPU_TIMERS
     return {
-        "name": told["name"],
-        "figure": told["figure"],
+        "name": info["name"],
+        "figure": info["figure"],
         "timer": "CPU" if by_cpu else "clock",
         "seconds": stats["min"],
         "median_seconds": stats["median"],
-        "clock_seconds": told["clock_s"],
+        "clock_seconds": info["clock_s"],
         "rounds": stats["rounds"],
-        "per_second": told["amount"] / stats["min"],
-        "unit": told["unit"],
+        "per_second": info["amount"] / stats["min"],
+        "unit": info["unit"],
         "target_seconds": target,
         "met": None if target is None else stats["min"] <= target,
     }

@@ -25,11 +25,11 @@ def measured(*lines):
 
 def line(group, name, seconds, *, figure="ratio", target=None, amount=100, timer="process_time"):
     """Return one benchmark of such a document."""
-    told = {"name": name, "figure": figure, "amount": amount, "unit": "boxes", "target_s": target}
-    told["clock_s"] = 3 * seconds
+    info = {"name": name, "figure": figure, "amount": amount, "unit": "boxes", "target_s": target}
+    info["clock_s"] = 3 * seconds
     stats = {"min": seconds, "median": 2 * seconds, "rounds": 5}
     options = {"timer": timer}
-    return {"group": group, "extra_info": told, "stats": stats, "options": options}
+    return {"group": group, "extra_info": info, "stats": stats, "options": options}
 
 
 def test_ratios_are_multiples_of_our_time() -> None:

@@ -10,10 +10,10 @@ import pytest
 Sample = TypeVar("Sample")
 
 
-def sample_of(samples: Mapping[str, Sample], name: str, wanted: str) -> Sample:
+def sample_of(samples: Mapping[str, Sample], name: str, description: str) -> Sample:
     """Return the sample of a registered extension; fail the test if there is none."""
     if name not in samples:
-        pytest.fail(f"'{name}' is registered but has no sample: add to SAMPLES here {wanted}")
+        pytest.fail(f"'{name}' is registered but has no sample: add to SAMPLES here {description}")
     return samples[name]
 
 

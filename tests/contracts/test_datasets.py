@@ -26,8 +26,8 @@ SAMPLES: Mapping[str, Callable[[Path], None]] = {
 @pytest.fixture(params=sorted(DATASETS.classes))
 def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """Return the folder of four frames."""
-    wanted = "a function that writes four small labeled frames below a folder"
-    sample_of(SAMPLES, request.param, wanted)(tmp_path)
+    description = "a function that writes four small labeled frames below a folder"
+    sample_of(SAMPLES, request.param, description)(tmp_path)
     return tmp_path
 
 
@@ -107,10 +107,10 @@ def test_annotations_are_boxes_in_the_lidar_frame(dataset) -> None:
         assert truth.boxes_2d.shape == (count, 4)
         assert truth.categories.dtype.kind == "U"
         assert truth.occluded.dtype == np.int64
-        known = ~np.isnan(truth.boxes).any(axis=1)
-        assert (truth.boxes[known, 3:6] > 0).all()
-        assert (np.abs(truth.boxes[known, 6]) <= np.pi).all()
-        assert set(truth.categories[~known]) <= {"DontCare"}
+        has_box = ~np.isnan(truth.boxes).any(axis=1)
+        assert (truth.boxes[has_box, 3:6] > 0).all()
+        assert (np.abs(truth.boxes[has_box, 6]) <= np.pi).all()
+        assert set(truth.categories[~has_box]) <= {"DontCare"}
         assert_same(truth, dataset.annotations(name))
 
 

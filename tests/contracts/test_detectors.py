@@ -84,8 +84,8 @@ def build(name: str, path: Path, minimum_score: float = 0.1):
 @pytest.fixture(scope="module", params=sorted(DETECTORS.classes))
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, frames):
     """Return the name and the file of every registered detector in turn."""
-    wanted = "a function that writes a small file from which the detector can be made"
-    write = sample_of(SAMPLES, request.param, wanted)
+    description = "a function that writes a small file from which the detector can be made"
+    write = sample_of(SAMPLES, request.param, description)
     return request.param, write(tmp_path_factory.mktemp(request.param), frames)
 
 

@@ -83,11 +83,13 @@ def exported(request: pytest.FixtureRequest, tmp_path: Path):
 
 def sample(name: str):
     """Return the function that edits the returned file of an editor."""
-    wanted = "three functions that change the boxes of a frame, take it away, add an unknown one"
-    return sample_of(SAMPLES, name, wanted)
+    description = (
+        "three functions that change the boxes of a frame, take it away, add an unknown one"
+    )
+    return sample_of(SAMPLES, name, description)
 
 
-def came_back(editor, folder: Path, sheet: Sheet):
+def imported(editor, folder: Path, sheet: Sheet):
     """Return the boxes that an editor returned, after the checks."""
     found = editor.read(folder, sheet, read)
     for boxes in found.values():
@@ -98,7 +100,7 @@ def came_back(editor, folder: Path, sheet: Sheet):
 def test_an_unedited_export_is_imported_unchanged(exported) -> None:
     """Categories and order are the same, boxes within a millimetre; no decision is made."""
     editor, sheet, folder = exported
-    found = came_back(editor, folder, sheet)
+    found = imported(editor, folder, sheet)
     assert list(found) == ["000001", "000002"]
     for shown in sheet.frames:
         boxes = np.array([box.box for box in found[shown.frame]])
@@ -112,7 +114,7 @@ def test_a_frame_missing_from_the_import_was_not_reviewed(exported) -> None:
     """It is left out, and the others are read."""
     editor, sheet, folder = exported
     sample(editor.name)[1](folder)
-    assert list(came_back(editor, folder, sheet)) == ["000001"]
+    assert list(imported(editor, folder, sheet)) == ["000001"]
 
 
 def test_an_unknown_frame_is_rejected(exported) -> None:
@@ -137,11 +139,11 @@ def test_an_unknown_frame_is_rejected(exported) -> None:
 def test_a_damaged_file_gives_a_one_line_error(exported, edit: Callable[[str], str]) -> None:
     """The message contains the file, whatever the damage; no other exception is raised."""
     editor, sheet, folder = exported
-    before = came_back(editor, folder, sheet)["000002"]
+    before = imported(editor, folder, sheet)["000002"]
     assert before[0].box[3] == pytest.approx(CYCLIST[3])
     sample(editor.name)[0](folder, edit)
     with pytest.raises(DataError, match=r"000002|default\.json") as error:
-        came_back(editor, folder, sheet)
+        imported(editor, folder, sheet)
     assert_one_line(error.value)
 
 

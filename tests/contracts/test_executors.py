@@ -140,7 +140,7 @@ def serial_rows(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tu
 
 
 def finished(home: Path, name: str, executor: str, workers: int) -> Workspace:
-    """A workspace in which all stages have run."""
+    """Return a workspace in which all stages have run."""
     document = toy_document(home / "kitti", home / "detector.txt")
     document["run"] = {"executor": executor, "workers": workers}
     workspace = initialise(home / name, make_config(document, "test"), "0.1", "")

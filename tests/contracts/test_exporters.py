@@ -405,8 +405,10 @@ OBJECT_WEIGHTS: Mapping[str, Callable[[Path], list[float]]] = {
 }
 
 
-@pytest.mark.parametrize("fault", ["weight", "labeled frame"])
-def test_an_export_iterates_over_the_labels_once(exporter, labels, tmp_path, fault: str) -> None:
+@pytest.mark.parametrize("broken_field", ["weight", "labeled frame"])
+def test_an_export_iterates_over_the_labels_once(
+    exporter, labels, tmp_path, broken_field: str
+) -> None:
     """An error in the last block is found in the same pass."""
     walks = []
 
@@ -422,7 +424,7 @@ def test_an_export_iterates_over_the_labels_once(exporter, labels, tmp_path, fau
 
     rows = rows_of(labels)
     wrong = {"weight": {"weight": "much"}, "labeled frame": {"frame": labels.frames[0].frame}}
-    bad = [block(rows[:-1]), block([rows[-1] | wrong[fault]])]
+    bad = [block(rows[:-1]), block([rows[-1] | wrong[broken_field]])]
     path = place(exporter, tmp_path)
     exporter.write(path, replace(labels, labels=Walked(labels.labels)))
     before = files(path)
@@ -441,6 +443,6 @@ def test_no_exporter_accepts_ground_truth_of_unlabeled_frames(exporter, labels, 
     with pytest.raises(LeakageError, match="000777"):
         replace(labels, frames=[*labels.frames, FrameFiles("000777", "val", "p", "i", "c")])
     rows = rows_of(labels)
-    strayed = with_rows(labels, [rows[0] | {"frame": first}, *rows[1:]])
+    misplaced = with_rows(labels, [rows[0] | {"frame": first}, *rows[1:]])
     with pytest.raises(DataError, match=first):
-        exporter.write(place(exporter, tmp_path), strayed)
+        exporter.write(place(exporter, tmp_path), misplaced)

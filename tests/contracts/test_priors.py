@@ -78,8 +78,8 @@ def test_a_declaration_matches_its_table(request: pytest.FixtureRequest, prior) 
     """The columns are in order, each with a unit or none, and a meaning."""
     name = request.node.callspec.params["prior"]
     declaration = source_of(name).declaration
-    known = declaration.table in Base.metadata.tables
-    table = Base.metadata.tables[declaration.table] if known else evidence_table(declaration)
+    is_builtin = declaration.table in Base.metadata.tables
+    table = Base.metadata.tables[declaration.table] if is_builtin else evidence_table(declaration)
     own = [column.name for column in table.columns if column.name not in KEY]
     assert own == [column.name for column in prior.columns]
     assert all(column.meaning for column in prior.columns)
@@ -97,8 +97,7 @@ def test_trust_lies_between_0_and_1(prior, frames) -> None:
         assert len(np.unique(rho)) > 1
 
 
-def test_the_measured_columns_are_stored_beside_the_trust(prior) -> None:
-    """Rating them gives the trust again."""
+def test_the_measured_columns_are_declared_and_exclude_the_trust(prior) -> None:
     assert prior.measured_columns
     names = {column.name for column in prior.columns}
     assert set(prior.measured_columns) <= names - {prior.rho_column}

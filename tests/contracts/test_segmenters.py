@@ -91,8 +91,10 @@ def build(name: str, path: Path):
 @pytest.fixture(scope="module", params=sorted(SEGMENTERS.classes))
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, frames):
     """Return the name and the file of every registered segmenter in turn."""
-    wanted = "a function that gives a small file or folder from which the segmenter can be made"
-    prepare = sample_of(SAMPLES, request.param, wanted)
+    description = (
+        "a function that gives a small file or folder from which the segmenter can be made"
+    )
+    prepare = sample_of(SAMPLES, request.param, description)
     return request.param, prepare(tmp_path_factory.mktemp(request.param), frames)
 
 

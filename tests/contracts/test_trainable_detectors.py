@@ -251,11 +251,11 @@ def test_an_external_detector_works_with_the_whole_command_line(
     shown = curate("query", "--named", "training", "-w", whole)
     assert shown.returncode == 0
     assert "gradient_norm" in shown.stdout
-    brought = tmp_path / "brought"
-    made = init(toy_kitti, brought, "--detector-path", whole / "checkpoints" / names[0])
+    external = tmp_path / "brought"
+    made = init(toy_kitti, external, "--detector-path", whole / "checkpoints" / names[0])
     assert made.returncode == 0, made.stderr
-    assert curate("pretrain", "-w", brought).returncode == ConfigError.exit_code
-    ran = curate("run", "--rounds", "1", "-w", brought)
+    assert curate("pretrain", "-w", external).returncode == ConfigError.exit_code
+    ran = curate("run", "--rounds", "1", "-w", external)
     assert ran.returncode == 0, ran.stderr
     foreign = whole / "curate.toml"
     foreign.write_text(foreign.read_text().replace(TOY, "pillars"))
@@ -266,7 +266,7 @@ def test_an_external_detector_works_with_the_whole_command_line(
     assert "'pillars'" in ran.stderr
     assert names[1] in ran.stderr
     wrong = tmp_path / "wrong"
-    made = curate("init", wrong, "--root", toy_kitti, "--detector-path", brought / "curate.toml")
+    made = curate("init", wrong, "--root", toy_kitti, "--detector-path", external / "curate.toml")
     assert made.returncode == 0, made.stderr
     ran = curate("predict", "-w", wrong)
     assert ran.returncode == ModelError.exit_code

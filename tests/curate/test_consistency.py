@@ -64,8 +64,8 @@ def test_identical_boxes_and_a_certain_score_have_no_loss():
 
 def test_loss_is_score_loss_plus_twice_the_box_loss():
     """L = 1.0 * (-ln s') + 2.0 * sum smoothL1(residual), worked out by hand."""
-    prediction, answer = CAR, moved(CAR, x=1.0, z=0.1)
-    found = consistency(detections([prediction]), detections([answer], scores=[0.25]))
+    prediction, reprediction = CAR, moved(CAR, x=1.0, z=0.1)
+    found = consistency(detections([prediction]), detections([reprediction], scores=[0.25]))
     far, near = 1.0 / 5.0, 0.1 / 1.5  # the diagonal of 4 x 3 is 5
     expected_box = (far - 0.5 / 9) + 0.5 * near**2 * 9
     assert found.score_loss[0] == pytest.approx(-np.log(0.25))
@@ -185,12 +185,12 @@ def test_matching_does_not_depend_on_the_order(predictions, repredictions, rando
 
     # Exact copies of a prediction are interchangeable, so the losses of all copies are compared
     # together.
-    def verdicts(boxes, scores, categories, losses):
+    def results_by_copy(boxes, scores, categories, losses):
         rows = zip(categories, scores, boxes.tolist(), losses, strict=True)
         return sorted((str(c), s, b, np.nan_to_num(loss, nan=-1.0)) for c, s, b, loss in rows)
 
     p = predictions
-    assert verdicts(p.boxes, p.scores, p.categories, straight.loss) == verdicts(
+    assert results_by_copy(p.boxes, p.scores, p.categories, straight.loss) == results_by_copy(
         p.boxes[rows], p.scores[rows], p.categories[rows], shuffled.loss
     )
 
@@ -205,8 +205,10 @@ def test_matching_does_not_depend_on_the_order(predictions, repredictions, rando
 def test_an_equivariant_detector_is_consistent(flip_y, turn, scale, predictions):
     """A^-1 of A's boxes are the boxes: the box loss is 0 for every A."""
     similarity = Similarity(flip_y, turn, scale)
-    answered = similarity.apply_to_boxes(predictions.boxes)
-    back = Detections(similarity.invert_boxes(answered), predictions.scores, predictions.categories)
+    repredicted = similarity.apply_to_boxes(predictions.boxes)
+    back = Detections(
+        similarity.invert_boxes(repredicted), predictions.scores, predictions.categories
+    )
     found = consistency(predictions, back)
     assert (found.matched >= 0).all()
     assert found.box_loss == pytest.approx(np.zeros(len(predictions)), abs=1e-12)

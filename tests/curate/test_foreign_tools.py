@@ -60,15 +60,15 @@ class Stubs:
 @pytest.fixture
 def stubbed(monkeypatch):
     """Replace packages for displays, CUDA and plots by stubs."""
-    gone: set[str] = {"labelCloud", "nuscenes", "datumaro"}
+    missing: set[str] = {"labelCloud", "nuscenes", "datumaro"}
 
     def stub(*packages: str) -> None:
-        gone.update(packages)
+        missing.update(packages)
         monkeypatch.setattr(sys, "meta_path", [Stubs(*packages), *sys.meta_path])
 
     yield stub
     # Modules imported with stubs must not stay for other tests.
-    for name in [name for name in sys.modules if name.partition(".")[0] in gone]:
+    for name in [name for name in sys.modules if name.partition(".")[0] in missing]:
         del sys.modules[name]
 
 
@@ -101,11 +101,11 @@ def test_pycocotools_evaluates_the_coco_file_against_itself(tmp_path, capsys):
     truth = [one for one in opened.dataset["annotations"] if not one.get("iscrowd")]
     names = ("image_id", "category_id", "bbox")
     found = opened.loadRes([{name: one[name] for name in names} | {"score": 1.0} for one in truth])
-    judged = evaluation.COCOeval(opened, found, "bbox")
-    judged.evaluate()
-    judged.accumulate()
-    judged.summarize()
-    assert judged.stats[0] == pytest.approx(1.0)
+    coco_eval = evaluation.COCOeval(opened, found, "bbox")
+    coco_eval.evaluate()
+    coco_eval.accumulate()
+    coco_eval.summarize()
+    assert coco_eval.stats[0] == pytest.approx(1.0)
 
 
 def test_the_devkit_of_nuscenes_reads_the_results(tmp_path, stubbed):

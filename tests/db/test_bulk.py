@@ -220,7 +220,7 @@ def test_a_server_rejects_integers_that_do_not_fit(database: Database, k: object
 
 
 def test_statistics_cover_the_rows_just_written(database: Database) -> None:
-    """Before other connections can see them, and without waiting for another ANALYZE."""
+    """Before other connections can see them, and without waiting for another refresh."""
     with database.writing() as connection:
         bulk.insert(connection, "weight", _weights(COUNT))
         bulk.refresh_statistics(connection)

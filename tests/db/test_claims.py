@@ -24,7 +24,7 @@ def pair(tmp_path: Path, new_url: Callable[[], str | None]) -> tuple[Database, D
 
 
 @pytest.mark.parametrize(
-    ("mine", "theirs", "word"),
+    ("first", "second", "word"),
     [
         ((1, None), (1, None), "round 1 is being worked on by predict"),
         ((1, None), (1, "pspsl"), "round 1 is being worked on by predict"),
@@ -33,30 +33,30 @@ def pair(tmp_path: Path, new_url: Callable[[], str | None]) -> tuple[Database, D
     ],
 )
 def test_a_claimed_round_is_rejected_with_its_owner(
-    pair: tuple[Database, Database], mine: tuple, theirs: tuple, word: str
+    pair: tuple[Database, Database], first: tuple, second: tuple, word: str
 ) -> None:
     """One line: what, by whom, since when, what to do; afterwards it is free."""
-    with pair[0].claiming_round(*mine, "predict"):
-        with pytest.raises(DatabaseError) as refused, pair[1].claiming_round(*theirs, "solve"):
+    with pair[0].claiming_round(*first, "predict"):
+        with pytest.raises(DatabaseError) as rejected, pair[1].claiming_round(*second, "solve"):
             pass
-        message = str(refused.value)
+        message = str(rejected.value)
         assert message.startswith(word)
         assert f"process {os.getpid()} on " in message
         assert ", since 2" in message
         assert "\n" not in message
-    with pair[1].claiming_round(*theirs, "solve"):
+    with pair[1].claiming_round(*second, "solve"):
         pass
 
 
 @pytest.mark.parametrize(
-    ("mine", "theirs"),
+    ("first", "second"),
     [((1, None), (2, None)), ((1, "spsl"), (1, "pspsl")), ((1, "spsl"), (11, None))],
 )
 def test_independent_claims_are_granted_in_parallel(
-    pair: tuple[Database, Database], mine: tuple, theirs: tuple
+    pair: tuple[Database, Database], first: tuple, second: tuple
 ) -> None:
     """Different rounds, and the policies of one round."""
-    with pair[0].claiming_round(*mine, "solve"), pair[1].claiming_round(*theirs, "solve"):
+    with pair[0].claiming_round(*first, "solve"), pair[1].claiming_round(*second, "solve"):
         pass
 
 
@@ -97,21 +97,21 @@ def lose_claims(database: Database) -> None:
 
 def test_a_process_that_lost_its_claim_writes_nothing_more(pair: tuple[Database, Database]) -> None:
     """Another process may have claimed it; what was written before is kept."""
-    mine, theirs = pair
+    first, second = pair
     add = "INSERT INTO label_file (path, round, policy, sha256) VALUES ('{}', 1, 'p', '')"
 
-    def lost_in_the_midst() -> None:
-        with mine.claiming_round(1, None, "predict"):
-            with mine.writing() as connection:
+    def lose_the_claim() -> None:
+        with first.claiming_round(1, None, "predict"):
+            with first.writing() as connection:
                 connection.exec_driver_sql(add.format("before"))
-            lose_claims(mine)
-            with theirs.claiming_round(1, None, "solve"), mine.writing() as connection:
+            lose_claims(first)
+            with second.claiming_round(1, None, "solve"), first.writing() as connection:
                 connection.exec_driver_sql(add.format("after"))
 
     with pytest.raises(DatabaseError, match="finished frames are kept") as found:
-        lost_in_the_midst()
+        lose_the_claim()
     assert "\n" not in str(found.value)
-    with theirs.claiming_round(1, None, "solve"), mine.writing() as connection:
+    with second.claiming_round(1, None, "solve"), first.writing() as connection:
         stored = connection.exec_driver_sql("SELECT path FROM label_file").scalars()
         assert list(stored) == ["before"]
 
@@ -125,7 +125,7 @@ def test_a_lost_server_gives_one_line(
         pytest.skip("a file is not lost like this")
     database, other = Database(url), Database(url)
 
-    def lost_in_the_midst() -> None:
+    def lose_the_claim() -> None:
         with database.claiming_round(1, None, "predict"), database.writing() as connection:
             with other.writing() as ending:
                 ending.exec_driver_sql(
@@ -135,5 +135,5 @@ def test_a_lost_server_gives_one_line(
             connection.exec_driver_sql("SELECT 1")
 
     with pytest.raises(DatabaseError, match="check that the server runs") as found:
-        lost_in_the_midst()
+        lose_the_claim()
     assert "\n" not in str(found.value)

@@ -123,9 +123,9 @@ def test_a_server_database_that_cannot_be_dumped_is_not_migrated(
     older_server_database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """pg_dump fails: one line with its reason, and the schema does not change."""
-    refusing = tmp_path / "pg_dump"
-    refusing.write_text("#!/bin/sh\necho server version mismatch >&2\nexit 1\n")
-    refusing.chmod(0o755)
+    failing = tmp_path / "pg_dump"
+    failing.write_text("#!/bin/sh\necho server version mismatch >&2\nexit 1\n")
+    failing.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     remedy = r"cannot be copied.*version mismatch; install the pg_dump of the server"
     with pytest.raises(DatabaseError, match=remedy):

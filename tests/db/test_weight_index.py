@@ -61,8 +61,8 @@ def test_a_query_for_a_policy_uses_its_index(tmp_path: Path, policy: str) -> Non
     with sqlite3.connect(tmp_path / "curate.db") as raw:
         (plan,) = raw.execute(f"EXPLAIN QUERY PLAN {literal}")
         assert f"{name} (round=? AND v>?)" in plan[3]
-        asked = "EXPLAIN QUERY PLAN SELECT v FROM weight WHERE round = ? AND policy = ? AND v > ?"
-        (plan,) = raw.execute(asked, (1, policy, 0.5))
+        explain = "EXPLAIN QUERY PLAN SELECT v FROM weight WHERE round = ? AND policy = ? AND v > ?"
+        (plan,) = raw.execute(explain, (1, policy, 0.5))
         assert f"{name} (round=? AND v>?)" in plan[3]
 
 

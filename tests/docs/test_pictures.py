@@ -11,9 +11,9 @@ from curate.viewing.tags import ShownLabels
 from docs.make_pictures import _RAW, before_after, results_chart, save_small_png
 
 
-def has(picture, colour):
+def has(drawn, colour):
     """Return whether a colour is in an image."""
-    return (np.abs(picture.astype(int) - np.array(colour)).max(axis=-1) < 4).any()
+    return (np.abs(drawn.astype(int) - np.array(colour)).max(axis=-1) < 4).any()
 
 
 def test_the_left_half_has_one_colour_and_the_right_half_those_of_the_weights():
@@ -24,9 +24,9 @@ def test_the_left_half_has_one_colour_and_the_right_half_those_of_the_weights():
     boxes = np.array([[20.0, 3, 0, 4, 2, 1.5, 0.3], [30, -5, 0, 4, 2, 1.5, 0]])
     weights = np.array([0.7, 0.0])
     labels = ShownLabels(boxes, np.array(["Car"] * 2), np.array([0.9, 0.8]), weights)
-    picture = before_after(frame, labels)
+    drawn = before_after(frame, labels)
     # Without the legend, which shows all colours.
-    left, right = picture[:-40, :620], picture[:-40, 632:]
+    left, right = drawn[:-40, :620], drawn[:-40, 632:]
     trusted, zero = weight_colours(weights)
     assert has(left, _RAW)
     assert not has(left, trusted)

@@ -106,11 +106,11 @@ def test_the_commands_with_a_user_detector(tmp_path: Path, kitti_root: Path) -> 
     own = (results / f"{labeled.pop()}.txt").read_text().splitlines()
     assert len(weights) == len(written) - len(own)
     assert any(weight > 0 for _, weight in weights)
-    picture = re.search(r"^picture: (.*)$", printed, re.MULTILINE)
+    image = re.search(r"^picture: (.*)$", printed, re.MULTILINE)
     report = re.search(r"^report: (.*)$", printed, re.MULTILINE)
-    assert picture is not None
+    assert image is not None
     assert report is not None
-    assert Path(picture[1]).read_bytes().startswith(b"\x89PNG")
+    assert Path(image[1]).read_bytes().startswith(b"\x89PNG")
     assert "<svg" in Path(report[1]).read_text()
 
 

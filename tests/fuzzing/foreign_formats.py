@@ -28,8 +28,8 @@ def _mapped() -> Frame:
 def write_map_results(path: Path) -> None:
     """Write results of two frames in nuScenes' format."""
     boxes = into_map(np.array([[10.0, 2, -1, 4.2, 1.8, 1.5, 0.3]]), vehicle_pose(0, 0))
-    told = {"detection_name": "car", "detection_score": 0.5}
-    results = {name: [box | told for box in boxes] for name in ("000000", "000001")}
+    fields = {"detection_name": "car", "detection_score": 0.5}
+    results = {name: [box | fields for box in boxes] for name in ("000000", "000001")}
     path.write_text(json.dumps({"meta": {"use_lidar": True}, "results": results}))
 
 

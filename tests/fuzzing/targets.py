@@ -68,11 +68,11 @@ class Target:
         try:
             self.read(path)
         except CurateError as error:
-            refused = error
+            rejected = error
         else:
             return None
-        assert len(str(refused).splitlines()) == 1, repr(str(refused))
-        return refused
+        assert len(str(rejected).splitlines()) == 1, repr(str(rejected))
+        return rejected
 
 
 def toy_frame() -> Frame:
@@ -203,9 +203,9 @@ def _json(path: Path) -> None:
 
 
 def _read_list(path: Path) -> None:
-    answers = read_results(path, "list", ReadOptions(("Car",)))
-    for name in answers:
-        answers[name]
+    results = read_results(path, "list", ReadOptions(("Car",)))
+    for name in results:
+        results[name]
 
 
 def _read_table(path: Path) -> None:

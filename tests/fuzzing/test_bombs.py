@@ -41,10 +41,10 @@ def explode(folder: Path) -> None:
             use(home / target.name)
             forget_peak()
             before = peak()
-            refused = target.attempt(home / target.name)
+            rejected = target.attempt(home / target.name)
             home.rename(folder / f"{home.name}-{use is write}")
         grown = peak() - before
-        assert refused is not None, name
+        assert rejected is not None, name
         sys.stdout.write(f"{name}: {grown}\n")
 
 

@@ -86,10 +86,10 @@ class Frame:
                 hits += 1
                 turn = label["alpha"] - self.results[best]["alpha"]
                 similarity += (1 + math.cos(turn)) / 2
-        false = [i for i in free if self.result_states[i] == "counted" and not self.cared(i)]
+        false = [i for i in free if self.result_states[i] == "counted" and not self.in_dontcare(i)]
         return hits, len(false), similarity
 
-    def cared(self, index):
+    def in_dontcare(self, index):
         """Return whether a detection is in a DontCare region by more than the minimum overlap."""
         box = self.results[index]["box_2d"]
         area = (box[2] - box[0]) * (box[3] - box[1])

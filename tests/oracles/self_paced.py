@@ -19,7 +19,7 @@ def pspsl_weight(loss, lambda_u, rho):
 
 def age_parameters(losses, groups, share):
     """Return lambda of each label, group by group in plain Python; None if no label matched."""
-    answers = []
+    lambdas = []
     for own in groups:
         seen = [
             loss
@@ -27,5 +27,5 @@ def age_parameters(losses, groups, share):
             if group == own and not np.isnan(loss)
         ]
         mean = sum(seen) / len(seen) if seen else None
-        answers.append(share * max(seen) + (1 - share) * mean if seen else None)
-    return answers
+        lambdas.append(share * max(seen) + (1 - share) * mean if seen else None)
+    return lambdas

@@ -78,9 +78,9 @@ def test_unknown_names_are_dropped_and_reported_once(
     code, out, _ = begin(curate, tmp_path / "w", toy_kitti, results)
     assert code == 0
     assert "12 rows" in out
-    told = [message for message in caplog.messages if "'Moped'" in message]
-    assert len(told) == 1
-    assert "rename" in told[0]
+    warned = [message for message in caplog.messages if "'Moped'" in message]
+    assert len(warned) == 1
+    assert "rename" in warned[0]
 
 
 def test_results_for_other_frames_end_the_command(
@@ -170,9 +170,9 @@ def test_a_report_needs_no_network(curate: Curate, workspace: Workspace, tmp_pat
     )  # fmt: skip
     title = re.search(r"<title>shown (\d+)/(\d+) asked (\d+)</title>", ended.stdout)
     assert title is not None, ended.stderr
-    shown, pictures, asked = map(int, title.groups())
-    assert shown == pictures > 0
-    assert asked == 0
+    shown, images, requested = map(int, title.groups())
+    assert shown == images > 0
+    assert requested == 0
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from pipelines.workspace.workspace import Workspace
 
 NAMES = ("curate", "db", "pipelines")
 # An import of this package instead of ours fails at once.
-STRANGER = "raise RuntimeError('the package of a stranger was imported')\n"
+FAILING_MODULE = "raise RuntimeError('the package of a stranger was imported')\n"
 SCRIPT = Path(sys.executable).with_name("curate")
 COMMANDS = {
     "script": [str(SCRIPT)],
@@ -33,21 +33,21 @@ def write_packages(folder: Path) -> None:
     """Write a package of each name that raises when it is imported."""
     for name in NAMES:
         (folder / name).mkdir(parents=True)
-        (folder / name / "__init__.py").write_text(STRANGER)
+        (folder / name / "__init__.py").write_text(FAILING_MODULE)
 
 
 def write_modules(folder: Path) -> None:
     """Write the same as single files."""
     folder.mkdir()
     for name in NAMES:
-        (folder / f"{name}.py").write_text(STRANGER)
+        (folder / f"{name}.py").write_text(FAILING_MODULE)
 
 
 def write_bare_folders(folder: Path) -> None:
     """Write folders without __init__.py, which Python takes for namespace packages."""
     for name in NAMES:
         (folder / name).mkdir(parents=True)
-        (folder / name / "models.py").write_text(STRANGER)
+        (folder / name / "models.py").write_text(FAILING_MODULE)
 
 
 @pytest.fixture(params=[write_packages, write_modules, write_bare_folders])

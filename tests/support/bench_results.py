@@ -64,10 +64,10 @@ class ToyJobs:
         self.root, self.fault = root, fault
         self.done: list[Job] = []
 
-    def __call__(self, job: Job, told: Callable[[str, int], None]) -> str | None:
+    def __call__(self, job: Job, report: Callable[[str, int], None]) -> str | None:
         """Run a job."""
         self.done.append(job)
-        told("train", 2)
+        report("train", 2)
         reason = self.fault(job)
         if reason is None:
             write_result(self.root, synthetic_result(job, 50.0))

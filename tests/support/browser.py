@@ -23,13 +23,13 @@ class Viewer:
         self.faults: list[str] = []
         self.width = width
         self._context = browser.new_context(viewport={"width": width, "height": 900})
-        self._context.route("**/*", self._pass_or_refuse)
+        self._context.route("**/*", self._pass_or_abort)
         self.page = self._context.new_page()
         self.page.set_default_timeout(120_000)
         self.page.on("pageerror", lambda error: self.faults.append(f"error: {error}"))
-        self.page.on("console", self._heard)
+        self.page.on("console", self._on_console)
         self.page.on("requestfailed", lambda request: self.faults.append(f"failed: {request.url}"))
-        self.page.on("response", self._answered)
+        self.page.on("response", self._on_response)
 
     def open(self, url: str) -> Any:
         """Return the page, completely loaded."""
@@ -46,17 +46,17 @@ class Viewer:
         found: list[str] = self.page.evaluate(f"{script}.map(i => i.alt)")
         return found
 
-    def _pass_or_refuse(self, route: Any) -> None:
+    def _pass_or_abort(self, route: Any) -> None:
         if route.request.url.startswith(("file:", "data:", "http://127.0.0.1:")):
             route.continue_()
         else:
             route.abort("internetdisconnected")
 
-    def _heard(self, message: Any) -> None:
+    def _on_console(self, message: Any) -> None:
         if message.type in {"error", "warning"}:
             self.faults.append(f"console: {message.text}")
 
-    def _answered(self, response: Any) -> None:
+    def _on_response(self, response: Any) -> None:
         if response.status >= 400:
             self.faults.append(f"{response.status}: {response.url}")
 

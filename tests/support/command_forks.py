@@ -17,10 +17,10 @@ class CommandForks:
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,))
+        self._connection, child_end = context.Pipe()
+        self._process = context.Process(target=_serve, args=(child_end,))
         self._process.start()
-        theirs.close()
+        child_end.close()
         self._connection.recv()
 
     def start(self, arguments: Sequence[object], environment: Mapping[str, str]) -> int:
@@ -50,7 +50,7 @@ def _serve(connection: Connection) -> None:
             elif pid := os.fork():
                 connection.send(pid)
             else:
-                _become(*message)
+                _run_command(*message)
 
 
 def _warm_up() -> None:
@@ -69,7 +69,7 @@ def _warm_up() -> None:
         workspace.database.close()
 
 
-def _become(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
+def _run_command(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
     """Turn this process into the command, without a parent that listens."""
     from pipelines.cli import main
 

@@ -27,15 +27,15 @@ def write_many_frames(root: Path, frames: int) -> Path:
     (root / "ImageSets" / "train.txt").write_text("\n".join(names) + "\n")
     (root / "ImageSets" / "val.txt").write_text("")
     (root / "labeled.txt").write_text("\n".join(names[:LABELED]) + "\n")
-    answers = [_answers(home / "velodyne" / f"{i:06d}.bin") for i in range(TEMPLATES)]
+    detections = [_detections(home / "velodyne" / f"{i:06d}.bin") for i in range(TEMPLATES)]
     with (root / "detections.csv").open("w") as file:
         file.write(HEADER + "\n")
         for i, name in enumerate(names):
-            file.writelines(f"{name},{answer}\n" for answer in answers[i % TEMPLATES])
+            file.writelines(f"{name},{line}\n" for line in detections[i % TEMPLATES])
     return root / "detections.csv"
 
 
-def _answers(path: Path) -> list[str]:
+def _detections(path: Path) -> list[str]:
     """Return a box per object, for the frame and for a mirrored copy."""
     points = np.fromfile(path, dtype=np.float32).reshape(-1, 4)
     rows = []

@@ -25,7 +25,7 @@ def unavailable() -> str | None:
     if _binaries() is None:
         return "no PostgreSQL binaries (initdb, postgres) in PATH or /usr/lib/postgresql"
     if os.geteuid() == 0 and _account() is None:
-        return "PostgreSQL refuses to run as root, and there is no account postgres or nobody"
+        return "PostgreSQL does not run as root, and there is no account postgres or nobody"
     return None
 
 
@@ -121,5 +121,5 @@ def _account() -> str | None:
 
     if os.geteuid() != 0:
         return None
-    known = {entry.pw_name for entry in pwd.getpwall()}
-    return next((name for name in ("postgres", "nobody") if name in known), None)
+    accounts = {entry.pw_name for entry in pwd.getpwall()}
+    return next((name for name in ("postgres", "nobody") if name in accounts), None)

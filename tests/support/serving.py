@@ -58,9 +58,9 @@ class Pages:
         query = f"?{urlencode(parameters, quote_via=quote)}" if parameters else ""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120)
         connection.request(method, path + query, body=body, headers=dict(headers or {}))
-        answer = connection.getresponse()
-        names = {name.lower(): value for name, value in answer.getheaders()}
-        found = Answer(answer.status, names, answer.read())
+        response = connection.getresponse()
+        names = {name.lower(): value for name, value in response.getheaders()}
+        found = Answer(response.status, names, response.read())
         connection.close()
         return found
 

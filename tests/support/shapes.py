@@ -27,7 +27,7 @@ _import_hook._is_no_type_check = _is_skipped  # noqa: SLF001
 
 
 def check(function: Callable) -> Callable:
-    """Return a function whose arrays are checked for their shapes and dtypes."""
+    """Return a function that checks the shapes and dtypes of its arrays."""
     function.__annotations__ = {
         name: hint if _has_shape(hint) else Any for name, hint in function.__annotations__.items()
     }

@@ -94,7 +94,7 @@ def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: b
         )
 
 
-def dawdle() -> None:
+def wait_if_requested() -> None:
     """Let a test stop the process during its work, or make it wait at a gate, which is a file.
 
     A process that has reached the gate writes another file beside it, named by its number.
@@ -123,7 +123,7 @@ class ToyDetector:
 
     def predict(self, frame: Frame) -> Detections:
         """Return one box per category."""
-        dawdle()
+        wait_if_requested()
         if frame.frame_id in self.poison:
             raise RuntimeError("CUDA error: an illegal memory access\nwas encountered")
         found = []
@@ -149,7 +149,7 @@ class ToySegmenter:
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the semantic map."""
-        dawdle()
+        wait_if_requested()
         width, height = frame.image_size
         class_ids = np.ones((height, width), dtype=np.uint8)
         class_ids[:, width // 2 :] = 2

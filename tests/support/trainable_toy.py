@@ -18,7 +18,7 @@ from curate.errors import ModelError
 from curate.files.atomic import replace_file
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
-from support.toys import INTENSITIES, SIZES, dawdle
+from support.toys import INTENSITIES, SIZES, wait_if_requested
 
 CELL_M, CELLS, LEFT_M = 2.0, 16, -16.0
 FEATURES = len(INTENSITIES) + 1
@@ -33,8 +33,8 @@ def cell_features(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     seen = np.ones((CELLS * CELLS, FEATURES), dtype=np.float32)
     bright = points[:, 3] > 0.6
     for column, intensity in enumerate(INTENSITIES.values()):
-        alike = cell[np.abs(points[:, 3] - intensity) < 0.01]
-        seen[:, column] = np.log1p(np.bincount(alike, minlength=CELLS * CELLS))
+        same_intensity = cell[np.abs(points[:, 3] - intensity) < 0.01]
+        seen[:, column] = np.log1p(np.bincount(same_intensity, minlength=CELLS * CELLS))
     count = np.maximum(np.bincount(cell[bright], minlength=CELLS * CELLS), 1)
     sums = [np.bincount(cell[bright], points[bright, k], CELLS * CELLS) for k in range(2)]
     return seen, np.stack(sums, axis=1) / count[:, None]
@@ -66,7 +66,7 @@ class GridStudent:
 
     def loss(self, batch: tuple[Tensor, Tensor, Tensor], expected_objects: float) -> dict:
         """Return the cross-entropy with random dropout, as object and background terms."""
-        dawdle()
+        wait_if_requested()
         seen, truth, weights = batch
         logits = self.network(functional.dropout(seen, 0.1))
         each = weights * functional.binary_cross_entropy_with_logits(

@@ -138,7 +138,7 @@ def test_scenes_stay_whole(unchanged_root):
     assert set(splits["val"]) == tokens["scene-0103"]
     for scene, own in tokens.items():
         assert set(sequences_of(dataset, own).values()) == {scene}
-    assert dataset.sequence_of("stranger") is None
+    assert dataset.sequence_of("unknown") is None
 
 
 def test_another_version_has_no_lists(tmp_path):

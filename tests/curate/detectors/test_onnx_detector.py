@@ -20,7 +20,7 @@ def frame(points=POINTS):
     return Frame("000001", points, toy_calibration(), (120, 40))
 
 
-def answer(path, options=None, **graph):
+def detect(path, options=None, **graph):
     """Return the detections of a tiny model."""
     tiny_detector(path, **graph)
     return OnnxDetector(path, **({"classes": CATEGORIES} | (options or {}))).predict(frame())
@@ -65,7 +65,7 @@ def path(tmp_path):
 
 def test_boxes_scores_and_labels_become_detections(path):
     """Sorted by falling score, with class names."""
-    found = answer(path)
+    found = detect(path)
     assert found.categories.tolist() == ["Car", "Pedestrian", "Cyclist"]
     np.testing.assert_allclose(found.boxes[0], [10, 2, -1, 3.9, 1.6, 1.5, 0.3], atol=1e-5)
     np.testing.assert_allclose(found.scores, [0.9, 0.525, 0.15], atol=1e-6)
@@ -85,7 +85,7 @@ def test_boxes_scores_and_labels_become_detections(path):
 )  # fmt: skip
 def test_declared_conventions_are_converted(path, convention, row):
     """The same car for every convention of the model."""
-    found = answer(path, {"convention": convention}, rows=np.array([row]))
+    found = detect(path, {"convention": convention}, rows=np.array([row]))
     np.testing.assert_allclose(found.boxes, [[10, 2, -1, 3.9, 1.6, 1.5, 0.3]], atol=1e-5)
 
 
@@ -93,7 +93,7 @@ def test_outputs_are_found_by_name_and_inputs_can_have_a_batch(path):
     """`[1, n, 3]` gets only x, y, z."""
     names = ("bbox", "confidence", "class")
     outputs = {"boxes": "bbox", "scores": "confidence", "labels": "class"}
-    found = answer(path, {"outputs": outputs}, names=names, shape=(1, "n", 3))
+    found = detect(path, {"outputs": outputs}, names=names, shape=(1, "n", 3))
     assert len(found) == 3
 
 
@@ -101,14 +101,14 @@ def test_scores_per_class_and_logits(path):
     """The best class of each box; the logistic function if scores are logits."""
     logits = np.array([[0.0, 2.0, -1.0], [-3.0, -4.0, 1.0]])
     rows = np.array([[0, 0, 0, 1, 1, 1, 0.0], [5, 0, 0, 1, 1, 1, 0.0]])
-    found = answer(path, {"sigmoid": True}, rows=rows, scores=logits)
+    found = detect(path, {"sigmoid": True}, rows=rows, scores=logits)
     assert found.categories.tolist() == ["Pedestrian", "Cyclist"]
     np.testing.assert_allclose(found.scores, 1 / (1 + np.exp([-2.0, -1.0])), atol=1e-6)
 
 
 def test_labels_can_start_at_one(path):
     """As in many frameworks."""
-    found = answer(path, {"first_label": 1}, labels=np.array([3, 1, 2]))
+    found = detect(path, {"first_label": 1}, labels=np.array([3, 1, 2]))
     assert found.categories.tolist() == ["Cyclist", "Car", "Pedestrian"]
 
 
@@ -116,14 +116,14 @@ def test_nms_can_be_added_to_an_export(path):
     """The better of two boxes of a category stays; other categories do not change."""
     rows = np.tile([0, 0, 0, 3.9, 1.6, 1.5, 0.0], (3, 1))
     labels = np.array([0, 0, 1])
-    assert len(answer(path, rows=rows, labels=labels)) == 3
-    assert len(answer(path, {"nms_iou": 0.5}, rows=rows, labels=labels)) == 2
+    assert len(detect(path, rows=rows, labels=labels)) == 3
+    assert len(detect(path, {"nms_iou": 0.5}, rows=rows, labels=labels)) == 2
 
 
 def test_user_supplied_functions_run_before_and_after_the_model(path):
     """Specified as package.module:function."""
     options = {"preprocess": f"{__name__}:double", "postprocess": f"{__name__}:upside_down"}
-    found = answer(path, options)
+    found = detect(path, options)
     assert found.categories.tolist() == ["Cyclist", "Pedestrian", "Car"]
 
 
@@ -156,7 +156,7 @@ def test_user_supplied_functions_run_before_and_after_the_model(path):
 def test_a_model_that_does_not_fit_gives_a_one_line_error(path, options, graph, error, message):
     """With the model, its outputs, and the option to set."""
     with pytest.raises(error, match=message) as caught:
-        answer(path, options, **graph)
+        detect(path, options, **graph)
     assert "\n" not in str(caught.value)
 
 

@@ -37,7 +37,7 @@ def street(boxes=BOXES, seed=0):
     return Frame("000001", cloud, toy_calibration(), (120, 40))
 
 
-def answer(boxes, names=("Car", "Car", "Car")):
+def detections(boxes, names=("Car", "Car", "Car")):
     """Return detections."""
     return Detections(np.array(boxes), np.linspace(0.9, 0.5, len(boxes)), as_categories(names))
 
@@ -57,7 +57,7 @@ def test_a_correct_frame_passes():
     """Every check, of data and of boxes."""
     frame = street()
     assert {one.state for one in examine_frame(frame)} == {"ok"}
-    assert set(states(frame, answer(BOXES)).values()) == {"ok"}
+    assert set(states(frame, detections(BOXES)).values()) == {"ok"}
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_correct_frame_passes():
 )
 def test_a_wrong_convention_is_reported(change, message):
     """Each of the common ones."""
-    finding = convention(street(), answer(BOXES), change(BOXES))
+    finding = convention(street(), detections(BOXES), change(BOXES))
     assert finding.state == "wrong"
     assert message in finding.message
 
@@ -87,13 +87,13 @@ def test_a_wrong_convention_is_reported(change, message):
 def test_names_points_and_projections_are_checked():
     """All wrong, some wrong."""
     frame = street()
-    assert states(frame, answer(BOXES, ("car",) * 3))["names"] == "wrong"
-    assert states(frame, answer(BOXES, ("Car", "Car", "Van")))["names"] == "suspect"
+    assert states(frame, detections(BOXES, ("car",) * 3))["names"] == "wrong"
+    assert states(frame, detections(BOXES, ("Car", "Car", "Van")))["names"] == "suspect"
     far = BOXES + np.array([200, 0, 0, 0, 0, 0, 0])
-    assert states(frame, answer(far))["boxes"] == "wrong"
-    assert states(frame, answer(BOXES * [-1, 1, 1, 1, 1, 1, 1]))["image"] == "wrong"
+    assert states(frame, detections(far))["boxes"] == "wrong"
+    assert states(frame, detections(BOXES * [-1, 1, 1, 1, 1, 1, 1]))["image"] == "wrong"
     mixed = np.vstack([BOXES[:1], far[:2]])
-    assert states(frame, answer(mixed))["boxes"] == "suspect"
+    assert states(frame, detections(mixed))["boxes"] == "suspect"
     assert states(frame, Detections.empty()) == {"detections": "suspect"}
 
 
@@ -121,7 +121,7 @@ def test_real_boxes_pass_and_wrong_ones_fail(kitti_root):
         "bottom": lambda boxes: boxes - boxes[:, 5:6] * np.array([0, 0, 0.5, 0, 0, 0, 0]),
         "high": lambda boxes: boxes + boxes[:, 5:6] * np.array([0, 0, 0.5, 0, 0, 0, 0]),
     }
-    said = {name: [] for name in changes}
+    messages = {name: [] for name in changes}
     for name in record.frame_ids():
         frame = dataset.read(name)
         frame = frame.with_points(
@@ -130,9 +130,11 @@ def test_real_boxes_pass_and_wrong_ones_fail(kitti_root):
         found = record.predict(frame)
         for what, change in changes.items():
             if len(found) >= 3:
-                said[what].append(convention(frame, found, change(found.boxes)))
-    assert len(said["right"]) >= 12
-    assert {one.state for one in said["right"]} == {"ok"}
-    assert all("90 degrees" in one.message or "rotation_y" in one.message for one in said["turned"])
-    assert np.mean(["bottom" in one.message for one in said["bottom"]]) > 0.75
-    assert np.mean(["taken for" in one.message for one in said["high"]]) > 0.65
+                messages[what].append(convention(frame, found, change(found.boxes)))
+    assert len(messages["right"]) >= 12
+    assert {one.state for one in messages["right"]} == {"ok"}
+    assert all(
+        "90 degrees" in one.message or "rotation_y" in one.message for one in messages["turned"]
+    )
+    assert np.mean(["bottom" in one.message for one in messages["bottom"]]) > 0.75
+    assert np.mean(["taken for" in one.message for one in messages["high"]]) > 0.65

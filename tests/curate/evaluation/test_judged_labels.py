@@ -76,9 +76,9 @@ def test_no_frames_give_empty_columns():
 def test_an_edge_belongs_to_the_range_above_it():
     """20 m is in 20-40 m; the last range is open."""
     by_distance = [part for part in slices(six_labels()) if part.by == "distance"]
-    held = [part.holds(np.array([0.0, 20, 39.9, 40, 300])).tolist() for part in by_distance]
-    assert np.array(held).sum(axis=0).tolist() == [1] * 5
-    assert held[1] == [False, True, True, False, False]
+    contained = [part.holds(np.array([0.0, 20, 39.9, 40, 300])).tolist() for part in by_distance]
+    assert np.array(contained).sum(axis=0).tolist() == [1] * 5
+    assert contained[1] == [False, True, True, False, False]
     assert [str(part) for part in (WHOLE, *by_distance)] == ["all", "0-20 m", "20-40 m", "40+ m"]
     assert str(Slice("points", 10, 50)) == "10-50"
 

@@ -68,7 +68,7 @@ def test_results_without_labels_are_an_error(folders):
 
 
 @pytest.mark.parametrize(
-    ("line", "fault"),
+    ("line", "message"),
     [
         (LINE, "15 fields"),
         (f"{LINE} 0.5 1", "17 fields"),
@@ -76,11 +76,11 @@ def test_results_without_labels_are_an_error(folders):
         (f"{LINE.replace('1.5 1.6', '-1.5 1.6')} 0.5", "negative"),
     ],
 )
-def test_invalid_result_lines_are_reported(folders, line, fault):
+def test_invalid_result_lines_are_reported(folders, line, message):
     """File, line and reason."""
     path = folders[1] / "000002.txt"
     path.write_text(f"{LINE} 0.5\n{line}\n")
-    with pytest.raises(DataError, match=rf"000002\.txt:2: .*{fault}"):
+    with pytest.raises(DataError, match=rf"000002\.txt:2: .*{message}"):
         read_folders(*folders)
 
 

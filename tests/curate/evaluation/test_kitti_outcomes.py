@@ -97,9 +97,9 @@ def test_outcomes_add_up_to_the_counts_of_the_oracle(seed, metric, difficulty, t
         ]
         hits, false, _ = np.sum([frame.tally(threshold) for frame in frames], axis=0)
         found = of_labels.outcomes[of_labels.categories == category].tolist()
-        answered = of_results.outcomes[of_results.categories == category].tolist()
-        assert found.count("tp") == answered.count("tp") == hits
-        assert answered.count("fp") == false
+        matched = of_results.outcomes[of_results.categories == category].tolist()
+        assert found.count("tp") == matched.count("tp") == hits
+        assert matched.count("fp") == false
         assert len(found) == sum(state != "absent" for frame in frames for state in frame.states)
 
 
@@ -107,7 +107,7 @@ def test_matches_refer_to_each_other():
     """A found object's detection refers to that object, and both have the same overlap."""
     labels, results = random_frames(np.random.default_rng(2), 30)
     of_labels, of_results = outcomes_of(labels, results, metric="bev")
-    answered = {
+    matched = {
         (frame, index): row
         for row, (frame, index) in enumerate(
             zip(of_results.frames, of_results.indices, strict=True)
@@ -115,9 +115,9 @@ def test_matches_refer_to_each_other():
         if of_results.outcomes[row] == "tp"
     }
     found = np.flatnonzero(of_labels.outcomes == "tp")
-    assert len(found) == len(answered) > 10
+    assert len(found) == len(matched) > 10
     for row in found:
-        other = answered[of_labels.frames[row], of_labels.matches[row]]
+        other = matched[of_labels.frames[row], of_labels.matches[row]]
         assert of_results.matches[other] == of_labels.indices[row]
         assert of_results.overlaps[other] == of_labels.overlaps[row]
         assert of_results.scores[other] == of_labels.scores[row]

@@ -168,8 +168,8 @@ def test_matching_is_one_to_one_and_independent_of_order(rows, places, random):
     assert len(set(taken)) == len(taken)
     order = np.array(random.sample(range(len(rows)), len(rows)), dtype=np.int64)
     again = judge(detections.select(order), objects)
-    verdict = sorted(zip(rows, found.right, strict=True))
-    assert verdict == sorted(zip([rows[i] for i in order], again.right, strict=True))
+    outcome = sorted(zip(rows, found.right, strict=True))
+    assert outcome == sorted(zip([rows[i] for i in order], again.right, strict=True))
 
 
 WEIGHTED = st.lists(

@@ -42,14 +42,16 @@ def test_columns_have_types_units_and_meanings(tmp_path):
 def test_the_file_describes_itself(tmp_path):
     """Frame of reference, units, round, policy, version."""
     ParquetExporter().write(tmp_path / "a.parquet", toy_labels())
-    told = parquet.read_schema(tmp_path / "a.parquet").metadata
-    said = {key.decode().removeprefix("curate."): value.decode() for key, value in told.items()}
-    assert said["frame_of_reference"].startswith("LiDAR: x forward, y left, z up")
-    assert said["units"] == "metres, radians"
-    assert (said["round"], said["policy"], said["version"]) == ("1", "pspsl", "1")
-    assert (said["dataset"], said["root"]) == ("kitti", "/data")
-    assert said["zero_weight"] == "ignore"
-    assert json.loads(said["categories"]) == ["Car", "Pedestrian", "Cyclist"]
+    metadata = parquet.read_schema(tmp_path / "a.parquet").metadata
+    described = {
+        key.decode().removeprefix("curate."): value.decode() for key, value in metadata.items()
+    }
+    assert described["frame_of_reference"].startswith("LiDAR: x forward, y left, z up")
+    assert described["units"] == "metres, radians"
+    assert (described["round"], described["policy"], described["version"]) == ("1", "pspsl", "1")
+    assert (described["dataset"], described["root"]) == ("kitti", "/data")
+    assert described["zero_weight"] == "ignore"
+    assert json.loads(described["categories"]) == ["Car", "Pedestrian", "Cyclist"]
 
 
 def test_rows_are_streamed_in_groups(tmp_path):

@@ -28,8 +28,8 @@ def test_a_wall_does_not_raise_the_ground_beside_it():
 
 def test_one_outlier_below_does_not_lower_the_ground():
     """A reflection from below the ground is ignored."""
-    stray = np.array([[20.0, 0.0, -9.0, 0.0]])
-    assert GroundMap.of(np.concatenate([plane(), stray])).at(stray[:, :2])[0] == -1.7
+    outlier = np.array([[20.0, 0.0, -9.0, 0.0]])
+    assert GroundMap.of(np.concatenate([plane(), outlier])).at(outlier[:, :2])[0] == -1.7
 
 
 def test_without_points_the_height_is_unknown():

@@ -34,21 +34,21 @@ def along(share: float) -> np.ndarray:
 def test_an_object_covers_all_overlapping_predictions() -> None:
     """Of any category, from an IoU of 0.1 on; the one that overlaps most leads."""
     boxes = np.stack([along(SAME_OBJECT_IOU + 0.02), along(0.8), along(SAME_OBJECT_IOU - 0.02)])
-    spoken = match_human_labels(
+    covered = match_human_labels(
         boxes, as_categories(["Car", "Van", "Car"]), labels(("added", "Car", BOX))
     )
-    assert spoken.label.tolist() == [0, 0, -1]
-    assert spoken.leads.tolist() == [False, True, False]
-    np.testing.assert_allclose(spoken.iou, [SAME_OBJECT_IOU + 0.02, 0.8, 0], atol=1e-9)
+    assert covered.label.tolist() == [0, 0, -1]
+    assert covered.leads.tolist() == [False, True, False]
+    np.testing.assert_allclose(covered.iou, [SAME_OBJECT_IOU + 0.02, 0.8, 0], atol=1e-9)
 
 
 def test_a_rejection_covers_its_category_and_position() -> None:
     """From an IoU of 0.3 on; another category at the same position is not covered."""
     boxes = np.stack([along(REJECTED_IOU + 0.02), along(REJECTED_IOU - 0.02), BOX])
     names = as_categories(["Car", "Car", "Pedestrian"])
-    spoken = match_human_labels(boxes, names, labels(("rejected", "Car", BOX)))
-    assert spoken.label.tolist() == [0, -1, -1]
-    assert not spoken.leads.any()
+    covered = match_human_labels(boxes, names, labels(("rejected", "Car", BOX)))
+    assert covered.label.tolist() == [0, -1, -1]
+    assert not covered.leads.any()
 
 
 def test_objects_come_before_rejections() -> None:
@@ -77,9 +77,9 @@ def test_every_object_leads_at_most_one_prediction(places: list[tuple[float, flo
     boxes = np.tile(BOX, (len(places), 1))
     boxes[:, :2] = places
     human = labels(*(("accepted", "Car", box) for box in boxes[::2]))
-    spoken = match_human_labels(boxes, as_categories(["Car"] * len(boxes)), human)
-    assert (spoken.label[::2] >= 0).all()
-    led = spoken.label[spoken.leads]
+    covered = match_human_labels(boxes, as_categories(["Car"] * len(boxes)), human)
+    assert (covered.label[::2] >= 0).all()
+    led = covered.label[covered.leads]
     assert len(led) == len(set(led.tolist()))
     assert (led >= 0).all()
 

@@ -21,7 +21,7 @@ def test_a_manifest_is_read_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "fault"),
+    ("before", "after", "message"),
     [
         ('"category": "Car"', '"category": "Van"', "changed since the export"),
         ('"frames"', '"pages"', "damaged"),
@@ -30,13 +30,13 @@ def test_a_manifest_is_read_back(tmp_path: Path) -> None:
     ],
 )
 def test_a_changed_manifest_is_rejected(
-    tmp_path: Path, before: str, after: str, fault: str
+    tmp_path: Path, before: str, after: str, message: str
 ) -> None:
     """The one-line error contains the file."""
     write_sheet(tmp_path, small_sheet())
     path = tmp_path / MANIFEST
     path.write_text(path.read_text().replace(before, after, 1))
-    with pytest.raises(DataError, match=f"{MANIFEST}: .*{fault}") as error:
+    with pytest.raises(DataError, match=f"{MANIFEST}: .*{message}") as error:
         read_sheet(tmp_path)
     assert "\n" not in str(error.value)
 
@@ -81,7 +81,7 @@ def test_changes_by_spreadsheet_programs_are_tolerated(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "word", "before", "after", "fault"),
+    ("key", "word", "before", "after", "message"),
     [
         ("f000001_1", "maybe", "", "", "3: invalid decision 'maybe'; write accept, reject"),
         ("f000001_all", "reject", "", "", "2: a whole frame cannot be rejected"),
@@ -97,11 +97,11 @@ def test_changes_by_spreadsheet_programs_are_tolerated(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_rows_are_rejected(
-    tmp_path: Path, key: str, word: str, before: str, after: str, fault: str
+    tmp_path: Path, key: str, word: str, before: str, after: str, message: str
 ) -> None:
     """With file and line."""
     edited(tmp_path, **{key: word})
     path = tmp_path / TABLE
     path.write_text(path.read_text().replace(before or "\0", after))
-    with pytest.raises(DataError, match=f"{TABLE}:.*{fault}"):
+    with pytest.raises(DataError, match=f"{TABLE}:.*{message}"):
         read_table(tmp_path, small_sheet())

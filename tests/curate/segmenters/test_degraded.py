@@ -116,10 +116,10 @@ def test_errors_depend_only_on_seed_and_frame(folder):
 def test_the_default_has_moderate_errors(folder, truth):
     """It needs no image, and most pixels do not change."""
     segmenter = DegradedSegmenter(folder)
-    answer = segmenter.segment(frame())
+    predicted = segmenter.segment(frame())
     assert not segmenter.needs_image
-    assert answer.category_classes["Cyclist"] == (3,)
-    assert 0.8 < (answer.class_ids == truth).mean() < 1
+    assert predicted.category_classes["Cyclist"] == (3,)
+    assert 0.8 < (predicted.class_ids == truth).mean() < 1
 
 
 @pytest.mark.parametrize(

@@ -33,9 +33,9 @@ def encoded(class_ids: np.ndarray) -> dict:
     }
 
 
-def save(path: Path, held: object) -> Path:
+def save(path: Path, content: object) -> Path:
     """Write JSON."""
-    path.write_text(json.dumps(held))
+    path.write_text(json.dumps(content))
     return path
 
 
@@ -112,7 +112,7 @@ def test_a_frame_without_objects_is_not_a_frame_without_masks(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("held", "message"),
+    ("content", "message"),
     [
         ({"annotations": 3}, "no list of instance masks"),
         ([3], "no list of instance masks"),
@@ -124,9 +124,9 @@ def test_a_frame_without_objects_is_not_a_frame_without_masks(tmp_path: Path) ->
          "object 1: the mask is 60 x 20 pixels, the image 120 x 40"),
     ],
 )  # fmt: skip
-def test_malformed_masks_are_reported(tmp_path: Path, held: object, message: str) -> None:
+def test_malformed_masks_are_reported(tmp_path: Path, content: object, message: str) -> None:
     """File, object and reason in one line."""
-    path = save(tmp_path / "a.json", held)
+    path = save(tmp_path / "a.json", content)
     with pytest.raises(DataError) as caught:
         InstanceSegmenter(path, COCO).segment(FRAME)
     assert message in str(caught.value)

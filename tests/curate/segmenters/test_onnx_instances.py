@@ -21,15 +21,15 @@ WIDTH, HEIGHT = 12, 8
 KINDS = {"f": TensorProto.FLOAT, "i": TensorProto.INT64, "b": TensorProto.BOOL}
 
 
-def constant_model(path, answers: Mapping[str, np.ndarray], shape=(1, 3, HEIGHT, WIDTH)):
+def constant_model(path, results: Mapping[str, np.ndarray], shape=(1, 3, HEIGHT, WIDTH)):
     """Save a float model that returns the same arrays for every image."""
     outputs = [
         helper.make_tensor_value_info(name, KINDS[values.dtype.kind], [None] * values.ndim)
-        for name, values in answers.items()
+        for name, values in results.items()
     ]
     nodes = [
         helper.make_node("Constant", [], [name], value=numpy_helper.from_array(values))
-        for name, values in answers.items()
+        for name, values in results.items()
     ]
     inputs = [helper.make_tensor_value_info("image", TensorProto.FLOAT, list(shape))]
     graph = helper.make_graph(nodes, "toy", inputs, outputs)
@@ -39,7 +39,7 @@ def constant_model(path, answers: Mapping[str, np.ndarray], shape=(1, 3, HEIGHT,
     return path
 
 
-def answers(boxes, labels, scores, masks) -> dict[str, np.ndarray]:
+def outputs_of(boxes, labels, scores, masks) -> dict[str, np.ndarray]:
     """Return outputs like those of Mask R-CNN."""
     return {
         "boxes": np.array(boxes, np.float32).reshape(-1, 4),
@@ -78,7 +78,7 @@ def test_a_mask_of_a_box_is_resized_into_it(tmp_path):
     expected = np.zeros((HEIGHT, WIDTH), np.uint8)
     expected[2:6, 3:7] = 3 * (np.outer(first, first) > 0.5)
     assert (expected > 0).sum() == 4
-    path = constant_model(tmp_path / "a.onnx", answers([[3, 2, 7, 6]], [3], [0.9], [mask]))
+    path = constant_model(tmp_path / "a.onnx", outputs_of([[3, 2, 7, 6]], [3], [0.9], [mask]))
     np.testing.assert_array_equal(classes_of(path), expected)
     lower = classes_of(path, mask_threshold=0.1)
     np.testing.assert_array_equal(lower[2:6, 3:7] > 0, np.outer(first, first) > 0.1)
@@ -88,7 +88,7 @@ def test_a_mask_of_a_box_is_resized_into_it(tmp_path):
 @pytest.mark.parametrize("batched", [False, True])
 def test_a_box_beyond_the_image_is_clipped(tmp_path, form, batched):
     """For each shape of masks."""
-    found = answers([[-6, 4, 6, 20]], [3], [0.9], np.ones(form))
+    found = outputs_of([[-6, 4, 6, 20]], [3], [0.9], np.ones(form))
     if batched:
         found = {name: values[None] for name, values in found.items()}
         found["masks"] = found["masks"].reshape(1, 1, 28, 28)
@@ -99,7 +99,7 @@ def test_a_box_beyond_the_image_is_clipped(tmp_path, form, batched):
 @pytest.mark.parametrize("kind", [np.float32, bool, np.int64])
 def test_masks_of_the_whole_input(tmp_path, kind):
     """The mask counts, not the box."""
-    found = answers([[0, 0, 1, 1]], [1], [0.9], np.zeros((1, 1, HEIGHT, WIDTH)))
+    found = outputs_of([[0, 0, 1, 1]], [1], [0.9], np.zeros((1, 1, HEIGHT, WIDTH)))
     found["masks"][0, 0, 1:3, 5:9] = 1
     found["masks"] = found["masks"].astype(kind)
     path = constant_model(tmp_path / "a.onnx", found)
@@ -111,7 +111,7 @@ def test_higher_scores_are_on_top_and_other_classes_hide(tmp_path):
     ones = np.ones((4, 4, 4))
     boxes = [[0, 0, 8, 8], [4, 0, 12, 8], [6, 0, 8, 8], [0, 0, 12, 8]]
     path = constant_model(
-        tmp_path / "a.onnx", answers(boxes, [3, 1, 8, 2], [0.6, 0.7, 0.9, 0.4], ones)
+        tmp_path / "a.onnx", outputs_of(boxes, [3, 1, 8, 2], [0.6, 0.7, 0.9, 0.4], ones)
     )
     expected = rectangle(0, 0, 4, 8, 3)
     expected[:, 4:12] = 1
@@ -121,7 +121,7 @@ def test_higher_scores_are_on_top_and_other_classes_hide(tmp_path):
 
 def test_scores_can_follow_the_boxes(tmp_path):
     """As in mmdetection's exports."""
-    found = answers([[0, 0, 4, 8]] * 2, [2, 0], [0, 0], np.ones((2, 4, 4)))
+    found = outputs_of([[0, 0, 4, 8]] * 2, [2, 0], [0, 0], np.ones((2, 4, 4)))
     del found["scores"]
     found["boxes"] = np.column_stack([found["boxes"], np.float32([0.9, 0.2])])[None]
     path = constant_model(tmp_path / "a.onnx", found)
@@ -134,13 +134,13 @@ def test_scores_can_follow_the_boxes(tmp_path):
 def test_a_larger_image_is_scaled_with_its_proportions(tmp_path):
     """36 x 12 into 12 x 8: a third, in the upper left corner; boxes become three times as large."""
     path = constant_model(
-        tmp_path / "a.onnx", answers([[1, 1, 3, 4]], [3], [0.9], np.ones((1, 4, 4)))
+        tmp_path / "a.onnx", outputs_of([[1, 1, 3, 4]], [3], [0.9], np.ones((1, 4, 4)))
     )
     found = classes_of(path, of=frame(36, 12))
     np.testing.assert_array_equal(found, rectangle(3, 3, 9, 12, 3, size=(12, 36)))
     whole = np.zeros((1, HEIGHT, WIDTH))
     whole[0, :, 6:] = 1
-    path = constant_model(tmp_path / "b.onnx", answers([[0, 0, 1, 1]], [3], [0.9], whole))
+    path = constant_model(tmp_path / "b.onnx", outputs_of([[0, 0, 1, 1]], [3], [0.9], whole))
     found = classes_of(path, of=frame(36, 12))
     np.testing.assert_array_equal(found, rectangle(18, 0, 36, 12, 3, size=(12, 36)))
 
@@ -167,11 +167,13 @@ def test_prototypes_are_combined_and_cropped_to_their_boxes(tmp_path):
 @pytest.mark.parametrize("shape", [(3, HEIGHT, WIDTH), ("n", 3, "h", "w"), (1, HEIGHT, WIDTH, 3)])
 def test_no_objects_in_any_input_format(tmp_path, shape):
     """An empty output is an empty map."""
-    path = constant_model(tmp_path / "a.onnx", answers([], [], [], np.zeros((0, 1, 28, 28))), shape)
+    path = constant_model(
+        tmp_path / "a.onnx", outputs_of([], [], [], np.zeros((0, 1, 28, 28))), shape
+    )
     assert not classes_of(path).any()
 
 
-GOOD = answers([[0, 0, 4, 4]], [3], [0.9], np.ones((1, 28, 28)))
+GOOD = outputs_of([[0, 0, 4, 4]], [3], [0.9], np.ones((1, 28, 28)))
 BAD = {
     "boxes of three numbers": ({"boxes": np.zeros((1, 3), np.float32)}, "answers boxes [1, 3], "),
     "one mask too few": (

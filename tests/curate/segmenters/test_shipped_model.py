@@ -27,7 +27,7 @@ FLOORS = {"Car": 0.75, "Pedestrian": 0.1, "Cyclist": 0.4}
 
 
 @pytest.fixture(scope="module")
-def answers(tmp_path_factory):
+def predictions(tmp_path_factory):
     """Return (ground truth, prediction) of ten new frames."""
     assert FRESH_SEED not in (TRAIN_SEED, TEST_SEED)
     root = tmp_path_factory.mktemp("fresh")
@@ -37,32 +37,32 @@ def answers(tmp_path_factory):
     pairs = []
     for frame_id in dataset.frame_ids():
         path = root / "training" / SEMANTIC_FOLDER / f"{frame_id}.png"
-        answer = segmenter.segment(dataset.read(frame_id, image=True)).class_ids
-        pairs.append((decode_image(path, cv2.IMREAD_UNCHANGED), answer))
+        predicted = segmenter.segment(dataset.read(frame_id, image=True)).class_ids
+        pairs.append((decode_image(path, cv2.IMREAD_UNCHANGED), predicted))
     return pairs
 
 
 @pytest.mark.parametrize(("category", "floor"), FLOORS.items())
-def test_it_finds_most_of_each_class(answers, category, floor):
+def test_it_finds_most_of_each_class(predictions, category, floor):
     """The IoU over all pixels of the new frames is above the minimum."""
     class_id = SEMANTIC_CLASSES[category]
-    common = sum(np.sum((truth == class_id) & (found == class_id)) for truth, found in answers)
-    union = sum(np.sum((truth == class_id) | (found == class_id)) for truth, found in answers)
+    common = sum(np.sum((truth == class_id) & (found == class_id)) for truth, found in predictions)
+    union = sum(np.sum((truth == class_id) | (found == class_id)) for truth, found in predictions)
     assert common / union > floor
 
 
-def test_it_makes_errors(answers):
+def test_it_makes_errors(predictions):
     """The pipeline must work with errors: some frames have wrong pixels of objects."""
-    assert any((truth != found)[truth > 0].mean() > 0.02 for truth, found in answers)
+    assert any((truth != found)[truth > 0].mean() > 0.02 for truth, found in predictions)
 
 
 def test_it_is_small_and_has_the_documented_input_and_output():
     """Below one megabyte; uint8 RGB in, uint8 class ids out, of a fixed size."""
     assert MODEL.stat().st_size < 1_000_000
     session = onnxruntime.InferenceSession(str(MODEL), providers=["CPUExecutionProvider"])
-    (image,), (answer,) = session.get_inputs(), session.get_outputs()
+    (image,), (predicted,) = session.get_inputs(), session.get_outputs()
     assert (image.type, image.shape) == ("tensor(uint8)", [1, 188, 621, 3])
-    assert (answer.type, answer.shape) == ("tensor(uint8)", [1, 188, 621])
+    assert (predicted.type, predicted.shape) == ("tensor(uint8)", [1, 188, 621])
 
 
 def test_the_training_script_writes_such_a_model(tmp_path):
@@ -77,5 +77,5 @@ def test_the_training_script_writes_such_a_model(tmp_path):
     session = onnxruntime.InferenceSession(
         str(tmp_path / "tiny.onnx"), providers=["CPUExecutionProvider"]
     )
-    answer = session.run(None, {"image": np.zeros((1, 188, 621, 3), np.uint8)})[0]
-    assert answer.shape == (1, 188, 621)
+    predicted = session.run(None, {"image": np.zeros((1, 188, 621, 3), np.uint8)})[0]
+    assert predicted.shape == (1, 188, 621)

@@ -12,10 +12,10 @@ from curate.viewing.tags import ShownLabels
 REGION = Region(0, 40, -20, 20, 10)
 
 
-def near(picture, place, colour, reach=2):
+def near(image, place, colour, reach=2):
     """Return whether a colour appears near a position (x, y in metres)."""
     column, row = np.rint(REGION.to_pixels(np.array(place, dtype=np.float64))).astype(int)
-    around = picture[row - reach : row + reach + 1, column - reach : column + reach + 1]
+    around = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
     return (np.abs(around.astype(int) - colour).max(axis=2) < 40).any()
 
 
@@ -30,11 +30,11 @@ def test_forward_is_up_and_left_is_left():
 def test_footprints_have_the_colour_of_their_weight():
     """The outline of a rotated box is at its corners."""
     box = [20, 5, 0, 4, 2, 1.5, np.pi / 2]
-    picture = draw_bird_eye(np.zeros((0, 4)), labels([box], [0.6]), region=REGION)
+    image = draw_bird_eye(np.zeros((0, 4)), labels([box], [0.6]), region=REGION)
     colour = weight_colours(np.array([0.6]))[0].astype(int)
     for corner in ((21, 7), (19, 7), (19, 3), (21, 3)):
-        assert near(picture, corner, colour)
-    assert not near(picture, (22, 5), colour)
+        assert near(image, corner, colour)
+    assert not near(image, (22, 5), colour)
 
 
 def test_ground_truth_is_white_and_can_be_nan():
@@ -50,8 +50,8 @@ def test_points_are_drawn():
     """Points in the region brighten their position; those outside are ignored."""
     points = np.array([[15.3, -7.2, 1.0, 0], [500, 500, 0, 0], [-5, 0, 0, 0]])
     empty = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
-    picture = draw_bird_eye(points, labels([], []), region=REGION)
-    rows, columns = np.nonzero((picture != empty).any(axis=2))
+    image = draw_bird_eye(points, labels([], []), region=REGION)
+    rows, columns = np.nonzero((image != empty).any(axis=2))
     place = REGION.to_pixels(points[0, :2])
     assert len(rows) > 0
     assert np.hypot(columns - place[0], rows - place[1]).max() < 3
@@ -87,22 +87,22 @@ def test_labels_behind_the_vehicle_are_drawn():
     """In the colour of their weight, with their points."""
     shown = labels([[-12.0, 3, 0, 4, 2, 1.5, 0]], [0.6])
     points = np.array([[-11.0, 8.0, 1.0, 0]])
-    picture = draw_bird_eye(points, shown)
+    image = draw_bird_eye(points, shown)
     region = region_around([shown.boxes], Region().size[0])
     colour = weight_colours(np.array([0.6]))[0].astype(int)
     column, row = np.rint(region.to_pixels(np.array([-14.0, 4.0]))).astype(int)
-    assert (np.abs(picture[row - 2 : row + 3, column - 2 : column + 3].astype(int) - colour)
+    assert (np.abs(image[row - 2 : row + 3, column - 2 : column + 3].astype(int) - colour)
             .max(axis=2) < 40).any()  # fmt: skip
     without = draw_bird_eye(np.zeros((0, 4)), shown)
-    assert (picture != without).any()
+    assert (image != without).any()
 
 
 def test_the_paper_style_has_a_white_background():
     """And its own colours."""
     shown = labels([[20, 5, 0, 4, 2, 1.5, 0]], [0.6])
-    picture = draw_bird_eye(np.zeros((0, 4)), shown, region=REGION, style=PAPER)
-    assert (picture == 255).all(axis=2).mean() > 0.7
-    assert near(picture, (22, 6), weight_colours(np.array([0.6]), PAPER)[0].astype(int))
+    image = draw_bird_eye(np.zeros((0, 4)), shown, region=REGION, style=PAPER)
+    assert (image == 255).all(axis=2).mean() > 0.7
+    assert near(image, (22, 6), weight_colours(np.array([0.6]), PAPER)[0].astype(int))
 
 
 @pytest.mark.parametrize("frame_id", ["000008", "000023"])
@@ -115,6 +115,6 @@ def test_real_frames(kitti_root, frame_id):
     frame = dataset.read(frame_id)
     found = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv").predict(frame)
     shown = ShownLabels(found.boxes, found.categories, found.scores, found.scores)
-    picture = draw_bird_eye(frame.points, shown, dataset.annotations(frame_id).boxes)
-    assert picture.shape[2] == 3
-    assert (picture.max(axis=2) > 90).mean() > 0.01
+    image = draw_bird_eye(frame.points, shown, dataset.annotations(frame_id).boxes)
+    assert image.shape[2] == 3
+    assert (image.max(axis=2) > 90).mean() > 0.01

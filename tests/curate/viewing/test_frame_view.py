@@ -16,8 +16,8 @@ BOX = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3]])
 
 def frame(image=True):
     """Return a grey frame without points."""
-    picture = np.full((40, 120, 3), 90, np.uint8) if image else None
-    return Frame("000000", np.zeros((0, 4), np.float32), toy_calibration(), (120, 40), picture)
+    pixels = np.full((40, 120, 3), 90, np.uint8) if image else None
+    return Frame("000000", np.zeros((0, 4), np.float32), toy_calibration(), (120, 40), pixels)
 
 
 def shown(weight):
@@ -25,9 +25,9 @@ def shown(weight):
     return ShownLabels(BOX, np.array(["Car"]), np.array([0.9]), np.array([weight]), np.array([7]))
 
 
-def has(picture, colour):
+def has(pixels, colour):
     """Return whether some pixel has nearly this colour."""
-    return (np.abs(picture.astype(int) - np.array(colour)).max(axis=2) < 12).any()
+    return (np.abs(pixels.astype(int) - np.array(colour)).max(axis=2) < 12).any()
 
 
 def test_image_and_bird_eye_view_are_one_image():

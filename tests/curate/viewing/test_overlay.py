@@ -49,27 +49,27 @@ def test_boxes_behind_the_camera_have_no_strokes():
 
 def test_without_boxes_the_frame_is_unchanged():
     image = np.full((400, 1200, 3), 90, np.uint8)
-    picture = draw_overlay(image, calibration(), labels([], []), np.zeros((0, 7)))
-    assert picture.shape == (400 + TITLE_HEIGHT + STRIP_HEIGHT, 1200, 3)
-    assert (picture[TITLE_HEIGHT:-STRIP_HEIGHT] == 90).all()
+    drawn = draw_overlay(image, calibration(), labels([], []), np.zeros((0, 7)))
+    assert drawn.shape == (400 + TITLE_HEIGHT + STRIP_HEIGHT, 1200, 3)
+    assert (drawn[TITLE_HEIGHT:-STRIP_HEIGHT] == 90).all()
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
 def test_boxes_have_the_colour_of_their_weight(weight):
     """Checked along an edge, on the image."""
     shown = labels([[15.0, 1, 0, 4, 2, 1.5, 0.3]], [weight])
-    picture = draw_overlay(np.full((400, 1200, 3), 90, np.uint8), calibration(), shown)
+    drawn = draw_overlay(np.full((400, 1200, 3), 90, np.uint8), calibration(), shown)
     stroke = box_strokes(shown.boxes, calibration(), SIZE)[0][1]
     column, row = np.rint(stroke.mean(axis=0)).astype(int)
-    around = picture[row + TITLE_HEIGHT - 2 : row + TITLE_HEIGHT + 3, column - 2 : column + 3]
+    around = drawn[row + TITLE_HEIGHT - 2 : row + TITLE_HEIGHT + 3, column - 2 : column + 3]
     colour = weight_colours(np.array([weight]))[0].astype(int)
     assert (np.abs(around.astype(int) - colour).max(axis=2) < 30).any()
 
 
 def test_small_images_are_enlarged():
     """By an integer factor, so that captions can be read."""
-    picture = draw_overlay(np.zeros((40, 500, 3), np.uint8), calibration(), labels([], []))
-    assert picture.shape[:2] == (40 * 3 + TITLE_HEIGHT + STRIP_HEIGHT, 1500)
+    drawn = draw_overlay(np.zeros((40, 500, 3), np.uint8), calibration(), labels([], []))
+    assert drawn.shape[:2] == (40 * 3 + TITLE_HEIGHT + STRIP_HEIGHT, 1500)
 
 
 def test_ground_truth_can_be_drawn():
@@ -77,8 +77,8 @@ def test_ground_truth_can_be_drawn():
     image = np.full((400, 1200, 3), 90, np.uint8)
     truth = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3], [np.nan] * 7])
     nothing = draw_overlay(image, calibration(), labels([], []), np.zeros((0, 7)))
-    picture = draw_overlay(image, calibration(), labels([], []), truth)
-    changed = picture[(picture != nothing).any(axis=2)]
+    drawn = draw_overlay(image, calibration(), labels([], []), truth)
+    changed = drawn[(drawn != nothing).any(axis=2)]
     assert len(changed) > 100
     assert changed.max() > 230
 

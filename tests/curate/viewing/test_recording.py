@@ -65,8 +65,10 @@ def read_back(path: Path) -> dict[str, list[dict]]:
     found: dict[str, list[dict]] = {}
     for chunk in rerun.RrdReader(path).store().stream():
         for row in chunk.to_record_batch().to_pylist():
-            held = {name.split(":")[-1]: value for name, value in row.items() if value is not None}
-            found.setdefault(str(chunk.entity_path).strip("/"), []).append(held)
+            content = {
+                name.split(":")[-1]: value for name, value in row.items() if value is not None
+            }
+            found.setdefault(str(chunk.entity_path).strip("/"), []).append(content)
     return {
         place: sorted(rows, key=lambda row: row.get("frame", -1)) for place, rows in found.items()
     }
@@ -124,8 +126,8 @@ def test_the_image_is_that_of_the_frame(tmp_path: Path, full: RecordedFrame) -> 
     """As a JPEG at the camera; no camera if the frame was read without its image."""
     pytest.importorskip("rerun", reason="the extra [rerun] is not installed")
     write_recording(tmp_path / "a.rrd", iter([full]))
-    [held] = read_back(tmp_path / "a.rrd")[f"{CAMERA}/image"]
-    blob = np.frombuffer(bytes(held["blob"][0]), np.uint8)
+    [content] = read_back(tmp_path / "a.rrd")[f"{CAMERA}/image"]
+    blob = np.frombuffer(bytes(content["blob"][0]), np.uint8)
     assert cv2.imdecode(blob, cv2.IMREAD_COLOR).shape == (40, 120, 3)
     blind = RecordedFrame(seen_frame(9, image=False), NOBODY, {}, NOTHING)
     write_recording(tmp_path / "b.rrd", iter([blind]))

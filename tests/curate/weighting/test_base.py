@@ -40,7 +40,7 @@ def test_labels_with_a_loss_are_matched():
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"score": np.array([0.1])}, "score"),
         ({"frame_index": np.zeros((2, 1))}, "frame_index"),
@@ -52,9 +52,9 @@ def test_labels_with_a_loss_are_matched():
         ({"rho": {"rho_anno": np.array([-1.0, 0.5])}}, "rho_anno of label 0"),
     ],
 )
-def test_evidence_out_of_shape_or_range_is_rejected(changes, said):
+def test_evidence_out_of_shape_or_range_is_rejected(changes, message):
     """The error contains the column and the label."""
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=message):
         evidence(**changes)
 
 

@@ -194,8 +194,8 @@ def test_equal_losses_have_weight_exactly_zero(scope, age):
     labels = evidence(
         [0.1] * 3 + [0.7] * 7, category=["a"] * 3 + ["b"] * 7, frame_index=[1] * 3 + [2] * 7
     )
-    lonely = evidence([0.1] * 7)
-    assert SPSL().weigh(lonely, age).v.tolist() == [0.0] * 7
+    isolated = evidence([0.1] * 7)
+    assert SPSL().weigh(isolated, age).v.tolist() == [0.0] * 7
     if scope != "round":
         assert SPSL(scope).weigh(labels, age).v.tolist() == [0.0] * 10
 
@@ -208,13 +208,13 @@ def test_a_tiny_lambda_does_not_overflow():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [({"scope": "batch"}, "batch"), ({"quantile": 0.0}, "quantile"), ({"quantile": 1.1}, "1.1")],
 )
 @pytest.mark.parametrize("policy", [SPSL, PSPSL])
-def test_invalid_settings_are_rejected(policy, wrong, said):
+def test_invalid_settings_are_rejected(policy, wrong, message):
     """The error contains the policy and the setting."""
-    with pytest.raises(ConfigError, match=rf"{policy.name}.*{said}"):
+    with pytest.raises(ConfigError, match=rf"{policy.name}.*{message}"):
         policy(**wrong)
 
 

@@ -99,7 +99,7 @@ def test_a_memory_without_current_boxes_is_an_error():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ({"keep": 0.2}, "ascending"),
         ({"keep": 1.2}, "1.2"),
@@ -107,7 +107,7 @@ def test_a_memory_without_current_boxes_is_an_error():
         ({"minimum_iou": 0.0}, "minimum_iou"),
     ],
 )
-def test_invalid_settings_are_rejected(wrong, said):
+def test_invalid_settings_are_rejected(wrong, message):
     """The error contains the policy and the setting."""
-    with pytest.raises(ConfigError, match=f"st3d.*{said}"):
+    with pytest.raises(ConfigError, match=f"st3d.*{message}"):
         ST3D(**wrong)

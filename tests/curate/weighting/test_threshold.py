@@ -31,9 +31,9 @@ def test_a_category_can_have_its_own_threshold():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [({"threshold": 1.5}, "1.5"), ({"per_category": {"Cyclist": -0.1}}, "Cyclist")],
 )
-def test_a_threshold_that_is_not_a_score_is_rejected(wrong, said):
-    with pytest.raises(ConfigError, match=said):
+def test_a_threshold_that_is_not_a_score_is_rejected(wrong, message):
+    with pytest.raises(ConfigError, match=message):
         Threshold(**wrong)

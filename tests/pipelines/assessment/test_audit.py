@@ -98,11 +98,11 @@ def test_folds_are_workspaces_inside_the_workspace(workspace: Workspace) -> None
     folds = list(open_folds(workspace, 2))
     home = workspace.root / "reports" / "audit" / "2-folds-seed-0"
     assert [fold.root for fold in folds] == [home / "fold-1", home / "fold-2"]
-    held = [set(fold.frames("val")) for fold in folds]
+    val_frames = [set(fold.frames("val")) for fold in folds]
     labeled = set(workspace.frames("labeled"))
-    assert held[0] | held[1] == labeled
-    assert not held[0] & held[1]
-    for fold, own in zip(folds, held, strict=True):
+    assert val_frames[0] | val_frames[1] == labeled
+    assert not val_frames[0] & val_frames[1]
+    for fold, own in zip(folds, val_frames, strict=True):
         assert set(fold.frames("labeled")) == labeled - own
         assert fold.database.url != workspace.database.url
         assert count(fold, "SELECT count(*) FROM prediction") == 3
@@ -169,9 +169,9 @@ def test_the_command_prints_plots_and_stores_the_audit(
         assert (code, err) == (0, "")
     assert "of 12 labels are right" in out
     assert "Of the policies, " in out
-    picture = workspace.root / "reports" / "audit-round-01-val-bev.png"
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert str(picture) in out
+    plot = workspace.root / "reports" / "audit-round-01-val-bev.png"
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert str(plot) in out
     sql = "SELECT policy, category, labels, auroc FROM audit"
     rows = json.loads(curate("query", sql, "--json", "-w", workspace.root)[1])
     assert len(rows) == 7 * 4
@@ -191,12 +191,12 @@ def test_the_json_has_the_same_values_as_the_tables(curate: Curate, workspace: W
     sql = "SELECT policy, category, auroc, auroc_low FROM audit WHERE overlap = '3d'"
     rows = json.loads(curate("query", sql, "--json", "-w", workspace.root)[1])
     stored = {(row["policy"], row["category"]): (row["auroc"], row["auroc_low"]) for row in rows}
-    told = {
+    printed = {
         (each["policy"], each["category"]): (each["auroc"]["value"], each["auroc"]["low"])
         for each in found["figures"]
         if each["slice"]["by"] == "all"
     }
-    assert stored == told
+    assert stored == printed
     assert len(stored) == 2 * 4
 
 

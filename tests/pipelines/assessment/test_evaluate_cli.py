@@ -227,8 +227,8 @@ def test_missed_objects_can_be_queried(curate: Curate, workspace: Workspace) -> 
         assert code == 0
     assert "stored as source 'round 1'" in out
     figures = json.loads(curate("evaluate", "--round", "1", "--json", "-w", workspace.root)[1])
-    missed = ask(curate, workspace, MISSED)
-    found = ask(curate, workspace, "SELECT * FROM evaluation WHERE outcome = 'tp'")
+    missed = query_rows(curate, workspace, MISSED)
+    found = query_rows(curate, workspace, "SELECT * FROM evaluation WHERE outcome = 'tp'")
     objects = [row for row in found if row["side"] == "object"]
     for category, overlap in (("Car", "0.7"), ("Pedestrian", "0.5"), ("Cyclist", "0.5")):
         tp = sum(row["category"] == category for row in objects)
@@ -239,7 +239,7 @@ def test_missed_objects_can_be_queried(curate: Curate, workspace: Workspace) -> 
     assert objects
     assert all(row["iou"] <= 0.7 for row in missed)
     sql = "SELECT ap_r40 FROM evaluation_ap WHERE figure = '3d' AND category = 'Cyclist'"
-    stored = [row["ap_r40"] for row in ask(curate, workspace, sql)]
+    stored = [row["ap_r40"] for row in query_rows(curate, workspace, sql)]
     assert sorted(stored) == pytest.approx(sorted(figures["AP_R40"]["Cyclist"]["3d"]))
 
 
@@ -247,7 +247,7 @@ def test_outcomes_contain_their_boxes(curate: Curate, workspace: Workspace) -> N
     """Of ground truth and of predictions; matches refer to each other."""
     curate("predict", "--split", "val", "-w", workspace.root)
     curate("evaluate", "--round", "1", "--store", "-w", workspace.root)
-    rows = ask(curate, workspace, "SELECT * FROM evaluation")
+    rows = query_rows(curate, workspace, "SELECT * FROM evaluation")
     truth = workspace.ground_truth("val")
     stored = workspace.predictions(1, list(workspace.frames("val").values()))
     for row in rows:
@@ -277,11 +277,11 @@ def test_a_checkpoint_is_stored_under_its_path(
     once = "compiling the evaluation, once: this takes some ten seconds\n"
     assert (code, err.removeprefix(once)) == (0, "")
     sql = "SELECT source, count(*) AS n FROM evaluation GROUP BY source ORDER BY source"
-    rows = ask(curate, workspace, sql)
+    rows = query_rows(curate, workspace, sql)
     assert [row["source"] for row in rows] == sorted([str(weights_file), "round 1"])
     assert rows[0]["n"] == rows[1]["n"]
 
 
-def ask(curate: Curate, workspace: Workspace, sql: str) -> list[dict]:
+def query_rows(curate: Curate, workspace: Workspace, sql: str) -> list[dict]:
     """Return the rows of a query."""
     return json.loads(curate("query", sql, "--json", "-w", workspace.root)[1])

@@ -93,7 +93,7 @@ def test_a_job_reports_its_units_by_kind(monkeypatch: pytest.MonkeyPatch) -> Non
             advance(units, "")
     with metered.track("predict", 3) as advance:
         advance(3, "")
-    told = [json.loads(line) for line in stream.getvalue().splitlines()]
-    assert sum(line["units"] for line in told if line["kind"] == "train") == 10
-    assert {line["kind"] for line in told} == {"train", "predict"}
+    messages = [json.loads(line) for line in stream.getvalue().splitlines()]
+    assert sum(line["units"] for line in messages if line["kind"] == "train") == 10
+    assert {line["kind"] for line in messages} == {"train", "predict"}
     assert metered.timings["train"] == (4, 4.0)

@@ -20,9 +20,9 @@ GRID = {"ratios": (0.25, 0.5), "seeds": (0, 1)}
 
 def run(bench: Bench, jobs: ToyJobs, workers: int = 1) -> list[str]:
     """Run a grid; return its messages."""
-    said: list[str] = []
-    run_grid(bench, jobs, workers, said.append, Silent())
-    return said
+    messages: list[str] = []
+    run_grid(bench, jobs, workers, messages.append, Silent())
+    return messages
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
@@ -52,16 +52,16 @@ def test_the_cost_of_a_job_is_reported_before_it_starts(toy_kitti: Path, tmp_pat
     """From the times of finished jobs: 98 s, 2 s per step, 0.5 s per val frame."""
     bench = make_bench(tmp_path, toy_kitti, steps=60)
     write_result(tmp_path, synthetic_result(Job(0.25, 0), 50.0))
-    said = run(bench, ToyJobs(tmp_path))
-    assert said[1] == "ratio 0.25, seed 0, baseline: about 3.7 min (60 steps, 4 frame passes)"
-    assert said[2].startswith("ratio 0.25, seed 0, baseline: mean 3D AP 13.3")
+    messages = run(bench, ToyJobs(tmp_path))
+    assert messages[1] == "ratio 0.25, seed 0, baseline: about 3.7 min (60 steps, 4 frame passes)"
+    assert messages[2].startswith("ratio 0.25, seed 0, baseline: mean 3D AP 13.3")
 
 
 def test_the_first_cost_is_reported_as_a_guess(toy_kitti: Path, tmp_path: Path) -> None:
     """Nothing has been measured yet."""
-    said = run(make_bench(tmp_path, toy_kitti), ToyJobs(tmp_path))
-    assert said[1].endswith("a first guess)")
-    assert not any("guess" in line for line in said[2:])
+    messages = run(make_bench(tmp_path, toy_kitti), ToyJobs(tmp_path))
+    assert messages[1].endswith("a first guess)")
+    assert not any("guess" in line for line in messages[2:])
 
 
 def test_a_failed_cell_does_not_stop_the_others(toy_kitti: Path, tmp_path: Path) -> None:
@@ -69,10 +69,10 @@ def test_a_failed_cell_does_not_stop_the_others(toy_kitti: Path, tmp_path: Path)
     bench = make_bench(tmp_path, toy_kitti, **GRID)
     bad = Job(0.25, 1, "baseline")
     jobs = ToyJobs(tmp_path, lambda job: "out of memory" if job == bad else None)
-    said: list[str] = []
+    messages: list[str] = []
     with pytest.raises(CellsFailed, match="1 of 8 cells failed"):
-        run_grid(bench, jobs, 2, said.append, Silent())
-    assert f"{bad}: failed: out of memory" in said
+        run_grid(bench, jobs, 2, messages.append, Silent())
+    assert f"{bad}: failed: out of memory" in messages
     assert len(jobs.done) == 12
     again = ToyJobs(tmp_path)
     run(bench, again)
@@ -84,10 +84,10 @@ def test_cells_fail_if_their_shared_job_failed(toy_kitti: Path, tmp_path: Path) 
     bench = make_bench(tmp_path, toy_kitti, **GRID)
     bad = Job(0.25, 0)
     jobs = ToyJobs(tmp_path, lambda job: "no labels" if job == bad else None)
-    said: list[str] = []
+    messages: list[str] = []
     with pytest.raises(CellsFailed, match="2 of 8 cells failed"):
-        run_grid(bench, jobs, 1, said.append, Silent())
-    assert f"{bad}: failed (so 2 cells cannot run): no labels" in said
+        run_grid(bench, jobs, 1, messages.append, Silent())
+    assert f"{bad}: failed (so 2 cells cannot run): no labels" in messages
     assert Job(0.25, 0, "pspsl") not in jobs.done
 
 
@@ -112,8 +112,8 @@ def test_the_progress_bar_ends_full(toy_kitti: Path, tmp_path: Path) -> None:
 
 def test_two_benches_cannot_use_the_same_folder(tmp_path: Path) -> None:
     """The second is rejected until the first has ended."""
-    refused = pytest.raises(WorkspaceError, match="another `curate bench`")
-    with alone(tmp_path), refused, alone(tmp_path):
+    rejected = pytest.raises(WorkspaceError, match="another `curate bench`")
+    with alone(tmp_path), rejected, alone(tmp_path):
         pass
     with alone(tmp_path):
         pass

@@ -225,10 +225,10 @@ def test_weights_of_two_policies_are_stored_together(workspace: Workspace) -> No
 
 def test_every_stage_reads_only_earlier_outputs(workspace: Workspace) -> None:
     """Inputs are sources or the outputs of earlier stages."""
-    known = {"frame", "ground_truth"}
+    available = {"frame", "ground_truth"}
     for each in round_graph().stages:
-        assert set(each.reads) <= known
-        known |= set(each.writes)
+        assert set(each.reads) <= available
+        available |= set(each.writes)
 
 
 def test_fingerprints_do_not_depend_on_the_location_of_the_data(workspace: Workspace) -> None:

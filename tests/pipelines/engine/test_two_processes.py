@@ -46,8 +46,8 @@ def owner(workspace: Workspace, number: int) -> str | None:
     try:
         with workspace.database.claiming_round(number, None, "a question"):
             return None
-    except DatabaseError as refusal:
-        return str(refusal)
+    except DatabaseError as error:
+        return str(error)
 
 
 def wait_until(condition: Callable[[], bool], process: subprocess.Popen | None = None) -> None:

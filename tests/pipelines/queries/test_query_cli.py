@@ -37,12 +37,12 @@ def test_every_named_query_is_described_and_runs(curate: Curate, weighted: Path)
         assert not query.sql.startswith("--"), name
         code, out, err = curate("query", "--named", name, "--json", "-w", weighted)
         assert (code, err) == (0, ""), name
-        answer = json.loads(out)
+        result = json.loads(out)
         code, out, err = curate("query", "--named", name, "--json", "--file", exported)
         if query.exported:
             assert (code, err) == (0, ""), name
             if name != "splits":  # an exported file has no val frames
-                assert _rounded(json.loads(out)) == _rounded(answer), name
+                assert _rounded(json.loads(out)) == _rounded(result), name
         else:
             assert code == ConfigError.exit_code, f"{name} works on the exported file: say so"
 
@@ -61,18 +61,18 @@ def test_the_results_agree_with_the_labels(curate: Curate, weighted: Path) -> No
     sql = f"SELECT count(*) AS n, {kept}, max(lambda_u) AS age FROM weighted_labels"
     [whole] = json.loads(curate("query", sql, "--json", "-w", weighted)[1])
 
-    def ask(name: str) -> list[dict]:
+    def query_rows(name: str) -> list[dict]:
         return json.loads(curate("query", "--named", name, "--format", "json", "-w", weighted)[1])
 
     assert whole["n"] == 18
-    assert sum(row["labels"] for row in ask("kept")) == whole["n"]
-    assert sum(row["kept"] for row in ask("kept")) == whole["kept"] > 0
-    assert {row["distance"] for row in ask("kept")} <= {"00-20 m", "20-40 m"}
-    assert [row["greatest_lambda"] for row in ask("age")] == [whole["age"]]
-    assert {row["split"]: row["frames"] for row in ask("splits")} == {
+    assert sum(row["labels"] for row in query_rows("kept")) == whole["n"]
+    assert sum(row["kept"] for row in query_rows("kept")) == whole["kept"] > 0
+    assert {row["distance"] for row in query_rows("kept")} <= {"00-20 m", "20-40 m"}
+    assert [row["greatest_lambda"] for row in query_rows("age")] == [whole["age"]]
+    assert {row["split"]: row["frames"] for row in query_rows("splits")} == {
         "labeled": 2, "unlabeled": 6, "val": 4,
     }  # fmt: skip
-    assert all(row["score"] >= 0.5 and row["weight"] < 0.2 for row in ask("doubted"))
+    assert all(row["score"] >= 0.5 and row["weight"] < 0.2 for row in query_rows("doubted"))
 
 
 def test_missed_objects_are_listed_after_an_evaluation(curate: Curate, weighted: Path) -> None:

@@ -30,12 +30,12 @@ def test_ten_million_labels(tmp_path: Path) -> None:
         start = time.perf_counter()
         solved(workspace, policy, rounds)
         figures[f"solve, {name}"] = time.perf_counter() - start
-    for question in (TRUSTED, HEAVIEST, FRAME, FRAME_OF_ROUND, COUNTS):
+    for query in (TRUSTED, HEAVIEST, FRAME, FRAME_OF_ROUND, COUNTS):
         with workspace.database.reading() as connection:
             streaming = connection.execution_options(stream_results=True)
             start = time.perf_counter()
-            assert streaming.execute(text(question)).fetchone()
-            figures[question] = time.perf_counter() - start
+            assert streaming.execute(text(query)).fetchone()
+            figures[query] = time.perf_counter() - start
     memory = peak() / 1024
     print(json.dumps({"labels": LABELS, "peak MiB": memory, **figures}, indent=1))  # noqa: T201 - what it is for
     with workspace.database.reading() as connection:

@@ -36,14 +36,14 @@ def measured(*arguments: str) -> tuple[str, int]:
     )
     assert ended.returncode == 0, ended.stderr
     print(ended.stdout)  # noqa: T201 - `pytest -s` shows the figures
-    told, peak = re.fullmatch(r"(.*)\npeak (\d+) .*\n", ended.stdout, re.DOTALL).groups()
-    return told, int(peak) // 1024
+    printed, peak = re.fullmatch(r"(.*)\npeak (\d+) .*\n", ended.stdout, re.DOTALL).groups()
+    return printed, int(peak) // 1024
 
 
 def report(root: Path, *arguments: str) -> tuple[Path, int]:
     """Return the page of `curate report`, and the peak memory in MiB."""
-    told, peak = measured("report", "-w", str(root), *arguments)
-    return Path(told.removeprefix("report: ")), peak
+    printed, peak = measured("report", "-w", str(root), *arguments)
+    return Path(printed.removeprefix("report: ")), peak
 
 
 @pytest.mark.slow
@@ -62,8 +62,8 @@ def test_two_million_labels_make_a_small_page(tmp_path: Path) -> None:
     assert "Since round 1" in text
     assert len(text) < 1_500_000
     assert second < MOST_MIB
-    told, compared = measured("diff", "1", "2", "--json", "-w", str(workspace.root))
-    rows = {row["category"]: row for row in json.loads(told)["categories"]}
+    printed, compared = measured("diff", "1", "2", "--json", "-w", str(workspace.root))
+    rows = {row["category"]: row for row in json.loads(printed)["categories"]}
     assert (rows["all"]["before"], rows["all"]["after"]) == (n, n // 4)
     assert rows["all"]["lost"] == n - rows["all"]["matched"]
     assert compared < MOST_MIB

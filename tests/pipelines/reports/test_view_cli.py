@@ -19,9 +19,9 @@ def drawn_image(path: Path) -> np.ndarray:
     """Return the image in a file."""
     import cv2
 
-    picture = cv2.imread(str(path))
-    assert picture is not None
-    return picture
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_the_options_for_output_and_policy_are_used(
     """Another policy colours the boxes differently."""
     assert curate("solve", "--policy", "uniform", "-w", weighted.root)[0] == 0
     name = next(iter(weighted.frames("unlabeled")))
-    pictures = []
+    images = []
     for policy in ("pspsl", "uniform"):
         path = tmp_path / f"{policy} <1>.png"
         code, out, _ = curate(
@@ -70,8 +70,8 @@ def test_the_options_for_output_and_policy_are_used(
         )
         assert code == 0
         assert str(path) in out
-        pictures.append(drawn_image(path))
-    assert (pictures[0] != pictures[1]).any()
+        images.append(drawn_image(path))
+    assert (images[0] != images[1]).any()
 
 
 @pytest.mark.parametrize(
@@ -151,9 +151,9 @@ def test_several_frames_give_several_plots(curate: Curate, weighted: Workspace) 
     assert (code, out.count("picture: ")) == (0, 2)
     code, out, _ = curate("view", "--all", "--limit", 3, "--json", "-w", weighted.root)
     assert code == 0
-    pictures = json.loads(out)["pictures"]
-    assert len(pictures) == 3
-    assert all(name in path for name, path in zip(names[:3], pictures, strict=True))
+    images = json.loads(out)["pictures"]
+    assert len(images) == 3
+    assert all(name in path for name, path in zip(names[:3], images, strict=True))
 
 
 def test_a_recording_has_a_time_line_over_the_frames(

@@ -135,10 +135,12 @@ def test_a_dry_run_stores_nothing(curate: Curate, weighted: Workspace, tmp_path:
     """It prints what would be stored."""
     folder = tmp_path / "review"
     corrected(folder, export_review(curate, weighted, folder, "--count", 18))
-    told = import_review(curate, weighted, folder, "--dry-run")
-    found = {name: told[name] for name in ("accepted", "rejected", "moved", "added", "untouched")}
+    printed = import_review(curate, weighted, folder, "--dry-run")
+    found = {
+        name: printed[name] for name in ("accepted", "rejected", "moved", "added", "untouched")
+    }
     assert found == {"accepted": 1, "rejected": 1, "moved": 1, "added": 1, "untouched": 15}
-    assert (told["dry_run"], told["frames"]) == (True, 6)
+    assert (printed["dry_run"], printed["frames"]) == (True, 6)
     assert rows(weighted, "SELECT count(*) FROM human_label") == [(0,)]
 
 
@@ -268,8 +270,8 @@ def test_a_later_review_overrides_an_earlier_one(
     assert [row[2] for row in table[2:]] == ["human"] * 3
     path = later / "label_2" / f"{frame}.txt"
     path.write_text("\n".join(path.read_text().splitlines()[1:]) + "\n")
-    told = import_review(curate, workspace, later)
-    assert (told["rejected"], told["replaced"], told["untouched"]) == (1, 1, 2)
+    printed = import_review(curate, workspace, later)
+    assert (printed["rejected"], printed["replaced"], printed["untouched"]) == (1, 1, 2)
     decisions = "SELECT decision FROM human_label ORDER BY n"
     assert rows(workspace, decisions) == [("rejected",), ("rejected",), ("moved",), ("added",)]
 
@@ -295,9 +297,9 @@ def test_human_labels_are_marked_in_every_output(
 ) -> None:
     """explain, view, report and the named query."""
     workspace, _, frame = reviewed
-    told = [curate("explain", frame, k, "-w", workspace.root) for k in (0, 1, 1_000_003)]
-    assert [code for code, _, _ in told] == [0, 0, 0]
-    accepted, rejected, added = (out for _, out, _ in told)
+    printed = [curate("explain", frame, k, "-w", workspace.root) for k in (0, 1, 1_000_003)]
+    assert [code for code, _, _ in printed] == [0, 0, 0]
+    accepted, rejected, added = (out for _, out, _ in printed)
     assert "accepted by ada" in accepted
     assert "pspsl alone gives" in accepted
     assert "rejected by ada" in rejected
@@ -314,15 +316,15 @@ def test_human_labels_are_marked_in_every_output(
     assert curate("report", "-w", workspace.root)[0] == 0
     page = next((workspace.root / "reports").glob("*.html")).read_text()
     assert "1 accepted, 1 added, 1 moved, 1 rejected" in page
-    asked = json.loads(curate("query", "--named", "human", "-w", workspace.root, "--json")[1])
-    assert sum(row["objects"] for row in asked) == 3
+    queried = json.loads(curate("query", "--named", "human", "-w", workspace.root, "--json")[1])
+    assert sum(row["objects"] for row in queried) == 3
     for arguments in (("solve", "--policy", "uniform"), ("report", "--policy", "uniform")):
         assert curate(*arguments, "-w", workspace.root)[0] == 0
     page = (workspace.root / "reports" / "round-01-uniform.html").read_text()
     assert "a person rejected it" in page
 
 
-WISHES = (
+INVALID_SELECTIONS = (
     (("--frames", "{labeled}"), 5, "is not unlabeled"),
     (("--frames", "{val}"), 5, "is not unlabeled"),
     (("--frames", "999999"), 2, "no frame is named '999999'"),
@@ -339,10 +341,10 @@ def test_an_impossible_selection_gives_a_one_line_error(
 ) -> None:
     """No folder is left."""
     names = {split: next(iter(weighted.frames(split))) for split in ("labeled", "val")}
-    for options, code, fault in WISHES:
+    for options, code, message in INVALID_SELECTIONS:
         words = [str(option).format(**names) for option in options]
         ended, _, err = curate("review", "export", tmp_path / "r", "-w", weighted.root, *words)
-        assert (ended, fault in err, err.count("\n")) == (code, True, 1), err
+        assert (ended, message in err, err.count("\n")) == (code, True, 1), err
         assert not (tmp_path / "r").exists()
 
 
@@ -359,7 +361,7 @@ def spoil_both(folder: Path, frame: str) -> None:
     path.write_text(path.read_text() + path.read_text().splitlines()[0] + "\n")
 
 
-FAULTS = (
+INVALID_EDITS = (
     (lambda folder, frame: (folder / "review.json").unlink(), (), "review.json: no such file"),
     (spoil_text, (), "fields, but a label line"),
     (spoil_both, (), "cannot lie in each other: reject one of box 1 ("),
@@ -376,12 +378,12 @@ def test_an_invalid_import_gives_one_line_and_stores_nothing(
     whole = tmp_path / "review"
     frame = export_review(curate, weighted, whole, *only_first(weighted))
     decide(whole, frame, 2, "accept")
-    for number, (spoil, options, fault) in enumerate(FAULTS):
+    for number, (spoil, options, message) in enumerate(INVALID_EDITS):
         folder = tmp_path / str(number)
         shutil.copytree(whole, folder)
         spoil(folder, frame)
         code, _, err = curate("review", "import", folder, "-w", weighted.root, *options)
-        assert (code in {2, 3}, fault in err, err.count("\n")) == (True, True, 1), err
+        assert (code in {2, 3}, message in err, err.count("\n")) == (True, True, 1), err
     assert rows(weighted, "SELECT count(*) FROM human_label") == [(0,)]
     code, _, err = curate("review", "export", whole, "-w", weighted.root)
     assert (code, "may hold answers" in err) == (2, True)

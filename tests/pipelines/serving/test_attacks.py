@@ -146,9 +146,9 @@ def test_sql_that_writes_is_rejected_in_one_line(pages: Pages) -> None:
     """Some of each kind, as page and as JSON; no file of the workspace changes."""
     before = content(pages)
     for sql in (*WRITES[::6], *READS_ELSEWHERE[::4], *TOO_MUCH[::4]):
-        answer = pages.get("/workspace.json", sql=sql)
-        assert answer.status == 400, sql
-        assert b"Traceback" not in answer.body
+        response = pages.get("/workspace.json", sql=sql)
+        assert response.status == 400, sql
+        assert b"Traceback" not in response.body
     assert pages.get("/labels", sql=WRITES[0]).status == 400
     where = "1 = 1; DELETE FROM weight"
     assert pages.get("/workspace/weight.json", _where=where).status == 400
@@ -158,9 +158,9 @@ def test_sql_that_writes_is_rejected_in_one_line(pages: Pages) -> None:
 @pytest.mark.parametrize("sql", ENDLESS)
 def test_an_endless_query_is_stopped(pages: Pages, sql: str) -> None:
     """The error says what to do; the server keeps running."""
-    answer = pages.get("/workspace", sql=sql)
-    assert answer.status == 400
-    assert "--time-limit" in answer.text
+    response = pages.get("/workspace", sql=sql)
+    assert response.status == 400
+    assert "--time-limit" in response.text
     assert pages.get("/").status == 200
 
 
@@ -173,22 +173,22 @@ def test_a_frame_name_is_not_used_as_a_path(pages: Pages, name: str) -> None:
         {"frame": "000003", "round": name or "-1"},
         {"id": name},
     ):
-        answer = pages.get("/-/picture", **parameters)
-        assert answer.status == 404, parameters
-        assert b"root:" not in answer.body
+        response = pages.get("/-/picture", **parameters)
+        assert response.status == 404, parameters
+        assert b"root:" not in response.body
     assert b"<script>alert" not in pages.get("/-/frame", frame=name, k=name).body
 
 
 @pytest.mark.parametrize("path", NO_PATHS)
 def test_no_other_file_or_internal_page_can_be_reached(pages: Pages, path: str) -> None:
     """The path is sent as written here; a browser would normalise it."""
-    answer = pages.get(path)
-    assert answer.status in {302, 400, 403, 404}, path
-    if answer.status == 302:
-        answer = pages.get(answer.headers["location"])
-        assert answer.status in {400, 403, 404}, path
+    response = pages.get(path)
+    assert response.status in {302, 400, 403, 404}, path
+    if response.status == 302:
+        response = pages.get(response.headers["location"])
+        assert response.status in {400, 403, 404}, path
     for secret in (b"root:", b"SQLite format 3", b"hookimpl", b"[dataset]", b'"path"'):
-        assert secret not in answer.body
+        assert secret not in response.body
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE"])

@@ -19,20 +19,20 @@ pytest.importorskip("datasette", reason="the extra [serve] is not installed")
 
 def test_the_first_page_links_to_both_databases(pages: Pages) -> None:
     """It lists the queries with their descriptions."""
-    answer = pages.get("/")
-    assert answer.status == 200
-    assert 'href="/workspace"' in answer.text
-    assert 'href="/labels"' in answer.text
-    assert all(query.description.split("`")[0][:30] in answer.text.replace("&#39;", "'")
+    response = pages.get("/")
+    assert response.status == 200
+    assert 'href="/workspace"' in response.text
+    assert 'href="/labels"' in response.text
+    assert all(query.description.split("`")[0][:30] in response.text.replace("&#39;", "'")
                for query in named_queries().values())  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(Base.metadata.tables))
 def test_a_table_shows_its_description(pages: Pages, name: str) -> None:
     """The text comes from its model."""
-    answer = pages.get(f"/workspace/{name}")
-    assert answer.status == 200
-    assert "metadata-description" in answer.text
+    response = pages.get(f"/workspace/{name}")
+    assert response.status == 200
+    assert "metadata-description" in response.text
 
 
 @pytest.mark.parametrize("name", named_queries())
@@ -40,9 +40,9 @@ def test_a_named_query_gives_the_same_rows_as_curate_query(pages: Pages, name: s
     """The same columns, too; those of the working database only there."""
     query = named_queries()[name]
     columns, rows = run_query(pages.workspace.database.url, query.sql)
-    answer = json.loads(pages.get(f"/workspace/{name}.json", _shape="array").text)
-    assert len(answer) == len(list(rows))
-    assert all(list(row) == list(columns) for row in answer)
+    response = json.loads(pages.get(f"/workspace/{name}.json", _shape="array").text)
+    assert len(response) == len(list(rows))
+    assert all(list(row) == list(columns) for row in response)
     assert pages.get(f"/workspace/{name}").status == 200
     assert pages.get(f"/labels/{name}").status == (200 if query.exported else 404)
 
@@ -62,9 +62,9 @@ def test_a_label_links_to_its_frame(pages: Pages) -> None:
 
 def test_an_image_is_the_one_of_curate_view(pages: Pages) -> None:
     """Nearly equal, because it is sent as JPEG."""
-    answer = pages.get("/-/picture", frame="000003")
-    assert (answer.status, answer.headers["content-type"]) == (200, "image/jpeg")
-    shown = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    response = pages.get("/-/picture", frame="000003")
+    assert (response.status, response.headers["content-type"]) == (200, "image/jpeg")
+    shown = cv2.imdecode(np.frombuffer(response.body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     drawn = frame_picture(pages.workspace, "000003", chosen_round(pages.workspace, None), "pspsl")
     assert shown.shape == drawn.shape
     assert np.abs(shown.astype(int) - drawn).mean() < 6
@@ -76,10 +76,10 @@ def test_every_split_has_pages(pages: Pages, split: str) -> None:
     """Neighbours are of the same split; name and key lead to the same frame."""
     names = pages.workspace.frames(split)
     first, second = list(names)[:2]
-    answer = pages.get("/-/frame", frame=first)
-    assert answer.status == 200
-    assert f"frame={second}&amp;" in answer.text
-    assert answer.body == pages.get("/-/frame", id=names[first]).body
+    response = pages.get("/-/frame", frame=first)
+    assert response.status == 200
+    assert f"frame={second}&amp;" in response.text
+    assert response.body == pages.get("/-/frame", id=names[first]).body
 
 
 def test_a_new_export_is_served_without_a_restart(pages: Pages) -> None:

@@ -43,8 +43,8 @@ def test_it_serves_until_it_is_stopped(weighted: Workspace, end: signal.Signals)
         lines = [server.stdout.readline() for _ in range(3)]
         url = lines[-1].split()[2]
         assert "until Ctrl-C" in lines[-1]
-        with urllib.request.urlopen(url, timeout=60) as answer:  # noqa: S310
-            assert answer.status == 200
+        with urllib.request.urlopen(url, timeout=60) as response:  # noqa: S310
+            assert response.status == 200
         server.send_signal(end)
         _, err = server.communicate(timeout=60)
     assert err == ""

@@ -73,10 +73,10 @@ def test_the_student_of_a_command_is_the_next_teacher(
         assert connection.exec_driver_sql(query).scalar_one() == 18
 
 
-def test_a_rounds_labels_are_the_same_after_its_training(
+def test_the_labels_of_a_round_can_be_exported_after_its_training(
     curate: Curate, exported: Workspace, command: str, tmp_path: Path
 ) -> None:
-    """Not the next round's labels, which do not exist yet; exporting them starts no round."""
+    """The export does not start the next round."""
     code, _, err = curate("train-round", "--command", command, "-w", exported.root)
     assert code == 0, err
     code, out, _ = curate("export", "-w", exported.root)
@@ -105,12 +105,12 @@ def test_a_command_given_as_an_option_trains_later_rounds_too(
     assert code == 0
     assert err.splitlines()[-1] == ("curate.toml: [train] now says command, for later rounds too")
     assert path.read_text().startswith("# mine\n")
-    told = Workspace.open(exported.root)
-    assert told.config == exported.with_settings("train", command=command).config
-    done = [(each.round, each.stage) for each in run_workspace(told, 2) if each.done]
+    configured = Workspace.open(exported.root)
+    assert configured.config == exported.with_settings("train", command=command).config
+    done = [(each.round, each.stage) for each in run_workspace(configured, 2) if each.done]
     assert (1, "train-round") not in done
     assert (2, "train-round") in done
-    assert find_teacher(told, 3)[1].path.read_text() == "student-2"
+    assert find_teacher(configured, 3)[1].path.read_text() == "student-2"
 
 
 def test_a_student_that_is_not_the_next_teacher_can_use_any_command(
@@ -131,8 +131,8 @@ def test_the_output_of_the_trainer_is_streamed(
     capfd: pytest.CaptureFixture, exported: Workspace, command: str
 ) -> None:
     """To standard error, so standard output stays JSON."""
-    told = exported.with_settings("train", command=command)
-    run_stage(told, "train-round", 1, "pspsl")
+    configured = exported.with_settings("train", command=command)
+    run_stage(configured, "train-round", 1, "pspsl")
     output = capfd.readouterr()
     assert output.out == ""
     assert f"round 1: 18 labels from {exported.config.detector.path}" in output.err
@@ -140,13 +140,13 @@ def test_the_output_of_the_trainer_is_streamed(
 
 def test_a_configured_command_trains_in_every_round(workspace: Workspace, command: str) -> None:
     """`curate run` then has several rounds with an external detector, and a second run has none."""
-    told = workspace.with_settings("train", command=command)
-    reports = run_workspace(told, 2)
+    configured = workspace.with_settings("train", command=command)
+    reports = run_workspace(configured, 2)
     assert [report.round for report in reports if report.stage == "train-round"] == [1, 2]
-    assert find_teacher(told, 2)[1].path.read_text() == "student-1"
-    assert find_teacher(told, 3)[1].path.read_text() == "student-2"
-    assert {report.done for report in run_workspace(told, 2)} == {0}
-    other = told.with_settings("train", command=command + " again")
+    assert find_teacher(configured, 2)[1].path.read_text() == "student-1"
+    assert find_teacher(configured, 3)[1].path.read_text() == "student-2"
+    assert {report.done for report in run_workspace(configured, 2)} == {0}
+    other = configured.with_settings("train", command=command + " again")
     again = [report.stage for report in run_workspace(other, 1) if report.done]
     assert again == ["train-round"]
 
@@ -155,9 +155,9 @@ def test_without_a_student_the_next_round_has_no_teacher(
     workspace: Workspace, command: str
 ) -> None:
     """The external detector is not used in a round that needs a student."""
-    told = workspace.with_settings("train", command=command)
+    configured = workspace.with_settings("train", command=command)
     with pytest.raises(WorkspaceError, match="round 2 has no teacher yet; run `curate train-r"):
-        find_teacher(told, 2)
+        find_teacher(configured, 2)
     assert find_teacher(workspace, 2)[1].path == workspace.config.detector.path
 
 
@@ -175,7 +175,7 @@ def test_labels_are_exported_in_the_requested_format(curate: Curate, exported: W
 
 
 @pytest.mark.parametrize(
-    ("code", "fault"),
+    ("code", "message"),
     [
         ("import sys; sys.exit(3)", "ended with exit code 3"),
         ("import os; os.kill(os.getpid(), 9)", "ended with signal 9"),
@@ -185,7 +185,7 @@ def test_labels_are_exported_in_the_requested_format(curate: Curate, exported: W
     ],
 )
 def test_a_failing_trainer_gives_one_line_and_an_exit_code(
-    curate: Curate, exported: Workspace, command: str, code: str, fault: str
+    curate: Curate, exported: Workspace, command: str, code: str, message: str
 ) -> None:
     """Nothing is registered, and an earlier student does not change."""
     curate("train-round", "--command", command, "--round", 1, "-w", exported.root)
@@ -194,7 +194,7 @@ def test_a_failing_trainer_gives_one_line_and_an_exit_code(
         "train-round", "--command", python(code), "--round", 1, "-w", exported.root
     )
     assert ended == TrainerFailed.exit_code
-    assert fault in err
+    assert message in err
     assert err.count("\n") == 1
     assert checkpoints(exported) == before
     assert (exported.root / "checkpoints" / "round-01-pspsl.txt").read_text() == "student-1"
@@ -228,7 +228,7 @@ def test_labels_that_are_not_exported_are_rejected(
 
 
 @pytest.mark.parametrize(
-    ("command", "fault"),
+    ("command", "message"),
     [
         ("", "is empty; name a program"),
         ("python 'train.py", "mend its quotes"),
@@ -236,11 +236,11 @@ def test_labels_that_are_not_exported_are_rejected(
     ],
 )
 def test_an_invalid_command_is_rejected(
-    curate: Curate, exported: Workspace, command: str, fault: str
+    curate: Curate, exported: Workspace, command: str, message: str
 ) -> None:
     ended, _, err = curate("train-round", "--command", command, "-w", exported.root)
     assert ended == ConfigError.exit_code
-    assert fault in err
+    assert message in err
     assert err.count("\n") == 1
 
 

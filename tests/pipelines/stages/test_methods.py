@@ -200,13 +200,13 @@ def test_every_ablation_of_the_weights_is_a_setting(
     curate: Curate, workspace: Workspace, section: str, flag: dict
 ) -> None:
     """It changes weights, and `explain` still recomputes them."""
-    question = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
-    before = rows(run(workspace), question)
+    query = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
+    before = rows(run(workspace), query)
     document = workspace.config.model_dump(mode="json")
     document[section] |= flag
     changed = Config.model_validate(document)
     write_config(workspace.root / "curate.toml", changed)
-    after = rows(run(replace(workspace, config=changed)), question)
+    after = rows(run(replace(workspace, config=changed)), query)
     assert before != after
     frame, k, weight = max(after, key=lambda row: row[2])
     _, out, _ = curate("explain", frame, k, "--json", "-w", workspace.root)

@@ -51,8 +51,8 @@ def test_solving_again_at_another_age_gives_the_rows_of_a_first_solve(
     others = _rows(workspace, "uda")
     younger = _rows(workspace, "pspsl")
     solved(workspace, rounds=7)
-    anew = solved(filled_workspace(tmp_path / "anew", FRAMES), rounds=7)
-    assert _rows(workspace, "pspsl") == _rows(anew, "pspsl") != younger
+    fresh = solved(filled_workspace(tmp_path / "anew", FRAMES), rounds=7)
+    assert _rows(workspace, "pspsl") == _rows(fresh, "pspsl") != younger
     assert _rows(workspace, "uda") == others
 
 

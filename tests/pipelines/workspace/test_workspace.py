@@ -63,9 +63,9 @@ def test_a_replaced_checkpoint_is_not_used(workspace: Workspace) -> None:
         register_checkpoint(connection, workspace, 1, workspace.config.run.method, path)
     assert open_round(workspace, 2).teacher.path == path
     path.write_bytes(b"another")
-    for ask in (lambda: open_round(workspace, 2), lambda: newest_checkpoint(workspace)):
+    for call in (lambda: open_round(workspace, 2), lambda: newest_checkpoint(workspace)):
         with pytest.raises(WorkspaceError, match=r"has changed since .* run `curate train-round"):
-            ask()
+            call()
     assert peek_round(workspace, 2) is not None
     path.write_bytes(b"made")
     assert newest_checkpoint(workspace) == path

@@ -147,8 +147,8 @@ def test_long_integers_of_python_2_are_read(tmp_path: Path) -> None:
 def test_a_damaged_header_gives_one_error_and_no_warning(tmp_path: Path) -> None:
     """Python warns of a number directly followed by a word."""
     path = write_npy(tmp_path / "a.npy", "(1and 40, 4)")
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as recorded:
         warnings.simplefilter("always")
         with pytest.raises(DataError, match=r"a\.npy: no readable"):
             read_cloud(path)
-    assert not told
+    assert not recorded

@@ -92,8 +92,13 @@ def test_a_link_to_the_outside_is_not_followed(tmp_path: Path, layout: str, part
 def test_a_description_that_leads_outside_is_rejected(tmp_path: Path, key: str) -> None:
     """By `..` or by an absolute path."""
     for where in ("../outside", "/etc"):
-        told = {"points": "lidar", "images": "camera", "calibration": "calib.txt", key: where}
-        lines = [f'{name} = "{value}"' for name, value in told.items()]
+        description = {
+            "points": "lidar",
+            "images": "camera",
+            "calibration": "calib.txt",
+            key: where,
+        }
+        lines = [f'{name} = "{value}"' for name, value in description.items()]
         (tmp_path / "dataset.toml").write_text("\n".join(lines))
         with pytest.raises(DataError, match="leads out of the data set"):
             FolderDataset(tmp_path)
@@ -106,8 +111,13 @@ def test_an_impossible_file_name_is_rejected(
 ) -> None:
     """In one short line, also if links may lead outside."""
     for where in ("9" * 5000, "nul\\u0000"):
-        told = {"points": "lidar", "images": "camera", "calibration": "calib.txt", key: where}
-        lines = [f'{name} = "{value}"' for name, value in told.items()]
+        description = {
+            "points": "lidar",
+            "images": "camera",
+            "calibration": "calib.txt",
+            key: where,
+        }
+        lines = [f'{name} = "{value}"' for name, value in description.items()]
         (tmp_path / "dataset.toml").write_text("\n".join(lines))
         with pytest.raises(DataError, match="is no path") as raised:
             FolderDataset(tmp_path, follow_links=follow_links)

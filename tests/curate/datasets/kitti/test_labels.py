@@ -101,9 +101,9 @@ def test_files_of_other_systems_are_read_equally(tmp_path):
     (tmp_path / "a.txt").write_text(f"{CAR}\n{CAR}\n")
     foreign = CAR.replace(" ", " \t ") + " \r\n"
     (tmp_path / "b.txt").write_bytes(b"\xef\xbb\xbf" + foreign.encode() * 2 + b"\r\n")
-    ours, theirs = read_objects(tmp_path / "a.txt"), read_objects(tmp_path / "b.txt")
-    assert theirs.categories.tolist() == ours.categories.tolist()
-    assert theirs.locations.tolist() == ours.locations.tolist()
+    ours, other = read_objects(tmp_path / "a.txt"), read_objects(tmp_path / "b.txt")
+    assert other.categories.tolist() == ours.categories.tolist()
+    assert other.locations.tolist() == ours.locations.tolist()
 
 
 @pytest.mark.parametrize("text", ["", "\n", "  \n\n"])

@@ -38,7 +38,7 @@ def targets_of(*frames):
     )
 
 
-def answers(frames=1, seed=0):
+def random_outputs(frames=1, seed=0):
     """Return random outputs that require gradients."""
     generator = torch.Generator().manual_seed(seed)
     parts = [
@@ -50,7 +50,7 @@ def answers(frames=1, seed=0):
 
 def gradients(targets, seed=0, frames=1):
     """Return the gradients of the whole loss."""
-    given = answers(frames, seed)
+    given = random_outputs(frames, seed)
     weighted_loss(given, targets, PRESET, 1.0)["loss"].backward()
     return Answers(*(part.grad for part in given))
 
@@ -93,8 +93,10 @@ def test_the_iou_term_is_least_at_the_true_overlap():
 
     silent = torch.full((1, *PRESET.cells, 1), -9.0)
 
-    def loss(said):
-        logits = torch.full((1, *PRESET.cells), math.log(said / (1 - said)), dtype=torch.float64)
+    def loss(predicted):
+        logits = torch.full(
+            (1, *PRESET.cells), math.log(predicted / (1 - predicted)), dtype=torch.float64
+        )
         return float(iou_loss(Answers(silent, codes, logits), targets, PRESET))
 
     entropy = -(math.log(1 / 3) / 3 + 2 * math.log(2 / 3) / 3)
@@ -105,7 +107,7 @@ def test_the_iou_term_is_least_at_the_true_overlap():
 def test_the_iou_term_does_not_move_the_box():
     """The overlap is a target: the gradient reaches only the estimate, in every frame."""
     targets = targets_of([(CAR, 1.0)], [(CAR, 1.0)])
-    given = answers(2)
+    given = random_outputs(2)
     iou_loss(given, targets, PRESET).backward()
     assert given.codes.grad is None
     assert given.logits.grad is None
@@ -164,7 +166,7 @@ def test_the_weights_of_other_objects_do_not_matter():
 def test_frames_of_a_batch_do_not_mix():
     """The loss of a batch is the sum of the losses of its frames."""
     frames = ([(CAR, 1.0)], [], [([5.0, -3.0, *CAR[2:]], 0.4), (CAR, 0.9)])
-    given = answers(3)
+    given = random_outputs(3)
     together = weighted_loss(given, targets_of(*frames), PRESET, 2.0)["loss"]
     alone = [
         weighted_loss(

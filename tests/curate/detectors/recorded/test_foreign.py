@@ -94,9 +94,9 @@ def write_inferencer(folder, frames=FRAMES):
     """Write the folder of the inferencer."""
     folder.mkdir()
     for frame_id, entry in mmdetection3d(frames).items():
-        held = {key: value.tolist() for key, value in entry.items()}
-        held["bboxes_3d"] = held.pop("boxes_3d")
-        (folder / f"{frame_id}.json").write_text(json.dumps(held | {"box_type_3d": "LiDAR"}))
+        content = {key: value.tolist() for key, value in entry.items()}
+        content["bboxes_3d"] = content.pop("boxes_3d")
+        (folder / f"{frame_id}.json").write_text(json.dumps(content | {"box_type_3d": "LiDAR"}))
     return folder
 
 
@@ -263,7 +263,7 @@ def test_numbered_labels_need_class_names(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "held", "message"),
+    ("name", "content", "message"),
     [
         ("a.json", {"a": 1}, "holds a dict, not a list of frames"),
         ("a.json", [], "holds no frames"),
@@ -273,9 +273,9 @@ def test_numbered_labels_need_class_names(tmp_path):
         ("a.feather", [], "no known record of detections; expected a .csv or .parquet file"),
     ],
 )
-def test_unsupported_contents_are_rejected(tmp_path, name, held, message):
+def test_unsupported_contents_are_rejected(tmp_path, name, content, message):
     """The error lists what can be read."""
-    (tmp_path / name).write_text(json.dumps(held))
+    (tmp_path / name).write_text(json.dumps(content))
     with pytest.raises(DataError, match=message):
         RecordedDetector(tmp_path / name)
 
@@ -376,8 +376,8 @@ def json_reader(request, monkeypatch):
 def test_streaming_and_whole_reading_agree(tmp_path):
     """A key in the meta that is called results is not mistaken for the results."""
     path = write_nuscenes(tmp_path / "a.json")
-    held = json.loads(path.read_text())
-    path.write_text(json.dumps({"meta": {"results": {"a": 1}}, **held, "more": [{}]}))
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({"meta": {"results": {"a": 1}}, **content, "more": [{}]}))
     record = RecordedDetector(path)
     assert record.frame_ids() == tuple(sorted(nuscenes()))
     path.write_text(json.dumps({"meta": {}, "results": {}}))

@@ -160,7 +160,7 @@ boxes = st.tuples(
     st.floats(2, 60), st.floats(-30, 30), st.floats(-3, 3),
     st.floats(2.1, 9), st.floats(0.3, 2.0), st.floats(0.3, 4), st.floats(-np.pi, np.pi),
 )  # fmt: skip
-answers = st.lists(
+detections = st.lists(
     st.tuples(boxes, st.floats(0.01, 1), st.sampled_from(NAMES)),
     min_size=1,
     max_size=5,
@@ -190,7 +190,7 @@ def test_every_format_has_a_writer() -> None:
 
 @pytest.mark.parametrize("kind", WRITERS)
 @settings(max_examples=15, deadline=None)
-@given(found=answers, rig=rigs)
+@given(found=detections, rig=rigs)
 def test_boxes_are_read_back_unchanged(kind: str, found: Detections, rig: Rig) -> None:
     """Whatever frame of reference, origin, order of sizes and angle the format has."""
     with tempfile.TemporaryDirectory() as folder:
@@ -202,7 +202,7 @@ def test_boxes_are_read_back_unchanged(kind: str, found: Detections, rig: Rig) -
 
 @pytest.mark.parametrize("kind", [kind for kind in WRITERS if kind not in ("csv", "parquet")])
 @settings(max_examples=8, deadline=None)
-@given(found=answers, rig=rigs, similarity=similarities.filter(lambda a: a != Similarity()))
+@given(found=detections, rig=rigs, similarity=similarities.filter(lambda a: a != Similarity()))
 def test_boxes_of_an_augmented_copy_are_read_back(
     kind: str, found: Detections, rig: Rig, similarity: Similarity
 ) -> None:

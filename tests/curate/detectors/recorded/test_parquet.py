@@ -183,6 +183,6 @@ def test_only_a_few_row_groups_are_in_memory(tmp_path, monkeypatch):
     for name in reversed(names):
         assert len(record.predict(empty_frame(name))) == 3
     # Cached row groups are not read again.
-    held = 30 - len(read)
-    assert held <= 2
-    assert read == list(reversed(range(30 - held)))
+    cached = 30 - len(read)
+    assert cached <= 2
+    assert read == list(reversed(range(30 - cached)))
