@@ -1,4 +1,4 @@
-"""Data that tests share: real KITTI frames where they are, and small handmade ones otherwise."""
+"""Shared test data: real KITTI frames if available, and small synthetic ones."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -20,7 +20,7 @@ from curate.exporters.sqlite import SqliteExporter
 from db.session import Database
 
 # The default run tries the same examples every time; `make fuzz-random` tries others.
-# How long an example takes says nothing on a busy machine.
+# No deadline: on a busy machine the run time of an example says nothing.
 settings.register_profile(
     "same", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
@@ -38,7 +38,7 @@ def _remember(connection: Connection) -> None:
 
 @pytest.fixture(autouse=True)
 def _closed_databases() -> Iterator[None]:
-    """Closes each database that a test used, whoever opened it."""
+    """Close each database that a test opened."""
     yield
     while _connected:
         _connected.pop().dispose()
@@ -53,19 +53,19 @@ def _shared(variable: str, name: str) -> Path:
 
 @pytest.fixture(scope="session")
 def kitti_root() -> Path:
-    """Real KITTI frames with recorded detections and a segmentation model."""
+    """Return the folder with real KITTI frames, recorded detections and a segmentation model."""
     return _shared("CURATE_KITTI", "kitti")
 
 
 @pytest.fixture(scope="session")
 def kitti_eval_root() -> Path:
-    """Made-up labels and results with the AP that the official devkit prints for them."""
+    """Return synthetic labels and results, and the AP that the official devkit reports for them."""
     return _shared("CURATE_KITTI_EVAL", "kitti_eval")
 
 
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[postgres_server.PostgresServer]:
-    """A PostgreSQL server with a migrated template, where its binaries are installed."""
+    """Return a PostgreSQL server with a migrated template; skip if PostgreSQL is not installed."""
     reason = postgres_server.unavailable()
     if reason is not None:
         pytest.skip(reason)
@@ -76,7 +76,7 @@ def postgres() -> Iterator[postgres_server.PostgresServer]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip tests of wrong shapes where jaxtyping rejects those before our own checks do."""
+    """Skip the tests of wrong shapes if jaxtyping would reject those before our own checks do."""
     if config.getoption("--jaxtyping-packages"):
         reason = "gives arrays of wrong shapes on purpose"
         for item in items:
@@ -85,7 +85,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Tests of a module with ENGINES go through the database on each of them."""
+    """Run the tests of a module that defines ENGINES once per database engine."""
     engines = getattr(metafunc.module, "ENGINES", ())
     if engines and "engine" in metafunc.fixturenames:
         metafunc.parametrize("engine", engines, indirect=True)
@@ -93,13 +93,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture
 def engine(request: pytest.FixtureRequest) -> str:
-    """Where the tables are: sqlite, unless the module says otherwise."""
+    """Return the database engine: sqlite, unless the module defines ENGINES."""
     return getattr(request, "param", "sqlite")
 
 
 @pytest.fixture
 def new_url(engine: str, request: pytest.FixtureRequest) -> Callable[[], str | None]:
-    """A function that gives each workspace a database of its own: its file, or one on a server."""
+    """Return a function that gives each workspace a new database: a file, or one on the server."""
     if engine == "sqlite":
         return lambda: None
     server = request.getfixturevalue("postgres")
@@ -108,7 +108,7 @@ def new_url(engine: str, request: pytest.FixtureRequest) -> Callable[[], str | N
 
 @pytest.fixture
 def toy_kitti(tmp_path: Path) -> Path:
-    """Twelve small frames in KITTI's layout, eight of them for training."""
+    """Return twelve small frames in KITTI's layout, eight of them for training."""
     root = tmp_path / "kitti"
     write_toy_kitti(root, frames=12, val=4)
     return root
@@ -116,7 +116,7 @@ def toy_kitti(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> str:
-    """The name of a preset of a tenth of the size, which covers the toy frames."""
+    """Return the name of a small preset, a tenth of the usual size, that covers the toy frames."""
     from curate.detectors.pillars import presets
 
     small = presets.PRESETS["small"]
@@ -136,7 +136,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture
 def make_labels(toy_kitti, tmp_path):
-    """Writes a label file: `labeled` frames with ground truth, `unlabeled` ones with weights."""
+    """Return a function that writes a label file of `labeled` and `unlabeled` frames."""
     dataset = KittiDataset(toy_kitti)
 
     def make(

@@ -1,4 +1,4 @@
-"""Tests of the check that `make venv` runs first, on systems that lack something."""
+"""The check that `make venv` runs first, on systems with missing parts."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 from support.paths import ROOT
 
 CHECK = ROOT / ".ci" / "check_system.py"
-# Runs the check as another user of another system: what it would look up is replaced before.
+# Runs the check as on another system: what it looks up is replaced before.
 RUN = """
 import builtins, ctypes, importlib.util, os, runpy, shutil, sys
 find_spec, which, CDLL = importlib.util.find_spec, shutil.which, ctypes.CDLL
@@ -31,7 +31,7 @@ runpy.run_path({check!r}, run_name='__main__')
 APT = '#!/bin/sh\necho "$DEBIAN_FRONTEND $*" >> "$(dirname "$0")/calls"\n'
 
 
-def check(
+def run_check(
     folder: Path,
     *arguments: str,
     lacking: tuple[str, ...] = (),
@@ -59,14 +59,16 @@ def check(
     return ended.returncode, ended.stderr, calls.read_text() if calls.exists() else ""
 
 
-def test_a_complete_system_passes_in_silence(tmp_path: Path) -> None:
+def test_a_complete_system_passes_silently(tmp_path: Path) -> None:
     """Nothing is printed or installed."""
-    assert check(tmp_path) == (0, "", "")
+    assert run_check(tmp_path) == (0, "", "")
 
 
 def test_an_old_python_is_rejected_in_one_line(tmp_path: Path) -> None:
-    """With its version and what to type."""
-    status, message, calls = check(tmp_path, version=(3, 10, 12), user=0, lacking=("ensurepip",))
+    """With its version and the command to run."""
+    status, message, calls = run_check(
+        tmp_path, version=(3, 10, 12), user=0, lacking=("ensurepip",)
+    )
     assert (status, calls) == (1, "")
     assert message.startswith("error: curate needs Python 3.11 or newer; ")
     assert "is 3.10.12. Name a newer one: make PYTHON=python3.12 venv\n" in message
@@ -76,9 +78,9 @@ def test_an_old_python_is_rejected_in_one_line(tmp_path: Path) -> None:
 MISSING = ("ensurepip", "libEGL.so.1", "libGL.so.1", "libX11.so.6")
 
 
-def test_one_command_lists_all_that_is_missing(tmp_path: Path) -> None:
+def test_one_command_lists_everything_missing(tmp_path: Path) -> None:
     """For a user who is not root."""
-    status, message, calls = check(tmp_path, lacking=MISSING)
+    status, message, calls = run_check(tmp_path, lacking=MISSING)
     assert (status, calls) == (1, "")
     assert (
         "sudo apt-get update && sudo apt-get install -y python3.11-venv libegl1 libgl1 libx11-6\n"
@@ -87,9 +89,9 @@ def test_one_command_lists_all_that_is_missing(tmp_path: Path) -> None:
     assert "make venv SIMULATION=no" in message
 
 
-def test_root_installs_all_that_is_missing(tmp_path: Path) -> None:
-    """Without questions, and it is reported in one line."""
-    status, message, calls = check(tmp_path, lacking=MISSING, user=0)
+def test_root_installs_everything_missing(tmp_path: Path) -> None:
+    """Without questions, and with one line of output."""
+    status, message, calls = run_check(tmp_path, lacking=MISSING, user=0)
     assert status == 0
     assert message == "Installing with apt-get: python3.11-venv libegl1 libgl1 libx11-6\n"
     update, install = calls.splitlines()
@@ -99,18 +101,18 @@ def test_root_installs_all_that_is_missing(tmp_path: Path) -> None:
 
 
 def test_a_failed_installation_is_reported(tmp_path: Path) -> None:
-    """With the words of apt-get."""
+    """With the message of apt-get."""
     apt = "#!/bin/sh\necho 'E: no network'\nexit 100\n"
-    status, message, _ = check(tmp_path, lacking=("libGL.so.1",), user=0, apt=apt)
+    status, message, _ = run_check(tmp_path, lacking=("libGL.so.1",), user=0, apt=apt)
     assert status == 1
     assert "E: no network" in message
     assert "`apt-get update -qq` failed" in message
 
 
-def test_a_system_without_apt_is_told_the_libraries(tmp_path: Path) -> None:
+def test_a_system_without_apt_gets_the_list_of_libraries(tmp_path: Path) -> None:
     """Package names of other systems are not known here."""
     lacking = ("apt-get", "ensurepip", "libGL.so.1")
-    status, message, _ = check(tmp_path, lacking=lacking, user=0)
+    status, message, _ = run_check(tmp_path, lacking=lacking, user=0)
     assert status == 1
     assert "lacks Python's venv module, libGL.so.1. Install them" in message
 
@@ -119,13 +121,17 @@ def test_a_system_without_apt_is_told_the_libraries(tmp_path: Path) -> None:
     ("arguments", "platform"), [(("--without-simulation",), "linux"), ((), "darwin")]
 )
 def test_libraries_are_not_needed(tmp_path: Path, arguments: tuple[str, ...], platform: str):
-    """Without simulation, or where the wheel contains them."""
-    assert check(tmp_path, *arguments, lacking=("libGL.so.1",), platform=platform) == (0, "", "")
+    """Without simulation, or if the wheel contains them."""
+    assert run_check(tmp_path, *arguments, lacking=("libGL.so.1",), platform=platform) == (
+        0,
+        "",
+        "",
+    )
 
 
 def test_the_venv_module_is_needed_without_simulation_too(tmp_path: Path) -> None:
-    """And then there is no other way to go on."""
-    status, message, _ = check(tmp_path, "--without-simulation", lacking=("ensurepip",))
+    """There is no alternative."""
+    status, message, _ = run_check(tmp_path, "--without-simulation", lacking=("ensurepip",))
     assert status == 1
     assert "python3.11-venv" in message
     assert "SIMULATION" not in message

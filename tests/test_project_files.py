@@ -1,4 +1,4 @@
-"""The files that a project has beside its code agree with it."""
+"""The project files agree with the code."""
 
 import re
 import tomllib
@@ -34,12 +34,11 @@ def test_the_licence_is_the_same_everywhere() -> None:
 
 
 @pytest.mark.parametrize("path", YAML, ids=lambda path: str(path.relative_to(ROOT)))
-def test_yaml_can_be_read(path) -> None:
-    """And it is a mapping, which all of these files are."""
+def test_yaml_files_are_mappings(path) -> None:
     assert isinstance(yaml.safe_load(path.read_text()), dict)
 
 
-def test_the_workflows_use_what_exists() -> None:
+def test_the_workflows_use_existing_targets_and_scripts() -> None:
     """Each `make` target is in the Makefile, and each script in the checkout."""
     makefile = (ROOT / "Makefile").read_text()
     targets = set(re.findall(r"^(\w[\w-]*):", makefile, re.MULTILINE))

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of this checkout, built as `make wheel` does."""
+    """Return the wheel of this checkout, built as `make wheel` does."""
     folder = tmp_path_factory.mktemp("dist")
     pip = (sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation")
     subprocess.run([*pip, "--wheel-dir", folder, ROOT], check=True)
@@ -29,10 +29,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of commands of an environment with the wheel.
+    """Return the bin folder of an environment with the wheel.
 
-    The dependencies are those of this environment, by a line that puts their folder on the path.
-    Lines of its own `.pth` files are not read, so the checkout is not found through them.
+    A `.pth` file adds the dependencies of this environment to the path. The `.pth` files of this
+    environment are not processed, so the checkout is not found through them.
     """
     home = tmp_path_factory.mktemp("clean") / "venv"
     venv.create(home, with_pip=False, symlinks=True)
@@ -46,7 +46,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(folder: Path, *command: object) -> str:
-    """Return what a command prints, run in a folder without PYTHONPATH."""
+    """Return the output of a command, run in a folder without PYTHONPATH."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     ended = subprocess.run(
         [str(word) for word in command],
@@ -60,7 +60,7 @@ def run(folder: Path, *command: object) -> str:
     return ended.stdout
 
 
-def test_the_wheel_holds_the_program_and_its_licence(wheel: Path) -> None:
+def test_the_wheel_contains_the_program_and_its_licence(wheel: Path) -> None:
     """Every file of the three packages, and nothing of tests or docs."""
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())

@@ -1,4 +1,4 @@
-"""What numba's kernels cost before their first answer: once per machine, and in every process."""
+"""Compilation cost of numba's kernels: once per machine, and in every process."""
 
 import os
 import subprocess
@@ -39,7 +39,7 @@ LINES = {
 
 @pytest.fixture(scope="module")
 def warm_cache(tmp_path_factory):
-    """A cache that holds every kernel."""
+    """Return a cache that contains every kernel."""
     folder = tmp_path_factory.mktemp("warm")
     _run(IMPORTS + CALLS, folder)
     return folder
@@ -47,7 +47,7 @@ def warm_cache(tmp_path_factory):
 
 @pytest.mark.parametrize("name", LINES)
 def bench_first_answer(benchmark, name, warm_cache, tmp_path_factory):
-    """A process that imports, and then calls every kernel once."""
+    """Measure a process that imports, and then calls every kernel once."""
     cache, code = LINES[name]
     before = _files(warm_cache)
     assert before

@@ -1,4 +1,4 @@
-"""The database in rows per second, against the bare driver on the same tables and pragmas."""
+"""Database rows per second, against the bare driver with the same tables and pragmas."""
 
 import shutil
 import sqlite3
@@ -30,7 +30,7 @@ BARE = "sqlite3, bare driver"
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory):
-    """A workspace whose database holds frames and a round, but no predictions."""
+    """Return a workspace with frames and a round, but without predictions."""
     root = tmp_path_factory.mktemp("database")
     config = make_config({"dataset": {"root": root}}, "benchmark")
     workspace = Workspace.create(root / "work", config)
@@ -43,13 +43,13 @@ def template(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def predictions():
-    """The rows of `prediction`."""
+    """Return the rows of `prediction`."""
     return prediction_rows(FRAMES, EACH)
 
 
 @pytest.fixture
 def copies(template, tmp_path):
-    """A function that returns the path of a fresh copy of the template."""
+    """Return a function that copies the template and returns the path."""
 
     def fresh():
         path = tmp_path / f"{len(list(tmp_path.glob('*.db')))}.db"
@@ -60,7 +60,7 @@ def copies(template, tmp_path):
 
 
 def bare_connection(path):
-    """The driver alone with the pragmas of `db.session`."""
+    """Return a connection of the bare driver with the pragmas of `db.session`."""
     connection = sqlite3.connect(path, isolation_level=None)
     connection.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
     connection.execute("PRAGMA journal_mode = WAL")
@@ -70,7 +70,7 @@ def bare_connection(path):
 
 
 def write_bare(path, rows):
-    """sqlite3's executemany in one transaction."""
+    """Write with sqlite3's executemany in one transaction."""
     connection = bare_connection(path)
     marks = ", ".join("?" * len(rows[0]))
     names = ", ".join(f'"{name}"' for name in COLUMNS["prediction"])
@@ -81,14 +81,14 @@ def write_bare(path, rows):
 
 
 def write_ours(database, rows):
-    """`db.bulk.insert` in one transaction."""
+    """Write with `db.bulk.insert` in one transaction."""
     with database.writing() as connection:
         store(connection, "prediction", rows)
     database.close()
 
 
 def write_core(database, rows):
-    """SQLAlchemy Core with a dictionary per row."""
+    """Write with SQLAlchemy Core and a dictionary per row."""
     names = COLUMNS["prediction"]
     with database.writing() as connection:
         connection.execute(
@@ -103,7 +103,7 @@ WRITERS = {OURS: write_ours, BARE: write_bare, "SQLAlchemy Core, dictionaries": 
 
 @pytest.mark.parametrize("name", WRITERS)
 def bench_write(benchmark, name, copies, predictions):
-    """Into an empty table with its primary key, foreign keys and index."""
+    """Insert into an empty table with its primary key, foreign keys and index."""
     last = []
 
     def setup() -> tuple[tuple, dict]:
@@ -128,7 +128,7 @@ def bench_write(benchmark, name, copies, predictions):
 
 @pytest.mark.parametrize("name", [OURS, BARE])
 def bench_read(benchmark, name, copies, predictions):
-    """All rows with all columns, as tuples."""
+    """Read all rows with all columns, as tuples."""
     path = copies()
     write_bare(path, predictions)
     names = COLUMNS["prediction"]
@@ -150,7 +150,7 @@ def bench_read(benchmark, name, copies, predictions):
 
 @pytest.mark.parametrize("name", [OURS, BARE])
 def bench_read_column(benchmark, name, copies, predictions):
-    """The scores of all labels by frame and k as an array, as solve reads its evidence."""
+    """Read the scores of all labels sorted by frame and k as an array, as solve does."""
     path = copies()
     write_bare(path, predictions)
     database, bare = Database(f"sqlite:///{path}"), bare_connection(path)
@@ -163,8 +163,8 @@ def bench_read_column(benchmark, name, copies, predictions):
             return bulk.select_columns(connection, query)["score"]
 
     def driver():
-        asked = "SELECT score FROM prediction WHERE round = 1 ORDER BY frame_id, k"
-        return np.array(bare.execute(asked).fetchall(), dtype=np.float64)[:, 0]
+        sql = "SELECT score FROM prediction WHERE round = 1 ORDER BY frame_id, k"
+        return np.array(bare.execute(sql).fetchall(), dtype=np.float64)[:, 0]
 
     read = ours if name == OURS else driver
     found = measure(benchmark, read, group=COLUMN, name=name, amount=ROWS, unit="values")
@@ -175,7 +175,7 @@ def bench_read_column(benchmark, name, copies, predictions):
 
 @pytest.fixture(scope="module")
 def solvable(template, predictions, tmp_path_factory):
-    """A workspace with the evidence of every label."""
+    """Return a workspace with the evidence of every label."""
     workspace = Workspace.create(tmp_path_factory.mktemp("solve"), template.config)
     workspace.database.close()
     shutil.copyfile(template.root / "curate.db", workspace.root / "curate.db")
@@ -195,14 +195,14 @@ def solvable(template, predictions, tmp_path_factory):
 
 
 def solve_product(workspace):
-    """What solve computes; its `write` stores the weights."""
+    """Return the result of solve; its `write` stores the weights."""
     context = RoundContext(1, 3, 0, Teacher(workspace.root, ""))
     frames = list(workspace.frames("unlabeled").values())
     return solve.run(workspace, RoundJob(context, "pspsl", frames), Silent())
 
 
 def bench_solve_reads(benchmark, solvable):
-    """Evidence joined from four tables, and the weight of every label."""
+    """Read evidence joined from four tables, and compute the weight of every label."""
     measure(
         benchmark,
         lambda: solve_product(solvable),
@@ -216,7 +216,7 @@ def bench_solve_reads(benchmark, solvable):
 
 @pytest.mark.parametrize("name", [OURS, BARE])
 def bench_solve_writes(benchmark, name, solvable):
-    """The rows of `weight`, in place of those of the last time."""
+    """Replace the rows of `weight`."""
     product = solve_product(solvable)
 
     def ours():

@@ -22,7 +22,7 @@ EXAMPLES = ROOT.parent / "shared" / "kitti_eval"
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """A folder of label files and one of result files."""
+    """Return a folder of label files and one of result files."""
     examples = Path(os.environ.get("CURATE_KITTI_EVAL", EXAMPLES))
     root = tmp_path_factory.mktemp("kitti")
     frames = kitti_frames(np.random.default_rng(0), FRAMES, examples if examples.is_dir() else None)
@@ -34,7 +34,7 @@ def folders(tmp_path_factory):
 
 
 def bench_load(benchmark, folders):
-    """Two folders of text files."""
+    """Load two folders of text files."""
     names, _, _ = measure(
         benchmark,
         lambda: read_folders(*folders),
@@ -49,7 +49,7 @@ def bench_load(benchmark, folders):
 
 
 def bench_evaluate(benchmark, folders):
-    """All that `curate evaluate` prints."""
+    """Compute everything that `curate evaluate` prints."""
     _, labels, results = read_folders(*folders)
     found = measure(
         benchmark,

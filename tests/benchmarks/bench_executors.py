@@ -1,4 +1,4 @@
-"""Executors and workers in frames per second, by the clock: predict with curate's own network."""
+"""Executors and workers: predict with curate's own network, in frames per second."""
 
 import shutil
 import time
@@ -24,7 +24,7 @@ GROUP = f"Predict for {FRAMES - 1} simulated frames by the clock, workers with t
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory):
-    """A function that gives a fresh workspace; its network has not learned anything."""
+    """Return a function that creates a workspace with an untrained network."""
     import torch
 
     from curate.detectors.pillars.checkpoint import save_checkpoint
@@ -58,7 +58,7 @@ def prepared(tmp_path_factory):
     ("executor", "workers"), [("serial", 1), ("process", 1), ("process", 2), ("ray", 1), ("ray", 2)]
 )
 def bench_predict(benchmark, prepared, executor, workers):
-    """Planned, worked on and stored, as `curate predict` does it."""
+    """Plan, run and store as `curate predict` does."""
     if executor == "ray":
         pytest.importorskip("ray", reason="Ray is not installed: pip install '.[ray]'")
     settings = {"executor": executor, "workers": workers}

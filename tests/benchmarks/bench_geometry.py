@@ -1,4 +1,4 @@
-"""The geometry kernels against other libraries, on the same data and with the same answer."""
+"""The geometry kernels against other libraries, on the same data and with the same results."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ from curate.geometry.points_in_boxes import count_points_in_boxes
 pytestmark = pytest.mark.benchmark(timer=cpu_seconds)
 
 NMS_IOU = 0.2
-# OpenCV calculates in float32, so that its borderline cases fall otherwise.
+# OpenCV calculates in float32, so its borderline cases can differ.
 CV2_TOLERANCE = 2e-2
 
 COUNTERS: dict[str, Callable] = {
@@ -39,7 +39,7 @@ COMMON_AREAS: dict[str, Callable] = {
 
 @pytest.mark.parametrize("name", COUNTERS)
 def bench_points_in_boxes(benchmark, name):
-    """How many of the points of a sweep lie in each box."""
+    """Count the points of a sweep in each box."""
     generator = np.random.default_rng(0)
     points, boxes = scenes.sweep(generator, 120_000), scenes.scattered_boxes(generator, 50, 40)
     counts = measure(
@@ -53,13 +53,13 @@ def bench_points_in_boxes(benchmark, name):
     )
     expected = count_points_in_boxes(points, boxes)
     assert expected.sum() > 1000
-    # A point on a face may fall to either side in float32.
+    # A point on a face can be on either side in float32.
     np.testing.assert_allclose(counts, expected, atol=2)
 
 
 @pytest.mark.parametrize("name", SUPPRESSORS)
 def bench_nms(benchmark, name):
-    """Which of many guesses around each of 256 objects stay."""
+    """Suppress many overlapping detections around each of 256 objects."""
     generator = np.random.default_rng(1)
     boxes = scenes.clustered_boxes(generator, 256, 16)
     scores = generator.random(len(boxes))
@@ -80,7 +80,10 @@ def bench_nms(benchmark, name):
 
 @pytest.mark.parametrize("name", [OURS, *COMMON_AREAS])
 def bench_iou_of_frames(benchmark, name):
-    """BEV IoU of predictions and labels within each frame; peers take all near pairs at once."""
+    """Compute BEV IoU of predictions and labels within each frame.
+
+    Peers get all near pairs at once.
+    """
     generator = np.random.default_rng(2)
     frames, each = 500, 20
     a = scenes.scattered_boxes(generator, frames * each, 20)
@@ -112,7 +115,7 @@ def bench_iou_of_frames(benchmark, name):
 
 @pytest.mark.parametrize("name", [OURS, *COMMON_AREAS])
 def bench_iou_dense(benchmark, name):
-    """BEV IoU of all boxes with all others, crowded; peers get the near pairs first."""
+    """Compute BEV IoU of all boxes with all others, crowded; peers get the near pairs first."""
     generator = np.random.default_rng(3)
     a, b = (scenes.scattered_boxes(generator, 1000, 20) for _ in range(2))
 

@@ -1,4 +1,4 @@
-"""What a frame costs beside the networks: read, augment, match, priors, solve, write."""
+"""The cost of a frame without the networks: read, augment, match, priors, solve, write."""
 
 import os
 import shutil
@@ -21,8 +21,8 @@ from pipelines.workspace.workspace import Workspace
 pytestmark = pytest.mark.benchmark(timer=cpu_seconds)
 
 POINTS, LABELS = 120_000, 20
-# One labeled frame and eight times as many others as the runner stores at once, so that what a
-# command does once hardly counts; they are links to a few files.
+# One labeled frame and eight times as many others as the runner stores at once, so that
+# start-up costs hardly count; they are links to a few files.
 FRAMES, TEMPLATES = 513, 8
 IMAGE_SIZE = (1242, 375)
 TARGET_S = 15e-3
@@ -32,14 +32,14 @@ STAGES = ("predict", "repredict", "points", "semantic", "solve")
 
 
 class Answers:
-    """A detector without a network: it answers boxes that it was given, for a copy like-wise."""
+    """A detector without a network: it returns given boxes, for the augmented copy as well."""
 
     def __init__(self, path):
         self.boxes = np.load(path)
         self.drawn = np.random.default_rng(0)
 
     def predict(self, frame):
-        """The frame's boxes, a little off."""
+        """Return the frame's boxes with a small offset."""
         boxes = self.boxes + self.drawn.normal(0, 0.02, self.boxes.shape)
         names = [CATEGORIES[i % len(CATEGORIES)] for i in range(len(boxes))]
         return Detections(boxes, np.linspace(0.9, 0.2, len(boxes)), as_categories(names))
@@ -52,17 +52,20 @@ class KnownMap:
 
     def __init__(self, path):
         classes = np.arange(IMAGE_SIZE[0] * IMAGE_SIZE[1]).reshape(IMAGE_SIZE[::-1]) // 97 % 4
-        known = {name: frozenset({i + 1}) for i, name in enumerate(CATEGORIES)}
-        self.answer = SemanticMap(classes.astype(np.uint8), known)
+        class_ids = {name: frozenset({i + 1}) for i, name in enumerate(CATEGORIES)}
+        self.answer = SemanticMap(classes.astype(np.uint8), class_ids)
 
     def segment(self, frame):
-        """The same map for every frame."""
+        """Return the same map for every frame."""
         return self.answer
 
 
 @pytest.fixture(scope="module")
 def configuration(tmp_path_factory):
-    """Settings of a workspace on frames in KITTI's layout; the boxes lie before the camera."""
+    """Return settings of a workspace on frames in KITTI's layout.
+
+    The boxes are in front of the camera.
+    """
     root = tmp_path_factory.mktemp("frames")
     generator = np.random.default_rng(0)
     kinds = np.arange(LABELS) % len(CATEGORIES)
@@ -88,7 +91,7 @@ def configuration(tmp_path_factory):
 
 
 def write_frame(home, name, generator, boxes):
-    """One frame; its first has labels."""
+    """Write one frame; the first one has labels."""
     import cv2
 
     projection = np.array([[721.5, 0, 609.6, 44.9], [0, 721.5, 172.9, 0.2], [0, 0, 1, 0.003]])
@@ -112,7 +115,7 @@ def write_frame(home, name, generator, boxes):
 
 
 def run_stage(workspace, name):
-    """Brings a stage up to date for all frames."""
+    """Bring a stage up to date for all frames."""
     report = rounds.run_stage(workspace, name)
     if name == "solve":
         return report
@@ -122,7 +125,7 @@ def run_stage(workspace, name):
 
 @pytest.fixture(scope="module")
 def prepared(configuration, tmp_path_factory):
-    """A function that gives a fresh workspace in which all stages before one are up to date."""
+    """Return a function that creates a workspace with all stages before one up to date."""
     home = tmp_path_factory.mktemp("prepared")
     workspace = initialise(home / "work", configuration, str(1 / FRAMES), "")
     for name in STAGES:
@@ -140,7 +143,7 @@ def prepared(configuration, tmp_path_factory):
 
 @pytest.mark.parametrize("name", STAGES)
 def bench_stage(benchmark, name, prepared):
-    """A stage as a command runs it: planned, worked on and stored."""
+    """Plan, run and store one stage as a command does."""
     measure(
         benchmark,
         run_stage,
@@ -155,7 +158,7 @@ def bench_stage(benchmark, name, prepared):
 
 
 def bench_round(benchmark, prepared):
-    """All of them, against the target per frame."""
+    """Run all stages, against the target per frame."""
 
     def whole(workspace):
         for name in STAGES:

@@ -1,4 +1,4 @@
-"""A PostgreSQL server in rows per second, against its driver and SQLAlchemy on the same tables."""
+"""PostgreSQL rows per second, against its driver and SQLAlchemy with the same tables."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ ROUNDS = 3
 
 @pytest.fixture(scope="module")
 def database(postgres):
-    """A database on a server of the run's own, with frames and a round, but no predictions."""
+    """Return a server database with frames and a round, but without predictions."""
     database = Database(postgres.new_database())
     with database.writing() as connection:
         store(connection, "frame", frame_rows(FRAMES))
@@ -30,17 +30,17 @@ def database(postgres):
 
 @pytest.fixture(scope="module")
 def predictions():
-    """The rows of `prediction`."""
+    """Return the rows of `prediction`."""
     return prediction_rows(FRAMES, EACH)
 
 
 def write_ours(connection, rows):
-    """COPY of named columns."""
+    """Write with COPY of named columns."""
     store(connection, "prediction", rows)
 
 
 def write_copy(connection, rows):
-    """COPY, its text form made row by row."""
+    """Write with COPY, its text form created row by row."""
     names = ", ".join(f'"{name}"' for name in COLUMNS["prediction"])
     with connection.connection.cursor().copy(f"COPY prediction ({names}) FROM STDIN") as copy:
         for row in rows:
@@ -48,7 +48,7 @@ def write_copy(connection, rows):
 
 
 def write_many(connection, rows):
-    """The driver's executemany, which sends the rows without waiting for each answer."""
+    """Write with the driver's executemany, which pipelines the rows."""
     names = COLUMNS["prediction"]
     quoted, marks = ", ".join(f'"{name}"' for name in names), ", ".join(["%s"] * len(names))
     statement = f"INSERT INTO prediction ({quoted}) VALUES ({marks})"
@@ -56,7 +56,7 @@ def write_many(connection, rows):
 
 
 def write_core(connection, rows):
-    """SQLAlchemy Core with a dictionary per row, a thousand of them in a statement."""
+    """Write with SQLAlchemy Core and a dictionary per row, a thousand rows per statement."""
     names = COLUMNS["prediction"]
     values = [dict(zip(names, row, strict=True)) for row in rows]
     connection.execute(insert(bulk.table("prediction")), values)
@@ -72,7 +72,7 @@ WRITERS = {
 
 @pytest.mark.parametrize("name", WRITERS)
 def bench_server_write(benchmark, name, database, predictions):
-    """Into an empty table with its primary key, foreign keys and index, in one transaction."""
+    """Insert into an empty table with keys and index, in one transaction."""
     table = bulk.table("prediction")
 
     def emptied() -> tuple[tuple, dict]:
@@ -101,7 +101,7 @@ def bench_server_write(benchmark, name, database, predictions):
 
 @pytest.mark.parametrize("name", [OURS, "SQLAlchemy Core, rows"])
 def bench_server_read(benchmark, name, database, predictions):
-    """The scores in the order of the key, as an array."""
+    """Read the scores in the order of the key, as an array."""
     emptied = "TRUNCATE prediction CASCADE"
     with database.writing() as connection:
         connection.exec_driver_sql(emptied)

@@ -1,4 +1,4 @@
-"""The stages of a round in frames per second on one core, without the networks' own time."""
+"""The stages of a round in frames per second on one core, without the time of the networks."""
 
 import numpy as np
 import pytest
@@ -24,19 +24,19 @@ CLUTTER = 55
 
 
 class KnownAnswers:
-    """A detector that takes no time: it answers what it was given for a frame."""
+    """A detector that takes no time: it returns given boxes for each frame."""
 
     def __init__(self, answers):
         self.answers = answers
 
     def predict(self, frame):
-        """The frame's boxes."""
+        """Return the frame's boxes."""
         return self.answers[frame.frame_id]
 
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory):
-    """A workspace on simulated frames, one of them labeled."""
+    """Return a workspace on simulated frames, one of them labeled."""
     root = tmp_path_factory.mktemp("simulated")
     simulate(root / "data", FRAMES, 0, val_frames=0, workers=1)
     document = {
@@ -52,13 +52,13 @@ def workspace(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def context(workspace):
-    """The first round."""
+    """Return the first round."""
     return RoundContext(1, 3, 0, Teacher(workspace.root / "none", ""))
 
 
 @pytest.fixture(scope="module")
 def guesses(workspace):
-    """Predictions by frame id."""
+    """Return predictions by frame id."""
     generator = np.random.default_rng(0)
     return {
         name: guesses_around(generator, workspace.dataset.annotations(name), CLUTTER)
@@ -67,7 +67,7 @@ def guesses(workspace):
 
 
 def of_frames(benchmark, names, function, name):
-    """Measures what is done with every frame."""
+    """Measure a function on every frame."""
     return measure(
         benchmark,
         lambda: [function(frame) for frame in names],
@@ -80,14 +80,14 @@ def of_frames(benchmark, names, function, name):
 
 
 def of_jobs(benchmark, guesses, stage, name):
-    """Measures a stage with the predictions of every frame, and returns the rows of the first."""
+    """Measure a stage with the predictions of every frame; return the rows of the first."""
     jobs = {frame: FrameJob(0, frame, found) for frame, found in guesses.items()}
     rows = of_frames(benchmark, list(jobs), lambda frame: stage(jobs[frame]), name)
     return rows[0]
 
 
 def bench_simulate(benchmark, tmp_path):
-    """Sweep, image, semantic map and labels of a frame."""
+    """Simulate sweep, image, semantic map and labels of a frame."""
     count = 3
 
     def setup() -> tuple[tuple, dict]:
@@ -108,7 +108,7 @@ def bench_simulate(benchmark, tmp_path):
 
 
 def bench_read(benchmark, workspace):
-    """Points, calibration and the size of the image."""
+    """Read points, calibration and the size of the image."""
     frames = of_frames(
         benchmark, workspace.dataset.frame_ids(), workspace.dataset.read, "read: sweep, calibration"
     )
@@ -116,7 +116,7 @@ def bench_read(benchmark, workspace):
 
 
 def bench_read_image(benchmark, workspace):
-    """The image as well."""
+    """Read the image as well."""
     of_frames(
         benchmark,
         workspace.dataset.frame_ids(),
@@ -126,7 +126,7 @@ def bench_read_image(benchmark, workspace):
 
 
 def bench_predict(benchmark, workspace):
-    """Up to the network: read, crop to the camera's view, make pillars."""
+    """Run everything before the network: read, crop to the camera's view, build pillars."""
 
     def prepare(name):
         frame = predict.visible(workspace.dataset.read(name), workspace.config)
@@ -139,7 +139,7 @@ def bench_predict(benchmark, workspace):
 
 
 def bench_repredict(benchmark, workspace, context, guesses):
-    """Read, crop, A, the answers mapped back, matching, consistency loss."""
+    """Read, crop, augment, map the boxes back, match, compute the consistency loss."""
     section = workspace.config.repredict
     answers = {}
     for name, found in guesses.items():
@@ -153,7 +153,7 @@ def bench_repredict(benchmark, workspace, context, guesses):
 
 
 def bench_points(benchmark, workspace, context, guesses):
-    """Read, count the points in the boxes."""
+    """Read, and count the points in the boxes."""
     stage = score.stage("points").function(workspace, context)
     stage.open()
     rows = of_jobs(benchmark, guesses, stage, "score --prior points")
@@ -161,7 +161,7 @@ def bench_points(benchmark, workspace, context, guesses):
 
 
 def bench_semantic(benchmark, workspace, context, guesses):
-    """Read the frame and its saved semantic map, count the pixels in the boxes."""
+    """Read the frame and its saved semantic map, and count the pixels in the boxes."""
     stage = score.stage("semantic").function(workspace, context)
     stage.open()
     rows = of_jobs(benchmark, guesses, stage, "score --prior semantic, saved maps")
@@ -169,7 +169,7 @@ def bench_semantic(benchmark, workspace, context, guesses):
 
 
 def bench_solve(benchmark):
-    """The closed form over a million labels of 20,000 frames, in memory."""
+    """Solve the closed form over a million labels of 20,000 frames, in memory."""
     generator = np.random.default_rng(0)
     count = 1_000_000
     evidence = Evidence(

@@ -1,8 +1,8 @@
-"""How a benchmark is measured: the best of several rounds, with what the report needs to know.
+"""How a benchmark is measured: the best of several rounds, and what the report needs.
 
-Work within one process is measured in CPU seconds of that process. On a quiet machine these are the
-seconds on the clock; on a busy one the clock also counts how long others had the core, which hits
-long calls always and short ones hardly ever: ratios by the clock would flatter the faster side.
+Work within one process is measured in CPU seconds of that process. On an idle machine these equal
+wall-clock seconds. On a busy one, the wall clock also counts the time of other processes, which
+affects long calls more than short ones: ratios would favour the faster side.
 """
 
 import resource
@@ -24,7 +24,7 @@ cpu_seconds = time.process_time
 
 
 def cpu_seconds_of_children() -> float:
-    """Timer of work in processes that this one has started and waited for."""
+    """Return the CPU time of processes that this one has started and waited for."""
     spent = resource.getrusage(resource.RUSAGE_CHILDREN)
     return spent.ru_utime + spent.ru_stime
 
@@ -42,19 +42,19 @@ def measure(
     target_s: float | None = None,
     figure: str = "ratio",
 ) -> Any:
-    """Runs a function once to warm up, then in rounds; the report shows the best of them.
+    """Call a function once to warm up, then in rounds; the report shows the best of them.
 
     Args:
         benchmark: the fixture of pytest-benchmark.
         function: the work.
-        group: the table in which it stands.
-        name: the line in that table; `OURS` is what the others are compared with.
+        group: the table of the report.
+        name: the line in that table; the others are compared with `OURS`.
         amount: how much work one call does.
         unit: of that amount, in the plural.
         setup: called before every call, outside the measured time; may return its arguments.
         rounds: how many; None derives them from the first call. 1 leaves out the warm-up.
-        target_s: what issue or design ask of it.
-        figure: "ratio" where the lines of a group do the same work, "rate" where they do not.
+        target_s: the required time.
+        figure: "ratio" if the lines of a group do the same work, "rate" if they do not.
 
     Returns:
         The result of the function.
@@ -64,7 +64,7 @@ def measure(
         start = time.perf_counter()
         function(*args, **kwargs)
         seconds = time.perf_counter() - start
-        # The first call pays for compilation; one more tells how long a round is.
+        # The first call includes compilation; the second one shows how long a round is.
         if seconds > BUDGET_S / MOST_ROUNDS and setup is None:
             start = time.perf_counter()
             function()

@@ -1,6 +1,6 @@
-"""The same work done with other libraries, each as well as a careful user of it would.
+"""The same work with other libraries, each as a careful user would write it.
 
-Every peer is prepared first: what it needs in a form of its own is made outside the measured time.
+Every peer is prepared first: conversions to its own format are outside the measured time.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ Pairs = tuple[np.ndarray, np.ndarray]
 
 
 def count_with_open3d(points: np.ndarray, boxes: np.ndarray) -> Counter:
-    """Open3D's oriented bounding boxes, one after the other."""
+    """Count with Open3D's oriented bounding boxes, one after the other."""
     from curate.simulation.open3d_loader import load
 
     open3d = load()
@@ -33,7 +33,7 @@ def count_with_open3d(points: np.ndarray, boxes: np.ndarray) -> Counter:
 
 
 def count_with_numpy(points: np.ndarray, boxes: np.ndarray) -> Counter:
-    """NumPy, one box after the other against all points."""
+    """Count with NumPy, one box after the other against all points."""
     columns = np.ascontiguousarray(points[:, :3].T)
 
     def count() -> np.ndarray:
@@ -43,7 +43,7 @@ def count_with_numpy(points: np.ndarray, boxes: np.ndarray) -> Counter:
 
 
 def count_with_sorted_numpy(points: np.ndarray, boxes: np.ndarray) -> Counter:
-    """NumPy with the points sorted by x, which is measured: each box looks at its own slab."""
+    """Count with NumPy and points sorted by x: each box checks only its own slab."""
 
     def count() -> np.ndarray:
         columns = np.ascontiguousarray(points[np.argsort(points[:, 0]), :3].T)
@@ -61,7 +61,7 @@ def count_with_sorted_numpy(points: np.ndarray, boxes: np.ndarray) -> Counter:
 
 
 def count_with_torch(points: np.ndarray, boxes: np.ndarray) -> Counter:
-    """Torch, all boxes against all points at once."""
+    """Count with torch, all boxes against all points at once."""
     import torch
 
     cloud, all_boxes = torch.from_numpy(points[:, :3]), torch.from_numpy(boxes.astype(np.float32))
@@ -79,7 +79,10 @@ def count_with_torch(points: np.ndarray, boxes: np.ndarray) -> Counter:
 
 
 def _inside(columns: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """(p,) bool, which of (3, p) points lie in a box; only those at its height are turned."""
+    """Return (p,) bool, which of (3, p) points are in a box.
+
+    Only those at its height are rotated.
+    """
     half = (box[3:6] / 2).astype(np.float32)
     x, y, z = (columns[axis] - np.float32(box[axis]) for axis in range(3))
     cos, sin = np.float32(np.cos(box[6])), np.float32(np.sin(box[6]))
@@ -90,13 +93,13 @@ def _inside(columns: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def near_pairs(a: np.ndarray, b: np.ndarray) -> Pairs:
-    """Rows of (n, 7) and (m, 7) boxes whose circles meet."""
+    """Return rows of (n, 7) and (m, 7) boxes with intersecting circumscribed circles."""
     rows_a, rows_b = near_pairs_of_groups(a[None], b[None])
     return rows_a, rows_b
 
 
 def near_pairs_of_groups(a: np.ndarray, b: np.ndarray) -> Pairs:
-    """Rows of (g, n, 7) and (g, m, 7) boxes, flat, whose circles meet within a group."""
+    """Return rows of (g, n, 7) and (g, m, 7) boxes, flat, with circles that meet in a group."""
     radius_a, radius_b = (np.hypot(boxes[..., 3], boxes[..., 4]) / 2 for boxes in (a, b))
     away_x = a[:, :, None, 0] - b[:, None, :, 0]
     away_y = a[:, :, None, 1] - b[:, None, :, 1]
@@ -106,12 +109,12 @@ def near_pairs_of_groups(a: np.ndarray, b: np.ndarray) -> Pairs:
 
 
 def iou_of_pairs(a: np.ndarray, b: np.ndarray, common: np.ndarray) -> np.ndarray:
-    """(p,) BEV IoU of (p, 7) boxes from their common areas."""
+    """Return (p,) BEV IoU of (p, 7) boxes from their common areas."""
     return np.asarray(common / (a[:, 3] * a[:, 4] + b[:, 3] * b[:, 4] - common))
 
 
 def shapely_common_areas(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(p,) common areas of the footprints of (p, 7) boxes by shapely, that is GEOS."""
+    """Return (p,) common areas of the footprints of (p, 7) boxes by shapely, that is GEOS."""
     import shapely
 
     polygons_a, polygons_b = shapely.polygons(bev_corners(a)), shapely.polygons(bev_corners(b))
@@ -119,7 +122,7 @@ def shapely_common_areas(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def cv2_common_areas(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(p,) common areas of the footprints of (p, 7) boxes by OpenCV, pair by pair."""
+    """Return (p,) common areas of the footprints of (p, 7) boxes by OpenCV, pair by pair."""
     import cv2
 
     common = np.zeros(len(a))
@@ -132,7 +135,7 @@ def cv2_common_areas(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def torch_common_areas(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
-    """(p,) common areas of the footprints of (p, 7) boxes by torch, all at once.
+    """Return (p,) common areas of the footprints of (p, 7) boxes by torch, all at once.
 
     The usual way: the corners of the common polygon, sorted by angle.
     """
@@ -162,7 +165,7 @@ def torch_common_areas(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:
     angle = torch.where(valid, torch.atan2(away[..., 1], away[..., 0]), torch.inf)
     order = angle.argsort(dim=1)
     ring = away.gather(1, order[..., None].expand_as(away))
-    # The ring closes at its first point, so what is not valid repeats that point.
+    # The ring closes at its first point; invalid points repeat that point.
     ring = torch.where(valid.gather(1, order)[..., None], ring, ring[:, :1])
     return np.asarray(cross(ring, ring.roll(-1, 1)).sum(dim=1).clamp(min=0) / 2)
 
@@ -182,31 +185,31 @@ def shapely_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.n
     for i, j in zip(rows[over].tolist(), others[over].tolist(), strict=True):
         rivals[i].append(j)
         rivals[j].append(i)
-    kept, gone = [], np.zeros(len(boxes), dtype=bool)
+    kept, suppressed = [], np.zeros(len(boxes), dtype=bool)
     for i in np.argsort(-scores, kind="stable").tolist():
-        if not gone[i]:
+        if not suppressed[i]:
             kept.append(i)
-            gone[rivals[i]] = True
+            suppressed[rivals[i]] = True
     return np.array(kept)
 
 
 def torch_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarray:
-    """Greedy NMS with torch's overlaps: each kept box against the rest whose circles it meets."""
+    """Greedy NMS with torch's overlaps: each kept box against the rest with circles that meet."""
     order = np.argsort(-scores, kind="stable")
     ranked = boxes[order]
     radius, areas = np.hypot(ranked[:, 3], ranked[:, 4]) / 2, ranked[:, 3] * ranked[:, 4]
-    kept, gone = [], np.zeros(len(boxes), dtype=bool)
+    kept, suppressed = [], np.zeros(len(boxes), dtype=bool)
     for i in range(len(boxes)):
-        if gone[i]:
+        if suppressed[i]:
             continue
         kept.append(i)
         away = ((ranked[i + 1 :, :2] - ranked[i, :2]) ** 2).sum(axis=1)
-        near = (away < (radius[i + 1 :] + radius[i]) ** 2) & ~gone[i + 1 :]
+        near = (away < (radius[i + 1 :] + radius[i]) ** 2) & ~suppressed[i + 1 :]
         rest = i + 1 + np.flatnonzero(near)
         if len(rest):
             one = np.broadcast_to(ranked[i], (len(rest), 7))
             common = torch_common_areas(one, ranked[rest])
-            gone[rest[common / (areas[i] + areas[rest] - common) > threshold]] = True
+            suppressed[rest[common / (areas[i] + areas[rest] - common) > threshold]] = True
     return np.asarray(order[kept])
 
 
@@ -219,7 +222,7 @@ def cv2_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarr
 
 
 def cv2_rectangles(boxes: np.ndarray) -> list[tuple]:
-    """Footprints as OpenCV wants them: centre, sides, degrees."""
+    """Return footprints in OpenCV's format: centre, sides, degrees."""
     return [
         ((x, y), (length, width), np.degrees(yaw))
         for x, y, _, length, width, _, yaw in boxes.tolist()

@@ -1,4 +1,4 @@
-"""Makes docs/benchmarks.json and docs/benchmarks.md of what pytest-benchmark measured.
+"""Create docs/benchmarks.json and docs/benchmarks.md from the output of pytest-benchmark.
 
 Usage: python report.py MEASURED.json FOLDER
 """
@@ -30,12 +30,12 @@ shows on a quiet core; while this was measured, {load:.1f} processes wanted the 
 def summarise(
     measured: Mapping[str, Any], versions: Mapping[str, str], load: float
 ) -> dict[str, Any]:
-    """The figures of a run, without names of the machine or its folders.
+    """Return the figures of a run, without names of the machine or its folders.
 
     Args:
         measured: the JSON document of pytest-benchmark.
         versions: of the packages that were used.
-        load: average number of processes that wanted to run, this one among them.
+        load: load average, this process included.
     """
     groups: dict[str, list[dict[str, Any]]] = {}
     for benchmark in measured["benchmarks"]:
@@ -54,7 +54,7 @@ def summarise(
 
 
 def render(summary: Mapping[str, Any]) -> str:
-    """The page: the targets first, then a table per group."""
+    """Return the page: the targets first, then a table per group."""
     machine = summary["machine"]
     packages = ", ".join(f"{name} {number}" for name, number in machine["packages"].items())
     parts = [_HEAD.format(**{**machine, "packages": packages}), _targets(summary["groups"])]
@@ -63,26 +63,26 @@ def render(summary: Mapping[str, Any]) -> str:
 
 
 def _line(benchmark: Mapping[str, Any]) -> dict[str, Any]:
-    told, stats = benchmark["extra_info"], benchmark["stats"]
-    target = told["target_s"]
+    info, stats = benchmark["extra_info"], benchmark["stats"]
+    target = info["target_s"]
     by_cpu = benchmark["options"]["timer"] in CPU_TIMERS
     return {
-        "name": told["name"],
-        "figure": told["figure"],
+        "name": info["name"],
+        "figure": info["figure"],
         "timer": "CPU" if by_cpu else "clock",
         "seconds": stats["min"],
         "median_seconds": stats["median"],
-        "clock_seconds": told["clock_s"],
+        "clock_seconds": info["clock_s"],
         "rounds": stats["rounds"],
-        "per_second": told["amount"] / stats["min"],
-        "unit": told["unit"],
+        "per_second": info["amount"] / stats["min"],
+        "unit": info["unit"],
         "target_seconds": target,
         "met": None if target is None else stats["min"] <= target,
     }
 
 
 def _with_ratios(lines: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Each line with its time as a multiple of ours, where the lines do the same work."""
+    """Return each line with its time as a multiple of ours, if the lines do the same work."""
     ours = next((line["seconds"] for line in lines if line["name"] == OURS), None)
     return [
         {**line, "ratio": line["seconds"] / ours if ours and line["figure"] == "ratio" else None}
@@ -138,14 +138,14 @@ def _time(seconds: float) -> str:
 
 
 def _number(value: float) -> str:
-    """Three significant digits, thousands marked."""
+    """Return three significant digits with thousands separators."""
     if value >= 100:
         return f"{float(f'{value:.3g}'):,.0f}"
     return f"{value:.3g}"
 
 
 def _versions() -> dict[str, str]:
-    """Of the packages that are installed."""
+    """Return the versions of the installed packages."""
     found = {}
     for name in PACKAGES:
         try:
@@ -156,7 +156,7 @@ def _versions() -> dict[str, str]:
 
 
 def main(measured: Path, folder: Path) -> None:
-    """Writes both files."""
+    """Write both files."""
     summary = summarise(
         json.loads(measured.read_text(encoding="utf-8")), _versions(), os.getloadavg()[1]
     )

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def frame_rows(count):
-    """Unlabeled frames, the rows of `frame`."""
+    """Return unlabeled frames as rows of `frame`."""
     return [
         ("kitti", f"{i:06d}", "unlabeled", f"{i}.bin", f"{i}.png", f"{i}.txt", None)
         for i in range(count)
@@ -12,7 +12,7 @@ def frame_rows(count):
 
 
 def prediction_rows(frames, each):
-    """As many labels of each frame in round 1, the rows of `prediction`."""
+    """Return equally many labels of each frame in round 1 as rows of `prediction`."""
     count = frames * each
     generator = np.random.default_rng(0)
     boxes, scores = generator.normal(0, 10, (count, 7)).tolist(), generator.random(count).tolist()

@@ -1,4 +1,4 @@
-"""What the benchmarks work on: sweeps, boxes and KITTI frames, drawn from a passed generator."""
+"""The data of the benchmarks: sweeps, boxes and KITTI frames, drawn from a given generator."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,7 @@ SIDES = np.array([[4.0, 1.7, 1.5], [0.8, 0.6, 1.75], [1.8, 0.6, 1.7]])
 
 
 def sweep(generator: np.random.Generator, count: int) -> np.ndarray:
-    """(count, 4) float32 points all around the sensor, denser near it as in a real sweep."""
+    """Return (count, 4) float32 points around the sensor, denser near it as in a real sweep."""
     distance = np.minimum(3 + generator.exponential(14, count), 80)
     azimuth = generator.uniform(-np.pi, np.pi, count)
     x, y = distance * np.cos(azimuth), distance * np.sin(azimuth)
@@ -23,7 +23,7 @@ def sweep(generator: np.random.Generator, count: int) -> np.ndarray:
 
 
 def scattered_boxes(generator: np.random.Generator, count: int, reach: float) -> np.ndarray:
-    """(count, 7) boxes of the three categories, their centres at most `reach` metres off."""
+    """Return (count, 7) boxes of three categories, their centres at most `reach` metres away."""
     sides = SIDES[generator.integers(len(SIDES), size=count)]
     centres = generator.uniform([-reach, -reach, -1.2], [reach, reach, -0.6], (count, 3))
     sides = sides * generator.uniform(0.85, 1.15, (count, 3))
@@ -31,7 +31,7 @@ def scattered_boxes(generator: np.random.Generator, count: int, reach: float) ->
 
 
 def clustered_boxes(generator: np.random.Generator, objects: int, each: int) -> np.ndarray:
-    """(objects * each, 7) what a detector answers before NMS: many guesses around every object."""
+    """Return (objects * each, 7) boxes as a detector predicts them before NMS."""
     guesses = np.repeat(scattered_boxes(generator, objects, 60), each, axis=0)
     spread = np.array([0.3, 0.3, 0.1, 0.15, 0.08, 0.08, 0.15])
     guesses += generator.normal(0, 1, guesses.shape) * spread
@@ -42,7 +42,7 @@ def clustered_boxes(generator: np.random.Generator, objects: int, each: int) -> 
 def guesses_around(
     generator: np.random.Generator, annotations: Annotations, clutter: int
 ) -> Detections:
-    """A detector's answer: every object somewhat off, and boxes where nothing is."""
+    """Return detections: every object with a small offset, and false positives."""
     wanted = annotations.select(np.isin(annotations.categories, CATEGORIES))
     kinds = generator.integers(len(CATEGORIES), size=clutter)
     nowhere = generator.uniform([5, -25, -1.2], [60, 25, -0.6], (clutter, 3))
@@ -56,7 +56,7 @@ def guesses_around(
 def kitti_frames(
     generator: np.random.Generator, count: int, examples: Path | None
 ) -> tuple[list[KittiObjects], list[KittiObjects]]:
-    """Labels and results of many frames: the examples over and over, each time a little different.
+    """Return labels and results of many frames: the examples repeated with small differences.
 
     Args:
         generator: draws the differences.
@@ -76,7 +76,7 @@ def kitti_frames(
 
 
 def _otherwise(generator: np.random.Generator, results: KittiObjects) -> KittiObjects:
-    """The same results with other scores and slightly other places."""
+    """Return the same results with other scores and slightly other positions."""
     count = len(results)
     return replace(
         results,

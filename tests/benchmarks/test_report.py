@@ -1,4 +1,4 @@
-"""The page of the benchmarks says what was measured, and nothing about whose machine it was."""
+"""The page of the benchmarks contains the measurements, and nothing about the machine's owner."""
 
 import ast
 import json
@@ -11,7 +11,7 @@ HERE = Path(__file__).parent
 
 
 def measured(*lines):
-    """A document as pytest-benchmark writes it."""
+    """Return a document as pytest-benchmark writes it."""
     return {
         "machine_info": {
             "node": "secret-host",
@@ -24,16 +24,16 @@ def measured(*lines):
 
 
 def line(group, name, seconds, *, figure="ratio", target=None, amount=100, timer="process_time"):
-    """One benchmark of such a document."""
-    told = {"name": name, "figure": figure, "amount": amount, "unit": "boxes", "target_s": target}
-    told["clock_s"] = 3 * seconds
+    """Return one benchmark of such a document."""
+    info = {"name": name, "figure": figure, "amount": amount, "unit": "boxes", "target_s": target}
+    info["clock_s"] = 3 * seconds
     stats = {"min": seconds, "median": 2 * seconds, "rounds": 5}
     options = {"timer": timer}
-    return {"group": group, "extra_info": told, "stats": stats, "options": options}
+    return {"group": group, "extra_info": info, "stats": stats, "options": options}
 
 
 def test_ratios_are_multiples_of_our_time() -> None:
-    """Within a group, wherever our line stands."""
+    """Within a group, wherever our line is."""
     summary = summarise(measured(line("NMS", "peer", 0.5), line("NMS", OURS, 0.25)), {}, 1.0)
     [peer, ours] = summary["groups"]["NMS"]
     assert (peer["ratio"], ours["ratio"]) == (2.0, 1.0)
@@ -41,7 +41,7 @@ def test_ratios_are_multiples_of_our_time() -> None:
     assert "| peer | 500 ms | 2 | 200 |" in render(summary)
 
 
-def test_lines_that_do_different_work_have_no_ratio() -> None:
+def test_lines_with_different_work_have_no_ratio() -> None:
     """Stages are not compared with each other."""
     summary = summarise(
         measured(
@@ -57,23 +57,23 @@ def test_lines_that_do_different_work_have_no_ratio() -> None:
 @pytest.mark.parametrize(
     ("timer", "shown"), [("process_time", "CPU time"), ("perf_counter", "by the clock")]
 )
-def test_a_table_says_what_its_times_are(timer: str, shown: str) -> None:
-    """CPU time and the time on the clock differ on a busy machine."""
+def test_a_table_explains_its_times(timer: str, shown: str) -> None:
+    """CPU time and wall-clock time differ on a busy machine."""
     page = render(summarise(measured(line("NMS", OURS, 0.25, timer=timer)), {}, 1.0))
     assert f"| {shown} | times curate's |" in page
 
 
 @pytest.mark.parametrize(("seconds", "verdict"), [(1e-3, "met"), (1.1e-3, "**not met**")])
-def test_targets_are_judged_honestly(seconds: float, verdict: str) -> None:
-    """A target that is reached is met; one that is missed by a tenth is not."""
+def test_a_target_is_met_or_missed(seconds: float, verdict: str) -> None:
+    """One that is missed by a tenth is missed."""
     page = render(summarise(measured(line("NMS", OURS, seconds, target=1e-3)), {}, 1.0))
     [row] = [row for row in page.splitlines() if "1 ms |" in row and row.startswith("| NMS")]
     assert row.split(" | ")[-1] == f"{verdict} |"
     assert f" {3000 * seconds:.3g} ms " in row
 
 
-def test_nothing_of_the_machine_but_its_kind_is_published(tmp_path: Path) -> None:
-    """No host, branch or folder in the files."""
+def test_only_the_kind_of_machine_is_published(tmp_path: Path) -> None:
+    """No host, branch or folder is in the files."""
     source = tmp_path / "measured.json"
     source.write_text(json.dumps(measured(line("NMS", OURS, 0.25))))
     main(source, tmp_path)
@@ -86,7 +86,7 @@ def test_nothing_of_the_machine_but_its_kind_is_published(tmp_path: Path) -> Non
 
 
 def test_a_benchmark_never_asserts_a_time() -> None:
-    """Asserts compare answers; how long they took is only reported."""
+    """Assertions compare results; times are only reported."""
     clocks = {"stats", "perf_counter", "monotonic", "elapsed"}
     for path in HERE.glob("bench_*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

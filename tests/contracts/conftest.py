@@ -1,4 +1,4 @@
-"""Small frames for extensions to work on."""
+"""Small frames that the contract tests run extensions on."""
 
 import pytest
 from support.toys import write_toy_kitti
@@ -9,7 +9,7 @@ from curate.frames import Frame
 
 @pytest.fixture(scope="session")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Frame, ...]:
-    """Three frames with points and image."""
+    """Return three frames with points and image."""
     root = tmp_path_factory.mktemp("frames")
     write_toy_kitti(root, frames=3)
     dataset = KittiDataset(root)

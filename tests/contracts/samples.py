@@ -1,4 +1,4 @@
-"""What contract tests need to know of each registered extension, and how they compare answers."""
+"""Samples of registered extensions, and comparisons of their outputs."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -10,15 +10,15 @@ import pytest
 Sample = TypeVar("Sample")
 
 
-def sample_of(samples: Mapping[str, Sample], name: str, wanted: str) -> Sample:
-    """The sample of a registered extension; the test fails in plain words where it has none."""
+def sample_of(samples: Mapping[str, Sample], name: str, description: str) -> Sample:
+    """Return the sample of a registered extension; fail the test if there is none."""
     if name not in samples:
-        pytest.fail(f"'{name}' is registered but has no sample: add to SAMPLES here {wanted}")
+        pytest.fail(f"'{name}' is registered but has no sample: add to SAMPLES here {description}")
     return samples[name]
 
 
 def assert_same(one: Any, other: Any) -> None:
-    """Two dataclasses of arrays are equal to the last bit, types included."""
+    """Check that two dataclasses of arrays are equal to the last bit, types included."""
     for field in fields(one):
         a, b = np.asarray(getattr(one, field.name)), np.asarray(getattr(other, field.name))
         assert a.dtype == b.dtype, field.name
@@ -26,6 +26,6 @@ def assert_same(one: Any, other: Any) -> None:
 
 
 def assert_one_line(error: BaseException) -> None:
-    """A message that a command can print after `error:`."""
+    """Check that a message fits on one line after `error:`."""
     assert str(error)
     assert "\n" not in str(error)

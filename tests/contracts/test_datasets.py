@@ -1,4 +1,4 @@
-"""What every registered data set promises."""
+"""The contract of every registered dataset."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ from curate.errors import DataError
 from curate.frames import Frame
 from pipelines.registry import DATASETS
 
-# Writes four frames below a folder, all with label files.
+# Write four frames below a folder, all with label files.
 SAMPLES: Mapping[str, Callable[[Path], None]] = {
     "kitti": lambda root: write_toy_kitti(root, frames=4, val=1),
     "kitti-raw": write_toy_raw,
@@ -25,32 +25,30 @@ SAMPLES: Mapping[str, Callable[[Path], None]] = {
 
 @pytest.fixture(params=sorted(DATASETS.classes))
 def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """The folder of four frames."""
-    wanted = "a function that writes four small labeled frames below a folder"
-    sample_of(SAMPLES, request.param, wanted)(tmp_path)
+    """Return the folder of four frames."""
+    description = "a function that writes four small labeled frames below a folder"
+    sample_of(SAMPLES, request.param, description)(tmp_path)
     return tmp_path
 
 
 @pytest.fixture
 def dataset(request: pytest.FixtureRequest, root: Path):
-    """Every registered data set."""
+    """Return every registered dataset in turn."""
     return DATASETS.build(request.node.callspec.params["root"], root, offered={}, options={})
 
 
 def same_frame(one: Frame, other: Frame) -> None:
-    """Two frames hold the same."""
+    """Compare all fields of two frames."""
     assert (one.frame_id, one.image_size) == (other.frame_id, other.image_size)
     np.testing.assert_array_equal(one.points, other.points)
     assert_same(one.calibration, other.calibration)
 
 
-def test_it_goes_by_its_registered_name(dataset) -> None:
-    """So that exported files say where their frames are from."""
+def test_it_has_its_registered_name(dataset) -> None:
     assert dataset.name in DATASETS.classes
 
 
-def test_frames_are_sorted_and_lists_name_some_of_them(dataset) -> None:
-    """Nothing occurs twice."""
+def test_frame_lists_are_sorted_and_without_duplicates(dataset) -> None:
     names = dataset.frame_ids()
     assert isinstance(names, tuple)
     assert len(names) == 4
@@ -59,8 +57,8 @@ def test_frames_are_sorted_and_lists_name_some_of_them(dataset) -> None:
         assert set(split) <= set(names)
 
 
-def test_a_frame_has_shapes_types_and_units(dataset) -> None:
-    """Points in float32, intensity within [0, 1], matrices of a calibration, RGB where asked."""
+def test_a_frame_has_the_documented_shapes_types_and_units(dataset) -> None:
+    """Points are float32, intensity is in [0, 1], calibrations are matrices, images are RGB."""
     for name in dataset.frame_ids():
         frame = dataset.read(name, image=True)
         assert frame.frame_id == name
@@ -75,8 +73,8 @@ def test_a_frame_has_shapes_types_and_units(dataset) -> None:
         assert (frame.image.shape, frame.image.dtype) == ((height, width, 3), np.uint8)
 
 
-def test_only_what_is_wanted_is_read(dataset) -> None:
-    """Neither points nor image; the size of the image is known all the same."""
+def test_only_requested_data_is_read(dataset) -> None:
+    """Neither points nor image are read; the size of the image is known all the same."""
     name = dataset.frame_ids()[0]
     whole, bare = dataset.read(name, image=True), dataset.read(name, points=False)
     assert bare.points.shape == (0, 4)
@@ -86,8 +84,8 @@ def test_only_what_is_wanted_is_read(dataset) -> None:
     assert_same(bare.calibration, whole.calibration)
 
 
-def test_frames_do_not_depend_on_what_was_read_before(dataset, root: Path) -> None:
-    """Read in another order, again, or after a caller has written into one."""
+def test_frames_do_not_depend_on_earlier_reads(dataset, root: Path) -> None:
+    """Read in another order, again, or after a caller has written into the arrays."""
     names = dataset.frame_ids()
     before = {name: dataset.read(name) for name in names}
     kept = {name: frame.points.copy() for name, frame in before.items()}
@@ -100,7 +98,7 @@ def test_frames_do_not_depend_on_what_was_read_before(dataset, root: Path) -> No
 
 
 def test_annotations_are_boxes_in_the_lidar_frame(dataset) -> None:
-    """A row per object; a box without sizes only for a region that has none."""
+    """One row per object; a box has no size only if it is a DontCare region."""
     for name in dataset.frame_ids():
         truth = dataset.annotations(name)
         count = len(truth)
@@ -109,16 +107,16 @@ def test_annotations_are_boxes_in_the_lidar_frame(dataset) -> None:
         assert truth.boxes_2d.shape == (count, 4)
         assert truth.categories.dtype.kind == "U"
         assert truth.occluded.dtype == np.int64
-        known = ~np.isnan(truth.boxes).any(axis=1)
-        assert (truth.boxes[known, 3:6] > 0).all()
-        assert (np.abs(truth.boxes[known, 6]) <= np.pi).all()
-        assert set(truth.categories[~known]) <= {"DontCare"}
+        has_box = ~np.isnan(truth.boxes).any(axis=1)
+        assert (truth.boxes[has_box, 3:6] > 0).all()
+        assert (np.abs(truth.boxes[has_box, 6]) <= np.pi).all()
+        assert set(truth.categories[~has_box]) <= {"DontCare"}
         assert_same(truth, dataset.annotations(name))
 
 
 @pytest.mark.parametrize("part", ["points", "image", "calibration", "label"])
-def test_a_missing_file_is_named(dataset, part: str) -> None:
-    """DataError in one line; the other frames can still be read."""
+def test_a_missing_file_is_reported(dataset, part: str) -> None:
+    """The DataError is one line; the other frames can still be read."""
     name, other = dataset.frame_ids()[:2]
     path = getattr(dataset.files(name), part)
     if path == getattr(dataset.files(other), part):
@@ -131,8 +129,8 @@ def test_a_missing_file_is_named(dataset, part: str) -> None:
     assert len(dataset.read(other, image=True).points) > 0
 
 
-def test_a_frame_without_label_file_is_a_frame(dataset, root: Path) -> None:
-    """X_u has none: `files` says so and the sensors' data can be read."""
+def test_a_frame_without_a_label_file_can_be_read(dataset, root: Path) -> None:
+    """Unlabeled frames have none: `files` shows that, and the sensor data can be read."""
     name = dataset.frame_ids()[0]
     dataset.files(name).label.unlink()
     assert dataset.files(name).label is None
@@ -140,10 +138,10 @@ def test_a_frame_without_label_file_is_a_frame(dataset, root: Path) -> None:
     assert len(dataset.read(name).points) > 0
 
 
-def test_a_folder_that_holds_no_data_set_is_refused(
+def test_a_folder_without_a_dataset_is_rejected(
     request: pytest.FixtureRequest, dataset, tmp_path: Path
 ) -> None:
-    """DataError in one line that names the folder."""
+    """The DataError is one line that contains the folder."""
     (tmp_path / "nothing").mkdir()
     name = request.node.callspec.params["root"]
     with pytest.raises(DataError, match="nothing") as caught:

@@ -1,4 +1,4 @@
-"""What every registered detector promises."""
+"""The contract of every registered detector."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ from pipelines.registry import DETECTORS
 
 
 def write_checkpoint(folder: Path, frames: Sequence[Frame]) -> Path:
-    """An untrained network that answers boxes of all scores."""
+    """Write the checkpoint of an untrained network that predicts boxes of all scores."""
     generator = torch.Generator().manual_seed(0)
     network = PillarNetwork(PRESETS["small"], len(CATEGORIES))
     with torch.no_grad():
@@ -37,7 +37,7 @@ def write_checkpoint(folder: Path, frames: Sequence[Frame]) -> Path:
 
 
 def write_record(folder: Path, frames: Sequence[Frame]) -> Path:
-    """Six boxes for each frame as it is and for a copy of it."""
+    """Write six boxes for each frame and for its augmented copy."""
     rng = np.random.default_rng(0)
     lines = [
         "frame,view,flip_y,rotation_rad,scale,category,score,x,y,z,length,width,height,yaw",
@@ -56,13 +56,13 @@ def write_record(folder: Path, frames: Sequence[Frame]) -> Path:
 
 
 def write_onnx(folder: Path, frames: Sequence[Frame]) -> Path:
-    """A graph that answers two boxes per category around the mean of the points."""
+    """Write a graph that predicts two boxes per category around the mean of the points."""
     path = folder / "model.onnx"
     tiny_detector(path, boxes_per_category=2)
     return path
 
 
-# Writes the file from which the detector is made, fit for some frames.
+# Write the file from which the detector is created, for the test frames.
 SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
     "pillars": write_checkpoint,
     "recorded": write_record,
@@ -71,7 +71,7 @@ SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
 
 
 def build(name: str, path: Path, minimum_score: float = 0.1):
-    """A detector as the pipeline builds it."""
+    """Return a detector as the pipeline builds it."""
     offered = {
         "minimum_score": lambda: minimum_score,
         "device": lambda: "cpu",
@@ -83,20 +83,20 @@ def build(name: str, path: Path, minimum_score: float = 0.1):
 
 @pytest.fixture(scope="module", params=sorted(DETECTORS.classes))
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, frames):
-    """Name and file of every registered detector."""
-    wanted = "a function that writes a small file from which the detector can be made"
-    write = sample_of(SAMPLES, request.param, wanted)
+    """Return the name and the file of every registered detector in turn."""
+    description = "a function that writes a small file from which the detector can be made"
+    write = sample_of(SAMPLES, request.param, description)
     return request.param, write(tmp_path_factory.mktemp(request.param), frames)
 
 
 @pytest.fixture(scope="module")
 def detector(made):
-    """Every registered detector with its default settings."""
+    """Return every registered detector with its default settings."""
     return build(*made)
 
 
-def check(found: Detections) -> None:
-    """Boxes, scores and categories are what the type says."""
+def check_output(found: Detections) -> None:
+    """Check shapes, types and ranges of boxes, scores and categories."""
     count = len(found)
     assert (found.boxes.shape, found.boxes.dtype) == ((count, 7), np.float64)
     assert (found.scores.shape, found.scores.dtype) == ((count,), np.float64)
@@ -108,16 +108,16 @@ def check(found: Detections) -> None:
     assert ((found.scores >= 0) & (found.scores <= 1)).all()
 
 
-def test_answers_are_boxes_scores_and_categories(detector, frames) -> None:
-    """In their shapes, types and ranges, for every frame; some have boxes."""
+def test_predictions_have_the_documented_shapes_and_ranges(detector, frames) -> None:
+    """Every frame is checked; at least one has boxes."""
     found = [detector.predict(frame) for frame in frames]
     for one in found:
-        check(one)
+        check_output(one)
     assert sum(map(len, found)) > 0
 
 
-def test_answers_do_not_depend_on_what_was_asked_before(made, detector, frames) -> None:
-    """Asked again, in another order, or of another instance: the same, to the last bit."""
+def test_predictions_do_not_depend_on_earlier_calls(made, detector, frames) -> None:
+    """A second call, another order or another instance gives the same boxes to the last bit."""
     before = [detector.predict(frame) for frame in frames]
     other = build(*made)
     for frame, expected in reversed(list(zip(frames, before, strict=True))):
@@ -125,8 +125,8 @@ def test_answers_do_not_depend_on_what_was_asked_before(made, detector, frames) 
         assert_same(detector.predict(frame), expected)
 
 
-def test_answers_do_not_depend_on_the_order_of_the_points(detector, frames) -> None:
-    """A sweep is a set; sums may differ in their last digits."""
+def test_predictions_do_not_depend_on_the_order_of_the_points(detector, frames) -> None:
+    """Sums may differ in their last digits."""
     order = np.random.default_rng(0).permutation(len(frames[0].points))
     expected = detector.predict(frames[0])
     found = detector.predict(frames[0].with_points(frames[0].points[order]))
@@ -135,8 +135,7 @@ def test_answers_do_not_depend_on_the_order_of_the_points(detector, frames) -> N
     np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-3)
 
 
-def test_a_frame_is_left_as_it_is(detector, frames) -> None:
-    """The next stage reads the same points."""
+def test_the_input_frame_is_not_modified(detector, frames) -> None:
     frame = replace(frames[0], points=frames[0].points.copy())
     frame.points.flags.writeable = False
     detector.predict(frame)
@@ -144,13 +143,12 @@ def test_a_frame_is_left_as_it_is(detector, frames) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_a_sweep_of_hardly_any_points_is_no_failure(detector, frames, count: int) -> None:
-    """Dropouts happen; the answer has the usual form."""
-    check(detector.predict(frames[0].with_points(frames[0].points[:count])))
+def test_a_sweep_with_few_points_does_not_fail(detector, frames, count: int) -> None:
+    check_output(detector.predict(frames[0].with_points(frames[0].points[:count])))
 
 
-def test_low_scores_are_left_out_as_told(made, frames) -> None:
-    """`minimum_score` includes its own value and changes nothing of what is above."""
+def test_scores_below_the_minimum_are_dropped(made, frames) -> None:
+    """`minimum_score` itself is kept, and the boxes above it do not change."""
     name, _ = made
     if not DETECTORS.takes(name, "minimum_score"):
         pytest.skip(f"{name} leaves this to the pipeline")
@@ -162,19 +160,19 @@ def test_low_scores_are_left_out_as_told(made, frames) -> None:
     assert np.sort(found.scores).tolist() == kept.tolist()
 
 
-def test_recorded_views_name_their_similarity(detector, frames) -> None:
-    """A detector that dictates the augmentation gives each A with what it saw there."""
+def test_recorded_detectors_report_the_similarity_of_each_view(detector, frames) -> None:
+    """A detector that dictates the augmentation returns the similarity together with its boxes."""
     if isinstance(detector, RecordedViews):
         views = detector.views(frames[0].frame_id)
         assert len(views) > 0
         for similarity, found in views:
             assert isinstance(similarity, Similarity)
-            check(found)
+            check_output(found)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no detector \x00\xff\n"])
-def test_a_file_that_is_no_detector_is_named(made, tmp_path: Path, content: bytes | None) -> None:
-    """Missing, empty or garbage: one line of the right class, never another exception."""
+def test_an_invalid_detector_file_is_rejected(made, tmp_path: Path, content: bytes | None) -> None:
+    """A missing, empty or random file gives a one-line error of the right class."""
     name, path = made
     broken = tmp_path / f"broken{path.suffix}"
     if content is not None:

@@ -1,4 +1,4 @@
-"""What every registered editor's format promises."""
+"""The contract of every registered editor format."""
 
 import json
 import zipfile
@@ -18,7 +18,7 @@ from curate.review.edits import check_boxes, compare_frame
 from curate.review.sheet import Sheet
 from pipelines.registry import EDITORS
 
-# Changes the text that holds the boxes of frame 000002.
+# Change the text that holds the boxes of frame 000002.
 Change = Callable[[Path, Callable[[str], str]], None]
 
 
@@ -44,7 +44,7 @@ def _without_last_item(text: str) -> str:
     return json.dumps(document)
 
 
-# How to edit an answer: change its text, take frame 000002 away, add a frame that nobody knows.
+# How to edit a returned file: change its text, remove frame 000002, add an unknown frame.
 SAMPLES: Mapping[str, tuple[Change, Callable[[Path], None], Callable[[Path], None]]] = {
     "kitti": (
         _change_file("label_2/000002.txt"),
@@ -65,7 +65,7 @@ SAMPLES: Mapping[str, tuple[Change, Callable[[Path], None], Callable[[Path], Non
 
 
 def read(name: str) -> Frame:
-    """A toy frame with an image."""
+    """Return a function that reads a toy frame with an image."""
     frame = toy_frame(name)
     width, height = frame.image_size
     image = np.zeros((height, width, 3), dtype=np.uint8)
@@ -74,7 +74,7 @@ def read(name: str) -> Frame:
 
 @pytest.fixture(params=sorted(EDITORS.classes))
 def exported(request: pytest.FixtureRequest, tmp_path: Path):
-    """An editor, its sheet, and the folder that it wrote."""
+    """Return an editor, its sheet, and the folder that it wrote."""
     editor = EDITORS.build(request.param, offered={}, options={})
     sheet = small_sheet(request.param)
     editor.write(tmp_path, sheet, read)
@@ -82,23 +82,25 @@ def exported(request: pytest.FixtureRequest, tmp_path: Path):
 
 
 def sample(name: str):
-    """How the answers of an editor are edited."""
-    wanted = "three functions that change the boxes of a frame, take it away, add an unknown one"
-    return sample_of(SAMPLES, name, wanted)
+    """Return the function that edits the returned file of an editor."""
+    description = (
+        "three functions that change the boxes of a frame, take it away, add an unknown one"
+    )
+    return sample_of(SAMPLES, name, description)
 
 
-def came_back(editor, folder: Path, sheet: Sheet):
-    """The checked boxes of an answer."""
+def imported(editor, folder: Path, sheet: Sheet):
+    """Return the boxes that an editor returned, after the checks."""
     found = editor.read(folder, sheet, read)
     for boxes in found.values():
         check_boxes(boxes, sheet.categories)
     return found
 
 
-def test_what_nobody_touched_comes_back_as_it_was(exported) -> None:
-    """Categories, boxes within a millimetre, in their order; so nothing is decided."""
+def test_an_unedited_export_is_imported_unchanged(exported) -> None:
+    """Categories and order are the same, boxes within a millimetre; no decision is made."""
     editor, sheet, folder = exported
-    found = came_back(editor, folder, sheet)
+    found = imported(editor, folder, sheet)
     assert list(found) == ["000001", "000002"]
     for shown in sheet.frames:
         boxes = np.array([box.box for box in found[shown.frame]])
@@ -108,15 +110,15 @@ def test_what_nobody_touched_comes_back_as_it_was(exported) -> None:
         assert compare_frame(shown, found[shown.frame]).decisions == ()
 
 
-def test_a_frame_that_did_not_come_back_was_not_looked_at(exported) -> None:
-    """It is left out, the others are read."""
+def test_a_frame_missing_from_the_import_was_not_reviewed(exported) -> None:
+    """It is left out, and the others are read."""
     editor, sheet, folder = exported
     sample(editor.name)[1](folder)
-    assert list(came_back(editor, folder, sheet)) == ["000001"]
+    assert list(imported(editor, folder, sheet)) == ["000001"]
 
 
-def test_an_unknown_frame_is_refused(exported) -> None:
-    """By name, in one line."""
+def test_an_unknown_frame_is_rejected(exported) -> None:
+    """The one-line error contains its name."""
     editor, sheet, folder = exported
     sample(editor.name)[2](folder)
     with pytest.raises(DataError, match="'000077'") as error:
@@ -134,19 +136,18 @@ def test_an_unknown_frame_is_refused(exported) -> None:
     ],
     ids=["category", "half", "nan", "word"],
 )
-def test_a_damaged_answer_is_one_line(exported, edit: Callable[[str], str]) -> None:
-    """Whatever happened to it, it names the file and raises nothing else."""
+def test_a_damaged_file_gives_a_one_line_error(exported, edit: Callable[[str], str]) -> None:
+    """The message contains the file, whatever the damage; no other exception is raised."""
     editor, sheet, folder = exported
-    before = came_back(editor, folder, sheet)["000002"]
+    before = imported(editor, folder, sheet)["000002"]
     assert before[0].box[3] == pytest.approx(CYCLIST[3])
     sample(editor.name)[0](folder, edit)
     with pytest.raises(DataError, match=r"000002|default\.json") as error:
-        came_back(editor, folder, sheet)
+        imported(editor, folder, sheet)
     assert_one_line(error.value)
 
 
-def test_a_missing_answer_is_refused(exported, tmp_path: Path) -> None:
-    """It names what is not there."""
+def test_a_missing_file_is_rejected(exported, tmp_path: Path) -> None:
     editor, sheet, _ = exported
     with pytest.raises(DataError, match="nowhere") as error:
         editor.read(tmp_path / "nowhere", sheet, read)

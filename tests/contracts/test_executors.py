@@ -1,4 +1,4 @@
-"""What every registered executor promises."""
+"""The contract of every registered executor."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +21,7 @@ from pipelines.workspace.workspace import Workspace
 
 @pytest.fixture(scope="module")
 def missing_ray() -> Iterator[str]:
-    """Why there is no Ray cluster here; "" where there is one, which all tests share."""
+    """Return why no Ray cluster can be started, or "" if there is one, which all tests share."""
     try:
         first = EXECUTORS.build("ray", offered={"workers": lambda: 3}, options={})
     except CurateError as error:
@@ -32,14 +32,14 @@ def missing_ray() -> Iterator[str]:
 
 
 def skip_absent(name: str, request: pytest.FixtureRequest) -> None:
-    """Skips what belongs to an executor that cannot run here, with the reason."""
+    """Skip the test of an executor that cannot run here, with the reason."""
     if name == "ray" and (reason := request.getfixturevalue("missing_ray")):
         pytest.skip(reason)
 
 
 @pytest.fixture(scope="module", params=sorted(EXECUTORS.classes))
 def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
-    """Every registered executor, with two workers where it has workers."""
+    """Return every registered executor, with two workers if it has workers."""
     skip_absent(request.param, request)
     made = EXECUTORS.build(request.param, offered={"workers": lambda: 2}, options={})
     yield made
@@ -48,7 +48,7 @@ def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
 
 @pytest.fixture
 def crew(executor: Executor) -> Executor:
-    """An executor whose workers can die without it."""
+    """Return an executor that survives the death of its workers."""
     if isinstance(executor, SerialExecutor):
         pytest.skip("serial works in this very process")
     return executor
@@ -58,7 +58,7 @@ JOBS = [FrameJob(key, f"{key:06d}") for key in range(50)]
 
 
 def test_every_job_has_one_outcome(executor: Executor) -> None:
-    """Rows or an error of one line, never both, none lost, none twice."""
+    """The outcome is rows or a one-line error; none is lost or doubled."""
     found = list(executor.map(Square(), iter(JOBS)))
     outcomes = {outcome.job.frame_id: outcome for outcome in found}
     assert sorted(outcome.job.frame_id for outcome in found) == list(range(50))
@@ -70,13 +70,12 @@ def test_every_job_has_one_outcome(executor: Executor) -> None:
             assert (outcome.rows, outcome.error) == (({"squares": {"value": [key**2]}},), None)
 
 
-def test_a_broken_model_ends_the_run_in_its_own_words(executor: Executor) -> None:
-    """It is no fault of any frame."""
+def test_a_model_that_cannot_load_ends_the_run_with_its_own_message(executor: Executor) -> None:
     with pytest.raises(ModelError, match=r"model.onnx: broken"):
         list(executor.map(Square(broken=True), iter(JOBS)))
 
 
-def test_jobs_are_taken_as_they_are_needed(executor: Executor) -> None:
+def test_jobs_are_taken_lazily(executor: Executor) -> None:
     """An endless list of frames does not fill the memory."""
     taken = 0
 
@@ -92,8 +91,8 @@ def test_jobs_are_taken_as_they_are_needed(executor: Executor) -> None:
     assert taken < 40
 
 
-def test_an_abandoned_run_leaves_nothing_to_the_next(executor: Executor) -> None:
-    """Neither its outcomes nor its models."""
+def test_an_abandoned_run_does_not_affect_the_next(executor: Executor) -> None:
+    """Neither its outcomes nor its models remain."""
     abandoned = executor.map(Deadly(), iter(JOBS))
     next(abandoned)
     abandoned.close()
@@ -102,21 +101,20 @@ def test_an_abandoned_run_leaves_nothing_to_the_next(executor: Executor) -> None
     assert [outcome.error is None for outcome in found].count(False) == 1
 
 
-def test_no_jobs_no_outcomes(executor: Executor) -> None:
-    """And no complaint."""
+def test_without_jobs_there_are_no_outcomes(executor: Executor) -> None:
     assert list(executor.map(Square(), iter([]))) == []
 
 
-def test_a_killed_worker_costs_its_frame_a_retry(crew: Executor, tmp_path: Path) -> None:
-    """SIGKILL, as the kernel sends it where memory is short: every frame is done all the same."""
+def test_the_frame_of_a_killed_worker_is_retried(crew: Executor, tmp_path: Path) -> None:
+    """SIGKILL, as the kernel sends it when memory runs out; every frame is done."""
     found = list(crew.map(Deadly(folder=tmp_path, once=(0, 7, 8, 31)), iter(JOBS)))
     assert sorted(outcome.job.frame_id for outcome in found) == list(range(50))
     assert {outcome.error for outcome in found} == {None}
     assert len(list(tmp_path.iterdir())) == 4
 
 
-def test_a_frame_that_kills_every_worker_fails_alone(crew: Executor, tmp_path: Path) -> None:
-    """It is tried twice, then counted as failed with its reason."""
+def test_only_the_frame_that_kills_its_workers_fails(crew: Executor, tmp_path: Path) -> None:
+    """It is tried twice, then recorded as failed with the reason."""
     found = list(crew.map(Deadly(folder=tmp_path, always=(5, 6)), iter(JOBS)))
     assert sorted(outcome.job.frame_id for outcome in found) == list(range(50))
     failed = {outcome.job.frame_id: outcome for outcome in found if outcome.error is not None}
@@ -127,14 +125,14 @@ def test_a_frame_that_kills_every_worker_fails_alone(crew: Executor, tmp_path: P
 
 
 def test_workers_that_die_while_loading_end_the_run(crew: Executor) -> None:
-    """A model for which there is no memory is not tried for every frame."""
+    """A model that does not fit into memory is not loaded again for every frame."""
     with pytest.raises(CurateError, match=r"died while they loaded their models.*fewer workers"):
         list(crew.map(Deadly(opening=True), iter(JOBS)))
 
 
 @pytest.fixture(scope="module")
 def serial_rows(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple]]:
-    """A toy data set, and the rows of all stages as one process makes them in order."""
+    """Return a toy dataset, and the rows of all stages as one process makes them in order."""
     home = tmp_path_factory.mktemp("executors")
     write_toy_kitti(home / "kitti", frames=24, val=2)
     (home / "detector.txt").write_text("000007")  # the detector raises on this frame
@@ -142,7 +140,7 @@ def serial_rows(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tu
 
 
 def finished(home: Path, name: str, executor: str, workers: int) -> Workspace:
-    """A workspace in which all stages have run."""
+    """Return a workspace in which all stages have run."""
     document = toy_document(home / "kitti", home / "detector.txt")
     document["run"] = {"executor": executor, "workers": workers}
     workspace = initialise(home / name, make_config(document, "test"), "0.1", "")
@@ -157,14 +155,14 @@ def finished(home: Path, name: str, executor: str, workers: int) -> Workspace:
         ("support.frame_functions:Shuffled", 1),
     ],
 )
-def test_the_rows_depend_on_nothing_but_the_seed(
+def test_the_rows_depend_only_on_the_seed(
     serial_rows: tuple[Path, list[tuple]],
     tmp_path: Path,
     request: pytest.FixtureRequest,
     name: str,
     workers: int,
 ) -> None:
-    """Whatever the executor, the number of workers, the order of frames: the same to the bit."""
+    """Executor, number of workers and order of frames make no difference to the bit."""
     skip_absent(name, request)
     home, rows = serial_rows
     assert sum(row[0] == "weight" for row in rows) > 50

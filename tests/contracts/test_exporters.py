@@ -1,4 +1,4 @@
-"""What every registered exporter promises."""
+"""The contract of every registered exporter."""
 
 import copy
 import csv
@@ -27,7 +27,7 @@ from curate.exporters.base import (
 )
 from pipelines.registry import EXPORTERS
 
-# Of the LiDAR in a map, for formats that need one.
+# Pose of the LiDAR in a map, for formats that need one.
 MAP_POSE = np.eye(4)
 MAP_POSE[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.02, -0.03]).as_matrix()
 MAP_POSE[:3, 3] = [600.0, 1600.0, 1.8]
@@ -37,7 +37,7 @@ Written = Mapping[str, list[tuple]]
 
 
 def read_sqlite(path: Path) -> Written:
-    """The view of a label file, and the unlabeled frames that have no label."""
+    """Read the view of a label file, with the unlabeled frames that have no label."""
     query = (
         "SELECT frame, category, x, y, z, length, width, height, yaw, weight "
         "FROM weighted_labels ORDER BY frame, k"
@@ -51,7 +51,7 @@ def read_sqlite(path: Path) -> Written:
 
 
 def read_kitti(path: Path) -> Written:
-    """The folder `weight` beside the label files."""
+    """Read the label files and the folder `weight` beside them."""
     found = {}
     for file in (path / "weight").iterdir():
         rows = [line.split() for line in file.read_text().splitlines()]
@@ -60,7 +60,7 @@ def read_kitti(path: Path) -> Written:
 
 
 def read_csv(path: Path) -> Written:
-    """The rows of the file, whose frames are those that have labels."""
+    """Read the rows of the file; only frames with labels are in it."""
     found: dict[str, list[tuple]] = {}
     with path.open(newline="") as file:
         for row in csv.DictReader(file):
@@ -70,7 +70,7 @@ def read_csv(path: Path) -> Written:
 
 
 def read_coco(path: Path) -> Written:
-    """The annotations of the unlabeled images, and what is background."""
+    """Read the annotations of the unlabeled images, and which of them are background."""
     document = json.loads(path.read_text())
     names = {category["id"]: category["name"] for category in document["categories"]}
     images = {image["id"]: image for image in document["images"] if image["split"] == "unlabeled"}
@@ -85,7 +85,7 @@ def read_coco(path: Path) -> Written:
 
 
 def read_openpcdet(path: Path) -> Written:
-    """The annos of the unlabeled frames."""
+    """Read the annos of the unlabeled frames."""
     infos = pickle.loads((path / "kitti_infos_train.pkl").read_bytes())
     found = {}
     for info in infos:
@@ -96,7 +96,7 @@ def read_openpcdet(path: Path) -> Written:
 
 
 def read_st3d(path: Path) -> Written:
-    """Boxes of single precision; the sign of the category says what is ignored."""
+    """Read boxes of single precision; the sign of the category marks ignored ones."""
     found = {}
     for name, frame in pickle.loads((path / "ps_label_e0.pkl").read_bytes()).items():
         boxes, weights = frame["gt_boxes"], frame["weight"]
@@ -108,7 +108,7 @@ def read_st3d(path: Path) -> Written:
 
 
 def read_mmdet3d(path: Path) -> Written:
-    """The instances of the unlabeled frames, brought back from the camera's frame."""
+    """Read the instances of the unlabeled frames, transformed from camera to LiDAR frame."""
     infos = pickle.loads((path / "kitti_infos_train.pkl").read_bytes())["data_list"]
     found = {}
     for info in infos:
@@ -126,7 +126,7 @@ def read_mmdet3d(path: Path) -> Written:
 
 
 def read_parquet(path: Path) -> Written:
-    """The rows of the file, whose frames are those that have labels."""
+    """Read the rows of the file; only frames with labels are in it."""
     from pyarrow import parquet
 
     found: dict[str, list[tuple]] = {}
@@ -137,7 +137,7 @@ def read_parquet(path: Path) -> Written:
 
 
 def read_nuscenes(path: Path) -> Written:
-    """Results, and boxes that are ignored or background, brought back from the map."""
+    """Read results and ignored or background boxes, transformed from map to LiDAR frame."""
     document = json.loads(path.read_text())
     found = {}
     for name, results in document["results"].items():
@@ -171,15 +171,15 @@ SAMPLES: Mapping[str, Callable[[Path], Written]] = {
     "parquet": read_parquet,
     "nuscenes": read_nuscenes,
 }
-# What no reader of the format would take for background is not in it.
+# Formats whose readers have no notion of background leave background labels out.
 LEAVE_OUT_BACKGROUND = {"st3d"}
-# Packages of extras, without which an exporter is not tested.
+# Packages of extras; without them an exporter is not tested.
 NEEDS = {"parquet": "pyarrow"}
 
 
 @pytest.fixture(params=sorted(EXPORTERS.classes))
 def exporter(request: pytest.FixtureRequest):
-    """Every registered exporter with its default settings."""
+    """Return every registered exporter with its default settings."""
     if request.param in NEEDS:
         pytest.importorskip(NEEDS[request.param], reason=f"{NEEDS[request.param]} is an extra")
     return EXPORTERS.build(request.param, offered={}, options={})
@@ -187,13 +187,13 @@ def exporter(request: pytest.FixtureRequest):
 
 @pytest.fixture
 def read_back(exporter) -> Callable[[Path], Written]:
-    """Reads an export of the exporter at hand."""
+    """Return the function that reads back an export of the current exporter."""
     return sample_of(SAMPLES, exporter.name, "a function that reads an export back, see `Written`")
 
 
 @pytest.fixture(params=["background", "ignore"])
 def labels(request: pytest.FixtureRequest, frames) -> LabelSet:
-    """A labeled frame with one object, and two unlabeled frames with five labels each."""
+    """Return a labeled frame with one object, and two unlabeled frames with five labels each."""
     rng = np.random.default_rng(0)
     frames = [
         replace(frame, calibration=replace(frame.calibration, lidar_to_map=MAP_POSE))
@@ -205,7 +205,7 @@ def labels(request: pytest.FixtureRequest, frames) -> LabelSet:
         for k in range(5):
             category = CATEGORIES[k % 3]
             box = (*rng.uniform([6, -4, -1], [30, 4, 0]).tolist(), *SIZES[category], float(k - 2))
-            # Without counterpart, without priors, weight zero and one: all that there is.
+            # All special cases: without counterpart, without priors, weights zero and one.
             loss, points = (None, None) if k == 0 else (0.5, 12)
             own = {"category": category, "loss": loss, "points": points, "weight": k / 4}
             rows.append(label(name, k, box, score=0.7, **own))
@@ -225,38 +225,37 @@ def labels(request: pytest.FixtureRequest, frames) -> LabelSet:
 
 
 def place(exporter, folder: Path) -> Path:
-    """A place for an export, in a folder that is not there yet."""
+    """Return a path for an export, in a folder that does not exist yet."""
     return folder / "new" / f"labels{exporter.suffix}"
 
 
 def files(path: Path) -> dict[str, bytes]:
-    """All that an export is made of, and all that was left beside it."""
+    """Return the contents of the export and of everything beside it."""
     found = [file for file in path.parent.rglob("*") if file.is_file()]
     return {str(file.relative_to(path.parent)): file.read_bytes() for file in found}
 
 
 def with_weight(labels: LabelSet, weight: float) -> LabelSet:
-    """The same labels, the last of which has another weight."""
+    """Return the same labels with another weight of the last one."""
     rows = rows_of(labels)
     return with_rows(labels, [*rows[:-1], rows[-1] | {"weight": weight}])
 
 
-def arriving(exporter, labels: LabelSet) -> list[dict]:
-    """The labels that are in an export."""
+def exported_labels(exporter, labels: LabelSet) -> list[dict]:
+    """Return the labels that are in an export."""
     leaves_out = exporter.name in LEAVE_OUT_BACKGROUND
     least = 0 if leaves_out and labels.description.zero_weight == "background" else -1
     return [row for row in rows_of(labels) if row["weight"] > least]
 
 
-def test_an_exporter_goes_by_its_registered_name(exporter, request) -> None:
-    """It is the name of the export in the workspace, too."""
+def test_it_has_its_registered_name(exporter, request) -> None:
     assert exporter.name == request.node.callspec.params["exporter"]
     assert exporter.suffix == "" or exporter.suffix.startswith(".")
 
 
-def test_every_label_arrives_with_its_weight(exporter, read_back, labels, tmp_path) -> None:
-    """Boxes to a millimetre, weights to a millionth, of all unlabeled frames."""
-    path, wanted = place(exporter, tmp_path), arriving(exporter, labels)
+def test_every_label_is_exported_with_its_weight(exporter, read_back, labels, tmp_path) -> None:
+    """Boxes of all unlabeled frames agree to a millimetre, weights to a millionth."""
+    path, wanted = place(exporter, tmp_path), exported_labels(exporter, labels)
     assert len(wanted) >= 8
     assert exporter.write(path, labels) == len(wanted)
     assert path.is_file() == bool(exporter.suffix)
@@ -270,7 +269,7 @@ def test_every_label_arrives_with_its_weight(exporter, read_back, labels, tmp_pa
 
 
 def test_the_same_labels_make_the_same_files(exporter, labels, tmp_path) -> None:
-    """Byte for byte, in another place, and over a former export."""
+    """Byte for byte, in another folder, and when an earlier export is replaced."""
     one, other = place(exporter, tmp_path / "one"), place(exporter, tmp_path / "other")
     exporter.write(one, labels)
     exporter.write(other, with_weight(labels, 0.125))
@@ -279,8 +278,8 @@ def test_the_same_labels_make_the_same_files(exporter, labels, tmp_path) -> None
     assert files(one) == files(other)
 
 
-def test_no_labels_make_an_export_without_labels(exporter, read_back, labels, tmp_path) -> None:
-    """Of X_l alone, and of nothing at all; an unlabeled frame without labels is no failure."""
+def test_an_export_without_labels_works(exporter, read_back, labels, tmp_path) -> None:
+    """With labeled frames only, and with no frames; an unlabeled frame may have no labels."""
     path = place(exporter, tmp_path)
     for frames in (labels.frames, labels.frames[:1], []):
         own = labels.ground_truth if frames else truth_block()
@@ -290,10 +289,10 @@ def test_no_labels_make_an_export_without_labels(exporter, read_back, labels, tm
 
 
 @pytest.mark.parametrize("weight", [1.5, -0.1, float("nan")])
-def test_an_export_that_fails_leaves_the_former_as_it_was(
+def test_a_failed_export_leaves_the_earlier_one_unchanged(
     exporter, labels, tmp_path, weight: float
 ) -> None:
-    """A weight that cannot be is an error of one line, and nothing half written stays."""
+    """An impossible weight gives a one-line error, and no partial file remains."""
     path = place(exporter, tmp_path)
     with pytest.raises(DataError):
         exporter.write(path, with_weight(labels, weight))
@@ -307,8 +306,10 @@ def test_an_export_that_fails_leaves_the_former_as_it_was(
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
-def test_what_is_no_former_export_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
-    """A file or a folder with something in it is named and kept."""
+def test_files_that_are_not_an_earlier_export_are_not_overwritten(
+    exporter, labels, tmp_path, kind: str
+) -> None:
+    """The error contains the path of the file or folder."""
     path = place(exporter, tmp_path)
     precious = path if kind == "file" else path / "thesis.tex"
     precious.parent.mkdir(parents=True)
@@ -320,8 +321,8 @@ def test_what_is_no_former_export_is_left_alone(exporter, labels, tmp_path, kind
 
 
 @pytest.mark.parametrize("kind", ["dangling", "loop", "former"])
-def test_a_link_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
-    """An export in its place would leave old labels, or none, where it leads."""
+def test_a_link_is_not_overwritten(exporter, labels, tmp_path, kind: str) -> None:
+    """An export in its place would leave the target of the link outdated."""
     path = place(exporter, tmp_path)
     path.parent.mkdir(parents=True, exist_ok=True)
     target = path if kind == "loop" else path.with_name(f"real{exporter.suffix}")
@@ -336,15 +337,14 @@ def test_a_link_is_left_alone(exporter, labels, tmp_path, kind: str) -> None:
     assert sorted(path.parent.iterdir()) == before
 
 
-def test_the_labels_are_left_as_they_are(exporter, labels, tmp_path) -> None:
-    """Rows are read, and read only."""
+def test_the_labels_are_not_modified(exporter, labels, tmp_path) -> None:
     before = copy.deepcopy((labels.frames, labels.ground_truth, labels.labels))
     exporter.write(place(exporter, tmp_path), labels)
     assert (labels.frames, labels.ground_truth, labels.labels) == before
 
 
-def test_background_is_no_object_to_a_reader_of_objects(exporter, labels, tmp_path) -> None:
-    """A label of weight 0 is found among no format's objects where it is background."""
+def test_background_labels_are_not_objects_in_the_export(exporter, labels, tmp_path) -> None:
+    """A reader of objects finds no label of weight 0 if weight 0 means background."""
     background = replace(labels, description=replace(labels.description, zero_weight="background"))
     path = place(exporter, tmp_path)
     exporter.write(path, background)
@@ -354,12 +354,15 @@ def test_background_is_no_object_to_a_reader_of_objects(exporter, labels, tmp_pa
 
 
 def weights_of_objects(name: str, path: Path) -> list[float]:
-    """The weights of what a reader that knows no weights takes for objects of unlabeled frames."""
+    """Return the weights of all objects that a reader without weights finds in unlabeled frames."""
     return OBJECT_WEIGHTS[name](path) if name in OBJECT_WEIGHTS else []
 
 
 def kitti_objects(path: Path) -> list[float]:
-    """The lines of label_2 have no weights: those beyond the labels above 0 count as 0."""
+    """Read the lines of label_2, which have no weights.
+
+    Those beyond the labels above 0 count as 0.
+    """
     weights = [row[-1] for rows in read_kitti(path).values() for row in rows]
     lines = "".join(file.read_text() for file in (path / "label_2").iterdir()).splitlines()
     objects = [line for line in lines if not line.startswith("DontCare")]
@@ -368,14 +371,14 @@ def kitti_objects(path: Path) -> list[float]:
 
 
 def openpcdet_objects(path: Path) -> list[float]:
-    """Annos with a name that is learned."""
+    """Read the annos with a name that is learned."""
     infos = pickle.loads((path / "kitti_infos_train.pkl").read_bytes())
     pairs = [zip(i["annos"]["weight"], i["annos"]["name"], strict=True) for i in infos]
     return [weight for pair in pairs for weight, shown in pair if shown in CATEGORIES]
 
 
 def mmdet3d_objects(path: Path) -> list[float]:
-    """Instances with a label."""
+    """Read the instances with a label."""
     infos = pickle.loads((path / "kitti_infos_train.pkl").read_bytes())["data_list"]
     instances = [each for info in infos for each in info["instances"]]
     return [each["weight"] for each in instances if each["bbox_label_3d"] >= 0]
@@ -402,13 +405,15 @@ OBJECT_WEIGHTS: Mapping[str, Callable[[Path], list[float]]] = {
 }
 
 
-@pytest.mark.parametrize("fault", ["weight", "labeled frame"])
-def test_an_export_walks_the_labels_once(exporter, labels, tmp_path, fault: str) -> None:
-    """What is wrong with the last block is found on the same walk as all others."""
+@pytest.mark.parametrize("broken_field", ["weight", "labeled frame"])
+def test_an_export_iterates_over_the_labels_once(
+    exporter, labels, tmp_path, broken_field: str
+) -> None:
+    """An error in the last block is found in the same pass."""
     walks = []
 
     class Walked:
-        """Blocks that note when they are walked."""
+        """Blocks that count how often they are iterated over."""
 
         def __init__(self, blocks) -> None:
             self.blocks = blocks
@@ -419,7 +424,7 @@ def test_an_export_walks_the_labels_once(exporter, labels, tmp_path, fault: str)
 
     rows = rows_of(labels)
     wrong = {"weight": {"weight": "much"}, "labeled frame": {"frame": labels.frames[0].frame}}
-    bad = [block(rows[:-1]), block([rows[-1] | wrong[fault]])]
+    bad = [block(rows[:-1]), block([rows[-1] | wrong[broken_field]])]
     path = place(exporter, tmp_path)
     exporter.write(path, replace(labels, labels=Walked(labels.labels)))
     before = files(path)
@@ -430,16 +435,14 @@ def test_an_export_walks_the_labels_once(exporter, labels, tmp_path, fault: str)
     assert files(path) == before
 
 
-def test_no_exporter_can_be_given_ground_truth_of_unlabeled_frames(
-    exporter, labels, tmp_path
-) -> None:
-    """The label set itself refuses it, as well as other splits and labels of labeled frames."""
+def test_no_exporter_accepts_ground_truth_of_unlabeled_frames(exporter, labels, tmp_path) -> None:
+    """The label set rejects it, as well as other splits and labels of labeled frames."""
     first, second, *_ = [each.frame for each in labels.frames]
     with pytest.raises(LeakageError, match=second):
         replace(labels, ground_truth=labels.ground_truth | {"frame": [second]})
     with pytest.raises(LeakageError, match="000777"):
         replace(labels, frames=[*labels.frames, FrameFiles("000777", "val", "p", "i", "c")])
     rows = rows_of(labels)
-    strayed = with_rows(labels, [rows[0] | {"frame": first}, *rows[1:]])
+    misplaced = with_rows(labels, [rows[0] | {"frame": first}, *rows[1:]])
     with pytest.raises(DataError, match=first):
-        exporter.write(place(exporter, tmp_path), strayed)
+        exporter.write(place(exporter, tmp_path), misplaced)

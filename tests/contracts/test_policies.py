@@ -1,4 +1,4 @@
-"""What every registered policy promises."""
+"""The contract of every registered policy."""
 
 from dataclasses import replace
 
@@ -11,8 +11,8 @@ from pipelines.registry import POLICIES
 AGES = [Age(1, 1), Age(1, 3), Age(3, 3)]
 
 
-def columns(n: int, seed: int) -> dict:
-    """What labels of this round and of the one before have in common."""
+def random_columns(n: int, seed: int) -> dict:
+    """Return random columns as both this round and the round before have them."""
     rng = np.random.default_rng([seed, n])
     boxes = np.column_stack([rng.uniform(0, 10, (n, 3)), rng.uniform(1, 4, (n, 3)), np.zeros(n)])
     return {
@@ -25,15 +25,15 @@ def columns(n: int, seed: int) -> dict:
 
 
 def evidence(n: int, seed: int = 0, *, remembered: int | None = None) -> Evidence:
-    """So many labels of a few frames and categories, a fifth of them without a match."""
+    """Return random labels of a few frames and categories, a fifth of them without a match."""
     rng = np.random.default_rng(seed)
     loss = rng.exponential(size=n)
     loss[rng.random(n) < 0.2] = np.nan
     memory = None
     if remembered is not None:
-        memory = Memory(**columns(remembered, seed + 1), v=rng.random(remembered))
+        memory = Memory(**random_columns(remembered, seed + 1), v=rng.random(remembered))
     return Evidence(
-        **columns(n, seed),
+        **random_columns(n, seed),
         loss=loss,
         rho={"rho_diff": rng.random(n), "rho_anno": rng.random(n)},
         memory=memory,
@@ -42,7 +42,7 @@ def evidence(n: int, seed: int = 0, *, remembered: int | None = None) -> Evidenc
 
 @pytest.fixture(params=sorted(POLICIES.classes))
 def policy(request: pytest.FixtureRequest):
-    """Every registered policy with its default settings."""
+    """Return every registered policy with its default settings."""
     return POLICIES.build(request.param, offered={}, options={})
 
 
@@ -50,7 +50,7 @@ def policy(request: pytest.FixtureRequest):
 @pytest.mark.parametrize("n", [0, 1, 200])
 @pytest.mark.parametrize("remembered", [None, 0, 150])
 def test_weights_are_finite_and_between_0_and_1(policy, age: Age, n: int, remembered) -> None:
-    """One weight per label, whatever the evidence; 0 for those that are dropped."""
+    """There is one weight per label; dropped labels have weight 0."""
     weights = policy.weigh(evidence(n, remembered=remembered), age)
     assert weights.v.shape == weights.lambda_u.shape == weights.dropped.shape == (n,)
     assert ((weights.v >= 0) & (weights.v <= 1)).all()
@@ -76,8 +76,8 @@ def test_weights_do_not_depend_on_the_order_of_the_labels(policy) -> None:
     assert got.dropped.tolist() == expected.dropped[order].tolist()
 
 
-def test_columns_that_a_policy_does_not_read_say_nothing_to_it(policy) -> None:
-    """Where it names what it reads, the rest can be left unread."""
+def test_undeclared_columns_do_not_change_the_weights(policy) -> None:
+    """If a policy declares the columns that it reads, the others can be left unread."""
     labels, reads = evidence(100), policy.reads
     nothing = {
         "category": np.full(100, ""),
@@ -95,13 +95,13 @@ def test_columns_that_a_policy_does_not_read_say_nothing_to_it(policy) -> None:
     assert np.array_equal(got.lambda_u, expected.lambda_u, equal_nan=True)
 
 
-def test_a_policy_goes_by_its_registered_name(policy, request: pytest.FixtureRequest) -> None:
-    """So that weights in the database and settings agree."""
+def test_a_policy_has_its_registered_name(policy, request: pytest.FixtureRequest) -> None:
+    """Weights in the database and settings then agree."""
     assert policy.name in POLICIES.classes
 
 
-def test_weights_do_not_depend_on_what_was_weighed_before(policy) -> None:
-    """Asked again after other labels and ages, the same weights to the last bit."""
+def test_weights_do_not_depend_on_earlier_calls(policy) -> None:
+    """After other labels and ages, the same input gives the same weights to the last bit."""
     before = policy.weigh(evidence(60), Age(1, 3))
     policy.weigh(evidence(30, seed=5), Age(3, 3))
     again = policy.weigh(evidence(60), Age(1, 3))
@@ -110,8 +110,7 @@ def test_weights_do_not_depend_on_what_was_weighed_before(policy) -> None:
     assert before.v.dtype == before.lambda_u.dtype == np.float64
 
 
-def test_the_evidence_is_left_as_it_is(policy) -> None:
-    """Several policies weigh the same labels."""
+def test_the_evidence_is_not_modified(policy) -> None:
     labels = evidence(50)
     for column in (labels.category, labels.score, labels.loss, *labels.rho.values()):
         column.flags.writeable = False
@@ -121,7 +120,7 @@ def test_the_evidence_is_left_as_it_is(policy) -> None:
 
 
 def test_weights_do_not_need_every_prior(policy) -> None:
-    """Without any prior, or with one that has scored some labels only, they stay in range."""
+    """Without any prior, or with one that scored only some labels, they stay in range."""
     labels = evidence(40)
     holes = np.where(np.arange(40) % 2, labels.rho["rho_diff"], np.nan)
     for rho in ({}, {"rho_diff": holes}):

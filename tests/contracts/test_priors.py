@@ -1,4 +1,4 @@
-"""What every registered prior promises."""
+"""The contract of every registered prior."""
 
 from dataclasses import replace
 from typing import Any
@@ -16,14 +16,14 @@ from db.models import Base
 from pipelines.labels.sources import source_of
 from pipelines.registry import PRIORS
 
-# Options without which a prior cannot be made.
+# Options without which a prior cannot be created.
 SAMPLES: dict[str, dict[str, Any]] = {}
 THRESHOLDS = {"Car": 30.0, "Pedestrian": 12.5, "Cyclist": 1.0}
 KEY = ("round", "frame_id", "k")
 
 
 def build(name: str, *, measures: bool = True):
-    """A prior as the pipeline builds it."""
+    """Return a prior as the pipeline builds it."""
     offered = {
         "thresholds": lambda: THRESHOLDS,
         "segmenter": lambda: ToySegmenter("none") if measures else None,
@@ -36,19 +36,19 @@ def build(name: str, *, measures: bool = True):
 
 @pytest.fixture(params=sorted(PRIORS.classes))
 def prior(request: pytest.FixtureRequest):
-    """Every registered prior."""
+    """Return every registered prior in turn."""
     return build(request.param)
 
 
 def assert_same_evidence(one: Evidence, other: Evidence) -> None:
-    """Equal to the last bit."""
+    """Check that two sets of evidence are equal to the last bit."""
     assert list(one) == list(other)
     for name, column in one.items():
         np.testing.assert_array_equal(column, other[name], err_msg=name)
 
 
-def labels(count: int, seed: int = 0) -> Detections:
-    """So many boxes of all categories around the camera, some behind it, scores from 0 to 1."""
+def random_labels(count: int, seed: int = 0) -> Detections:
+    """Return random boxes of all categories around the camera, some behind it, with all scores."""
     rng = np.random.default_rng(seed)
     categories = rng.choice(CATEGORIES, count).astype(np.str_)
     boxes = np.column_stack([
@@ -62,9 +62,9 @@ def labels(count: int, seed: int = 0) -> Detections:
 
 
 @pytest.mark.parametrize("count", [0, 1, 60])
-def test_evidence_is_what_was_declared(prior, frames, count: int) -> None:
-    """A value per label and declared column, in its order and of its type."""
-    found = prior.score(frames[0], labels(count))
+def test_evidence_has_the_declared_columns(prior, frames, count: int) -> None:
+    """One value per label and column, in the declared order and type."""
+    found = prior.score(frames[0], random_labels(count))
     assert list(found) == [column.name for column in prior.columns]
     for column in prior.columns:
         values = found[column.name]
@@ -74,12 +74,12 @@ def test_evidence_is_what_was_declared(prior, frames, count: int) -> None:
     assert list(check_evidence(prior, found, count)) == list(found)
 
 
-def test_a_declaration_has_its_table(request: pytest.FixtureRequest, prior) -> None:
-    """With its columns in their order, each with a unit or none, and a meaning."""
+def test_a_declaration_matches_its_table(request: pytest.FixtureRequest, prior) -> None:
+    """The columns are in order, each with a unit or none, and a meaning."""
     name = request.node.callspec.params["prior"]
     declaration = source_of(name).declaration
-    known = declaration.table in Base.metadata.tables
-    table = Base.metadata.tables[declaration.table] if known else evidence_table(declaration)
+    is_builtin = declaration.table in Base.metadata.tables
+    table = Base.metadata.tables[declaration.table] if is_builtin else evidence_table(declaration)
     own = [column.name for column in table.columns if column.name not in KEY]
     assert own == [column.name for column in prior.columns]
     assert all(column.meaning for column in prior.columns)
@@ -87,26 +87,25 @@ def test_a_declaration_has_its_table(request: pytest.FixtureRequest, prior) -> N
 
 
 def test_trust_lies_between_0_and_1(prior, frames) -> None:
-    """For labels of all scores, in view or not, with points or without; not all alike."""
+    """For all scores, visible or not, with points or without; the values differ."""
     if prior.rho_column is None:
         pytest.skip("evidence, but not a prior")
     for frame in frames:
-        rho = prior.score(frame, labels(80))[prior.rho_column]
+        rho = prior.score(frame, random_labels(80))[prior.rho_column]
         assert rho.dtype == np.float64
         assert ((rho >= 0) & (rho <= 1)).all()
         assert len(np.unique(rho)) > 1
 
 
-def test_what_is_measured_is_not_the_trust(prior) -> None:
-    """It is among the columns, and the trust follows from it."""
+def test_the_measured_columns_are_declared_and_exclude_the_trust(prior) -> None:
     assert prior.measured_columns
     names = {column.name for column in prior.columns}
     assert set(prior.measured_columns) <= names - {prior.rho_column}
 
 
-def test_labels_do_not_matter_to_each_other(prior, frames) -> None:
-    """A permutation of the labels permutes the evidence; a part of them has its part of it."""
-    found = labels(50)
+def test_labels_do_not_affect_each_other(prior, frames) -> None:
+    """A permutation of the labels permutes the evidence; a subset has the same values."""
+    found = random_labels(50)
     whole = prior.score(frames[0], found)
     order = np.random.default_rng(1).permutation(50)
     for index in (order, order[:7]):
@@ -116,24 +115,25 @@ def test_labels_do_not_matter_to_each_other(prior, frames) -> None:
 
 
 def test_the_order_of_the_points_does_not_matter(prior, frames) -> None:
-    """A sweep is a set."""
     frame = frames[0]
     shuffled = frame.with_points(np.random.default_rng(0).permutation(frame.points))
-    assert_same_evidence(prior.score(shuffled, labels(50)), prior.score(frame, labels(50)))
+    assert_same_evidence(
+        prior.score(shuffled, random_labels(50)), prior.score(frame, random_labels(50))
+    )
 
 
-def test_evidence_does_not_depend_on_what_was_asked_before(prior, frames) -> None:
-    """Asked again, in another order, or of another instance: the same, to the last bit."""
-    before = [prior.score(frame, labels(20)) for frame in frames]
+def test_evidence_does_not_depend_on_earlier_calls(prior, frames) -> None:
+    """A second call, another order or another instance gives the same to the last bit."""
+    before = [prior.score(frame, random_labels(20)) for frame in frames]
     other = build(prior.name)
     for frame, expected in reversed(list(zip(frames, before, strict=True))):
-        assert_same_evidence(other.score(frame, labels(20)), expected)
-        assert_same_evidence(prior.score(frame, labels(20)), expected)
+        assert_same_evidence(other.score(frame, random_labels(20)), expected)
+        assert_same_evidence(prior.score(frame, random_labels(20)), expected)
 
 
-def test_rating_what_was_measured_is_scoring(prior, frames) -> None:
-    """Also by a prior that could not measure, from numbers that have been in a database."""
-    found = labels(40)
+def test_rating_measurements_gives_the_same_as_scoring(prior, frames) -> None:
+    """Also by a prior that could not measure, from numbers that were in a database."""
+    found = random_labels(40)
     measured = prior.measure(frames[0], found)
     assert set(measured) == set(prior.measured_columns)
     expected = prior.score(frames[0], found)
@@ -142,26 +142,25 @@ def test_rating_what_was_measured_is_scoring(prior, frames) -> None:
     assert_same_evidence(build(prior.name, measures=False).rate(found, stored), expected)
 
 
-def test_frame_and_labels_are_left_as_they_are(prior, frames) -> None:
-    """The next prior sees the same."""
+def test_frame_and_labels_are_not_modified(prior, frames) -> None:
     frame = replace(frames[0], points=frames[0].points.copy(), image=frames[0].image.copy())
-    found = labels(30)
+    found = random_labels(30)
     for array in (frame.points, frame.image, found.boxes, found.scores, found.categories):
         array.flags.writeable = False
     prior.score(frame, found)
     np.testing.assert_array_equal(frame.points, frames[0].points)
-    assert_same(found, labels(30))
+    assert_same(found, random_labels(30))
 
 
-def test_a_sweep_without_points_is_no_failure(prior, frames) -> None:
-    """Every label has its evidence."""
-    found = prior.score(frames[0].with_points(frames[0].points[:0]), labels(9))
+def test_a_sweep_without_points_does_not_fail(prior, frames) -> None:
+    found = prior.score(frames[0].with_points(frames[0].points[:0]), random_labels(9))
     assert list(check_evidence(prior, found, 9)) == [column.name for column in prior.columns]
 
 
-def test_the_image_is_read_only_where_it_is_needed(prior, frames) -> None:
-    """Who does not need it must do without."""
+def test_the_image_is_read_only_if_it_is_needed(prior, frames) -> None:
     assert isinstance(prior.needs_image, bool)
     if not prior.needs_image:
         bare = replace(frames[0], image=None)
-        assert_same_evidence(prior.score(bare, labels(9)), prior.score(frames[0], labels(9)))
+        assert_same_evidence(
+            prior.score(bare, random_labels(9)), prior.score(frames[0], random_labels(9))
+        )

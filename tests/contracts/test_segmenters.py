@@ -1,4 +1,4 @@
-"""What every registered segmenter promises."""
+"""The contract of every registered segmenter."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ from pipelines.registry import SEGMENTERS
 
 
 def write_maps(folder: Path, frames: Sequence[Frame]) -> Path:
-    """A semantic map per frame: rectangles of all classes."""
+    """Write a semantic map per frame: rectangles of all classes."""
     for number, frame in enumerate(frames):
         width, height = frame.image_size
         class_ids = np.zeros((height, width), dtype=np.uint8)
@@ -31,7 +31,7 @@ def write_maps(folder: Path, frames: Sequence[Frame]) -> Path:
 
 
 def write_instances(folder: Path, frames: Sequence[Frame]) -> Path:
-    """A file of instance masks: a rectangle per class."""
+    """Write a file of instance masks: a rectangle per class."""
     polygons = [[left, 5, left + 20, 5, left + 20, 35, left, 35] for left in (30, 60, 90)]
     objects = [
         {"image_id": frame.frame_id, "category_id": class_id, "segmentation": [polygon]}
@@ -44,7 +44,7 @@ def write_instances(folder: Path, frames: Sequence[Frame]) -> Path:
 
 
 def write_instance_model(folder: Path, frames: Sequence[Frame]) -> Path:
-    """A model that sees a rectangle per class whatever the image."""
+    """Write a model that predicts a rectangle per class for every image."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
@@ -72,7 +72,7 @@ def write_instance_model(folder: Path, frames: Sequence[Frame]) -> Path:
     return path
 
 
-# Gives the file or folder from which the segmenter is made, fit for some frames.
+# Write the file or folder from which the segmenter is created, for the test frames.
 SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
     "onnx": lambda folder, frames: SHIPPED_SEGMENTER,
     "onnx-instances": write_instance_model,
@@ -83,42 +83,44 @@ SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
 
 
 def build(name: str, path: Path):
-    """A segmenter as the pipeline builds it."""
+    """Return a segmenter as the pipeline builds it."""
     offered = {"classes": lambda: class_map("simulated"), "seed": lambda: 0}
     return SEGMENTERS.build(name, path, offered=offered, options={})
 
 
 @pytest.fixture(scope="module", params=sorted(SEGMENTERS.classes))
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, frames):
-    """Name and file of every registered segmenter."""
-    wanted = "a function that gives a small file or folder from which the segmenter can be made"
-    prepare = sample_of(SAMPLES, request.param, wanted)
+    """Return the name and the file of every registered segmenter in turn."""
+    description = (
+        "a function that gives a small file or folder from which the segmenter can be made"
+    )
+    prepare = sample_of(SAMPLES, request.param, description)
     return request.param, prepare(tmp_path_factory.mktemp(request.param), frames)
 
 
 @pytest.fixture(scope="module")
 def segmenter(made):
-    """Every registered segmenter with its default settings."""
+    """Return every registered segmenter with its default settings."""
     return build(*made)
 
 
-def seen_by(segmenter, frame: Frame) -> Frame:
-    """The frame as the pipeline reads it for a segmenter."""
+def segmenter_input(segmenter, frame: Frame) -> Frame:
+    """Return the frame as the pipeline reads it for a segmenter."""
     return frame if segmenter.needs_image else replace(frame, image=None)
 
 
 def test_a_map_has_a_class_for_every_pixel(segmenter, frames) -> None:
-    """uint8, rows by columns, in the size of the image."""
+    """Its type is uint8, its shape that of the image."""
     assert isinstance(segmenter.needs_image, bool)
     for frame in frames:
         width, height = frame.image_size
-        found = segmenter.segment(seen_by(segmenter, frame))
+        found = segmenter.segment(segmenter_input(segmenter, frame))
         assert (found.class_ids.shape, found.class_ids.dtype) == ((height, width), np.uint8)
 
 
 def test_every_category_has_its_classes(segmenter, frames) -> None:
-    """At least one id of 0 to 255 each, in tuples."""
-    classes = segmenter.segment(seen_by(segmenter, frames[0])).category_classes
+    """Tuples with at least one id in [0, 255]."""
+    classes = segmenter.segment(segmenter_input(segmenter, frames[0])).category_classes
     for category in CATEGORIES:
         ids = classes[category]
         assert isinstance(ids, tuple)
@@ -126,9 +128,9 @@ def test_every_category_has_its_classes(segmenter, frames) -> None:
         assert all(isinstance(one, int) and 0 <= one <= 255 for one in ids)
 
 
-def test_maps_do_not_depend_on_what_was_asked_before(made, segmenter, frames) -> None:
-    """Asked again, in another order, or of another instance: the same pixels."""
-    seen = [seen_by(segmenter, frame) for frame in frames]
+def test_maps_do_not_depend_on_earlier_calls(made, segmenter, frames) -> None:
+    """A second call, another order or another instance gives the same pixels."""
+    seen = [segmenter_input(segmenter, frame) for frame in frames]
     before = [segmenter.segment(frame).class_ids.copy() for frame in seen]
     other = build(*made)
     for frame, expected in reversed(list(zip(seen, before, strict=True))):
@@ -136,26 +138,28 @@ def test_maps_do_not_depend_on_what_was_asked_before(made, segmenter, frames) ->
         np.testing.assert_array_equal(segmenter.segment(frame).class_ids, expected)
 
 
-def test_a_frame_is_left_as_it_is_and_its_points_do_not_matter(segmenter, frames) -> None:
-    """The image cannot be written to, and there are no points."""
+def test_a_frame_is_not_modified_and_its_points_are_not_used(segmenter, frames) -> None:
+    """The image is read-only, and there are no points."""
     image = frames[0].image.copy()
     image.flags.writeable = False
     frame = replace(frames[0].with_points(frames[0].points[:0]), image=image)
     found = segmenter.segment(frame).class_ids
-    np.testing.assert_array_equal(found, segmenter.segment(seen_by(segmenter, frames[0])).class_ids)
+    np.testing.assert_array_equal(
+        found, segmenter.segment(segmenter_input(segmenter, frames[0])).class_ids
+    )
     np.testing.assert_array_equal(image, frames[0].image)
 
 
-def test_a_frame_without_what_is_needed_is_named(segmenter, frames) -> None:
-    """No image, or no saved map: one line with the frame's name."""
+def test_a_frame_without_image_or_map_is_reported(segmenter, frames) -> None:
+    """The error is one line with the frame's name."""
     with pytest.raises((ModelError, DataError), match="999999") as caught:
         segmenter.segment(replace(frames[0], frame_id="999999", image=None))
     assert_one_line(caught.value)
 
 
 @pytest.mark.parametrize("content", [None, b"no model \x00\xff\n"])
-def test_what_is_no_segmenter_is_named(made, tmp_path: Path, content: bytes | None) -> None:
-    """Missing, or a file of garbage: one line of the right class."""
+def test_an_invalid_segmenter_file_is_rejected(made, tmp_path: Path, content: bytes | None) -> None:
+    """A missing or random file gives a one-line error of the right class."""
     broken = tmp_path / "broken.onnx"
     if content is not None:
         broken.write_bytes(content)

@@ -1,4 +1,4 @@
-"""Every trainable detector: it trains, resumes to the same weights, saves, loads and detects."""
+"""The contract of every trainable detector: training, resuming, saving, loading, detecting."""
 
 import inspect
 import os
@@ -33,7 +33,7 @@ TOY = "support.trainable_toy:GridDetector"
 
 @pytest.fixture(params=[*trainable_names(), TOY])
 def detector(request: pytest.FixtureRequest, tiny: str, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The class of every trainable detector; pillars' smallest preset comes first."""
+    """Return the class of every trainable detector; pillars uses its smallest preset."""
     found = trainable(request.param)
     assert found is not None
     if tiny in found.presets:
@@ -42,22 +42,22 @@ def detector(request: pytest.FixtureRequest, tiny: str, monkeypatch: pytest.Monk
 
 
 def trained(detector: Any, labels: Path, output: Path, **more: Any) -> TrainingReport:
-    """A training of a few steps."""
+    """Train for a few steps."""
     options = {name: more.pop(name) for name in ("start", "progress") if name in more}
     settings = TrainingSettings(**{"steps": 5, "snapshot_seconds": 0.0, "pasted": 1} | more)
     return train(detector, labels, output, settings, **options)
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """The contents of a folder."""
+    """Return the contents of a folder."""
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
 @pytest.mark.parametrize("teacher", ["student", "ema"])
-def test_a_killed_training_ends_in_the_same_files(
+def test_a_resumed_training_ends_with_the_same_files(
     detector: Any, make_labels: Callable[..., Path], tmp_path: Path, teacher: str
 ) -> None:
-    """Also with dropout: what a step draws depends on the seed and the step alone."""
+    """Also with dropout: random draws depend only on the seed and the step."""
     labels = make_labels(labeled=3, unlabeled=2)
     whole, killed = (tmp_path / name / f"a{detector.checkpoint_suffix}" for name in ("w", "k"))
     report = trained(detector, labels, whole, teacher=teacher, statistics_steps=2)
@@ -75,10 +75,10 @@ def test_a_killed_training_ends_in_the_same_files(
     assert {"learning_rate", "gradient_norm"} < {each.name for each in report.statistics}
 
 
-def test_a_checkpoint_loads_detects_and_is_saved_again(
+def test_a_checkpoint_loads_detects_and_saves(
     detector: Any, make_labels: Callable[..., Path], toy_kitti: Path, tmp_path: Path
 ) -> None:
-    """The bytes are the same, and so are the boxes; all is where the constructor looks for it."""
+    """The saved bytes and the boxes are the same as before."""
     first, second = (tmp_path / name / f"a{detector.checkpoint_suffix}" for name in ("1", "2"))
     trained(detector, make_labels(labeled=2), first, steps=40, learning_rate=2e-2)
     detector.check_checkpoint(first)
@@ -95,7 +95,7 @@ def test_a_checkpoint_loads_detects_and_is_saved_again(
 def test_the_weight_of_an_object_scales_its_loss(
     detector: Any, make_labels: Callable[..., Path], tmp_path: Path
 ) -> None:
-    """A weight of 0 is an ignore region: labels of weight 0 and 1 give different losses."""
+    """Weight 0 is an ignore region: labels of weight 0 and 1 give different losses."""
     losses = []
     for weight in (0.0, 0.5, 1.0):
         labels = make_labels(labeled=1, unlabeled=2, weight=weight, name=f"{weight}.sqlite")
@@ -104,10 +104,10 @@ def test_the_weight_of_an_object_scales_its_loss(
     assert len(set(losses)) == 3
 
 
-def test_a_start_of_another_detector_is_named(
+def test_an_invalid_start_checkpoint_is_rejected(
     detector: Any, make_labels: Callable[..., Path], tmp_path: Path
 ) -> None:
-    """A checkpoint of every other detector, rubbish and a missing file: one line each."""
+    """A checkpoint of another detector, a random file and a missing one give one line each."""
     labels, wrong = make_labels(labeled=2), tmp_path / "wrong.bin"
     others = [trainable(name) for name in (*trainable_names(), TOY)]
     contents = [b"rubbish", None]
@@ -130,8 +130,8 @@ def test_a_start_of_another_detector_is_named(
             assert_one_line(caught.value)
 
 
-def test_presets_suffix_and_version_are_what_the_protocol_says(detector: Any) -> None:
-    """A preset at least, a suffix that begins with a dot, and a version."""
+def test_presets_suffix_and_version_follow_the_protocol(detector: Any) -> None:
+    """There is at least one preset, the suffix begins with a dot, and there is a version."""
     assert list(detector.presets)
     assert detector.checkpoint_suffix.startswith(".")
     assert detector.checkpoint_version
@@ -142,10 +142,10 @@ def test_presets_suffix_and_version_are_what_the_protocol_says(detector: Any) ->
     "member", ["presets", "checkpoint_suffix", "checkpoint_version", "check_checkpoint",
                "new_student", "load_student"],
 )  # fmt: skip
-def test_an_outside_class_that_lacks_a_member_is_named(
+def test_an_incomplete_trainable_class_is_rejected(
     member: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One line names it; a class without any of them is a detector that curate does not train."""
+    """The error contains the missing member. A class with none of them is a plain detector."""
     monkeypatch.delattr(GridDetector, member)
     with pytest.raises(ConfigError, match=f"^detector '{TOY}' .* has no {member}; see") as caught:
         trainable(TOY)
@@ -154,7 +154,7 @@ def test_an_outside_class_that_lacks_a_member_is_named(
 
 
 @pytest.mark.parametrize("member", ["encode", "loss", "save"])
-def test_a_student_that_lacks_a_member_is_named(
+def test_an_incomplete_student_is_rejected(
     member: str,
     make_labels: Callable[..., Path],
     tmp_path: Path,
@@ -168,7 +168,7 @@ def test_a_student_that_lacks_a_member_is_named(
 
 
 def curate(*arguments: object, **environment: str) -> subprocess.CompletedProcess:
-    """A command in a process of its own, which finds the toy."""
+    """Return a function that runs a command in a new process, which can import the toy."""
     return subprocess.run(
         _line(*arguments), capture_output=True, text=True, check=False, env=_env(environment)
     )
@@ -183,7 +183,7 @@ def _env(more: dict[str, str]) -> dict[str, str]:
 
 
 def init(root: Path, folder: Path, *more: object) -> subprocess.CompletedProcess:
-    """A workspace with the toy as its detector."""
+    """Create a workspace with the toy as its detector."""
     settings = (
         "train.pretrain_steps=30", "train.round_steps=30", "train.options={snapshot_seconds=0.0}",
         "train.statistics_steps=10", "train.learning_rate=0.05", "solve.self_paced=false",
@@ -196,13 +196,13 @@ def init(root: Path, folder: Path, *more: object) -> subprocess.CompletedProcess
 
 
 def rows(folder: Path, query: str) -> list[tuple]:
-    """The rows of a query in the working database."""
+    """Return the rows of a query in the working database."""
     with closing(sqlite3.connect(folder / "curate.db")) as connection:
         return connection.execute(query).fetchall()
 
 
 def kill_in_training(folder: Path, output: str, *command: object) -> None:
-    """Kills a command with SIGKILL as soon as its training has left a snapshot."""
+    """Kill a command with SIGKILL as soon as its training has written a snapshot."""
     snapshot = snapshot_path(folder / "checkpoints" / output)
     started = subprocess.Popen(_line(*command, "-w", folder), env=_env({"TOY_DELAY_S": "0.05"}))
     end = time.monotonic() + 60
@@ -217,12 +217,12 @@ STATISTICS = "SELECT * FROM training_statistics ORDER BY 1, 2, 3, 4"
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
-def test_a_detector_from_outside_goes_through_the_whole_command_line(
+def test_an_external_detector_works_with_the_whole_command_line(
     toy_kitti: Path, tmp_path: Path
 ) -> None:
-    """Killed in pretrain and in a round, it ends like an undisturbed run: two rounds, their curves.
+    """Killed in pretrain and in a round, the run ends like an undisturbed one.
 
-    Then its checkpoint is brought to another workspace, and one of another detector is refused.
+    Then its checkpoint is used in another workspace, and one of another detector is rejected.
     """
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
@@ -251,11 +251,11 @@ def test_a_detector_from_outside_goes_through_the_whole_command_line(
     shown = curate("query", "--named", "training", "-w", whole)
     assert shown.returncode == 0
     assert "gradient_norm" in shown.stdout
-    brought = tmp_path / "brought"
-    made = init(toy_kitti, brought, "--detector-path", whole / "checkpoints" / names[0])
+    external = tmp_path / "brought"
+    made = init(toy_kitti, external, "--detector-path", whole / "checkpoints" / names[0])
     assert made.returncode == 0, made.stderr
-    assert curate("pretrain", "-w", brought).returncode == ConfigError.exit_code
-    ran = curate("run", "--rounds", "1", "-w", brought)
+    assert curate("pretrain", "-w", external).returncode == ConfigError.exit_code
+    ran = curate("run", "--rounds", "1", "-w", external)
     assert ran.returncode == 0, ran.stderr
     foreign = whole / "curate.toml"
     foreign.write_text(foreign.read_text().replace(TOY, "pillars"))
@@ -266,7 +266,7 @@ def test_a_detector_from_outside_goes_through_the_whole_command_line(
     assert "'pillars'" in ran.stderr
     assert names[1] in ran.stderr
     wrong = tmp_path / "wrong"
-    made = curate("init", wrong, "--root", toy_kitti, "--detector-path", brought / "curate.toml")
+    made = curate("init", wrong, "--root", toy_kitti, "--detector-path", external / "curate.toml")
     assert made.returncode == 0, made.stderr
     ran = curate("predict", "-w", wrong)
     assert ran.returncode == ModelError.exit_code
@@ -274,8 +274,8 @@ def test_a_detector_from_outside_goes_through_the_whole_command_line(
     assert "curate.toml: not a readable safetensors file" in ran.stderr
 
 
-def test_an_unknown_preset_is_refused_before_any_work(toy_kitti: Path, tmp_path: Path) -> None:
-    """One line names those that the configured detector knows."""
+def test_an_unknown_preset_is_rejected_before_any_work(toy_kitti: Path, tmp_path: Path) -> None:
+    """The one-line error lists the presets of the configured detector."""
     made = init(toy_kitti, tmp_path / "work", "--set", "train.preset=huge")
     assert made.returncode == ConfigError.exit_code
     assert made.stderr.count("\n") == 1
@@ -292,8 +292,7 @@ def test_an_unknown_preset_is_refused_before_any_work(toy_kitti: Path, tmp_path:
     assert rows(tmp_path / "work", "SELECT count(*) FROM task") == [(0,)]
 
 
-def test_a_plain_detector_of_the_registry_is_not_trained() -> None:
-    """Only those that satisfy the protocol are."""
+def test_a_registered_detector_without_training_is_not_trained() -> None:
     assert trainable_names() == ["pillars"]
     assert set(trainable_names()) < set(DETECTORS.classes)
     assert np.all([trainable(name) is None for name in ("onnx", "recorded")])

@@ -24,7 +24,7 @@ CAR = [10.0, 2.0, -0.8, 4.0, 3.0, 1.5, 0.3]
 
 
 def detections(boxes, scores=None, categories=None):
-    """Detections of cars with a score of 0.5 unless told otherwise."""
+    """Return detections of cars with a score of 0.5 by default."""
     n = len(boxes)
     return Detections(
         np.reshape(np.array(boxes, dtype=np.float64), (n, 7)),
@@ -34,14 +34,14 @@ def detections(boxes, scores=None, categories=None):
 
 
 def moved(box, **changes):
-    """The box with some of its seven numbers shifted."""
+    """Return the box with some of its seven numbers shifted."""
     names = ("x", "y", "z", "length", "width", "height", "yaw")
     return [value + changes.get(name, 0.0) for name, value in zip(names, box, strict=True)]
 
 
 @st.composite
 def crowds(draw, largest=5):
-    """A few boxes so close together that most overlap, some of them exact copies."""
+    """Draw a few boxes so close together that most overlap, some of them exact copies."""
     places = st.tuples(
         st.integers(0, 4),
         st.integers(0, 2),
@@ -54,8 +54,8 @@ def crowds(draw, largest=5):
     return detections(boxes, [r[4] for r in rows], [r[3] for r in rows])
 
 
-def test_identical_boxes_and_a_certain_score_cost_nothing():
-    """L = 0 where the detector repeats itself and is sure."""
+def test_identical_boxes_and_a_certain_score_have_no_loss():
+    """L = 0 if the reprediction is identical and the score is 1."""
     found = consistency(detections([CAR]), detections([CAR], scores=[1.0]))
     assert found.matched.tolist() == [0]
     assert found.iou.tolist() == [1.0]
@@ -64,8 +64,8 @@ def test_identical_boxes_and_a_certain_score_cost_nothing():
 
 def test_loss_is_score_loss_plus_twice_the_box_loss():
     """L = 1.0 * (-ln s') + 2.0 * sum smoothL1(residual), worked out by hand."""
-    prediction, answer = CAR, moved(CAR, x=1.0, z=0.1)
-    found = consistency(detections([prediction]), detections([answer], scores=[0.25]))
+    prediction, reprediction = CAR, moved(CAR, x=1.0, z=0.1)
+    found = consistency(detections([prediction]), detections([reprediction], scores=[0.25]))
     far, near = 1.0 / 5.0, 0.1 / 1.5  # the diagonal of 4 x 3 is 5
     expected_box = (far - 0.5 / 9) + 0.5 * near**2 * 9
     assert found.score_loss[0] == pytest.approx(-np.log(0.25))
@@ -74,7 +74,7 @@ def test_loss_is_score_loss_plus_twice_the_box_loss():
 
 
 def test_weights_of_the_two_terms_are_settings():
-    """The terms are stored without their weights, the loss holds them."""
+    """The terms are stored without their weights, the loss contains them."""
     plain = consistency(detections([CAR]), detections([moved(CAR, y=0.5)]))
     weighed = consistency(
         detections([CAR]),
@@ -86,20 +86,20 @@ def test_weights_of_the_two_terms_are_settings():
     assert weighed.loss[0] == pytest.approx(3 * plain.score_loss[0] + 0.5 * plain.box_loss[0])
 
 
-def test_residual_takes_its_measure_from_the_prediction():
+def test_the_residual_is_relative_to_the_prediction():
     """The anchor is the prediction: its diagonal and height divide, its sizes are the base."""
     target = [11.0, 0.0, 0.2, 8.0, 1.5, 3.0, 0.3 + np.pi / 6]
     expected = [0.2, -0.4, 1 / 1.5, np.log(2), np.log(0.5), np.log(2), 0.5]
     assert residual(np.array([CAR]), np.array([target]))[0] == pytest.approx(expected)
 
 
-def test_a_heading_turned_round_costs_nothing():
-    """The sine of the yaw difference is blind to a half turn, as in SECOND."""
+def test_a_reversed_heading_has_no_loss():
+    """The sine of the yaw difference ignores a half turn, as in SECOND."""
     turned = moved(CAR, yaw=np.pi)
     assert residual(np.array([CAR]), np.array([turned]))[0] == pytest.approx(np.zeros(7), abs=1e-12)
 
 
-def test_smooth_l1_joins_at_beta_and_keeps_its_slope():
+def test_smooth_l1_is_smooth_at_beta():
     """Parabola below beta, line above, equal in value and slope where they meet."""
     beta, step = 1 / 9, 1e-6
     at = smooth_l1(np.array([beta - step, beta, beta + step, 0.0, -2.0]), beta)
@@ -110,7 +110,7 @@ def test_smooth_l1_joins_at_beta_and_keeps_its_slope():
 
 
 def test_a_score_of_zero_has_a_finite_loss():
-    """The logarithm is kept away from 0."""
+    """The logarithm is bounded."""
     found = consistency(detections([CAR]), detections([CAR], scores=[0.0]))
     assert found.loss[0] == pytest.approx(-np.log(SCORE_FLOOR))
 
@@ -143,8 +143,8 @@ def test_the_minimum_iou_itself_does_not_match():
     assert match(*pair, minimum_iou=np.nextafter(iou, 0))[0].tolist() == [0]
 
 
-def test_a_forbidden_pair_does_not_displace_an_allowed_one():
-    """Overlaps below the minimum gain nothing, so they cannot tip the total."""
+def test_a_pair_below_the_minimum_does_not_displace_a_valid_one():
+    """Its overlap does not count in the total."""
     straight = [0.0, 0.0, 0.0, 10.0, 2.0, 1.5, 0.0]
     shifted = moved(straight, x=2.0)
     predictions = detections([straight, shifted])
@@ -157,8 +157,8 @@ def test_a_forbidden_pair_does_not_displace_an_allowed_one():
 
 @settings(max_examples=60)
 @given(crowds(), crowds())
-def test_matching_is_one_to_one_and_best(predictions, repredictions):
-    """No reprediction serves twice, categories agree, and no assignment has a larger total IoU."""
+def test_matching_is_one_to_one_and_optimal(predictions, repredictions):
+    """No reprediction is used twice, categories agree, and no assignment has a larger total IoU."""
     matched, iou = match(predictions, repredictions, minimum_iou=0.1)
     found = np.flatnonzero(matched >= 0)
     assert len(set(matched[found])) == len(found)
@@ -183,13 +183,14 @@ def test_matching_does_not_depend_on_the_order(predictions, repredictions, rando
         repredictions.select(np.array(columns, dtype=np.int64)),
     )
 
-    # Exact copies of a prediction are interchangeable, so compare what all copies got together.
-    def verdicts(boxes, scores, categories, losses):
+    # Exact copies of a prediction are interchangeable, so the losses of all copies are compared
+    # together.
+    def results_by_copy(boxes, scores, categories, losses):
         rows = zip(categories, scores, boxes.tolist(), losses, strict=True)
         return sorted((str(c), s, b, np.nan_to_num(loss, nan=-1.0)) for c, s, b, loss in rows)
 
     p = predictions
-    assert verdicts(p.boxes, p.scores, p.categories, straight.loss) == verdicts(
+    assert results_by_copy(p.boxes, p.scores, p.categories, straight.loss) == results_by_copy(
         p.boxes[rows], p.scores[rows], p.categories[rows], shuffled.loss
     )
 
@@ -201,11 +202,13 @@ def test_matching_does_not_depend_on_the_order(predictions, repredictions, rando
     st.floats(0.9, 1.1),
     crowds(),
 )
-def test_a_detector_that_follows_the_augmentation_is_consistent(flip_y, turn, scale, predictions):
-    """A^-1 of A's boxes are the boxes: the box loss vanishes whatever A was."""
+def test_an_equivariant_detector_is_consistent(flip_y, turn, scale, predictions):
+    """A^-1 of A's boxes are the boxes: the box loss is 0 for every A."""
     similarity = Similarity(flip_y, turn, scale)
-    answered = similarity.apply_to_boxes(predictions.boxes)
-    back = Detections(similarity.invert_boxes(answered), predictions.scores, predictions.categories)
+    repredicted = similarity.apply_to_boxes(predictions.boxes)
+    back = Detections(
+        similarity.invert_boxes(repredicted), predictions.scores, predictions.categories
+    )
     found = consistency(predictions, back)
     assert (found.matched >= 0).all()
     assert found.box_loss == pytest.approx(np.zeros(len(predictions)), abs=1e-12)
@@ -225,8 +228,8 @@ def test_the_mean_counts_only_views_that_matched():
     assert np.isnan(mean.loss[1])
 
 
-def test_a_box_without_height_is_the_detectors_fault():
-    """A matched box that has no residual ends in one line, not in an infinite loss."""
+def test_a_box_without_height_is_reported():
+    """A matched box without a residual gives a one-line error, not an infinite loss."""
     flat = [*CAR[:5], 0.0, CAR[6]]
     with pytest.raises(ModelError, match="no size"):
         consistency(detections([CAR]), detections([flat]))
@@ -235,7 +238,6 @@ def test_a_box_without_height_is_the_detectors_fault():
 @pytest.mark.parametrize(
     "wrong", [{"score_weight": -1}, {"box_weight": -1}, {"beta": 0}, {"minimum_iou": 1}]
 )
-def test_settings_without_meaning_are_refused(wrong):
-    """A setting out of its range is named."""
+def test_invalid_settings_are_rejected(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         ConsistencySettings(**wrong)

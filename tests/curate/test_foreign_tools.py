@@ -1,8 +1,8 @@
-"""Other projects' own readers take what curate writes; each is skipped where it is not installed.
+"""Readers of other projects accept curate's files; each test is skipped if its project is missing.
 
-Without most of their dependencies they suffice: `pip install --no-deps pycocotools nuscenes-devkit
-labelCloud datumaro orjson attrs mmengine addict termcolor yapf pyquaternion`. What needs a
-display or CUDA in them is put out of the way.
+Most of their dependencies are not needed: `pip install --no-deps pycocotools nuscenes-devkit
+labelCloud datumaro orjson attrs mmengine addict termcolor yapf pyquaternion`. Parts that need a
+display or CUDA are replaced by stubs.
 """
 
 import importlib.util
@@ -30,7 +30,7 @@ from curate.review.editors.labelcloud import LabelCloudEditor
 
 
 def foreign(name: str):
-    """A module of another project; the test is skipped where it cannot be imported."""
+    """Return a module of another project; skip the test if it cannot be imported."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -38,42 +38,42 @@ def foreign(name: str):
 
 
 class Stubs:
-    """Finds any module of some packages, and makes it of nothing."""
+    """Finds any module of some packages, and creates an empty stub."""
 
     def __init__(self, *packages: str) -> None:
         self.packages = packages
 
     def find_spec(self, name: str, path=None, target=None):
-        """For the import system."""
+        """Find a module for the import system."""
         if name.partition(".")[0] in self.packages:
             return importlib.machinery.ModuleSpec(name, self, is_package=True)
         return None
 
     def create_module(self, spec):
-        """Whatever is asked of it is there."""
+        """Create a module in which every name exists."""
         return MagicMock(__path__=[], __spec__=spec)
 
     def exec_module(self, module) -> None:
-        """Nothing happens."""
+        """Do nothing."""
 
 
 @pytest.fixture
 def stubbed(monkeypatch):
-    """Puts packages for displays, CUDA and plots out of the way."""
-    gone: set[str] = {"labelCloud", "nuscenes", "datumaro"}
+    """Replace packages for displays, CUDA and plots by stubs."""
+    missing: set[str] = {"labelCloud", "nuscenes", "datumaro"}
 
     def stub(*packages: str) -> None:
-        gone.update(packages)
+        missing.update(packages)
         monkeypatch.setattr(sys, "meta_path", [Stubs(*packages), *sys.meta_path])
 
     yield stub
-    # What was imported with stubs in it must not be what others get.
-    for name in [name for name in sys.modules if name.partition(".")[0] in gone]:
+    # Modules imported with stubs must not stay for other tests.
+    for name in [name for name in sys.modules if name.partition(".")[0] in missing]:
         del sys.modules[name]
 
 
 def read(name: str) -> Frame:
-    """A toy frame with an image."""
+    """Return a function that reads a toy frame with an image."""
     frame = toy_labels().read(name)
     image = np.zeros((IMAGE_SIZE[1], IMAGE_SIZE[0], 3), dtype=np.uint8)
     return replace(frame, image=image)
@@ -93,23 +93,23 @@ def test_pycocotools_opens_the_coco_file(tmp_path, capsys):
         assert opened.loadCats(one["category_id"])[0]["name"] in {"Car", "Van", "Pedestrian"}
 
 
-def test_pycocotools_scores_the_coco_file_against_itself(tmp_path, capsys):
-    """As detections with their scores: everything that is not to be ignored is found."""
+def test_pycocotools_evaluates_the_coco_file_against_itself(tmp_path, capsys):
+    """As detections with their scores: everything that is not ignored is found."""
     coco, evaluation = foreign("pycocotools.coco"), foreign("pycocotools.cocoeval")
     CocoExporter().write(tmp_path / "a.json", toy_labels())
     opened = coco.COCO(str(tmp_path / "a.json"))
     truth = [one for one in opened.dataset["annotations"] if not one.get("iscrowd")]
     names = ("image_id", "category_id", "bbox")
     found = opened.loadRes([{name: one[name] for name in names} | {"score": 1.0} for one in truth])
-    judged = evaluation.COCOeval(opened, found, "bbox")
-    judged.evaluate()
-    judged.accumulate()
-    judged.summarize()
-    assert judged.stats[0] == pytest.approx(1.0)
+    coco_eval = evaluation.COCOeval(opened, found, "bbox")
+    coco_eval.evaluate()
+    coco_eval.accumulate()
+    coco_eval.summarize()
+    assert coco_eval.stats[0] == pytest.approx(1.0)
 
 
 def test_the_devkit_of_nuscenes_reads_the_results(tmp_path, stubbed):
-    """Its own class of a detection takes each box of the exported results."""
+    """Its detection class accepts each box of the exported results."""
     stubbed("matplotlib", "sklearn", "PIL", "cachetools", "descartes", "shapely", "tqdm")
     classes = foreign("nuscenes.eval.detection.data_classes")
     common = foreign("nuscenes.eval.common.data_classes")
@@ -127,8 +127,8 @@ def test_the_devkit_of_nuscenes_reads_the_results(tmp_path, stubbed):
     assert {box.detection_name for box in boxes.all} == {"car"}
 
 
-def test_labelcloud_opens_what_is_handed_out(tmp_path, stubbed, monkeypatch):
-    """Its reader gives the boxes, and its writer's file comes back as they were."""
+def test_labelcloud_opens_an_exported_review(tmp_path, stubbed, monkeypatch):
+    """Its reader gives the boxes, and the file that its writer writes is imported unchanged."""
     stubbed("OpenGL", "PyQt5", "pkg_resources")
     installed = importlib.util.find_spec("labelCloud")
     if installed is None:
@@ -162,8 +162,8 @@ def test_labelcloud_opens_what_is_handed_out(tmp_path, stubbed, monkeypatch):
             np.testing.assert_allclose(edited.box[:6], own.box[:6], atol=1e-5)
 
 
-def test_datumaro_opens_what_is_handed_to_cvat(tmp_path, stubbed):
-    """The annotations are those of its own format, cuboids with position, rotation and scale."""
+def test_datumaro_opens_a_review_exported_for_cvat(tmp_path, stubbed):
+    """The annotations have its own format, cuboids with position, rotation and scale."""
     stubbed("json_stream", "imagesize", "PIL", "shapely", "tifffile", "pandas", "tqdm", "lxml")
     datumaro = foreign("datumaro.components.annotation")
     base = foreign("datumaro.plugins.data_formats.datumaro.base")
@@ -186,8 +186,8 @@ def test_datumaro_opens_what_is_handed_to_cvat(tmp_path, stubbed):
             assert cuboid.rotation[2] == pytest.approx(own.box[6], abs=0.01)
 
 
-def test_the_data_sets_of_mmdetection3d_read_the_infos(tmp_path):
-    """Its engine's class, on which they build, finds every frame and its instances."""
+def test_the_dataset_class_of_mmdetection3d_reads_the_infos(tmp_path):
+    """The base class from its engine finds every frame and its instances."""
     engine = foreign("mmengine.dataset.base_dataset")
     labels = replace(toy_labels(), read=read)
     MMDet3DExporter().write(tmp_path / "a", labels)

@@ -1,4 +1,4 @@
-"""`from curate import ...`: the names, when they are loaded, and what type checkers see."""
+"""`from curate import ...`: the names, lazy loading, and what type checkers see."""
 
 import ast
 import inspect
@@ -15,7 +15,7 @@ SOURCE = ast.parse(Path(curate.__file__).read_text())
 
 
 def python(code: str) -> str:
-    """Return what a fresh interpreter prints."""
+    """Return what a new interpreter prints."""
     ended = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT
     )
@@ -24,7 +24,7 @@ def python(code: str) -> str:
 
 
 def test_the_lists_of_names_agree() -> None:
-    """Those for type checkers, for `import *`, and for loading name the same from the same."""
+    """Those for type checkers, for `import *`, and for lazy loading."""
     [block] = [
         node
         for node in SOURCE.body
@@ -50,7 +50,7 @@ def test_the_lists_of_names_agree() -> None:
 
 @pytest.mark.parametrize("name", curate.__all__)
 def test_every_name_is_documented(name: str) -> None:
-    """It can be loaded, is what its module calls so, and has a docstring of its own."""
+    """It can be loaded, has the same name in its module, and has its own docstring."""
     found = getattr(curate, name)
     if name != "CATEGORIES":
         assert found.__name__ == name
@@ -58,8 +58,8 @@ def test_every_name_is_documented(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", curate.__all__)
-def test_paths_are_text_or_path(name: str) -> None:
-    """No public function insists on a `Path`."""
+def test_paths_can_be_text_or_path(name: str) -> None:
+    """No public function requires a `Path`."""
     found = getattr(curate, name)
     if callable(found):
         try:
@@ -71,7 +71,7 @@ def test_paths_are_text_or_path(name: str) -> None:
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
-    """As with any module; `hasattr` works."""
+    """`hasattr` works."""
     assert not hasattr(curate, "Detection")
     with pytest.raises(ImportError, match="cannot import name 'Detection'"):
         from curate import Detection  # noqa: F401
@@ -87,7 +87,7 @@ def test_importing_loads_no_heavy_library() -> None:
 
 @pytest.mark.slow
 def test_type_checkers_see_the_names(tmp_path: Path) -> None:
-    """Mypy knows the types of what is imported, and of tables by library."""
+    """Mypy knows the types of imported names, and of tables by library."""
     mypy = pytest.importorskip("mypy.api", reason="mypy is not installed")
     script = tmp_path / "notebook.py"
     script.write_text(
@@ -105,6 +105,6 @@ def test_type_checkers_see_the_names(tmp_path: Path) -> None:
     assert 'Module "curate" has no attribute "Detection"' in shown
 
 
-def test_the_packages_say_that_they_are_typed() -> None:
-    """Or type checkers would not look into them once they are installed (PEP 561)."""
+def test_the_packages_are_marked_as_typed() -> None:
+    """Otherwise type checkers ignore them once they are installed (PEP 561)."""
     assert all((ROOT / package / "py.typed").exists() for package in ("curate", "db", "pipelines"))

@@ -22,6 +22,6 @@ def test_the_closest_name_is_suggested(word: str, meant: str) -> None:
 
 
 @pytest.mark.parametrize("word", ["", "waymo-open", "x"])
-def test_nothing_is_suggested_for_a_word_that_resembles_none(word: str) -> None:
+def test_a_name_without_a_similar_one_gets_no_suggestion(word: str) -> None:
     """A wrong suggestion would mislead."""
     assert did_you_mean(word, KNOWN) == ""

@@ -10,5 +10,5 @@ from db.session import Database
 
 @pytest.fixture
 def database(tmp_path: Path, new_url: Callable[[], str | None]) -> Database:
-    """An empty database: SQLite, or of either kind in modules with ENGINES."""
+    """Return an empty database: SQLite, or each engine in modules with ENGINES."""
     return Database(new_url() or f"sqlite:///{tmp_path / 'curate.db'}")

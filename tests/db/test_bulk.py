@@ -1,4 +1,4 @@
-"""The bulk paths: every row goes in and comes out, whatever the size of a block."""
+"""Bulk writing and reading: every row is stored and read back, for any block size."""
 
 import math
 import threading
@@ -22,7 +22,7 @@ COUNT = 23
 
 @pytest.fixture
 def database(database: Database) -> Database:
-    """A database with a few predictions."""
+    """Return a database with a few predictions."""
     with database.writing() as connection:
         add_one_frame(connection)
         rows = [
@@ -34,8 +34,8 @@ def database(database: Database) -> Database:
 
 
 @pytest.mark.parametrize("count", [0, 1, 4, 49, 50, 51, 100, 149])
-def test_rows_and_columns_are_stored_alike(database: Database, count: int) -> None:
-    """To the last bit, however many rows a statement takes; null stays null."""
+def test_rows_and_columns_are_stored_equally(database: Database, count: int) -> None:
+    """To the last bit, for any number of rows per statement; null stays null."""
     keys = range(1000, 1000 + count)
     rows = [(1, 1, k, "Car", k / 7777, *[k / 3] * 7, None) for k in keys]
     weights = [(1, 1, k, "spsl", k / 3 if k % 2 else None, k / 7777, k / 9999) for k in keys]
@@ -52,10 +52,10 @@ def test_rows_and_columns_are_stored_alike(database: Database, count: int) -> No
 
 
 @pytest.mark.parametrize("block", [1, 5, COUNT, 50_000])
-def test_columns_come_out_whole_and_in_order(
+def test_columns_are_read_completely_and_in_order(
     database: Database, monkeypatch: pytest.MonkeyPatch, block: int
 ) -> None:
-    """To the last bit, the first and the last row among them; null is NaN."""
+    """To the last bit, including the first and the last row; null is NaN."""
     monkeypatch.setattr(bulk, "FETCHED_ROWS", block)
     monkeypatch.setattr(bulk, "BLOCK_ROWS", block)
     table = bulk.table("prediction").c
@@ -82,7 +82,7 @@ def _column(connection: Connection, statement: Select) -> np.ndarray:
 
 
 INFINITE = [math.inf, -math.inf, 5e-324, -1.7976931348623157e308, -0.0, 0.1]
-# PostgreSQL knows no zero byte in a text, and neither engine a lone surrogate.
+# PostgreSQL accepts no zero byte in a text, and neither engine a lone surrogate.
 TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=9)
 
 
@@ -99,7 +99,7 @@ def _stored(database: Database, *names: str) -> list[tuple]:
         return bulk.select(connection, select(*(table[n] for n in names)).order_by(table.k))
 
 
-def test_numbers_of_every_kind_go_in_and_come_out(database: Database) -> None:
+def test_numbers_of_every_kind_are_stored(database: Database) -> None:
     """Infinite, tiny, negative and missing ones, given as lists."""
     count = len(INFINITE)
     columns = _weights(count + 1) | {"lambda_u": [*INFINITE, None], "v": [*INFINITE, 1]}
@@ -116,8 +116,8 @@ def test_numbers_of_every_kind_go_in_and_come_out(database: Database) -> None:
     assert keys.tolist() == [-2_000_000_000_000 * k for k in range(count + 1)]
 
 
-def test_arrays_are_columns_too(database: Database) -> None:
-    """NaN in one of floats is null, whole numbers of any width are integers."""
+def test_arrays_can_be_columns(database: Database) -> None:
+    """NaN in a float array is null, integers of any width are integers."""
     columns = _weights(3) | {
         "k": np.arange(3, dtype=np.int16),
         "lambda_u": np.array([0.1, np.nan, 3]),
@@ -131,8 +131,8 @@ def test_arrays_are_columns_too(database: Database) -> None:
     ]  # fmt: skip
 
 
-def test_columns_of_nothing(database: Database) -> None:
-    """No rows go in, none come out."""
+def test_empty_columns(database: Database) -> None:
+    """No rows are written, none are read."""
     table = bulk.table("weight").c
     with database.writing() as connection:
         bulk.insert(connection, "weight", _weights(0))
@@ -145,7 +145,7 @@ def test_columns_of_nothing(database: Database) -> None:
     rows=st.lists(st.tuples(TEXTS, st.floats(allow_nan=False), st.none() | st.floats(0, 1))),
     block=st.sampled_from([1, 3, 50_000]),
 )
-def test_any_rows_are_stored_as_they_are(database: Database, rows: list[tuple], block: int) -> None:
+def test_any_rows_are_stored_unchanged(database: Database, rows: list[tuple], block: int) -> None:
     """Texts of any length and script, any number and null, in blocks of any size."""
     stored = [(1, 1, k, name, x, *[x] * 7, iou) for k, (name, x, iou) in enumerate(rows)]
     with pytest.MonkeyPatch.context() as patch, database.writing() as connection:
@@ -156,8 +156,8 @@ def test_any_rows_are_stored_as_they_are(database: Database, rows: list[tuple], 
         assert bulk.select(connection, select(table).order_by(table.c.k)) == stored
 
 
-def test_parameters_of_a_query_stay_values(database: Database) -> None:
-    """Whatever a text holds, and however many there are."""
+def test_query_parameters_are_never_interpreted_as_sql(database: Database) -> None:
+    """For any text and any number of parameters."""
     table = bulk.table("prediction").c
     names = ["'; DROP TABLE weight; --", "%s %(x)s", *(f"é{k}\t\\N\n" for k in (3, 5))]
     with database.reading() as connection:
@@ -167,15 +167,15 @@ def test_parameters_of_a_query_stay_values(database: Database) -> None:
         assert _column(connection, query.where(table.category == names[0])).tolist() == []
 
 
-def test_a_null_where_integers_are_asked_for_is_no_number(database: Database) -> None:
-    """It would shift all that come after it."""
+def test_a_null_in_an_integer_column_is_an_error(database: Database) -> None:
+    """It would shift all later values."""
     table = bulk.table("prediction").c
     with database.reading() as connection, pytest.raises((TypeError, ValueError)):
         _column(connection, select(cast(table.iou, Integer).label("iou")).order_by(table.k))
 
 
-def test_an_error_in_mid_answer_is_one_line(tmp_path: Path, database: Database) -> None:
-    """The server names it, after some rows already."""
+def test_an_error_in_the_middle_of_a_result_is_one_line(tmp_path: Path, database: Database) -> None:
+    """The server reports it after some rows."""
     if database.engine.dialect.name == "sqlite":
         pytest.skip("SQLite answers null for what cannot be computed")
     table = bulk.table("prediction").c
@@ -189,7 +189,7 @@ def test_an_error_in_mid_answer_is_one_line(tmp_path: Path, database: Database) 
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"k": [1, 1]},  # doubled
+        {"k": [1, 1]},  # duplicate
         {"k": [1, None]},
         {"k": [1, COUNT]},  # no such prediction
         {"k": [1, 2], "v": [0.5, None]},
@@ -197,7 +197,7 @@ def test_an_error_in_mid_answer_is_one_line(tmp_path: Path, database: Database) 
         {"k": [1, 2], "policy": ["spsl", None]},
     ],
 )
-def test_rows_that_the_table_refuses_are_one_line(database: Database, wrong: dict) -> None:
+def test_rows_that_the_table_rejects_give_one_line(database: Database, wrong: dict) -> None:
     """And none of the rows is stored."""
     if wrong.get("v") == [0.5, "heavy"] and database.engine.dialect.name == "sqlite":
         pytest.skip("SQLite's columns take values of any type")
@@ -208,8 +208,8 @@ def test_rows_that_the_table_refuses_are_one_line(database: Database, wrong: dic
 
 
 @pytest.mark.parametrize("k", [2**31, -(2**31) - 1, 2**63, 0.5, "one", "x" * 9])
-def test_a_server_says_what_is_no_integer_of_its_own(database: Database, k: object) -> None:
-    """Nothing is cut to the bytes that it would have."""
+def test_a_server_rejects_integers_that_do_not_fit(database: Database, k: object) -> None:
+    """Nothing is truncated to the size of the column."""
     if database.engine.dialect.name == "sqlite":
         pytest.skip("SQLite's columns take values of any type")
     with (
@@ -219,8 +219,8 @@ def test_a_server_says_what_is_no_integer_of_its_own(database: Database, k: obje
         bulk.insert(connection, "weight", _weights(2) | {"k": [1, k]})
 
 
-def test_statistics_are_those_of_the_rows_just_written(database: Database) -> None:
-    """Before anybody else can see them, and without waiting for one who samples the table too."""
+def test_statistics_cover_the_rows_just_written(database: Database) -> None:
+    """Before other connections can see them, and without waiting for another refresh."""
     with database.writing() as connection:
         bulk.insert(connection, "weight", _weights(COUNT))
         bulk.refresh_statistics(connection)

@@ -1,4 +1,4 @@
-"""Claims: who may work on a round beside whom, on either engine."""
+"""Claims: which processes can work on a round at the same time, with either engine."""
 
 import os
 import shutil
@@ -15,13 +15,16 @@ ENGINES = ("sqlite", "postgresql")
 
 @pytest.fixture
 def pair(tmp_path: Path, new_url: Callable[[], str | None]) -> tuple[Database, Database]:
-    """One database as two processes see it; a claim belongs to an open file or to a session."""
+    """Return one database as two processes see it.
+
+    A claim belongs to an open file or to a session.
+    """
     url = new_url() or f"sqlite:///{tmp_path / 'curate.db'}"
     return Database(url), Database(url)
 
 
 @pytest.mark.parametrize(
-    ("mine", "theirs", "word"),
+    ("first", "second", "word"),
     [
         ((1, None), (1, None), "round 1 is being worked on by predict"),
         ((1, None), (1, "pspsl"), "round 1 is being worked on by predict"),
@@ -29,31 +32,31 @@ def pair(tmp_path: Path, new_url: Callable[[], str | None]) -> tuple[Database, D
         ((1, "pspsl"), (1, "pspsl"), "round 1 of pspsl is being worked on by predict"),
     ],
 )
-def test_what_is_claimed_is_refused_with_its_owner(
-    pair: tuple[Database, Database], mine: tuple, theirs: tuple, word: str
+def test_a_claimed_round_is_rejected_with_its_owner(
+    pair: tuple[Database, Database], first: tuple, second: tuple, word: str
 ) -> None:
     """One line: what, by whom, since when, what to do; afterwards it is free."""
-    with pair[0].claiming_round(*mine, "predict"):
-        with pytest.raises(DatabaseError) as refused, pair[1].claiming_round(*theirs, "solve"):
+    with pair[0].claiming_round(*first, "predict"):
+        with pytest.raises(DatabaseError) as rejected, pair[1].claiming_round(*second, "solve"):
             pass
-        message = str(refused.value)
+        message = str(rejected.value)
         assert message.startswith(word)
         assert f"process {os.getpid()} on " in message
         assert ", since 2" in message
         assert "\n" not in message
-    with pair[1].claiming_round(*theirs, "solve"):
+    with pair[1].claiming_round(*second, "solve"):
         pass
 
 
 @pytest.mark.parametrize(
-    ("mine", "theirs"),
+    ("first", "second"),
     [((1, None), (2, None)), ((1, "spsl"), (1, "pspsl")), ((1, "spsl"), (11, None))],
 )
-def test_what_does_not_collide_runs_side_by_side(
-    pair: tuple[Database, Database], mine: tuple, theirs: tuple
+def test_independent_claims_are_granted_in_parallel(
+    pair: tuple[Database, Database], first: tuple, second: tuple
 ) -> None:
     """Different rounds, and the policies of one round."""
-    with pair[0].claiming_round(*mine, "solve"), pair[1].claiming_round(*theirs, "solve"):
+    with pair[0].claiming_round(*first, "solve"), pair[1].claiming_round(*second, "solve"):
         pass
 
 
@@ -72,7 +75,7 @@ def test_a_link_to_the_file_is_claimed_with_it(tmp_path: Path) -> None:
 
 
 def test_an_error_ends_the_claim(pair: tuple[Database, Database]) -> None:
-    """Whatever went wrong while it was held."""
+    """Any error while it was held."""
     with pytest.raises(ZeroDivisionError), pair[0].claiming_round(1, None, "predict"):
         raise ZeroDivisionError
     with pair[1].claiming_round(1, None, "predict"):
@@ -80,7 +83,7 @@ def test_an_error_ends_the_claim(pair: tuple[Database, Database]) -> None:
 
 
 def lose_claims(database: Database) -> None:
-    """Ends the session that holds them, or deletes the locked files."""
+    """End the session that holds the claims, or delete the locked files."""
     if database.engine.dialect.name == "sqlite":
         shutil.rmtree(f"{database.url.database}-locks")
         return
@@ -92,37 +95,37 @@ def lose_claims(database: Database) -> None:
         assert list(ended) == [True]
 
 
-def test_who_lost_a_claim_writes_nothing_more(pair: tuple[Database, Database]) -> None:
-    """Another process may have got it in the meantime; what was written before is kept."""
-    mine, theirs = pair
+def test_a_process_that_lost_its_claim_writes_nothing_more(pair: tuple[Database, Database]) -> None:
+    """Another process may have claimed it; what was written before is kept."""
+    first, second = pair
     add = "INSERT INTO label_file (path, round, policy, sha256) VALUES ('{}', 1, 'p', '')"
 
-    def lost_in_the_midst() -> None:
-        with mine.claiming_round(1, None, "predict"):
-            with mine.writing() as connection:
+    def lose_the_claim() -> None:
+        with first.claiming_round(1, None, "predict"):
+            with first.writing() as connection:
                 connection.exec_driver_sql(add.format("before"))
-            lose_claims(mine)
-            with theirs.claiming_round(1, None, "solve"), mine.writing() as connection:
+            lose_claims(first)
+            with second.claiming_round(1, None, "solve"), first.writing() as connection:
                 connection.exec_driver_sql(add.format("after"))
 
     with pytest.raises(DatabaseError, match="finished frames are kept") as found:
-        lost_in_the_midst()
+        lose_the_claim()
     assert "\n" not in str(found.value)
-    with theirs.claiming_round(1, None, "solve"), mine.writing() as connection:
+    with second.claiming_round(1, None, "solve"), first.writing() as connection:
         stored = connection.exec_driver_sql("SELECT path FROM label_file").scalars()
         assert list(stored) == ["before"]
 
 
-def test_a_server_that_is_lost_in_the_midst_is_told_in_one_line(
+def test_a_lost_server_gives_one_line(
     new_url: Callable[[], str | None],
 ) -> None:
-    """The claim is lost as well; giving it back must not speak in place of what failed."""
+    """The claim is lost as well; releasing it must not hide the original error."""
     url = new_url()
     if url is None:
         pytest.skip("a file is not lost like this")
     database, other = Database(url), Database(url)
 
-    def lost_in_the_midst() -> None:
+    def lose_the_claim() -> None:
         with database.claiming_round(1, None, "predict"), database.writing() as connection:
             with other.writing() as ending:
                 ending.exec_driver_sql(
@@ -132,5 +135,5 @@ def test_a_server_that_is_lost_in_the_midst_is_told_in_one_line(
             connection.exec_driver_sql("SELECT 1")
 
     with pytest.raises(DatabaseError, match="check that the server runs") as found:
-        lost_in_the_midst()
+        lose_the_claim()
     assert "\n" not in str(found.value)

@@ -1,4 +1,4 @@
-"""The database: its schema, its refusals, and its errors in our own words."""
+"""The database: its schema, its constraints, and its error messages."""
 
 import os
 import shutil
@@ -31,7 +31,7 @@ ENGINES = ("sqlite", "postgresql")
 
 @pytest.fixture
 def sqlite_database(tmp_path: Path) -> Database:
-    """An empty SQLite database."""
+    """Return an empty SQLite database."""
     return Database(f"sqlite:///{tmp_path / 'curate.db'}")
 
 
@@ -46,15 +46,15 @@ def _truth(frame_id: int, split: str) -> tuple:
     return (frame_id, 0, split, "Car", *[1.0] * 7, 0.0, 0, 0.0, *[1.0] * 4)
 
 
-def test_migrations_make_the_tables_of_the_models(database: Database) -> None:
-    """No difference is left between the migrated schema and the models."""
+def test_migrations_create_the_tables_of_the_models(database: Database) -> None:
+    """There is no difference between the migrated schema and the models."""
     with database.reading() as connection:
         difference = compare_metadata(MigrationContext.configure(connection), Base.metadata)
     assert difference == [], "make a migration: alembic -x url=... revision --autogenerate"
 
 
 def test_a_database_of_an_older_curate_is_migrated(database: Database) -> None:
-    """Its rows are kept, the new tables and views are there, and its backward step undoes it."""
+    """Its rows are kept, the new tables and views exist, and the downgrade restores it."""
     _frame(database, "val")
     with database.writing() as connection:
         drop_views(connection)
@@ -67,10 +67,10 @@ def test_a_database_of_an_older_curate_is_migrated(database: Database) -> None:
             assert connection.exec_driver_sql(f"SELECT count(*) FROM {name}").scalar_one() == 0
 
 
-def test_an_older_database_is_kept_before_it_is_migrated(
+def test_an_older_database_is_copied_before_it_is_migrated(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As it was, under a name that says which schema it has; a new database needs no copy."""
+    """The name of the copy contains its schema; a new database needs no copy."""
     url = f"sqlite:///{tmp_path / 'curate.db'}"
     database = Database(url)
     assert [path.name for path in tmp_path.glob("*backup*")] == []
@@ -90,7 +90,7 @@ def test_an_older_database_is_kept_before_it_is_migrated(
 
 @pytest.fixture
 def older_server_database(new_url: Callable[[], str | None]) -> Database:
-    """A PostgreSQL database of the first schema, with one frame."""
+    """Return a PostgreSQL database of the first schema, with one frame."""
     url = new_url()
     if url is None:
         pytest.skip("SQLite files are copied, see above")
@@ -122,10 +122,10 @@ def test_an_older_server_database_is_dumped_before_it_is_migrated(
 def test_a_server_database_that_cannot_be_dumped_is_not_migrated(
     older_server_database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """pg_dump fails: one line with its reason, and the schema stays as it was."""
-    refusing = tmp_path / "pg_dump"
-    refusing.write_text("#!/bin/sh\necho server version mismatch >&2\nexit 1\n")
-    refusing.chmod(0o755)
+    """pg_dump fails: one line with its reason, and the schema does not change."""
+    failing = tmp_path / "pg_dump"
+    failing.write_text("#!/bin/sh\necho server version mismatch >&2\nexit 1\n")
+    failing.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     remedy = r"cannot be copied.*version mismatch; install the pg_dump of the server"
     with pytest.raises(DatabaseError, match=remedy):
@@ -141,14 +141,14 @@ def test_a_server_without_pg_dump_is_migrated_with_a_warning(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """The migration is one transaction of its own."""
+    """The migration is one transaction."""
     monkeypatch.setenv("PATH", str(tmp_path))
     Database(older_server_database.url, tmp_path).close()
     assert "without a copy" in caplog.text
     assert list(tmp_path.iterdir()) == []
 
 
-def test_who_finds_a_database_migrated_meanwhile_leaves_its_copy_alone(
+def test_a_second_process_does_not_overwrite_the_copy(
     tmp_path: Path, new_url: Callable[[], str | None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two processes find an older schema at once; the copy stays that of the older schema."""
@@ -172,7 +172,7 @@ def test_who_finds_a_database_migrated_meanwhile_leaves_its_copy_alone(
 
 
 def test_a_password_anywhere_in_a_url_is_not_shown() -> None:
-    """The server's library takes it from the query as well."""
+    """The server's library also accepts it in the query."""
     for address in (
         "postgresql://me:hidden@/name?host=/x",
         "postgresql://me@/name?password=hidden",
@@ -199,7 +199,7 @@ def test_ground_truth_of_an_unlabeled_frame_cannot_be_stored(
         store(connection, "ground_truth", [_truth(frame_id, claimed)])
 
 
-def test_ground_truth_is_refused_with_foreign_keys_switched_off(
+def test_ground_truth_is_rejected_with_foreign_keys_switched_off(
     sqlite_database: Database, tmp_path: Path
 ) -> None:
     """The sqlite3 shell, which does not check foreign keys, cannot do it either."""
@@ -212,7 +212,7 @@ def test_ground_truth_is_refused_with_foreign_keys_switched_off(
 
 
 def test_a_labeled_frame_with_ground_truth_cannot_become_unlabeled(database: Database) -> None:
-    """The key of the ground truth holds the split."""
+    """The key of the ground truth includes the split."""
     frame_id = _frame(database, "labeled")
     with database.writing() as connection:
         store(connection, "ground_truth", [_truth(frame_id, "labeled")])
@@ -227,8 +227,8 @@ def test_an_unlabeled_frame_has_no_label_path(database: Database) -> None:
         store(connection, "frame", [row])
 
 
-def test_a_transaction_is_kept_whole_or_not_at_all(database: Database) -> None:
-    """An error takes back what the transaction had written."""
+def test_a_transaction_is_stored_completely_or_not_at_all(database: Database) -> None:
+    """An error rolls back what the transaction had written."""
     with pytest.raises(ZeroDivisionError), database.writing() as connection:
         store(connection, "frame", [("kitti", "x", "val", "p", "i", "c", None)])
         raise ZeroDivisionError
@@ -236,8 +236,7 @@ def test_a_transaction_is_kept_whole_or_not_at_all(database: Database) -> None:
         assert connection.exec_driver_sql("SELECT count(*) FROM frame").scalar_one() == 0
 
 
-def test_evidence_leaves_with_its_prediction(database: Database) -> None:
-    """Deleting a frame's predictions deletes what was found out about them."""
+def test_evidence_is_deleted_with_its_prediction(database: Database) -> None:
     frame_id = _frame(database, "unlabeled")
     with database.writing() as connection:
         store(connection, "round", [(1, 1, None, "{}", "0", 0)])
@@ -247,8 +246,8 @@ def test_evidence_leaves_with_its_prediction(database: Database) -> None:
         assert connection.exec_driver_sql("SELECT count(*) FROM weight").scalar_one() == 0
 
 
-def test_a_damaged_file_is_named_with_a_remedy(tmp_path: Path) -> None:
-    """Garbage in place of a database is a one-line error."""
+def test_a_damaged_file_is_reported_with_a_fix(tmp_path: Path) -> None:
+    """A random file in place of a database gives a one-line error."""
     path = tmp_path / "curate.db"
     path.write_bytes(b"not a database at all" * 100)
     with pytest.raises(DatabaseError, match=r"curate.db.*not a database.*restore") as error:
@@ -256,7 +255,7 @@ def test_a_damaged_file_is_named_with_a_remedy(tmp_path: Path) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_a_dropped_table_is_missed(database: Database) -> None:
+def test_a_dropped_table_is_reported(database: Database) -> None:
     """At once, not by the first command that needs it."""
     with database.writing() as connection:
         drop_views(connection)
@@ -266,7 +265,7 @@ def test_a_dropped_table_is_missed(database: Database) -> None:
         Database(database.url)
 
 
-def test_a_database_of_a_newer_curate_is_refused(database: Database) -> None:
+def test_a_database_of_a_newer_curate_is_rejected(database: Database) -> None:
     """Its schema is unknown here."""
     with database.writing() as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
@@ -275,8 +274,8 @@ def test_a_database_of_a_newer_curate_is_refused(database: Database) -> None:
         Database(database.url)
 
 
-def test_a_database_of_two_schemas_is_refused(tmp_path: Path) -> None:
-    """A second row in alembic's table, written by hand, is told in one line."""
+def test_a_database_of_two_schemas_is_rejected(tmp_path: Path) -> None:
+    """A second row in alembic's table, written by hand, gives a one-line error."""
     path = tmp_path / "curate.db"
     Database(f"sqlite:///{path}").close()
     with closing(sqlite3.connect(path)) as connection:
@@ -287,8 +286,8 @@ def test_a_database_of_two_schemas_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("table", ["photos", "frame"])
-def test_a_database_of_another_program_is_left_alone(tmp_path: Path, table: str) -> None:
-    """Its tables are named, and not a byte of it changes."""
+def test_a_database_of_another_program_is_not_changed(tmp_path: Path, table: str) -> None:
+    """The error lists its tables, and not a byte of it changes."""
     path = tmp_path / "curate.db"
     with closing(sqlite3.connect(path)) as connection:
         connection.execute(f"CREATE TABLE {table} (id, name)")

@@ -19,7 +19,7 @@ POLICIES = ("pspsl", "my.curation:Policy", "My.curation:Policy", 'it\'s "quoted"
 
 @pytest.fixture
 def database(database: Database) -> Database:
-    """A database whose labels several policies have weighed."""
+    """Return a database with weights of several policies."""
     with database.writing() as connection:
         add_one_frame(connection)
         rows = [(1, 1, k, "Car", 0.5, *[1.0] * 7, None) for k in range(20)]
@@ -40,8 +40,8 @@ def _indices(database: Database) -> set[str]:
     return {str(each["name"]) for each in found}
 
 
-def test_every_policy_gets_one_index_whatever_its_name(database: Database) -> None:
-    """Also where a class of the user's own weighs; to ask twice changes nothing."""
+def test_every_policy_gets_one_index_for_any_name(database: Database) -> None:
+    """Also for a user-supplied class; a second call changes nothing."""
     for policy in (*POLICIES, *POLICIES):
         weight_index.prepare(database, policy)
     expected = {str(weight_index.index_of(policy).name) for policy in POLICIES}
@@ -50,8 +50,8 @@ def test_every_policy_gets_one_index_whatever_its_name(database: Database) -> No
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-def test_a_question_for_a_policy_is_answered_by_its_index(tmp_path: Path, policy: str) -> None:
-    """Whether the policy stands in the question or is given with it."""
+def test_a_query_for_a_policy_uses_its_index(tmp_path: Path, policy: str) -> None:
+    """Whether the policy is in the query or a parameter."""
     database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
     weight_index.prepare(database, policy)
     weight = bulk.table("weight").c
@@ -61,15 +61,15 @@ def test_a_question_for_a_policy_is_answered_by_its_index(tmp_path: Path, policy
     with sqlite3.connect(tmp_path / "curate.db") as raw:
         (plan,) = raw.execute(f"EXPLAIN QUERY PLAN {literal}")
         assert f"{name} (round=? AND v>?)" in plan[3]
-        asked = "EXPLAIN QUERY PLAN SELECT v FROM weight WHERE round = ? AND policy = ? AND v > ?"
-        (plan,) = raw.execute(asked, (1, policy, 0.5))
+        explain = "EXPLAIN QUERY PLAN SELECT v FROM weight WHERE round = ? AND policy = ? AND v > ?"
+        (plan,) = raw.execute(explain, (1, policy, 0.5))
         assert f"{name} (round=? AND v>?)" in plan[3]
 
 
-def test_only_the_policys_own_index_is_made_anew(
+def test_only_the_index_of_the_policy_is_rebuilt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While its weights are replaced it is away, that of another stays; then both are there."""
+    """It is dropped while its weights are replaced, that of another stays; then both exist."""
     monkeypatch.setattr(weight_index, "REBUILT_FROM", 1)
     database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
     for policy in ("pspsl", "spsl"):
@@ -82,7 +82,7 @@ def test_only_the_policys_own_index_is_made_anew(
 
 
 def test_weights_of_an_older_schema_get_their_indices(database: Database) -> None:
-    """And its backward step leaves the one index that there was."""
+    """The downgrade leaves the single index of that schema."""
     weight_index.prepare(database, "pspsl")
     with database.writing() as connection:
         drop_views(connection)

@@ -1,4 +1,4 @@
-"""The example of the page about evidence sources is a source."""
+"""The example of the page about evidence sources."""
 
 import re
 from typing import Any

@@ -1,4 +1,4 @@
-"""The paths that the hand-written pages mention."""
+"""The paths on the handwritten pages."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ MENTIONED = re.compile(r"(?<![\w./-])(?:curate|db|pipelines|tests|docs|examples)
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_path_on_a_page_exists(page: Path) -> None:
-    """Files move; a page that mentions one must follow. `NAME` stands for a file of the reader."""
+    """Pages must follow when files move. `NAME` stands for a file of the reader."""
     found = MENTIONED.findall(page.read_text())
     mentioned = {path.rstrip(".").partition("NAME")[0] for path in found}
     assert [path for path in sorted(mentioned) if not (ROOT / path).exists()] == []

@@ -1,4 +1,4 @@
-"""The pictures of the README and the docs, and the script that draws them."""
+"""The images of the README and the docs, and the script that draws them."""
 
 import numpy as np
 from PIL import Image
@@ -11,9 +11,9 @@ from curate.viewing.tags import ShownLabels
 from docs.make_pictures import _RAW, before_after, results_chart, save_small_png
 
 
-def has(picture, colour):
-    """Whether a colour is in a picture."""
-    return (np.abs(picture.astype(int) - np.array(colour)).max(axis=-1) < 4).any()
+def has(drawn, colour):
+    """Return whether a colour is in an image."""
+    return (np.abs(drawn.astype(int) - np.array(colour)).max(axis=-1) < 4).any()
 
 
 def test_the_left_half_has_one_colour_and_the_right_half_those_of_the_weights():
@@ -24,9 +24,9 @@ def test_the_left_half_has_one_colour_and_the_right_half_those_of_the_weights():
     boxes = np.array([[20.0, 3, 0, 4, 2, 1.5, 0.3], [30, -5, 0, 4, 2, 1.5, 0]])
     weights = np.array([0.7, 0.0])
     labels = ShownLabels(boxes, np.array(["Car"] * 2), np.array([0.9, 0.8]), weights)
-    picture = before_after(frame, labels)
+    drawn = before_after(frame, labels)
     # Without the legend, which shows all colours.
-    left, right = picture[:-40, :620], picture[:-40, 632:]
+    left, right = drawn[:-40, :620], drawn[:-40, 632:]
     trusted, zero = weight_colours(weights)
     assert has(left, _RAW)
     assert not has(left, trusted)
@@ -35,8 +35,8 @@ def test_the_left_half_has_one_colour_and_the_right_half_those_of_the_weights():
     assert not has(right, _RAW)
 
 
-def test_a_small_picture_keeps_the_colours_of_the_weights(tmp_path):
-    """Though nearly all of it has other colours."""
+def test_a_small_image_keeps_the_colours_of_the_weights(tmp_path):
+    """Though most of it has other colours."""
     noise = np.random.default_rng(0).integers(100, 160, (200, 200, 3), dtype=np.uint8)
     colours = weight_colours(np.linspace(0.05, 1, 20))
     noise[0, :20] = colours
@@ -46,7 +46,7 @@ def test_a_small_picture_keeps_the_colours_of_the_weights(tmp_path):
 
 
 def test_the_chart_of_the_results_shows_their_tables():
-    """Both overlaps; what is not measured is left out."""
+    """Both overlaps; missing values are left out."""
     figure = results_chart((ROOT / "docs" / "results.md").read_text(encoding="utf-8")).figure
     strict, relaxed = figure.axes
     assert strict.get_title(loc="left") == "Mean 3D AP, IoU 0.7/0.5/0.5"
@@ -63,7 +63,7 @@ def test_the_chart_of_the_results_shows_their_tables():
     assert len(relaxed.lines) == len(named)
 
 
-def test_the_pictures_of_the_docs_are_small_enough_to_load():
+def test_the_images_of_the_docs_are_small():
     """At most 400 kB each."""
     for name in ("before-after.png", "overlay.png", "results.png"):
         assert (ROOT / "docs" / name).stat().st_size < 400_000

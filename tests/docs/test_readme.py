@@ -39,7 +39,7 @@ def lines_of(block: str) -> list[list[str]]:
 
 
 def run_all(lines: list[list[str]], folder: Path, replace: dict[str, str], edit=None) -> str:
-    """Run command lines one after the other as a shell would; return what they print."""
+    """Run command lines one after the other as a shell would; return their output."""
     printed = []
     for line in lines:
         words = [replace.get(word, word) for word in line]
@@ -65,7 +65,7 @@ def run_all(lines: list[list[str]], folder: Path, replace: dict[str, str], edit=
 
 
 def short_training(path: Path) -> None:
-    """Shorten the trainings: the commands are tested here, not the detector."""
+    """Limit trainings to a few steps: the commands are tested here, not the detector."""
     text = path.read_text()
     for name in ("pretrain_steps", "round_steps"):
         text, found = re.subn(rf"{name} = \d+", f"{name} = 60", text)
@@ -73,8 +73,8 @@ def short_training(path: Path) -> None:
     path.write_text(text.replace('executor = "serial"', 'executor = "process"'))
 
 
-def test_the_quick_start(tmp_path: Path) -> None:
-    """The quick start goes from no data to the explanation of a weight."""
+def test_the_commands_on_user_data(tmp_path: Path) -> None:
+    """From nothing to the explained weight of one label."""
     lines = commands(DOCS / "quick-start.md", "The steps of the demo, one by one")
     explain = [line for line in lines if line[1] == "explain"]
     printed = run_all(
@@ -90,8 +90,8 @@ def test_the_quick_start(tmp_path: Path) -> None:
 
 
 @pytest.mark.kitti
-def test_the_commands_with_your_detector(tmp_path: Path, kitti_root: Path) -> None:
-    """From a real detector's KITTI result files to weights, a picture and a report."""
+def test_the_commands_with_a_user_detector(tmp_path: Path, kitti_root: Path) -> None:
+    """From a real detector's KITTI result files to weights, a plot and a report."""
     frames, results = tmp_path / "few", tmp_path / "results"
     for folder in ("velodyne", "image_2", "calib", "label_2"):
         (frames / folder).mkdir(parents=True)
@@ -115,11 +115,11 @@ def test_the_commands_with_your_detector(tmp_path: Path, kitti_root: Path) -> No
     own = (results / f"{labeled.pop()}.txt").read_text().splitlines()
     assert len(weights) == len(written) - len(own)
     assert any(weight > 0 for _, weight in weights)
-    picture = re.search(r"^picture: (.*)$", printed, re.MULTILINE)
+    image = re.search(r"^picture: (.*)$", printed, re.MULTILINE)
     report = re.search(r"^report: (.*)$", printed, re.MULTILINE)
-    assert picture is not None
+    assert image is not None
     assert report is not None
-    assert Path(picture[1]).read_bytes().startswith(b"\x89PNG")
+    assert Path(image[1]).read_bytes().startswith(b"\x89PNG")
     assert "<svg" in Path(report[1]).read_text()
 
 
@@ -166,7 +166,7 @@ def test_commands_and_options_exist(page: Path) -> None:
 
 
 def write_results(folder: Path, root: Path, record: Path) -> None:
-    """Write the predictions of a detector as result files of the KITTI benchmark."""
+    """Write the predictions of a detector as KITTI result files."""
     dataset, detector = KittiDataset(root), RecordedDetector(record)
     folder.mkdir()
     for name in dataset.frame_ids():

@@ -1,4 +1,4 @@
-"""docs/training.md: its example runs, and the data set needs nothing of the engine."""
+"""docs/training.md: its example runs, and the dataset needs neither db nor pipelines."""
 
 import re
 import subprocess
@@ -16,12 +16,12 @@ from curate.weighting.base import ZeroWeight
 from pipelines.registry import EXPORTERS
 
 PAGE = ROOT / "docs" / "training.md"
-# As on a machine where somebody else's db.py and pipelines.py come first.
+# As if a user's own db.py and pipelines.py were imported first.
 BLOCKED = "import sys\nsys.modules['db'] = sys.modules['pipelines'] = None\n"
 
 
 def write_labels(tmp_path: Path, zero_weight: ZeroWeight) -> Path:
-    """A labeled frame with a car, an unlabeled one with three labels of weight 0 to 1."""
+    """Write a labeled frame with a car, an unlabeled one with three labels of weight 0 to 1."""
     root = tmp_path / "kitti"
     write_toy_kitti(root, frames=2)
     files = [
@@ -48,12 +48,12 @@ def write_labels(tmp_path: Path, zero_weight: ZeroWeight) -> Path:
 
 @pytest.fixture
 def labels(tmp_path: Path) -> Path:
-    """A label file in which a weight of 0 is to be ignored."""
+    """Return a label file in which weight 0 is ignored."""
     return write_labels(tmp_path, "ignore")
 
 
 def run(code: str, *arguments: object) -> str:
-    """What a Python without db and pipelines prints."""
+    """Return the output of a Python process without db and pipelines."""
     ended = subprocess.run(
         [sys.executable, "-c", BLOCKED + code, *map(str, arguments)],
         capture_output=True, text=True, check=False, cwd=PAGE.parent.parent,
@@ -62,7 +62,7 @@ def run(code: str, *arguments: object) -> str:
     return ended.stdout
 
 
-# The slopes at the three labels of the unlabeled frame, and beside all of them.
+# The gradients at the three labels of the unlabeled frame, and beside all of them.
 CHECK = """
 found, codes, weight = targets(labels[1])
 output = torch.zeros(1600, 7, requires_grad=True)
@@ -73,13 +73,13 @@ print([output.grad[(cells - torch.tensor([x, 0.5])).norm(dim=1).argmin(), 0].ite
 
 
 def definitions() -> str:
-    """The example up to where it trains."""
+    """Return the example up to the training loop."""
     example = re.search(r"<!-- plain pytorch.*?```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert example is not None
     return example[1].partition("torch.manual_seed")[0]
 
 
-def test_the_torch_data_set_needs_neither_db_nor_pipelines(labels: Path) -> None:
+def test_the_torch_dataset_needs_neither_db_nor_pipelines(labels: Path) -> None:
     """From the file to weights in a user's own training script."""
     code = (
         "import sys, pathlib\n"
@@ -93,7 +93,7 @@ def test_the_torch_data_set_needs_neither_db_nor_pipelines(labels: Path) -> None
 
 
 def test_the_plain_pytorch_example_learns(labels: Path, tmp_path: Path) -> None:
-    """It runs as it is printed, its loss falls, and it leaves its checkpoint."""
+    """It runs as printed, its loss falls, and it writes its checkpoint."""
     example = re.search(r"<!-- plain pytorch.*?```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert example is not None
     printed = run(example[1], labels, tmp_path / "student.pt")
@@ -103,19 +103,19 @@ def test_the_plain_pytorch_example_learns(labels: Path, tmp_path: Path) -> None:
     assert (tmp_path / "student.pt").stat().st_size > 0
 
 
-def test_the_example_lets_v_count(labels: Path) -> None:
-    """No gradient in the region of a label with v = 0; half of it where v is half."""
+def test_the_example_uses_the_weights(labels: Path) -> None:
+    """No gradient in the region of a label with v = 0; half of it for v = 0.5."""
     assert run(definitions() + CHECK, labels) == "[0.0, -0.25, -0.5, 0.5]\n"
 
 
-def test_the_example_takes_background_for_background(tmp_path: Path) -> None:
-    """Where the file says so, the region of a label with v = 0 teaches that nothing is there."""
+def test_the_example_distinguishes_background(tmp_path: Path) -> None:
+    """If weight 0 is background, the region of such a label has a background gradient."""
     path = write_labels(tmp_path, "background")
     assert run(definitions() + CHECK, path) == "[0.5, -0.25, -0.5, 0.5]\n"
 
 
 def test_every_format_is_described() -> None:
-    """And nothing that is not registered."""
+    """And no unregistered one."""
     page = (ROOT / "docs" / "exports.md").read_text()
     named = set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE))
     assert named == set(EXPORTERS.classes)

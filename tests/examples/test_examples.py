@@ -1,4 +1,4 @@
-"""The scripts of examples/, run as a reader would: in a fresh folder, one after the other."""
+"""The scripts of examples/, run as a reader would: in a new folder, one after the other."""
 
 import ast
 import os
@@ -16,7 +16,7 @@ EXAMPLES = ROOT / "examples"
 
 
 def run(script: str, folder: Path, *arguments: object) -> str:
-    """Return what a script prints; `curate` is the command beside this Python."""
+    """Return the output of a script; `curate` is the command beside this Python."""
     home = Path(sys.executable).parent
     ended = subprocess.run(
         [sys.executable, EXAMPLES / script, *map(str, arguments)],
@@ -30,7 +30,7 @@ def run(script: str, folder: Path, *arguments: object) -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fresh folder, in which the second example has made the labels that it explores."""
+    """Return a new folder in which the second example has created labels."""
     made = tmp_path_factory.mktemp("examples")
     (made / "printed.txt").write_text(run("explore_labels.py", made))
     return made
@@ -47,7 +47,7 @@ def test_results_become_weighted_labels(folder: Path) -> None:
     assert 0 < int(found[1]) < len(results)
     with closing(sqlite3.connect(folder / "work/exports/labels.sqlite")) as file:
         [(count, weight)] = file.execute("SELECT count(*), avg(weight) FROM weighted_labels")
-        # Stand-in results of one object differ by 6 m to the left, and in nothing else.
+        # Stand-in results of one object differ only by 6 m to the left.
         [(sure, doubtful)] = file.execute(
             "SELECT avg(weight) FILTER (WHERE score > 0.6), avg(weight) FILTER (WHERE score < 0.5) "
             "FROM weighted_labels"
@@ -76,7 +76,7 @@ def test_a_model_learns_from_the_labels(folder: Path) -> None:
     assert (folder / "my_model.pt").exists()
 
 
-def test_results_of_ones_own_are_taken_by_path(folder: Path, tmp_path: Path) -> None:
+def test_user_results_can_be_passed_by_path(folder: Path, tmp_path: Path) -> None:
     """With frames and results as arguments nothing is simulated."""
     printed = run("curate_results.py", tmp_path, folder / "simulated", folder / "results")
     assert "labels in work/exports/labels.sqlite" in printed

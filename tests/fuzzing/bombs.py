@@ -1,4 +1,4 @@
-"""Small files that claim, or unfold to, far more than a memory holds."""
+"""Small files that claim, or expand to, far more than fits into memory."""
 
 import io
 import pickle
@@ -14,7 +14,7 @@ from fuzzing.targets import TARGETS
 
 
 def _png(path: Path) -> None:
-    """A gigapixel of nothing, compressed to its width in kilobytes."""
+    """Return a PNG of a gigapixel of zeros, compressed to kilobytes."""
     width, height = 40_000, 25_000
 
     def chunk(kind: bytes, content: bytes) -> bytes:
@@ -31,7 +31,7 @@ def _png(path: Path) -> None:
 
 
 def _png_piece(path: Path) -> None:
-    """The pixels claim to be so long."""
+    """Return a PNG with a pixel chunk of this claimed length."""
     TARGETS["png"].write(path)
     content = bytearray(path.read_bytes())
     at = content.index(b"IDAT")
@@ -75,7 +75,7 @@ def _far_point(path: Path) -> None:
 
 
 def _laughs(path: Path) -> None:
-    """A list of ten lists of ten lists ..., each the same."""
+    """Return a list of ten lists of ten lists ..., each the same."""
     boxes = [1.0] * 10
     for _ in range(30):
         boxes = [boxes] * 10
@@ -84,13 +84,13 @@ def _laughs(path: Path) -> None:
 
 
 def _called(name: bytes) -> Callable[[Path], None]:
-    """builtins.NAME(60_000_000_000): so many zeros."""
+    """Return a pickle of builtins.NAME(60_000_000_000), which allocates that many zeros."""
     call = b"\x80\x04c" + name + b"\n\x8a\x08" + struct.pack("<q", 60_000_000_000) + b"\x85R."
     return lambda path: path.write_bytes(call) and None
 
 
 def _memo(path: Path) -> None:
-    """Known object number two billion."""
+    """Return a pickle with memo entry number two billion."""
     path.write_bytes(b"\x80\x02]r" + struct.pack("<I", 2_000_000_000) + b".")
 
 
@@ -99,7 +99,7 @@ def _byte_array(path: Path) -> None:
 
 
 def _endless_view(path: Path) -> None:
-    """The labels are a view that never ends."""
+    """Return a label file with an endless view in place of the labels."""
     TARGETS["label file"].write(path)
     with closing(sqlite3.connect(path)) as file:
         names = [row[1] for row in file.execute("PRAGMA table_xinfo(label)")]
@@ -113,7 +113,7 @@ def _endless_view(path: Path) -> None:
 
 
 def _wide_column(path: Path) -> None:
-    """A generated column that makes half a gigabyte when it is looked at."""
+    """Return a label file with a generated column of half a gigabyte."""
     TARGETS["label file"].write(path)
     with closing(sqlite3.connect(path)) as file:
         file.executescript(
@@ -124,7 +124,7 @@ def _wide_column(path: Path) -> None:
 
 
 def _many_boxes(path: Path) -> None:
-    """The same box three million times."""
+    """Return the same box three million times."""
     from pyarrow import parquet
 
     TARGETS["parquet"].write(path)
@@ -133,7 +133,7 @@ def _many_boxes(path: Path) -> None:
 
 
 def _long_name(path: Path) -> None:
-    """A frame whose name are 300 megabytes of one letter."""
+    """Return a frame name of 300 megabytes."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -183,5 +183,5 @@ _BOMBS: Mapping[str, tuple[str, Callable[[Path], None]]] = {
     "a key of many parts": ("description", _dotted_key),
     "a heading of many parts": ("configuration", _dotted_heading),
 }
-# What is read with an extra is there with it.
+# Formats of extras are included if the extra is installed.
 BOMBS = {name: bomb for name, bomb in _BOMBS.items() if bomb[0] in TARGETS}

@@ -17,7 +17,7 @@ CLASSES = {"Car": (3,), "Pedestrian": (1,)}
 
 
 def _mapped() -> Frame:
-    """A frame whose LiDAR knows its place in the map."""
+    """Return a frame with a LiDAR pose in the map."""
     pose = vehicle_pose(0, 0)
     placed = np.eye(4)
     placed[:3, :3], placed[:3, 3] = pose.turn.as_matrix(), pose.place
@@ -26,15 +26,15 @@ def _mapped() -> Frame:
 
 
 def write_map_results(path: Path) -> None:
-    """Results of two frames in nuScenes' form."""
+    """Write results of two frames in nuScenes' format."""
     boxes = into_map(np.array([[10.0, 2, -1, 4.2, 1.8, 1.5, 0.3]]), vehicle_pose(0, 0))
-    told = {"detection_name": "car", "detection_score": 0.5}
-    results = {name: [box | told for box in boxes] for name in ("000000", "000001")}
+    fields = {"detection_name": "car", "detection_score": 0.5}
+    results = {name: [box | fields for box in boxes] for name in ("000000", "000001")}
     path.write_text(json.dumps({"meta": {"use_lidar": True}, "results": results}))
 
 
 def read_map_results(path: Path) -> None:
-    """Both frames, in the LiDAR's frame of reference."""
+    """Read both frames, in the LiDAR frame."""
     from curate.detectors.recorded import RecordedDetector
 
     detector = RecordedDetector(path)
@@ -43,12 +43,12 @@ def read_map_results(path: Path) -> None:
 
 
 def write_tables(path: Path) -> None:
-    """A tiny nuScenes, of which the table in `path` gets damaged."""
+    """Write a tiny nuScenes dataset; the table in `path` will be damaged."""
     write_nuscenes(path.parent.parent, scenes=("scene-0061",), steps=1)
 
 
 def read_tables(path: Path) -> None:
-    """Everything that the data set can say."""
+    """Read everything in the dataset."""
     from curate.datasets.nuscenes import NuScenesDataset
 
     dataset = NuScenesDataset(path.parent.parent)
@@ -59,7 +59,7 @@ def read_tables(path: Path) -> None:
 
 
 def write_parquet(path: Path) -> None:
-    """Three frames of two boxes with a view, in two row groups."""
+    """Write three frames of two boxes with a view, in two row groups."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -77,7 +77,7 @@ def write_parquet(path: Path) -> None:
 
 
 def read_parquet(path: Path) -> None:
-    """Every frame and view."""
+    """Read every frame and view."""
     from curate.detectors.recorded.parquet import ParquetRecord
 
     record = ParquetRecord.read(path)
@@ -93,7 +93,7 @@ def _image_frame() -> Frame:
 
 
 def write_masks(path: Path) -> None:
-    """Masks of a frame in each of COCO's three forms."""
+    """Write masks of a frame in each of COCO's three formats."""
     width, height = IMAGE_SIZE
     runs = [5 * height, 100, width * height - 5 * height - 100]
     forms = [
@@ -109,7 +109,7 @@ def write_masks(path: Path) -> None:
 
 
 def _packed(number: int) -> str:
-    """A number from 0 on in the characters of compressed runs."""
+    """Return a non-negative number in the characters of compressed runs."""
     text = ""
     while True:
         bits, number = number & 31, number >> 5
@@ -120,26 +120,26 @@ def _packed(number: int) -> str:
 
 
 def read_masks(path: Path) -> None:
-    """As a map of the frame."""
+    """Read the file as a map of the frame."""
     from curate.segmenters.instances import InstanceSegmenter
 
     InstanceSegmenter(path, CLASSES).segment(_image_frame())
 
 
 def write_wide_map(path: Path) -> None:
-    """A map of 16 bits: class * 1000 + instance."""
+    """Write a map of 16 bits: class * 1000 + instance."""
     cv2.imwrite(str(path), np.full((IMAGE_SIZE[1], IMAGE_SIZE[0]), 3002, dtype=np.uint16))
 
 
 def read_wide_map(path: Path) -> None:
-    """As a map of the frame."""
+    """Read the file as a map of the frame."""
     from curate.segmenters.saved import SavedSegmenter
 
     SavedSegmenter(path.parent, CLASSES, divisor=1000).segment(_image_frame())
 
 
 def write_instance_model(path: Path) -> None:
-    """A model with two constant objects."""
+    """Write a model with two constant objects."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
@@ -165,7 +165,7 @@ def write_instance_model(path: Path) -> None:
 
 
 def read_instance_model(path: Path) -> None:
-    """As a map of the frame."""
+    """Read the file as a map of the frame."""
     from curate.segmenters.onnx_instances import OnnxInstanceSegmenter
 
     OnnxInstanceSegmenter(path, CLASSES).segment(_image_frame())

@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def main(name: str, seconds: int) -> int:
-    """Damages the reader's valid file until something else than a CurateError is raised."""
+    """Damage the reader's valid file until an exception other than CurateError is raised."""
     try:
         import atheris
     except ImportError:

@@ -1,4 +1,4 @@
-"""Damage of the kinds that foreign files have: cut off, flipped, repeated, with absurd numbers."""
+"""Typical damage of external files: truncated, flipped, repeated, with absurd numbers."""
 
 import struct
 from collections.abc import Callable
@@ -27,7 +27,7 @@ NUMBERS = tuple(
 
 
 def mutated(content: bytes, choose: Choose) -> bytes:
-    """The content after one to four kinds of damage; rarely something else altogether."""
+    """Return the content after one to four kinds of damage; rarely something else altogether."""
     if choose(0, 40) == 0:
         return bytes(choose(0, 255) for _ in range(choose(0, 64)))
     for _ in range(choose(1, 4)):
@@ -47,7 +47,7 @@ def _flipped(content: bytes, choose: Choose) -> bytes:
 
 
 def _head_changed(content: bytes, choose: Choose) -> bytes:
-    """Most formats keep what matters in their first bytes."""
+    """Change one of the first bytes, which usually contain the header."""
     damaged = bytearray(content)
     if damaged:
         damaged[choose(0, min(len(damaged), 256) - 1)] = choose(0, 255)

@@ -1,4 +1,4 @@
-"""Everything that reads foreign files: a valid file for each, and how it is read."""
+"""Every reader of external files: a valid file for each, and a function that reads it."""
 
 import io
 import json
@@ -55,7 +55,7 @@ class Target:
 
     Attributes:
         name: of the file that it reads.
-        write: makes a valid one in a folder that is otherwise empty, with what belongs to it.
+        write: creates a valid one in an otherwise empty folder, with the files that it refers to.
         read: reads it; raises nothing but `CurateError`.
     """
 
@@ -64,19 +64,19 @@ class Target:
     read: Callable[[Path], object]
 
     def attempt(self, path: Path) -> CurateError | None:
-        """Reads the file; the error where it is refused, which must be one line."""
+        """Read the file; return the error if it is rejected, after checking that it is one line."""
         try:
             self.read(path)
         except CurateError as error:
-            refused = error
+            rejected = error
         else:
             return None
-        assert len(str(refused).splitlines()) == 1, repr(str(refused))
-        return refused
+        assert len(str(rejected).splitlines()) == 1, repr(str(rejected))
+        return rejected
 
 
 def toy_frame() -> Frame:
-    """A frame with a hundred points."""
+    """Return a frame with a hundred points."""
     points = np.random.default_rng(0).uniform([5, -5, -2, 0], [30, 5, 1, 1], (100, 4))
     image = np.zeros((IMAGE_SIZE[1], IMAGE_SIZE[0], 3), dtype=np.uint8)
     return Frame("000000", points.astype(np.float32), toy_calibration(), IMAGE_SIZE, image)
@@ -203,9 +203,9 @@ def _json(path: Path) -> None:
 
 
 def _read_list(path: Path) -> None:
-    answers = read_results(path, "list", ReadOptions(("Car",)))
-    for name in answers:
-        answers[name]
+    results = read_results(path, "list", ReadOptions(("Car",)))
+    for name in results:
+        results[name]
 
 
 def _read_table(path: Path) -> None:

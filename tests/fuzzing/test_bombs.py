@@ -9,12 +9,12 @@ from fuzzing.targets import TARGETS
 from support.paths import TESTS
 from support.process_tree import forget_peak, peak
 
-# Above what Python with its libraries takes by itself.
+# In addition to the memory of Python and its libraries.
 MOST_KIB = 300 << 10
 
 
-def test_every_bomb_is_refused_and_none_fills_the_memory(tmp_path: Path) -> None:
-    """All in one process, whose greatest size tells."""
+def test_every_bomb_is_rejected_and_none_fills_the_memory(tmp_path: Path) -> None:
+    """All in one process; its peak memory is compared."""
     ended = subprocess.run(
         [sys.executable, "-m", "fuzzing.test_bombs", tmp_path],
         capture_output=True,
@@ -31,20 +31,20 @@ def test_every_bomb_is_refused_and_none_fills_the_memory(tmp_path: Path) -> None
 
 
 def explode(folder: Path) -> None:
-    """Reads every bomb, and prints by how many KiB the greatest size of this process grew."""
+    """Read every bomb, and print by how many KiB the peak memory of this process grew."""
     for name, (kind, write) in BOMBS.items():
         target = TARGETS[kind]
-        # A valid file first, so that only the bomb counts and not the libraries.
+        # A valid file first, so that the libraries are loaded before the measurement.
         home = folder / name.replace(" ", "-")
         for use in (target.write, write):
             home.mkdir()
             use(home / target.name)
             forget_peak()
             before = peak()
-            refused = target.attempt(home / target.name)
+            rejected = target.attempt(home / target.name)
             home.rename(folder / f"{home.name}-{use is write}")
         grown = peak() - before
-        assert refused is not None, name
+        assert rejected is not None, name
         sys.stdout.write(f"{name}: {grown}\n")
 
 

@@ -1,4 +1,4 @@
-"""No file, however damaged, does more than be refused in one line."""
+"""Every damaged file is read or gives a one-line error."""
 
 import random
 import warnings
@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.process_tree import forget_peak, peak
 
-# Few for each reader in the normal run; `make prove` tries many, `make fuzz` goes on.
+# Few for each reader in the normal run; `make prove` tries many, `make fuzz` continues.
 EXAMPLES, MANY = 60, 2_000
-# All that many damaged files leave behind and take at once.
+# Limits on the memory of many damaged files, after and during reading.
 MOST_KIB = 300 << 10
-# Readers in C that take long for a file, and were tried more often by hand.
+# Readers in C that take long for a file, and were fuzzed more often by hand.
 COSTLY = {
     "onnx detector": 15,
     "onnx segmenter": 15,
@@ -28,7 +28,7 @@ COSTLY = {
 
 
 def prepared(target: Target, folder: Path) -> tuple[Path, bytes]:
-    """A valid file of a reader and its content."""
+    """Return a valid file of a reader and its content."""
     path = folder / target.name
     target.write(path)
     return path, path.read_bytes()
@@ -36,7 +36,7 @@ def prepared(target: Target, folder: Path) -> tuple[Path, bytes]:
 
 @contextmanager
 def within_memory() -> Iterator[None]:
-    """Fails where reading a few bytes took far more than the readers themselves."""
+    """Fail if reading a few bytes took far more memory than the readers themselves."""
     forget_peak()
     before = peak()
     yield
@@ -44,7 +44,7 @@ def within_memory() -> Iterator[None]:
 
 
 def try_damaged(target: Target, path: Path, content: bytes) -> None:
-    """Reads damaged content; numbers that overflow on the way are faults too."""
+    """Read damaged content; numerical overflow warnings are errors too."""
     path.write_bytes(content)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
@@ -53,13 +53,13 @@ def try_damaged(target: Target, path: Path, content: bytes) -> None:
 
 @pytest.mark.parametrize("name", sorted(set(TARGETS) - {"checkpoint"}))
 def test_a_valid_file_is_read(tmp_path: Path, name: str) -> None:
-    """Or else nothing below would say anything."""
+    """Otherwise the tests below would prove nothing."""
     path, _ = prepared(TARGETS[name], tmp_path)
     assert TARGETS[name].attempt(path) is None
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_a_damaged_file_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, name) -> None:
+def test_a_damaged_file_is_read_or_rejected(tmp_path_factory: pytest.TempPathFactory, name) -> None:
     """A result, or a CurateError of one line."""
     target = TARGETS[name]
     path, content = prepared(target, tmp_path_factory.mktemp("damaged"))
@@ -81,8 +81,8 @@ def test_a_damaged_file_is_read_or_refused(tmp_path_factory: pytest.TempPathFact
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
-def test_many_damaged_files_are_read_or_refused(tmp_path: Path, name: str) -> None:
-    """The same, longer."""
+def test_many_damaged_files_are_read_or_rejected(tmp_path: Path, name: str) -> None:
+    """The same with more examples."""
     target = TARGETS[name]
     path, content = prepared(target, tmp_path)
     target.attempt(path)

@@ -4,7 +4,7 @@ from itertools import combinations, permutations
 
 
 def best_total(gains):
-    """The largest sum of gains over one-to-one pairs of rows and columns of a small matrix."""
+    """Return the largest sum of gains over one-to-one pairs of rows and columns."""
     rows, columns = len(gains), len(gains[0]) if len(gains) else 0
     best = 0.0
     for size in range(1, min(rows, columns) + 1):

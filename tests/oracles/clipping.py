@@ -1,6 +1,6 @@
 """Overlap of rotated boxes: by Sutherland-Hodgman clipping, and by counting random points.
 
-Not shapely: its overlay finds no common area at all for some rectangles that differ by micrometres.
+Not shapely: its overlay finds no common area for some rectangles that differ by micrometres.
 """
 
 import math
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def footprint(box):
-    """Corners of the box seen from above, counter-clockwise, as complex numbers."""
+    """Return the corners of the box in BEV, counter-clockwise, as complex numbers."""
     turn = complex(math.cos(box[6]), math.sin(box[6]))
     ahead, left = turn * box[3] / 2, turn * 1j * box[4] / 2
     centre = complex(box[0], box[1])
@@ -23,12 +23,12 @@ def footprint(box):
 
 
 def cross(a, b):
-    """The cross product of two vectors in the plane."""
+    """Return the cross product of two vectors in the plane."""
     return (a.conjugate() * b).imag
 
 
 def clip(polygon, start, end):
-    """The part of a convex polygon to the left of the line from start to end."""
+    """Return the part of a convex polygon to the left of the line from start to end."""
     kept = []
     for here, there in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         side_here, side_there = cross(end - start, here - start), cross(end - start, there - start)
@@ -40,7 +40,7 @@ def clip(polygon, start, end):
 
 
 def common_area(a, b):
-    """Area that two footprints share."""
+    """Return the common area of two footprints."""
     polygon, knife = footprint(a), footprint(b)
     for start, end in zip(knife, knife[1:] + knife[:1], strict=True):
         polygon = clip(polygon, start, end)
@@ -49,7 +49,7 @@ def common_area(a, b):
 
 
 def bev_iou(a, b):
-    """IoU of two footprints; 0 where a side is 0."""
+    """Return the IoU of two footprints; 0 if a side is 0."""
     if min(a[3], a[4], b[3], b[4]) <= 0:
         return 0.0
     common = common_area(a, b)
@@ -57,7 +57,7 @@ def bev_iou(a, b):
 
 
 def iou_3d(a, b):
-    """IoU of two upright boxes; 0 where a side is 0."""
+    """Return the IoU of two upright boxes; 0 if a side is 0."""
     if min(*a[3:6], *b[3:6]) <= 0:
         return 0.0
     low = max(a[2] - a[5] / 2, b[2] - b[5] / 2)
@@ -67,7 +67,7 @@ def iou_3d(a, b):
 
 
 def bev_iou_by_sampling(a, b, generator, count):
-    """Share of random points in a or b that lie in both."""
+    """Return the share of random points in a or b that are in both."""
     reach = max(math.hypot(*a[3:5]), math.hypot(*b[3:5])) / 2
     low = np.minimum(a[:2], b[:2]) - reach
     high = np.maximum(a[:2], b[:2]) + reach

@@ -5,7 +5,7 @@ import math
 
 
 def contains(box, point):
-    """Whether the closed box holds the point."""
+    """Return whether the closed box contains the point."""
     x, y, z, length, width, height, yaw = map(float, box)
     turned = complex(float(point[0]) - x, float(point[1]) - y) * cmath.rect(1, -yaw)
     away = (abs(turned.real), abs(turned.imag), abs(float(point[2]) - z))
@@ -17,5 +17,5 @@ def contains(box, point):
 
 
 def first_box(boxes, point):
-    """Index of the first box that holds the point, -1 where none."""
+    """Return the index of the first box that contains the point, -1 if there is none."""
     return next((index for index, box in enumerate(boxes) if contains(box, point)), -1)

@@ -1,4 +1,4 @@
-"""KITTI's object evaluation as its rules say: frame by frame, threshold by threshold."""
+"""KITTI's object evaluation by its rules: frame by frame, threshold by threshold."""
 
 import math
 
@@ -9,7 +9,7 @@ NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
 def average_precision(labels, results, category, figure, difficulty, min_overlap):
-    """(R11, R40) in percent; labels and results are lists of lists of dicts, one list per frame."""
+    """Return (R11, R40) in percent; labels and results are lists of dicts, one list per frame."""
     metric = "image" if figure == "aos" else figure
     frames = [
         Frame(label, result, category, metric, difficulty, min_overlap)
@@ -26,7 +26,7 @@ def average_precision(labels, results, category, figure, difficulty, min_overlap
 
 
 def sampled(scores, count):
-    """Scores nearest to each 1/40 of recall; `scores` descend."""
+    """Return the scores nearest to each 1/40 of recall; `scores` descend."""
     thresholds, recall = [], 0.0
     for number, score in enumerate(scores, start=1):
         left = number / count
@@ -39,7 +39,7 @@ def sampled(scores, count):
 
 
 class Frame:
-    """One frame under one category, metric and difficulty."""
+    """One frame for one category, metric and difficulty."""
 
     def __init__(self, labels, results, category, metric, difficulty, min_overlap):
         self.labels, self.results = labels, results
@@ -51,7 +51,7 @@ class Frame:
             self.regions = []
 
     def pairs(self, label, free):
-        """(result index, overlap) of the free results that overlap enough."""
+        """Return (result index, overlap) of the free results that overlap enough."""
         for index, result in enumerate(self.results):
             if index in free and self.result_states[index] != "absent":
                 overlap = self.overlap(label, result)
@@ -59,7 +59,7 @@ class Frame:
                     yield index, overlap
 
     def scores_found(self):
-        """Scores of true positives when each object takes the highest score."""
+        """Return scores of true positives when each object takes the highest score."""
         free, scores = set(range(len(self.results))), []
         for label, state in zip(self.labels, self.states, strict=True):
             options = [index for index, _ in self.pairs(label, free)] if state != "absent" else []
@@ -71,7 +71,7 @@ class Frame:
         return scores
 
     def tally(self, threshold):
-        """(true positives, false positives, similarity) when each takes the greatest overlap."""
+        """Return (tp, fp, similarity) when each object takes the greatest overlap."""
         free = {i for i, result in enumerate(self.results) if result["score"] >= threshold}
         hits, similarity = 0, 0.0
         for label, state in zip(self.labels, self.states, strict=True):
@@ -86,11 +86,11 @@ class Frame:
                 hits += 1
                 turn = label["alpha"] - self.results[best]["alpha"]
                 similarity += (1 + math.cos(turn)) / 2
-        false = [i for i in free if self.result_states[i] == "counted" and not self.cared(i)]
+        false = [i for i in free if self.result_states[i] == "counted" and not self.in_dontcare(i)]
         return hits, len(false), similarity
 
-    def cared(self, index):
-        """Whether a detection lies in a DontCare region by more than the minimum overlap."""
+    def in_dontcare(self, index):
+        """Return whether a detection is in a DontCare region by more than the minimum overlap."""
         box = self.results[index]["box_2d"]
         area = (box[2] - box[0]) * (box[3] - box[1])
         return any(
@@ -99,7 +99,7 @@ class Frame:
 
 
 def label_state(label, category, difficulty):
-    """Counted, ignored or absent."""
+    """Return whether a label is counted, ignored or absent."""
     if label["category"] == NEIGHBOURS.get(category):
         return "ignored"
     if label["category"] != category:
@@ -113,27 +113,27 @@ def label_state(label, category, difficulty):
 
 
 def result_state(result, category, difficulty):
-    """Counted, ignored or absent."""
+    """Return whether a result is counted, ignored or absent."""
     if result["box_2d"][3] - result["box_2d"][1] < HEIGHTS[difficulty]:
         return "ignored"
     return "counted" if result["category"] == category else "absent"
 
 
 def common_area(a, b):
-    """Area that two rectangles share."""
+    """Return the common area of two rectangles."""
     width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
     return max(width, 0) * max(height, 0)
 
 
 def image_iou(a, b):
-    """IoU of the 2D boxes."""
+    """Return the IoU of the 2D boxes."""
     a, b = a["box_2d"], b["box_2d"]
     common = common_area(a, b)
     return common / (sum((c[2] - c[0]) * (c[3] - c[1]) for c in (a, b)) - common)
 
 
 def lidar_like(item):
-    """Centre box with x forward, y left, z up."""
+    """Return the box by its centre, with x forward, y left, z up."""
     x, y, z = item["location"]
     height, width, length = item["dimensions"]
     return z, -x, height / 2 - y, length, width, height, -item["rotation_y"] - math.pi / 2

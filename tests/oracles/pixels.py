@@ -5,7 +5,7 @@ from math import floor
 
 
 def count(rectangle, class_ids, classes):
-    """(S, A): the pixels of `classes` and all pixels of the image whose square is touched.
+    """Return (S, A): the pixels of `classes`, and all pixels, that the rectangle touches.
 
     The square of pixel (row, column) is [column - 1/2, column + 1/2) x [row - 1/2, row + 1/2).
     """

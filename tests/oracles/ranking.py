@@ -2,7 +2,10 @@
 
 
 def auroc(weights, right):
-    """Share of (right, wrong) pairs in which the right label weighs more; ties count half."""
+    """Return the share of (correct, wrong) pairs in which the correct label weighs more.
+
+    Ties count 1/2.
+    """
     wins = pairs = 0.0
     for weight, is_right in zip(weights, right, strict=True):
         for other, other_right in zip(weights, right, strict=True):
@@ -13,7 +16,7 @@ def auroc(weights, right):
 
 
 def average_precision(weights, right):
-    """Sum over the thresholds, from high to low, of the step in recall times the precision."""
+    """Return the sum, over falling thresholds, of the step in recall times the precision."""
     positives = sum(right)
     total = previous = 0.0
     for threshold in sorted(set(weights), reverse=True):

@@ -1,10 +1,10 @@
-"""COCO's run lengths the other way round: masks to runs, and runs to the compressed string."""
+"""The inverse of reading COCO's run lengths: masks to runs, and runs to the compressed string."""
 
 from itertools import groupby
 
 
 def runs(mask):
-    """Lengths of equal pixels down the columns, the first of them outside."""
+    """Return lengths of equal pixels down the columns, starting with a run outside."""
     height, width = len(mask), len(mask[0])
     pixels = [bool(mask[row][column]) for column in range(width) for row in range(height)]
     found = [(value, len(list(group))) for value, group in groupby(pixels)]
@@ -12,7 +12,7 @@ def runs(mask):
 
 
 def compress(lengths):
-    """Five bits a character, the sixth says that more follow; two's complement."""
+    """Return five bits per character, with a continuation bit; two's complement."""
     text = ""
     for place, length in enumerate(lengths):
         number = length - (lengths[place - 2] if place > 2 else 0)
@@ -27,7 +27,7 @@ def compress(lengths):
 
 
 def centre_inside(polygon, column, row):
-    """Whether the centre of a pixel lies inside by the winding of single rays (even-odd)."""
+    """Return whether the centre of a pixel is inside, by the even-odd rule along a ray."""
     x, y = column + 0.5, row + 0.5
     corners = list(zip(polygon[::2], polygon[1::2], strict=True))
     inside = False

@@ -1,10 +1,10 @@
-"""Non-maximum suppression as its definition says, one pair at a time."""
+"""Non-maximum suppression by its definition, one pair at a time."""
 
 from oracles.clipping import bev_iou
 
 
 def nms(boxes, scores, threshold):
-    """Kept indices, best first; equal scores by index."""
+    """Return kept indices, best first; equal scores by index."""
     kept = []
     for candidate in sorted(range(len(boxes)), key=lambda index: (-scores[index], index)):
         if all(bev_iou(boxes[candidate], boxes[other]) <= threshold for other in kept):

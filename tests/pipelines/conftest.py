@@ -14,7 +14,7 @@ from pipelines.workspace.workspace import Workspace
 
 @pytest.fixture
 def weights_file(tmp_path: Path) -> Path:
-    """What the toy detector takes for its checkpoint."""
+    """Return the file that the toy detector takes for its checkpoint."""
     path = tmp_path / "detector.txt"
     path.write_text("")
     return path
@@ -24,14 +24,14 @@ def weights_file(tmp_path: Path) -> Path:
 def workspace(
     tmp_path: Path, toy_kitti: Path, weights_file: Path, new_url: Callable[[], str | None]
 ) -> Workspace:
-    """Two labeled, six unlabeled and four val frames, in either database."""
+    """Return a workspace of two labeled, six unlabeled and four val frames, with either engine."""
     document = toy_document(toy_kitti, weights_file) | {"run": {"database": new_url()}}
     return initialise(tmp_path / "work", make_config(document, "test"), "0.25", "")
 
 
 @pytest.fixture
 def another(workspace: Workspace, new_url: Callable[[], str | None]) -> Callable[[Path], Workspace]:
-    """A function that makes a workspace with the same settings and a database of its own."""
+    """Return a function that creates a workspace with the same settings and a new database."""
 
     def make(root: Path) -> Workspace:
         apart = workspace.with_settings("run", database=new_url())
@@ -42,5 +42,5 @@ def another(workspace: Workspace, new_url: Callable[[], str | None]) -> Callable
 
 @pytest.fixture
 def curate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Curate:
-    """Runs the command line in this process: exit code, standard output, standard error."""
+    """Return a function that runs the command line in this process: (exit code, stdout, stderr)."""
     return in_process(monkeypatch, capsys)

@@ -1,4 +1,4 @@
-"""Bad input as a user brings it to the command line: each is one clear line, or just works."""
+"""Invalid input on the command line: each case gives one clear line, or just works."""
 
 import os
 import pickle
@@ -22,7 +22,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 def write_results(path: Path, root: Path, **changes) -> Path:
-    """OpenPCDet results that are the truth, or a change of it per key."""
+    """Write OpenPCDet results equal to the ground truth, or with changed keys."""
     dataset, entries = KittiDataset(root), []
     for name in dataset.frame_ids():
         truth = dataset.annotations(name)
@@ -38,7 +38,7 @@ def write_results(path: Path, root: Path, **changes) -> Path:
 
 
 def begin(curate: Curate, work: Path, root: Path, results: Path) -> tuple[int, str, str]:
-    """A workspace with recorded results, and its predictions."""
+    """Create a workspace with recorded results, and predict."""
     code, _, err = curate(
         "init", work, "--root", root, "--labeled", "0.25",
         "--detector", "recorded", "--detector-path", results,
@@ -47,10 +47,10 @@ def begin(curate: Curate, work: Path, root: Path, results: Path) -> tuple[int, s
     return curate("predict", "-w", work)
 
 
-def test_names_in_other_letters_fail_every_frame_with_the_remedy(
+def test_class_names_in_lower_case_fail_every_frame_with_a_fix(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """Lower case would leave no label at all; the setting that mends it is printed, and works."""
+    """There would be no label at all; the printed setting works."""
     results = write_results(tmp_path / "a.pkl", toy_kitti, name=np.char.lower)
     work = tmp_path / "w"
     code, _, err = begin(curate, work, toy_kitti, results)
@@ -67,26 +67,26 @@ def test_names_in_other_letters_fail_every_frame_with_the_remedy(
     assert "18 rows" in out
 
 
-def test_unknown_names_are_left_out_and_told_once(
+def test_unknown_names_are_dropped_and_reported_once(
     curate: Curate, tmp_path: Path, toy_kitti: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The others stay."""
-    # A name that no other test of this process has been told of.
+    """The other boxes stay."""
+    # A name that no other test of this process has used.
     results = write_results(
         tmp_path / "a.pkl", toy_kitti, name=lambda names: np.char.replace(names, "Cyclist", "Moped")
     )
     code, out, _ = begin(curate, tmp_path / "w", toy_kitti, results)
     assert code == 0
     assert "12 rows" in out
-    told = [message for message in caplog.messages if "'Moped'" in message]
-    assert len(told) == 1
-    assert "rename" in told[0]
+    warned = [message for message in caplog.messages if "'Moped'" in message]
+    assert len(warned) == 1
+    assert "rename" in warned[0]
 
 
 def test_results_for_other_frames_end_the_command(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """None of the recorded frames exists: the error shows how the data set names its frames."""
+    """No recorded frame exists: the error shows how the dataset names its frames."""
     results = write_results(tmp_path / "a.pkl", toy_kitti, frame_id=lambda name: f"drive_{name}")
     code, _, err = begin(curate, tmp_path / "w", toy_kitti, results)
     assert code == DataError.exit_code
@@ -95,10 +95,10 @@ def test_results_for_other_frames_end_the_command(
     assert "Traceback" not in err
 
 
-def test_camera_boxes_taken_for_lidar_boxes_are_found_out(
+def test_camera_boxes_read_as_lidar_boxes_are_detected(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """Axes right, down, forward: no box holds points, and doctor ends with a fault."""
+    """Axes right, down, forward: no box contains points, and doctor fails."""
     results = write_results(
         tmp_path / "a.pkl",
         toy_kitti,
@@ -111,10 +111,10 @@ def test_camera_boxes_taken_for_lidar_boxes_are_found_out(
     assert re.search(r"^wrong +boxes", out, re.MULTILINE)
 
 
-def test_a_pickle_that_runs_code_runs_nothing_from_the_command_line(
+def test_a_pickle_with_code_does_not_run_it(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """Armed: the usual reader makes the folder."""
+    """The pickle is armed: with pickle.load it creates the folder."""
     results, pwned = tmp_path / "a.pkl", tmp_path / "pwned"
     results.write_bytes(b"cos\nmkdir\n(V" + str(pwned).encode() + b"\ntR.")
     code, _, err = begin(curate, tmp_path / "w", toy_kitti, results)
@@ -125,10 +125,8 @@ def test_a_pickle_that_runs_code_runs_nothing_from_the_command_line(
     assert pwned.exists()
 
 
-def test_sql_that_writes_leaves_the_database_as_it_was(
-    curate: Curate, workspace: Workspace
-) -> None:
-    """Byte by byte, whatever is tried."""
+def test_sql_that_writes_does_not_change_the_database(curate: Curate, workspace: Workspace) -> None:
+    """Compared byte by byte, for several statements."""
     assert curate("predict", "-w", workspace.root)[0] == 0
     path = workspace.root / "curate.db"
     before = path.read_bytes()
@@ -148,12 +146,12 @@ def test_sql_that_writes_leaves_the_database_as_it_was(
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 def test_a_report_needs_no_network(curate: Curate, workspace: Workspace, tmp_path: Path) -> None:
-    """In a browser whose every connection fails, all pictures show and nothing was asked for."""
+    """In a browser without any connection, all images are shown and nothing was requested."""
     for command in ("predict", "repredict", "score", "solve"):
         assert curate(command, "-w", workspace.root)[0] == 0
     _, out, _ = curate("report", "-w", workspace.root)
     text = Path(out.removeprefix("report: ").strip()).read_text()
-    # The page runs no script; the copy gets one that writes down what the browser made of it.
+    # The page runs no script; the copy gets one that stores the rendered state.
     page = tmp_path / "report.html"
     page.write_text(
         text + "<script>addEventListener('load', () => {"
@@ -172,9 +170,9 @@ def test_a_report_needs_no_network(curate: Curate, workspace: Workspace, tmp_pat
     )  # fmt: skip
     title = re.search(r"<title>shown (\d+)/(\d+) asked (\d+)</title>", ended.stdout)
     assert title is not None, ended.stderr
-    shown, pictures, asked = map(int, title.groups())
-    assert shown == pictures > 0
-    assert asked == 0
+    shown, images, requested = map(int, title.groups())
+    assert shown == images > 0
+    assert requested == 0
 
 
 @pytest.mark.parametrize(
@@ -186,10 +184,10 @@ def test_a_report_needs_no_network(curate: Curate, workspace: Workspace, tmp_pat
         ({"name": "saved", "path": "gone", "classes": "voc"}, "no such folder of semantic maps"),
     ],
 )
-def test_a_wrong_segmenter_is_told_before_any_work(
+def test_a_wrong_segmenter_is_reported_before_any_work(
     workspace: Workspace, settings: dict[str, Any], message: str
 ) -> None:
-    """Not after hours of predictions; without the semantic prior nobody misses it."""
+    """Not after hours of predictions; without the semantic prior it is not needed."""
     wrong = workspace.with_settings("segmenter", **settings)
     with pytest.raises(CurateError, match=message):
         run_workspace(wrong, 1)

@@ -1,4 +1,4 @@
-"""The command line as a person uses it: what it prints, how it ends, what it refuses."""
+"""The command line as a user runs it: output, exit codes, invalid input."""
 
 import csv
 import io
@@ -18,7 +18,7 @@ LABELS = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
 
 @pytest.fixture
 def made(curate: Curate, tmp_path: Path, toy_kitti: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A toy workspace made by `curate init`, and the current folder."""
+    """Return a toy workspace created by `curate init`; it is the current folder."""
     weights = tmp_path / "detector.txt"
     weights.write_text("")
     folder = tmp_path / "work"
@@ -33,8 +33,8 @@ def made(curate: Curate, tmp_path: Path, toy_kitti: Path, monkeypatch: pytest.Mo
     return folder
 
 
-def test_the_stages_run_one_by_one_and_the_weights_are_in_sql(curate: Curate, made: Path) -> None:
-    """Every stage is a command; the last one leaves the weights in the exported file."""
+def test_the_stages_run_one_by_one_and_store_the_weights(curate: Curate, made: Path) -> None:
+    """Every stage is a command; the last one writes the weights to the exported file."""
     for command in ("predict", "repredict", "score", "solve", "export"):
         code, out, err = curate(command)
         assert (code, err) == (0, ""), command
@@ -45,8 +45,8 @@ def test_the_stages_run_one_by_one_and_the_weights_are_in_sql(curate: Curate, ma
     assert len(exported) == 18
 
 
-def test_run_does_all_stages_and_says_what_each_did(curate: Curate, made: Path) -> None:
-    """And the second time that there was nothing to do."""
+def test_run_does_all_stages_and_prints_each(curate: Curate, made: Path) -> None:
+    """The second run prints that there was nothing to do."""
     code, out, _ = curate("run")
     assert code == 0
     assert [line.split()[2] for line in out.splitlines()] == [
@@ -72,7 +72,7 @@ def test_status_shows_every_stage(curate: Curate, made: Path) -> None:
     assert states["solve"] == states["export"] == "stale"
 
 
-def test_a_failed_frame_ends_in_a_count_and_a_non_zero_exit(
+def test_a_failed_frame_gives_a_count_and_a_non_zero_exit_code(
     curate: Curate, made: Path, toy_kitti: Path
 ) -> None:
     """`status --failed` lists it with its error."""
@@ -89,7 +89,7 @@ def test_a_failed_frame_ends_in_a_count_and_a_non_zero_exit(
 
 
 def test_explain_recomputes_the_weight(curate: Curate, made: Path) -> None:
-    """From the stored numbers alone."""
+    """Only from the stored numbers."""
     curate("run")
     _, out, _ = curate(
         "query", "SELECT frame, k, weight FROM weighted_labels ORDER BY weight DESC", "--json"
@@ -126,7 +126,7 @@ def test_explain_recomputes_the_weight(curate: Curate, made: Path) -> None:
         "",
     ],
 )
-def test_a_query_can_only_read(curate: Curate, made: Path, sql: str) -> None:
+def test_a_query_is_read_only(curate: Curate, made: Path, sql: str) -> None:
     """Anything else is a one-line error."""
     code, out, err = curate("query", sql)
     assert (code, out) == (ConfigError.exit_code, "")
@@ -142,7 +142,7 @@ def test_a_query_prints_csv(curate: Curate, made: Path) -> None:
     assert len(rows) == 13
 
 
-def test_outside_a_workspace_the_remedy_is_named(
+def test_outside_a_workspace_the_error_says_what_to_do(
     curate: Curate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One line and the exit code of its kind."""
@@ -152,7 +152,7 @@ def test_outside_a_workspace_the_remedy_is_named(
     assert "curate init" in err
 
 
-def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> None:
+def test_all_wrong_settings_are_reported_at_once(curate: Curate, made: Path) -> None:
     """A misspelt key and a value out of range."""
     path = made / "curate.toml"
     text = path.read_text().replace("minimum_score = 0.1", "minimum_score = 7.0")
@@ -180,10 +180,10 @@ def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> Non
         ("[run]", '[run]\ndatabase = "oracle9://x"', "oracle9"),
     ],
 )
-def test_a_setting_without_meaning_is_refused_before_any_work(
+def test_an_invalid_setting_is_rejected_before_any_work(
     curate: Curate, made: Path, former: str, later: str, message: str
 ) -> None:
-    """It costs one line, not a failed frame each."""
+    """It gives one line, not a failed frame each."""
     path = made / "curate.toml"
     assert former in path.read_text()
     path.write_text(path.read_text().replace(former, later))
@@ -193,8 +193,8 @@ def test_a_setting_without_meaning_is_refused_before_any_work(
     assert err.count("\n") == 1
 
 
-def test_a_policy_option_of_another_type_is_one_line(curate: Curate, made: Path) -> None:
-    """A class may raise anything for what it is given; it is named, without a traceback."""
+def test_a_policy_option_of_another_type_gives_a_one_line_error(curate: Curate, made: Path) -> None:
+    """The class may raise any exception; the option is reported, without a traceback."""
     path = made / "curate.toml"
     options = 'options = {threshold = {threshold = "high"}}'
     path.write_text(path.read_text().replace("options = {}\n\n[train]", f"{options}\n\n[train]"))
@@ -205,10 +205,10 @@ def test_a_policy_option_of_another_type_is_one_line(curate: Curate, made: Path)
     assert err.count("\n") == 1
 
 
-def test_frames_that_an_earlier_stage_lost_are_not_counted_as_done(
+def test_frames_lost_in_an_earlier_stage_are_not_counted_as_done(
     curate: Curate, made: Path, toy_kitti: Path
 ) -> None:
-    """A later stage says nothing of a frame that it never got."""
+    """A later stage does not report a frame that it never got."""
     name = json.loads(
         curate("query", "SELECT frame FROM frame WHERE split='unlabeled'", "--json")[1]
     )
@@ -217,9 +217,7 @@ def test_frames_that_an_earlier_stage_lost_are_not_counted_as_done(
     assert [report["kept"] for report in reports if report["stage"] == "repredict"] == [0]
 
 
-def test_status_leaves_out_what_never_happens_to_a_brought_detector(
-    curate: Curate, made: Path
-) -> None:
+def test_status_lists_no_training_for_an_external_detector(curate: Curate, made: Path) -> None:
     """Only a detector that curate trains waits for a training."""
     curate("run")
     states = {row["stage"]: row["state"] for row in json.loads(curate("status", "--json")[1])}
@@ -227,7 +225,7 @@ def test_status_leaves_out_what_never_happens_to_a_brought_detector(
     assert not {"pretrain", "train-round"} & set(states)
 
 
-def test_json_holds_no_word_that_json_does_not_know(curate: Curate, made: Path) -> None:
+def test_json_contains_only_valid_json_values(curate: Curate, made: Path) -> None:
     """Infinity is null."""
     _, out, _ = curate("query", "SELECT 1e400 AS far, 2 AS near", "--json")
     assert out.count("null") == 1
@@ -235,10 +233,10 @@ def test_json_holds_no_word_that_json_does_not_know(curate: Curate, made: Path) 
 
 
 @pytest.mark.parametrize("option", ["--labeled", "--val"])
-def test_a_list_may_name_a_frame_twice(
+def test_a_list_can_contain_a_frame_twice(
     curate: Curate, tmp_path: Path, toy_kitti: Path, option: str
 ) -> None:
-    """It is one frame all the same."""
+    """It counts once."""
     (tmp_path / "ids.txt").write_text("000001\n000003\n000001\n")
     code, out, err = curate(
         "init", tmp_path / "w", "--root", toy_kitti, option, tmp_path / "ids.txt"
@@ -255,10 +253,10 @@ def test_a_list_may_name_a_frame_twice(
         (b"000002\n", "000002 has no label file"),
     ],
 )
-def test_a_bad_list_of_frames_is_one_line(
+def test_an_invalid_list_of_frames_gives_a_one_line_error(
     curate: Curate, tmp_path: Path, toy_kitti: Path, content: bytes, message: str
 ) -> None:
-    """A binary file, a stranger, a frame without a label."""
+    """A binary file, an unknown frame, a frame without a label."""
     (toy_kitti / "training" / "label_2" / "000002.txt").unlink()
     (tmp_path / "ids.txt").write_bytes(content)
     code, _, err = curate(
@@ -270,8 +268,8 @@ def test_a_bad_list_of_frames_is_one_line(
     assert not (tmp_path / "w").exists()
 
 
-def test_a_workspace_whose_init_was_killed_is_no_empty_success(curate: Curate, made: Path) -> None:
-    """Settings without frames: the remedy is named, and no empty export passes for labels."""
+def test_a_workspace_with_a_killed_init_is_reported(curate: Curate, made: Path) -> None:
+    """Settings without frames: the error says what to do, and no empty export is written."""
     for path in made.glob("curate.db*"):
         path.unlink()
     code, out, err = curate("run")
@@ -280,10 +278,10 @@ def test_a_workspace_whose_init_was_killed_is_no_empty_success(curate: Curate, m
     assert not (made / "exports" / "labels.sqlite").exists()
 
 
-def test_relative_paths_in_the_settings_are_taken_from_the_workspace(
+def test_relative_paths_in_the_settings_start_at_the_workspace(
     curate: Curate, made: Path, toy_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever the command is typed, and after data and workspace have moved together."""
+    """From any current folder, and after data and workspace have moved together."""
     path = made / "curate.toml"
     path.write_text(path.read_text().replace(f'"{tmp_path}/', '"../'))
     assert 'root = "../' in path.read_text()
@@ -307,30 +305,30 @@ def test_relative_paths_in_the_settings_are_taken_from_the_workspace(
         (("--segmenter", "onnx", "--segmenter-path", "a.onnx"), "a.onnx: no such file"),
     ],
 )
-def test_a_workspace_is_not_made_over_what_is_not_there(
+def test_a_workspace_is_not_created_with_missing_files(
     curate: Curate, tmp_path: Path, toy_kitti: Path, options: tuple[str, ...], message: str
 ) -> None:
-    """Not hours later, when the stage comes that needs it."""
+    """The error comes at once, not hours later in the stage that needs them."""
     code, _, err = curate("init", tmp_path / "w", "--root", toy_kitti, *options)
     assert code == ConfigError.exit_code
     assert message in err
     assert not (tmp_path / "w").exists()
 
 
-def test_val_frames_without_labels_name_the_way_out(
+def test_val_frames_without_labels_are_reported_with_a_fix(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """The data set's own val list may name frames that nobody labeled."""
+    """The dataset's own val list may contain frames without labels."""
     (toy_kitti / "training" / "label_2" / "000010.txt").unlink()
     code, _, err = curate("init", tmp_path / "w", "--root", toy_kitti, "--labeled", "0.25")
     assert code == ConfigError.exit_code
     assert "val frame 000010 has no label file; give --val 0" in err
 
 
-def test_a_workspace_may_lie_in_a_folder_of_any_name(
+def test_a_workspace_can_be_in_a_folder_of_any_name(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """What means something in a URL or in TOML means nothing in a folder's name."""
+    """Special characters of URLs and TOML are allowed."""
     folder = tmp_path / 'a "b" ü %41?c=d#e'
     assert curate("init", folder, "--root", toy_kitti, "--labeled", "0.25")[0] == 0
     code, out, err = curate("query", "SELECT count(*) FROM frame", "--csv", "-w", folder)
@@ -348,7 +346,7 @@ def test_a_workspace_may_lie_in_a_folder_of_any_name(
 def test_a_damaged_label_of_a_val_frame_stops_init(
     curate: Curate, tmp_path: Path, toy_kitti: Path, line: str, message: str
 ) -> None:
-    """File and line are named, and no half workspace is left."""
+    """The error contains file and line, and no incomplete workspace is left."""
     path = toy_kitti / "training" / "label_2" / "000010.txt"
     path.write_text(path.read_text() + line + "\n")
     code, _, err = curate("init", tmp_path / "w", "--root", toy_kitti)
@@ -361,7 +359,7 @@ def test_a_damaged_label_of_a_val_frame_stops_init(
 def test_the_label_of_an_unlabeled_frame_is_never_opened(
     curate: Curate, made: Path, toy_kitti: Path
 ) -> None:
-    """Garbage in it disturbs nobody, because nobody looks."""
+    """Invalid content in it causes no error."""
     _, out, _ = curate("query", "SELECT frame FROM frame WHERE split = 'unlabeled'", "--json")
     for row in json.loads(out):
         path = toy_kitti / "training" / "label_2" / f"{row['frame']}.txt"
@@ -371,7 +369,7 @@ def test_the_label_of_an_unlabeled_frame_is_never_opened(
     assert (code, err) == (0, "")
 
 
-def test_init_again_keeps_the_workspace_and_refuses_another_split(
+def test_init_again_keeps_the_workspace_and_rejects_another_split(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
     """The same call is harmless; another share would mix the splits."""
@@ -383,10 +381,10 @@ def test_init_again_keeps_the_workspace_and_refuses_another_split(
     assert "another split" in err
 
 
-def test_a_category_without_ground_truth_warns_and_uses_the_fallback(
+def test_a_category_without_ground_truth_uses_the_fallback_with_a_warning(
     curate: Curate, made: Path, toy_kitti: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The configured number of points stands in for m_th."""
+    """The configured number of points replaces m_th."""
     for path in (toy_kitti / "training" / "label_2").glob("*.txt"):
         lines = [line for line in path.read_text().splitlines() if "Cyclist" not in line]
         path.write_text("\n".join(lines) + "\n")
@@ -408,10 +406,10 @@ def test_a_category_without_ground_truth_warns_and_uses_the_fallback(
     ("configured", "workers", "used"),
     [("serial", 4, "process"), ("process", 1, "serial"), ("ray", 4, "ray"), ("ray", 1, "ray")],
 )
-def test_workers_choose_an_executor_only_where_none_of_a_cluster_is_configured(
+def test_workers_choose_an_executor_unless_a_cluster_is_configured(
     made: Path, configured: str, workers: int, used: str
 ) -> None:
-    """On one machine more than one worker are processes; a cluster stays a cluster."""
+    """On one machine, more than one worker are processes; a configured cluster is kept."""
     path = made / "curate.toml"
     path.write_text(path.read_text().replace('executor = "serial"', f'executor = "{configured}"'))
     run = open_workspace(made, workers=workers).config.run

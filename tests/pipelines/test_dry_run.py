@@ -1,4 +1,4 @@
-"""`--dry-run`: what would be done, why, at what cost, and that nothing is."""
+"""`--dry-run`: what would be done, why, at what cost; nothing is changed."""
 
 import json
 import sqlite3
@@ -18,14 +18,14 @@ STAGES = ("predict", "repredict", "points", "semantic", "solve", "export")
 
 @pytest.fixture
 def made(workspace: Workspace, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a toy workspace, which is the current folder."""
+    """Return the folder of a toy workspace; it is the current folder."""
     monkeypatch.chdir(workspace.root)
     return workspace.root
 
 
 @pytest.fixture
 def dry(curate: Curate) -> Callable[..., dict[str, dict]]:
-    """A function that returns what would be done, by stage."""
+    """Return a function that returns what would be done, by stage."""
 
     def run(*arguments: object) -> dict[str, dict]:
         code, out, err = curate(*arguments, "--dry-run", "--json")
@@ -43,21 +43,21 @@ def change(root: Path, former: str, later: str) -> None:
 
 
 def contents(root: Path) -> tuple[list[str], dict[Path, bytes]]:
-    """All rows of the database, and all other files."""
+    """Return all rows of the database, and all other files."""
     with closing(sqlite3.connect(root / "curate.db")) as connection:
         rows = list(connection.iterdump())
     files = (path for path in root.rglob("*") if path.is_file() and "curate.db" not in path.name)
     return rows, {path: path.read_bytes() for path in files}
 
 
-def test_every_stage_command_has_it() -> None:
-    """And no stage is left out."""
+def test_every_stage_command_has_the_option() -> None:
+    """Every stage is listed."""
     stages = {"pretrain", "predict", "repredict", "score", "solve", "export", "train-round", "run"}
     assert with_option("--dry-run") == stages | {"review import"}
 
 
 def test_a_new_workspace_would_run_everything(made: Path, dry: Callable) -> None:
-    """On all unlabeled frames, with the first of them by name, at an unknown cost."""
+    """On all unlabeled frames; the first ones are listed, the cost is unknown."""
     found = dry("run")
     assert tuple(found) == STAGES
     for stage in STAGES[:4]:
@@ -70,7 +70,7 @@ def test_a_new_workspace_would_run_everything(made: Path, dry: Callable) -> None
 
 @pytest.mark.parametrize("command", ["run", "predict", "pretrain", "repredict", "score"])
 def test_nothing_is_written(curate: Curate, made: Path, command: str) -> None:
-    """Neither rows, such as the round or the detector, nor files; whatever the command answers."""
+    """Neither rows, such as the round or the detector, nor files; whatever the output."""
     before = contents(made)
     curate(command, "--dry-run")
     assert contents(made) == before
@@ -89,7 +89,7 @@ def test_nothing_is_written(curate: Curate, made: Path, command: str) -> None:
 def test_nothing_is_written_after_a_run(
     curate: Curate, made: Path, command: tuple[str, ...]
 ) -> None:
-    """Though there is something to do."""
+    """Even if there is something to do."""
     assert curate("run")[0] == 0
     change(made, 'scope = "round"', 'scope = "frame"')
     curate("solve")
@@ -101,10 +101,10 @@ def test_nothing_is_written_after_a_run(
     assert contents(made) == before
 
 
-def test_a_changed_setting_is_named_and_what_follows_is_due(
+def test_a_changed_setting_is_reported_and_later_stages_are_due(
     curate: Curate, made: Path, dry: Callable
 ) -> None:
-    """The stage itself by its setting, later ones by their input; the others are up to date."""
+    """The stage itself with its setting, later ones with their input; the others are up to date."""
     assert curate("run")[0] == 0
     assert all(not each["reasons"] for each in dry("run").values())
     assert "Everything is up to date" in curate("run", "--dry-run")[1]
@@ -124,7 +124,7 @@ def test_a_changed_setting_is_named_and_what_follows_is_due(
     assert {stage for stage, count in done.items() if count} == {"repredict", "solve", "export"}
 
 
-def test_another_teacher_is_named(
+def test_another_teacher_is_reported(
     curate: Curate, made: Path, dry: Callable, weights_file: Path
 ) -> None:
     """An external detector with another file; the new file is not recorded."""
@@ -134,10 +134,9 @@ def test_another_teacher_is_named(
     assert find_teacher(Workspace.open(made), 1)[0] is None
 
 
-def test_a_failed_frame_is_due_again(
+def test_only_a_failed_frame_is_due_again(
     curate: Curate, made: Path, toy_kitti: Path, workspace: Workspace, dry: Callable
 ) -> None:
-    """It alone."""
     name = min(workspace.frames("unlabeled"))
     path = toy_kitti / "training" / "calib" / f"{name}.txt"
     content = path.read_bytes()
@@ -161,8 +160,10 @@ def test_a_changed_formula_costs_no_measurement(curate: Curate, made: Path, dry:
     assert found["reasons"] == ["changed settings: semantic.mean"]
 
 
-def test_the_cost_follows_from_earlier_frames(curate: Curate, made: Path, dry: Callable) -> None:
-    """By the median, which a slow first frame does not move; several workers share it."""
+def test_the_cost_is_estimated_from_earlier_frames(
+    curate: Curate, made: Path, dry: Callable
+) -> None:
+    """By the median, which a slow first frame does not change; several workers share it."""
     assert curate("run")[0] == 0
     with closing(sqlite3.connect(made / "curate.db")) as connection, connection:
         connection.execute("UPDATE task SET seconds = 2.0 WHERE stage = 'predict'")
@@ -178,14 +179,14 @@ def test_the_cost_follows_from_earlier_frames(curate: Curate, made: Path, dry: C
     assert "changed settings: detector.minimum_score; about 12 s" in out
 
 
-def test_a_stage_that_could_not_run_says_so(curate: Curate, made: Path) -> None:
-    """As the command itself would."""
+def test_a_stage_that_cannot_run_is_reported(curate: Curate, made: Path) -> None:
+    """With the message of the command itself."""
     code, out, err = curate("solve", "--dry-run")
     assert (code, out) == (WorkspaceError.exit_code, "")
     assert "run `curate predict`" in err
 
 
-def test_a_teacher_that_is_still_to_be_trained_makes_every_round_due(
+def test_every_round_is_due_if_the_teacher_is_not_trained(
     curate: Curate, tmp_path: Path, toy_kitti: Path, dry: Callable
 ) -> None:
     """All frames of all rounds."""

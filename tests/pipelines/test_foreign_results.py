@@ -1,4 +1,4 @@
-"""A foreign detector's result files without a second pass, and what a new user does with them."""
+"""Result files of an external detector without a second pass, and the steps of a new user."""
 
 import json
 import shlex
@@ -17,13 +17,13 @@ from curate.errors import ConfigError
 
 @pytest.fixture
 def results(tmp_path: Path, toy_kitti: Path) -> Path:
-    """KITTI result files of a detector that finds what is there, with a score of 0.9."""
+    """Return KITTI result files of a detector that finds all objects, with a score of 0.9."""
     dataset = KittiDataset(toy_kitti)
     folder = tmp_path / "results"
     folder.mkdir()
     for name in dataset.frame_ids():
         frame, truth = dataset.read(name), dataset.annotations(name)
-        # A centimetre off: a detector that repeats the labels to the digit has seen them.
+        # A centimetre off: exact copies of the labels would be reported as a leak.
         beside = np.add(truth.boxes, [0.01, 0, 0, 0, 0, 0, 0])
         found = Detections(beside, truth.alpha + 0.9, truth.categories)
         objects = from_detections(found, frame.calibration, frame.image_size)
@@ -32,7 +32,7 @@ def results(tmp_path: Path, toy_kitti: Path) -> Path:
 
 
 def begin(curate: Curate, work: Path, root: Path, results: Path, *more: object) -> None:
-    """A workspace over the result files."""
+    """Create a workspace over the result files."""
     code, _, err = curate(
         "init", work, "--root", root, "--labeled", "0.25",
         "--detector", "recorded", "--detector-path", results, *more,
@@ -43,7 +43,7 @@ def begin(curate: Curate, work: Path, root: Path, results: Path, *more: object) 
 def test_without_a_second_pass_labels_are_kept_with_weight_0(
     curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """No evidence is weight 0, not a label that vanishes; doctor names the remedy."""
+    """Without evidence the weight is 0, and no label is lost; doctor says what to do."""
     work = tmp_path / "work"
     begin(curate, work, toy_kitti, results)
     code, out, _ = curate("doctor", "-w", work)
@@ -58,10 +58,10 @@ def test_without_a_second_pass_labels_are_kept_with_weight_0(
     assert row == {"n": 18, "losses": 0, "v": 0.0}
 
 
-def test_the_priors_alone_weigh_where_the_setting_says_so(
+def test_a_setting_uses_only_the_priors_as_weight(
     curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Every label weighs rho_det, and explain works it out again."""
+    """Every label has weight rho_det, and explain recomputes it."""
     work = tmp_path / "work"
     begin(curate, work, toy_kitti, results, "--set", "solve.self_paced=false")
     assert "the weights come from the priors only" in curate("doctor", "-w", work)[1]
@@ -83,10 +83,13 @@ def test_the_priors_alone_weigh_where_the_setting_says_so(
     assert "no reprediction matched it" not in page
 
 
-def test_a_folder_of_results_is_taught_by_a_folder_of_results(
+def test_result_files_can_be_taught_by_result_files(
     curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path
 ) -> None:
-    """The next detector's files, which the command writes; trained anew, they replace those."""
+    """The command writes the next detector's files.
+
+    After a new training they replace the old ones.
+    """
     work = tmp_path / "work"
     begin(curate, work, toy_kitti, results, "--set", "solve.self_paced=false")
     assert curate("run", "-w", work)[0] == 0
@@ -124,10 +127,10 @@ def test_a_folder_of_results_is_taught_by_a_folder_of_results(
         ("run.seed.first=3", "run.seed"),
     ],
 )
-def test_a_wrong_setting_is_refused(
+def test_a_wrong_setting_is_rejected(
     curate: Curate, tmp_path: Path, toy_kitti: Path, setting: str, message: str
 ) -> None:
-    """Before a workspace is made."""
+    """Before a workspace is created."""
     code, _, err = curate("init", tmp_path / "w", "--root", toy_kitti, "--set", setting)
     assert code == ConfigError.exit_code
     assert message in err
@@ -135,10 +138,10 @@ def test_a_wrong_setting_is_refused(
     assert not (tmp_path / "w").exists()
 
 
-def test_whose_class_numbers_a_segmenter_answers_must_be_said(
+def test_the_class_numbers_of_a_segmenter_must_be_specified(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """By name, or as a table; a guess would weigh by the wrong pixels."""
+    """By name or as a table; a guess could use the wrong pixels."""
     (tmp_path / "maps").mkdir()
     words = [
         "--root", toy_kitti, "--labeled", "0.25",

@@ -1,4 +1,4 @@
-"""What `curate` says of itself, and that it is quick to answer."""
+"""The help of `curate`, and its start time."""
 
 import os
 import re
@@ -16,7 +16,7 @@ from pipelines import registry
 from pipelines.cli import COMMANDS, GROUPS, app
 from pipelines.workspace.workspace import Workspace
 
-# What a reader of rows has no use for.
+# Not needed by commands that only read rows.
 HEAVY = {
     "torch", "numba", "scipy", "open3d", "cv2", "onnx", "onnxruntime", "alembic", "sklearn",
     "matplotlib", "pandas", "safetensors",
@@ -24,7 +24,7 @@ HEAVY = {
 
 
 def loaded(*arguments: object) -> set[str]:
-    """The packages that are loaded once a command has ended, in a process of its own."""
+    """Return the packages that are loaded once a command has ended, in a new process."""
     code = (
         f"import sys; sys.argv = {['curate', *map(str, arguments)]!r}\n"
         "from pipelines.cli import main\n"
@@ -45,15 +45,15 @@ def loaded(*arguments: object) -> set[str]:
 
 
 @pytest.mark.parametrize("command", ["--help", "init --help", "solve --help", "--version"])
-def test_help_needs_neither_numbers_nor_a_database(command: str) -> None:
-    """Nor a configuration."""
+def test_help_imports_neither_numpy_nor_the_database(command: str) -> None:
+    """Nor the configuration."""
     found = loaded(*command.split())
     assert "typer" in found
     assert not found & (HEAVY | {"numpy", "sqlalchemy"})
 
 
-def test_a_row_is_read_without_heavy_imports(workspace: Workspace) -> None:
-    """Neither status nor query load what computes, though the workspace has all stages."""
+def test_reading_rows_needs_no_heavy_imports(workspace: Workspace) -> None:
+    """Neither status nor query imports what computes, though the workspace has all stages."""
     for command in (("status",), ("status", "--json"), ("query", "SELECT frame FROM frame")):
         found = loaded(*command, "-w", workspace.root)
         assert "sqlalchemy" in found
@@ -77,7 +77,7 @@ def test_the_help_lists_every_command_under_a_heading_with_a_whole_sentence(
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_option_is_described_in_a_sentence(name: str) -> None:
-    """The description starts with a capital letter, or a name, and ends with a full stop."""
+    """The description starts with a capital letter or a name, and ends with a full stop."""
     command = get_command(app)
     for word in name.split():
         command = command.commands[word]
@@ -104,10 +104,10 @@ def test_every_option_is_described_in_a_sentence(name: str) -> None:
         ("review export", registry.EDITORS),
     ],
 )
-def test_a_help_text_lists_what_is_registered(
+def test_a_help_text_lists_the_registered_names(
     curate: Curate, command: str, names: registry.Registry
 ) -> None:
-    """All names, in the order of the registry, and a class of the user's own."""
+    """All names, in the order of the registry, and a user-supplied class."""
     _, out, _ = curate(*command.split(), "-h")
     text = " ".join(out.split())
     *others, last = (*names.classes, "module:Class")
@@ -126,8 +126,7 @@ def test_both_options_show_the_help(curate: Curate, name: str, option: str) -> N
     assert "-h, --help" in out
 
 
-def test_the_version(curate: Curate) -> None:
-    """Of the package."""
+def test_the_version_is_that_of_the_package(curate: Curate) -> None:
     assert curate("--version") == (0, f"curate {package.__version__}\n", "")
 
 
@@ -136,7 +135,7 @@ def test_the_version(curate: Curate) -> None:
     [("curate exp", {"export", "explain"}), ("curate solve --policy spsl", {"spsl"})],
 )
 def test_the_shell_completes_commands_and_registered_names(words: str, expected: set[str]) -> None:
-    """As bash asks for it."""
+    """With the protocol that bash uses."""
     ended = subprocess.run(
         [sys.executable, "-m", "curate_command"],
         env=os.environ
@@ -154,7 +153,9 @@ def test_the_shell_completes_commands_and_registered_names(words: str, expected:
     assert found == expected, ended.stderr
 
 
-def test_python_runs_the_package_beside_strangers(tmp_path: Path, workspace: Workspace) -> None:
+def test_python_runs_the_package_beside_packages_of_the_same_name(
+    tmp_path: Path, workspace: Workspace
+) -> None:
     """`python -m curate`, in a folder with packages `db` and `pipelines` of another project."""
     for name in ("db", "pipelines"):
         (tmp_path / "project" / name).mkdir(parents=True)

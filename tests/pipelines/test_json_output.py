@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.bench_results import made_up, make_bench
+from support.bench_results import make_bench, synthetic_result
 from support.pipelines_cli import Curate, with_option
 
 from curate.errors import FramesFailed
@@ -18,7 +18,7 @@ Arguments = Sequence[object]
 
 
 def parsed(text: str) -> Any:
-    """A JSON document without NaN and Infinity, which JSON does not know."""
+    """Parse a JSON document, and reject NaN and Infinity, which JSON does not define."""
 
     def reject(word: str) -> None:
         pytest.fail(f"{word} is not JSON")
@@ -26,8 +26,8 @@ def parsed(text: str) -> Any:
     return json.loads(text, parse_constant=reject)
 
 
-def walk(root: Path, data: Path) -> Mapping[str, Arguments]:
-    """Arguments for each command, in an order in which each finds what it needs."""
+def commands_in_order(root: Path, data: Path) -> Mapping[str, Arguments]:
+    """Return arguments for each command, in an order in which each finds what it needs."""
     work, review = root / "work", root / "review"
     results = root / "results"
     results.mkdir()
@@ -72,18 +72,18 @@ def walk(root: Path, data: Path) -> Mapping[str, Arguments]:
 def test_every_command_with_the_option_prints_one_document(
     curate: Curate, tmp_path: Path, toy_kitti: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A command that gets the option later must be added to the walk."""
+    """A new command with the option must be added to the list."""
     monkeypatch.setattr("curate.simulation.simulate", lambda *_, **__: None)
     job = Job(0.25, 0, "pspsl")
     bench = make_bench(tmp_path / "bench", toy_kitti)
-    write_result(bench.root, made_up(job, 50.0))
-    steps = walk(tmp_path, toy_kitti)
+    write_result(bench.root, synthetic_result(job, 50.0))
+    steps = commands_in_order(tmp_path, toy_kitti)
     assert with_option("--json") == set(steps)
     frame = ""
     for name, arguments in steps.items():
         given = [frame if each == "FRAME" else each for each in arguments]
         code, out, err = curate(*name.split(), *given, "--json")
-        # A check of doctor fails for the toy detector, which was not trained yet.
+        # One check of doctor fails for the toy detector, which was not trained yet.
         assert code == (1 if name == "doctor" else 0), (name, err)
         document = parsed(out)
         assert document, name
@@ -97,7 +97,7 @@ def test_every_command_with_the_option_prints_one_document(
 def test_every_format_of_an_export_is_reported_as_json(
     curate: Curate, workspace: Any, monkeypatch: pytest.MonkeyPatch, form: str
 ) -> None:
-    """With the number of labels, and the place in the summary."""
+    """With the number of labels, and the path in the summary."""
     monkeypatch.chdir(workspace.root)
     assert curate("run")[0] == 0
     code, out, err = curate("export", "--format", form, "--output", f"labels.{form}", "--json")
@@ -107,7 +107,7 @@ def test_every_format_of_an_export_is_reported_as_json(
     assert f"labels.{form}" in report["summary"]
 
 
-def test_failed_frames_leave_a_document_and_a_line_of_error(
+def test_failed_frames_give_a_document_and_an_error_line(
     curate: Curate, workspace: Any, toy_kitti: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The document is on standard output, the line on standard error."""
@@ -121,7 +121,7 @@ def test_failed_frames_leave_a_document_and_a_line_of_error(
     assert err.count("\n") == 1
 
 
-def test_what_json_does_not_know_is_null(capsys: pytest.CaptureFixture) -> None:
-    """Also deep inside."""
+def test_values_that_json_does_not_define_are_null(capsys: pytest.CaptureFixture) -> None:
+    """Also in nested values."""
     print_json({"a": [float("nan"), {"b": float("-inf")}], "c": 0.5})
     assert parsed(capsys.readouterr().out) == {"a": [None, {"b": None}], "c": 0.5}

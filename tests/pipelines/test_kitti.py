@@ -1,4 +1,4 @@
-"""The commands on real KITTI frames, with a real detector's record and a real segmenter."""
+"""The commands on real KITTI frames, with recorded detections and a real segmenter."""
 
 import csv
 import json
@@ -15,7 +15,7 @@ FRAMES = ("000000", "000004", "000008", "000016", "000020", "000025")
 
 @pytest.fixture
 def real_frames(tmp_path: Path, kitti_root: Path) -> Path:
-    """Six real frames in KITTI's layout."""
+    """Return six real frames in KITTI's layout."""
     for folder, ending in (("velodyne", "bin"), ("image_2", "png"), ("calib", "txt")):
         (tmp_path / "kitti" / folder).mkdir(parents=True)
         for frame in FRAMES:
@@ -28,7 +28,10 @@ def real_frames(tmp_path: Path, kitti_root: Path) -> Path:
 def test_real_frames_get_weights_that_a_query_lists(
     curate: Curate, tmp_path: Path, real_frames: Path, kitti_root: Path
 ) -> None:
-    """Stage by stage to the exported file; the parked cars in front are trusted, clutter is not."""
+    """Stage by stage to the exported file.
+
+    The parked cars in front have high weights, clutter does not.
+    """
     work = tmp_path / "work"
     (tmp_path / "labeled.txt").write_text("000000\n000004\n")
     code, out, err = curate(
@@ -60,7 +63,7 @@ def test_real_frames_get_weights_that_a_query_lists(
 def test_frames_without_labels_are_read_too(
     curate: Curate, tmp_path: Path, kitti_root: Path
 ) -> None:
-    """The raw drive has no label_2; the record dictates its own augmented copies."""
+    """The raw drive has no label_2; the record defines its own augmented copies."""
     work = tmp_path / "work"
     code, out, err = curate(
         "init", work, "--root", kitti_root / "raw", "--labeled", "0",

@@ -31,22 +31,22 @@ TURN = Similarity(flip_y=True, rotation_rad=0.2, scale=1.02)
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Four scenes to train with and two official ones of v1.0-trainval's val."""
+    """Return four scenes for training and two official ones of v1.0-trainval's val."""
     write_nuscenes(tmp_path / "nuscenes", SCENES, STEPS, "v1.0-trainval")
     return tmp_path / "nuscenes"
 
 
 def tokens(*scenes: str) -> set[str]:
-    """The frames of scenes."""
+    """Return the frames of scenes."""
     return {sample_token(scene, step) for scene in scenes for step in range(STEPS)}
 
 
 def write_results(path: Path, similarity: Similarity = AS_IT_IS) -> Path:
-    """What a detector finds that knows cars and pedestrians, in nuScenes' form."""
+    """Write the detections of cars and pedestrians in nuScenes' format."""
     results = {}
     for number, scene in enumerate(SCENES):
         for step in range(STEPS):
-            # A centimetre off: who repeats the labels to the digit has seen them.
+            # A centimetre off: exact copies of the labels would be reported as a leak.
             boxes = np.add(drawn_boxes(number, step)[:2], [0.01, 0, 0, 0, 0, 0, 0])
             boxes = similarity.apply_to_boxes(boxes)
             placed = into_map(boxes, vehicle_pose(number, step))
@@ -60,7 +60,7 @@ def write_results(path: Path, similarity: Similarity = AS_IT_IS) -> Path:
 
 
 def test_a_share_takes_whole_scenes(root: Path, tmp_path: Path) -> None:
-    """Of labeled frames and of val, whatever the seed."""
+    """For labeled frames and for val, with any seed."""
     dataset = NuScenesDataset(root)
     for seed in range(5):
         split = choose_split(dataset, "0.3", "", seed)
@@ -77,8 +77,8 @@ def test_a_share_takes_whole_scenes(root: Path, tmp_path: Path) -> None:
     )
 
 
-def test_a_list_that_cuts_a_scene_is_refused(root: Path, tmp_path: Path) -> None:
-    """Neighbours show the same objects; who wants it all the same can say so."""
+def test_a_list_that_cuts_a_scene_is_rejected(root: Path, tmp_path: Path) -> None:
+    """Neighbours show the same objects; an option allows it."""
     chosen = sample_token("scene-0001", 1)
     (tmp_path / "labeled.txt").write_text(chosen)
     arguments = (NuScenesDataset(root), str(tmp_path / "labeled.txt"), "", 0)
@@ -92,7 +92,7 @@ def test_a_list_that_cuts_a_scene_is_refused(root: Path, tmp_path: Path) -> None
 def test_recorded_results_become_weights_and_results(
     root: Path, tmp_path: Path, curate: Curate
 ) -> None:
-    """From the command line: init, run, ask, export, and the export is a record again."""
+    """On the command line: init, run, query, export; the export is a valid record again."""
     work = tmp_path / "work"
     plain = write_results(tmp_path / "plain.json")
     write_results(tmp_path / "turned.json", TURN)
@@ -118,7 +118,7 @@ def test_recorded_results_become_weights_and_results(
     assert len(rows) == 12
     assert {row["category"] for row in rows} == {"Car", "Pedestrian"}
     assert all(int(row["points"]) >= 30 for row in rows)
-    # Both passes agree: of the loss only the score's part is left.
+    # Both passes agree, so only the score's part of the loss is left.
     expected = [-np.log(float(row["score"])) for row in rows]
     assert [float(row["loss"]) for row in rows] == pytest.approx(expected, abs=1e-6)
     assert max(float(row["weight"]) for row in rows) > 0
@@ -129,7 +129,7 @@ def test_recorded_results_become_weights_and_results(
     given = json.loads(plain.read_text())["results"]
     assert len(found["results"]) == 6
     for token, kept in found["results"].items():
-        assert found["ignored"][token] == []  # under pspsl a weight of 0 is background
+        assert found["ignored"][token] == []  # under pspsl weight 0 is background
         boxes = sorted(kept + found["background"][token], key=lambda box: box["k"])
         for box, right in zip(boxes, given[token], strict=True):
             np.testing.assert_allclose(box["translation"], right["translation"], atol=1e-6)
@@ -137,8 +137,8 @@ def test_recorded_results_become_weights_and_results(
             assert abs(np.dot(box["rotation"], right["rotation"])) == pytest.approx(1, abs=1e-9)
 
 
-def test_wrong_results_are_one_line(root: Path, tmp_path: Path, curate: Curate) -> None:
-    """Tokens of another data set, an option without a value."""
+def test_wrong_results_give_a_one_line_error(root: Path, tmp_path: Path, curate: Curate) -> None:
+    """Tokens of another dataset, an option without a value."""
     arguments = ("init", tmp_path / "work", "--dataset", "nuscenes", "--root", root)
     code, _, err = curate(*arguments, "--dataset-option", "camera")
     assert code == ConfigError.exit_code
@@ -157,7 +157,7 @@ def test_wrong_results_are_one_line(root: Path, tmp_path: Path, curate: Curate) 
 
 
 def test_folds_do_not_cut_scenes(root: Path, tmp_path: Path, curate: Curate) -> None:
-    """And there are no more of them than scenes."""
+    """There are at most as many folds as scenes."""
     plain = write_results(tmp_path / "plain.json")
     code, _, err = curate(
         "init", tmp_path / "work", "--dataset", "nuscenes", "--root", root, "--labeled", "0.75",

@@ -1,4 +1,4 @@
-"""Classes that a user names, whatever their modules do."""
+"""User-supplied classes, and modules that fail on import."""
 
 from pathlib import Path
 from zlib import crc32
@@ -20,10 +20,10 @@ from pipelines.registry import DETECTORS, PRIORS
         ("class Mine: ...", "has no predict; see curate.detectors.base.Detector"),
     ],
 )
-def test_a_module_that_cannot_be_used_is_named(
+def test_a_module_that_fails_on_import_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, words: str
 ) -> None:
-    """One line, and above all no exit status 0 as if all had been done."""
+    """One line, and in particular not exit code 0 as if all had been done."""
     name = f"of_a_user_{crc32(source.encode())}"
     (tmp_path / f"{name}.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
@@ -32,10 +32,10 @@ def test_a_module_that_cannot_be_used_is_named(
     assert "\n" not in str(found.value)
 
 
-def test_a_class_without_what_the_pipeline_asks_for_is_refused(
+def test_a_class_without_the_required_members_is_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Methods and class attributes; what an instance brings may be made later."""
+    """Methods and class attributes are required; instance attributes may be set later."""
     (tmp_path / "priors_of_a_user.py").write_text(
         "class Mine:\n    name = 'mine'\n    measured_columns = ()\n"
         "    def measure(self, frame, detections): ...\n"
@@ -70,10 +70,10 @@ class Anything(Mine):
         ("{}:Mine", {}, "missing a required .*argument: 'minimum_score'$"),
     ],
 )
-def test_a_wrong_name_or_option_is_explained(
+def test_a_wrong_name_or_option_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, options: dict, words: str
 ) -> None:
-    """Without an instance being made."""
+    """Without creating an instance."""
     module = "detectors_of_a_user"
     (tmp_path / f"{module}.py").write_text(SOURCE)
     monkeypatch.syspath_prepend(tmp_path)
@@ -81,10 +81,9 @@ def test_a_wrong_name_or_option_is_explained(
         DETECTORS.check(name.format(module), None, offered=(), options=options)
 
 
-def test_a_class_that_takes_any_option_gets_them(
+def test_a_class_that_accepts_any_option_gets_all_options(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it does with them is its own affair."""
     (tmp_path / "open_detectors_of_a_user.py").write_text(SOURCE)
     monkeypatch.syspath_prepend(tmp_path)
     made = DETECTORS.build(

@@ -1,4 +1,4 @@
-"""A user's own packages `curate`, `db` and `pipelines`, where Python finds them before ours."""
+"""A user's own packages `curate`, `db` and `pipelines`, which Python finds before ours."""
 
 import os
 import subprocess
@@ -12,8 +12,8 @@ from support.paths import ROOT, TESTS
 from pipelines.workspace.workspace import Workspace
 
 NAMES = ("curate", "db", "pipelines")
-# Whoever imports this package in place of ours fails at once.
-STRANGER = "raise RuntimeError('the package of a stranger was imported')\n"
+# An import of this package instead of ours fails at once.
+FAILING_MODULE = "raise RuntimeError('the package of a stranger was imported')\n"
 SCRIPT = Path(sys.executable).with_name("curate")
 COMMANDS = {
     "script": [str(SCRIPT)],
@@ -30,43 +30,43 @@ EXECUTORS = [
 
 
 def write_packages(folder: Path) -> None:
-    """A package of each name that raises when it is imported."""
+    """Write a package of each name that raises when it is imported."""
     for name in NAMES:
         (folder / name).mkdir(parents=True)
-        (folder / name / "__init__.py").write_text(STRANGER)
+        (folder / name / "__init__.py").write_text(FAILING_MODULE)
 
 
 def write_modules(folder: Path) -> None:
-    """The same as single files."""
+    """Write the same as single files."""
     folder.mkdir()
     for name in NAMES:
-        (folder / f"{name}.py").write_text(STRANGER)
+        (folder / f"{name}.py").write_text(FAILING_MODULE)
 
 
 def write_bare_folders(folder: Path) -> None:
-    """Folders of data without __init__.py, which Python takes for namespace packages."""
+    """Write folders without __init__.py, which Python takes for namespace packages."""
     for name in NAMES:
         (folder / name).mkdir(parents=True)
-        (folder / name / "models.py").write_text(STRANGER)
+        (folder / name / "models.py").write_text(FAILING_MODULE)
 
 
 @pytest.fixture(params=[write_packages, write_modules, write_bare_folders])
 def project(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A folder with strangers in it."""
+    """Return a folder with packages of the same names."""
     request.param(tmp_path / "project")
     return tmp_path / "project"
 
 
 @pytest.fixture(params=COMMANDS)
 def command(request: pytest.FixtureRequest) -> list[str]:
-    """How curate is started."""
+    """Return how curate is started."""
     if request.param == "script" and not SCRIPT.exists():
         pytest.skip("curate is not installed here, it has no console script")
     return COMMANDS[request.param]
 
 
 def curate(command: list[str], project: Path, *arguments: object) -> subprocess.CompletedProcess:
-    """Run it in the project's folder, with the project first on PYTHONPATH."""
+    """Run curate in the project's folder, with the project first on PYTHONPATH."""
     folders = os.pathsep.join(map(str, (project, TESTS, ROOT)))
     return subprocess.run(
         [*command, *map(str, arguments)],
@@ -79,7 +79,7 @@ def curate(command: list[str], project: Path, *arguments: object) -> subprocess.
     )
 
 
-def test_help_and_status_work_beside_strangers(
+def test_help_and_status_work_beside_packages_of_the_same_name(
     command: list[str], project: Path, workspace: Workspace
 ) -> None:
     """In the current folder and on PYTHONPATH, as packages, modules and bare folders."""
@@ -89,10 +89,10 @@ def test_help_and_status_work_beside_strangers(
 
 
 @pytest.mark.parametrize("executor", EXECUTORS)
-def test_a_stage_runs_beside_strangers(
+def test_a_stage_runs_beside_packages_of_the_same_name(
     command: list[str], project: Path, workspace: Workspace, executor: str
 ) -> None:
-    """Two workers, each of them a process that looks for its modules anew."""
+    """Two workers, each a new process that searches for its modules again."""
     configuration = workspace.root / "curate.toml"
     text = configuration.read_text()
     assert "\nexecutor = " in text
@@ -104,7 +104,8 @@ def test_a_stage_runs_beside_strangers(
     workers = [] if executor == "serial" else ["workers = 2"]
     at = lines.index(f'executor = "{executor}"')
     configuration.write_text("\n".join([*lines[:at], *workers, *lines[at:], ""]))
-    # Workers are started anew by each command, which takes long; one stage shows that they start.
+    # Each command starts new workers, which takes long; one stage is enough to show that they
+    # start.
     for stage in ("predict", "repredict", "score") if executor == "serial" else ("predict",):
         ended = curate(command, project, stage, "-w", workspace.root)
         assert ended.returncode == 0, ended.stderr
@@ -134,7 +135,7 @@ def run_with_detector(
 
 
 def write_project_database(project: Path) -> None:
-    """The package `db` of a project, with what only that project has."""
+    """Write the package `db` of a project, with a function that only that project has."""
     (project / "db").mkdir(parents=True)
     (project / "db" / "__init__.py").write_text("def connect(): return 'the project'\n")
     (project / "db" / "models.py").write_text("class Sensor: ...\n")
@@ -152,10 +153,10 @@ def write_project_database(project: Path) -> None:
         ("pass", "import db; db.connect()"),
     ],
 )
-def test_a_detector_that_expects_its_own_db_is_rejected(
+def test_a_detector_that_imports_its_own_db_is_rejected(
     tmp_path: Path, workspace: Workspace, line: str, late: str
 ) -> None:
-    """In one line with both packages and what to do, and before any frame."""
+    """The one-line error contains both packages and what to do, before any frame."""
     project = tmp_path / "project"
     write_project_database(project)
     ended = run_with_detector(project, workspace, line, late)
@@ -167,10 +168,10 @@ def test_a_detector_that_expects_its_own_db_is_rejected(
     assert "rename yours" in ended.stderr
 
 
-def test_a_detector_that_does_not_use_the_other_db_works(
+def test_a_detector_that_does_not_import_its_own_db_works(
     tmp_path: Path, workspace: Workspace
 ) -> None:
-    """The package beside it is nobody's concern."""
+    """The package beside it is ignored."""
     project = tmp_path / "project"
     write_project_database(project)
     ended = run_with_detector(project, workspace, "import json")
@@ -197,11 +198,11 @@ def test_a_detector_in_the_current_folder_is_found_without_a_pythonpath(
         timeout=300,
     )
     assert ended.returncode == 2
-    # It was found: what is wrong is its constructor, or the segmenter that is not on the path.
+    # It was found: the error is about its constructor, or the segmenter that is not on the path.
     assert "No module named 'mydet'" not in ended.stderr
 
 
-def test_a_package_that_was_imported_first_is_named(tmp_path: Path) -> None:
+def test_a_package_that_was_imported_first_is_reported(tmp_path: Path) -> None:
     """By a script that starts the command line itself."""
     (tmp_path / "db.py").write_text("")
     ended = subprocess.run(

@@ -1,4 +1,4 @@
-"""What works where open3d cannot be loaded: everything but simulation."""
+"""Without open3d, everything but simulation works."""
 
 import sys
 from pathlib import Path
@@ -15,8 +15,8 @@ def _without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
 
 
-def test_own_data_is_curated(curate: Curate, workspace: Workspace) -> None:
-    """A round, its labels, and what shows them."""
+def test_user_data_can_be_curated(curate: Curate, workspace: Workspace) -> None:
+    """A round, its labels, and the commands that show them."""
     for arguments in (
         ("run", "--rounds", 1),
         ("status",),
@@ -32,7 +32,9 @@ def test_own_data_is_curated(curate: Curate, workspace: Workspace) -> None:
 
 
 @pytest.mark.parametrize("command", ["simulate", "demo"])
-def test_simulation_reports_what_it_needs(curate: Curate, tmp_path: Path, command: str) -> None:
+def test_simulation_reports_the_missing_package(
+    curate: Curate, tmp_path: Path, command: str
+) -> None:
     """In one line, with the exit code of a wrong configuration."""
     arguments = ("--frames", 8, "--val", 4, "--workers", 1)
     code, _, error = curate(command, tmp_path / "made", *arguments)

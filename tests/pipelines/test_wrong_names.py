@@ -15,7 +15,7 @@ STAGES = ("predict", "repredict", "score", "solve", "export", "train-round", "ru
 
 
 def edit(workspace: Workspace, *changes: tuple[str, str]) -> None:
-    """Replace lines of `curate.toml`; each line must be there."""
+    """Replace lines of `curate.toml`; each line must exist."""
     path = workspace.root / "curate.toml"
     content = path.read_text()
     for old, new in changes:
@@ -49,7 +49,7 @@ def fails_before_any_work(curate: Curate, workspace: Workspace, *command: str) -
 def test_a_misspelled_name_stops_every_stage(
     curate: Curate, workspace: Workspace, command: str, old: str, new: str, words: str
 ) -> None:
-    """With the file, the key and the name that was probably meant."""
+    """The error contains the file, the key and the most similar name."""
     edit(workspace, (old, new))
     err = fails_before_any_work(curate, workspace, command)
     assert f"{workspace.root / 'curate.toml'}: {words}" in err
@@ -102,7 +102,7 @@ def test_a_class_that_cannot_be_used_is_found_before_any_work(
     assert words in fails_before_any_work(curate, workspace, command)
 
 
-def test_a_format_for_the_users_trainer_is_found_before_any_work(
+def test_an_export_format_for_the_trainer_is_checked_before_any_work(
     curate: Curate, workspace: Workspace
 ) -> None:
     """Not after frames have been predicted and scored."""
@@ -117,7 +117,7 @@ def test_a_format_for_the_users_trainer_is_found_before_any_work(
 
 
 @pytest.mark.parametrize("command", ["predict", "run"])
-def test_a_detector_whose_constructor_fails_stops_the_first_stage(
+def test_a_failing_detector_constructor_stops_the_first_stage(
     curate: Curate,
     workspace: Workspace,
     tmp_path: Path,
@@ -164,7 +164,7 @@ def test_an_option_of_the_command_line_is_checked_like_the_file(
         ("train.preset=kiti", "train.preset of detector 'pillars': unknown preset 'kiti'"),
     ],
 )
-def test_a_workspace_is_not_made_with_a_class_that_cannot_be_used(
+def test_a_workspace_is_not_created_with_a_class_that_cannot_be_used(
     curate: Curate, tmp_path: Path, toy_kitti: Path, change: str, words: str
 ) -> None:
     """`curate init` checks all of them, without loading a model."""
@@ -174,7 +174,7 @@ def test_a_workspace_is_not_made_with_a_class_that_cannot_be_used(
     assert not (tmp_path / "w").exists()
 
 
-def test_a_query_does_not_import_what_it_does_not_need(
+def test_a_query_does_not_import_unneeded_classes(
     curate: Curate, workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not the user's detector, policy or executor: those may be broken or slow."""
@@ -193,10 +193,10 @@ def test_a_query_does_not_import_what_it_does_not_need(
     assert "slow_module" not in sys.modules
 
 
-def test_status_does_not_import_what_runs_models(
+def test_status_does_not_import_models(
     curate: Curate, workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither torch for a detector that curate trains, nor an executor or exporter of the user."""
+    """Neither torch for a detector that curate trains, nor a user's executor or exporter."""
     (tmp_path / "heavy_module.py").write_text("raise SystemExit('was imported')\n")
     monkeypatch.syspath_prepend(tmp_path)
     edit(

@@ -1,4 +1,4 @@
-"""A handful of judged labels whose figures can be worked out by hand."""
+"""A few evaluated labels, so that the expected figures can be computed by hand."""
 
 import numpy as np
 
@@ -15,9 +15,10 @@ WEIGHTS = {
 
 
 def six_labels(points=(5, 60, 300, 5, 60, 20)):
-    """Two right and two wrong cars, a neutral one, a wrong cyclist; five objects; frame 2 is empty.
+    """Return six labels and five objects; frame 2 is empty.
 
-    Distances 10, 30, 30, 50, 10 and 15 m.
+    Two cars are correct and two wrong, one label is neutral, one cyclist is wrong.
+    The distances are 10, 30, 30, 50, 10 and 15 m.
     """
     return EvaluatedLabels(
         frames=3,
@@ -34,7 +35,7 @@ def six_labels(points=(5, 60, 300, 5, 60, 20)):
 
 
 def small_audit(weights=None, labels=None, **options):
-    """The audit of `six_labels`."""
+    """Return the audit of `six_labels`."""
     return audit(
         six_labels() if labels is None else labels,
         WEIGHTS if weights is None else weights,
@@ -45,7 +46,7 @@ def small_audit(weights=None, labels=None, **options):
 
 
 def many_labels(frames=60, seed=0):
-    """Right and wrong labels of many frames, and a good, a fair and a blind judge of them."""
+    """Return correct and wrong labels of many frames, and a good, a fair and a random weighting."""
     generator = np.random.default_rng(seed)
     frame = np.repeat(np.arange(frames), 5)
     n = len(frame)

@@ -1,4 +1,4 @@
-"""Benches with made-up results, and a stand-in for the processes that do their jobs."""
+"""Benches with synthetic results, and a stand-in for the processes that run their jobs."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +18,7 @@ def make_bench(
     seeds: tuple[int, ...] = (0,),
     **settings: object,
 ) -> Bench:
-    """A claimed bench over a folder in KITTI's layout."""
+    """Create a bench over a folder in KITTI's layout."""
     given = {"steps": 4, "rounds": 1} | settings
     bench = Bench(
         root,
@@ -29,8 +29,8 @@ def make_bench(
     return bench
 
 
-def made_up(job: Job, car: float, **changes: object) -> JobResult:
-    """A result whose AP is `car` for easy cars, 10 and 20 less for harder ones, 0 for others."""
+def synthetic_result(job: Job, car: float, **changes: object) -> JobResult:
+    """Return a result with AP `car` for easy cars, 10 and 20 less for harder ones, else 0."""
     levels = {"Car": (car, car - 10, car - 20), "Pedestrian": (0.0,) * 3, "Cyclist": (0.0,) * 3}
     values = {
         "ratio": job.ratio,
@@ -49,12 +49,12 @@ def made_up(job: Job, car: float, **changes: object) -> JobResult:
 
 
 def label_figures() -> LabelFigures:
-    """Labels of one round, without any weight."""
+    """Return the labels of one round, without weights."""
     return LabelFigures(round=1, labels=100, trusted=0, precision=None, recall=0.0, auroc=0.5)
 
 
 class ToyJobs:
-    """Does jobs at once, with made-up results; those that `fault` names fail.
+    """Run jobs at once, with synthetic results; those listed in `fault` fail.
 
     Attributes:
         done: jobs in the order in which they were run.
@@ -64,14 +64,14 @@ class ToyJobs:
         self.root, self.fault = root, fault
         self.done: list[Job] = []
 
-    def __call__(self, job: Job, told: Callable[[str, int], None]) -> str | None:
-        """Runs a job."""
+    def __call__(self, job: Job, report: Callable[[str, int], None]) -> str | None:
+        """Run a job."""
         self.done.append(job)
-        told("train", 2)
+        report("train", 2)
         reason = self.fault(job)
         if reason is None:
-            write_result(self.root, made_up(job, 50.0))
+            write_result(self.root, synthetic_result(job, 50.0))
         return reason
 
     def end(self) -> None:
-        """Nothing runs on."""
+        """Do nothing: no process is running."""

@@ -1,4 +1,4 @@
-"""A headless Chromium without a network, and what it says of a page."""
+"""A headless Chromium without a network."""
 
 import shutil
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable
 
 
 class Viewer:
-    """Opens pages; every request that leaves this machine, every error and failure is a fault.
+    """Open pages; every request to another host, every error and failure is recorded as a fault.
 
     Args:
         browser: of Playwright.
@@ -23,47 +23,47 @@ class Viewer:
         self.faults: list[str] = []
         self.width = width
         self._context = browser.new_context(viewport={"width": width, "height": 900})
-        self._context.route("**/*", self._pass_or_refuse)
+        self._context.route("**/*", self._pass_or_abort)
         self.page = self._context.new_page()
         self.page.set_default_timeout(120_000)
         self.page.on("pageerror", lambda error: self.faults.append(f"error: {error}"))
-        self.page.on("console", self._heard)
+        self.page.on("console", self._on_console)
         self.page.on("requestfailed", lambda request: self.faults.append(f"failed: {request.url}"))
-        self.page.on("response", self._answered)
+        self.page.on("response", self._on_response)
 
     def open(self, url: str) -> Any:
-        """The page, with all that it loads."""
+        """Return the page, completely loaded."""
         self.page.goto(url, wait_until="load")
         return self.page
 
     def overflow(self) -> int:
-        """By how many pixels the page is wider than the window."""
+        """Return by how many pixels the page is wider than the window."""
         return int(self.page.evaluate("document.documentElement.scrollWidth")) - self.width
 
     def undecoded(self) -> list[str]:
-        """The pictures of the page that are none."""
+        """Return the images of the page that could not be decoded."""
         script = "[...document.images].filter(i => !(i.complete && i.naturalWidth > 0))"
         found: list[str] = self.page.evaluate(f"{script}.map(i => i.alt)")
         return found
 
-    def _pass_or_refuse(self, route: Any) -> None:
+    def _pass_or_abort(self, route: Any) -> None:
         if route.request.url.startswith(("file:", "data:", "http://127.0.0.1:")):
             route.continue_()
         else:
             route.abort("internetdisconnected")
 
-    def _heard(self, message: Any) -> None:
+    def _on_console(self, message: Any) -> None:
         if message.type in {"error", "warning"}:
             self.faults.append(f"console: {message.text}")
 
-    def _answered(self, response: Any) -> None:
+    def _on_response(self, response: Any) -> None:
         if response.status >= 400:
             self.faults.append(f"{response.status}: {response.url}")
 
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """A browser; the test is skipped where none can be had."""
+    """Return a browser; skip the test if none is installed."""
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="the extra [browser] is not installed"
     )

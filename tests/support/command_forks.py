@@ -1,4 +1,4 @@
-"""Commands forked from a process that has loaded everything, so that a kill meets their work."""
+"""Commands forked from a process that has loaded everything, so that a kill hits their work."""
 
 import contextlib
 import multiprocessing
@@ -13,28 +13,28 @@ from support.rounds import run_workspace
 
 
 class CommandForks:
-    """A process that forks a child for every command; it never opens a database that is tested."""
+    """A process that forks a child for every command; it never opens a database under test."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,))
+        self._connection, child_end = context.Pipe()
+        self._process = context.Process(target=_serve, args=(child_end,))
         self._process.start()
-        theirs.close()
+        child_end.close()
         self._connection.recv()
 
     def start(self, arguments: Sequence[object], environment: Mapping[str, str]) -> int:
-        """`curate ARGUMENTS`, started; the key of its process."""
+        """Start `curate ARGUMENTS` and return the key of its process."""
         self._connection.send((list(map(str, arguments)), dict(environment)))
         return self._connection.recv()
 
     def end(self, pid: int) -> int:
-        """Waits for a command: its exit code, -9 where it was killed."""
+        """Wait for a command and return its exit code, -9 if it was killed."""
         self._connection.send(pid)
         return self._connection.recv()
 
     def close(self) -> None:
-        """Ends the process."""
+        """End the process."""
         self._connection.close()
         self._process.join()
 
@@ -50,11 +50,11 @@ def _serve(connection: Connection) -> None:
             elif pid := os.fork():
                 connection.send(pid)
             else:
-                _become(*message)
+                _run_command(*message)
 
 
 def _warm_up() -> None:
-    """Runs all stages once: modules are loaded then, and kernels compiled."""
+    """Run all stages once, so that modules are loaded and kernels compiled."""
     from pipelines.workspace.config import make_config
     from pipelines.workspace.setup import initialise
     from support.toys import toy_document, write_toy_kitti
@@ -69,8 +69,8 @@ def _warm_up() -> None:
         workspace.database.close()
 
 
-def _become(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
-    """Is the command from here on, with nobody to listen to it."""
+def _run_command(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
+    """Turn this process into the command, without a parent that listens."""
     from pipelines.cli import main
 
     nowhere = os.open(os.devnull, os.O_RDWR)

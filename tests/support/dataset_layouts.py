@@ -1,4 +1,4 @@
-"""The toy frames in the layouts of other data sets."""
+"""The toy frames in the layouts of other datasets."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ def _text(matrix: np.ndarray) -> str:
 
 
 def write_toy_raw(root: Path, frames: int = 4) -> None:
-    """KITTI raw: one drive of a day below ROOT."""
+    """Write KITTI raw below ROOT: one drive of one day."""
     write_toy_kitti(root / "made", frames)
     drive = root / "2011_09_26" / DRIVE
     homes = {"velodyne": "velodyne_points/data", "image_2": "image_02/data", "label_2": "label_2"}
@@ -35,7 +35,7 @@ def write_toy_raw(root: Path, frames: int = 4) -> None:
 
 
 def write_toy_folder(root: Path, frames: int = 4) -> None:
-    """A plain folder, each frame's points in another format."""
+    """Write a plain folder, each frame's points in another format."""
     write_toy_kitti(root / "made", frames)
     made = KittiDataset(root / "made")
     for source, home in (("image_2", "camera"), ("label_2", "boxes")):
@@ -54,7 +54,7 @@ def write_toy_folder(root: Path, frames: int = 4) -> None:
 
 
 def write_cloud(path: Path, points: np.ndarray) -> None:
-    """A file of (n, 4) points in the format of its suffix."""
+    """Write a file of (n, 4) points in the format of its suffix."""
     points = np.float32(points)
     rows = "\n".join(" ".join(map(repr, row)) for row in points.tolist())
     if path.suffix == ".bin":

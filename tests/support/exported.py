@@ -20,7 +20,7 @@ from curate.weighting.base import ZeroWeight
 from support.toys import IMAGE_SIZE, toy_calibration
 
 TRUE_BOX = (10.0, 0.0, -0.8, 4.0, 1.8, 1.6, 0.0)
-# In view, of weight 0, and behind the camera.
+# Visible, of weight 0, and behind the camera.
 BOXES = (
     (20.0, 1.0, -0.5, 4.0, 2.0, 1.5, 0.1),
     (10.0, -2.0, 0.0, 0.8, 0.6, 1.7, 3.0),
@@ -34,7 +34,7 @@ Row = dict[str, Any]
 
 
 def label(frame: str, k: int = 0, box: Sequence[float] = BOXES[0], **changes: Any) -> Row:
-    """A weighted label by column name."""
+    """Return a weighted label by column name."""
     return {
         "round": 1, "frame": frame, "k": k, "category": "Car",
         **dict(zip(BOX_COLUMNS, box, strict=True)), "score": 0.9, "loss": 0.2, "points": 30,
@@ -45,23 +45,23 @@ def label(frame: str, k: int = 0, box: Sequence[float] = BOXES[0], **changes: An
 
 
 def truth(frame: str, k: int = 0, box: Sequence[float] = TRUE_BOX, **changes: Any) -> Row:
-    """An object of ground truth by column name."""
+    """Return a ground-truth object by column name."""
     own = {"frame": frame, "k": k, "category": "Car", "truncated": 0.0, "occluded": 0}
     return own | dict(zip(BOX_COLUMNS, box, strict=True)) | changes
 
 
 def block(rows: Sequence[Row], names: Sequence[str] = WEIGHTED_LABEL_COLUMNS) -> dict[str, list]:
-    """Rows as named columns."""
+    """Return rows as named columns."""
     return {name: [row[name] for row in rows] for name in names}
 
 
 def truth_block(rows: Sequence[Row] = ()) -> dict[str, list]:
-    """Ground truth as named columns."""
+    """Return ground truth as named columns."""
     return block(rows, GROUND_TRUTH_COLUMNS)
 
 
 def rows_of(labels: LabelSet) -> list[Row]:
-    """The labels of a label set, a row each."""
+    """Return the labels of a label set, one row each."""
     return [
         dict(zip(each, values, strict=True))
         for each in labels.labels
@@ -70,12 +70,12 @@ def rows_of(labels: LabelSet) -> list[Row]:
 
 
 def with_rows(labels: LabelSet, rows: Sequence[Row]) -> LabelSet:
-    """The label set with other labels."""
+    """Return the label set with other labels."""
     return replace(labels, labels=[block(rows)] if rows else [])
 
 
 def renamed(labels: LabelSet, names: dict[str, str], read: Callable[[str], Frame]) -> LabelSet:
-    """The label set with other names of frames, and their reader."""
+    """Return the label set with other frame names, and their reader."""
     moved = with_rows(labels, [row | {"frame": names[row["frame"]]} for row in rows_of(labels)])
     return replace(
         moved,
@@ -89,7 +89,7 @@ def renamed(labels: LabelSet, names: dict[str, str], read: Callable[[str], Frame
 
 
 def toy_frame(name: str) -> Frame:
-    """Seven points in the middle of the true box, one outside."""
+    """Return a frame with seven points in the middle of the true box, one outside."""
     points = np.zeros((8, 4), dtype=np.float32)
     points[:, :3] = TRUE_BOX[:3]
     points[:7, 0] += np.linspace(-1, 1, 7, dtype=np.float32)
@@ -100,7 +100,7 @@ def toy_frame(name: str) -> Frame:
 def toy_labels(
     points: tuple[int | None, ...] = (12, None, 3), zero_weight: ZeroWeight = "ignore"
 ) -> LabelSet:
-    """Labeled frame 000000 with a car and a van, unlabeled 000001 with three labels."""
+    """Return labeled frame 000000 with a car and a van, unlabeled 000001 with three labels."""
     files = [(f"velodyne/00000{i}.bin", f"image_2/00000{i}.png", "c") for i in range(2)]
     evidence = {
         "points_threshold": 20.0, "rho_diff": 0.6, "mask_pixels": 30, "box_pixels": 100,

@@ -1,4 +1,4 @@
-"""What executors are tested with: functions that travel to workers, and an executor of ill will."""
+"""Functions that executors send to workers, and an executor that returns results out of order."""
 
 import os
 import signal
@@ -17,17 +17,17 @@ from pipelines.engine.executors.serial import SerialExecutor
 
 @dataclass
 class Square:
-    """Squares the key of a frame; refuses some, cannot even start if told so."""
+    """Square the key of a frame; reject some keys, fail to open if configured to."""
 
     broken: bool = False
 
     def open(self) -> None:
-        """Fails where the model is broken."""
+        """Raise if the model is configured as broken."""
         if self.broken:
             raise ModelError("model.onnx: broken")
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """One row."""
+        """Return one row."""
         if job.frame_id % 7 == 3:
             raise ValueError(f"three\nlines {job.frame_id}\nlong")
         return {"squares": {"value": [job.frame_id**2]}}
@@ -35,13 +35,13 @@ class Square:
 
 @dataclass
 class Deadly(Square):
-    """Frames that the system kills their worker for: some always, some once.
+    """Kill the worker on some frames, always or once.
 
     Attributes:
-        folder: where it remembers whom it has killed.
-        always: these frames take their worker with them.
-        once: these do so the first time.
-        opening: whether loading the model is too much already.
+        folder: where it records which workers it has killed.
+        always: frames that kill their worker every time.
+        once: frames that do so the first time.
+        opening: whether loading the model kills the worker.
     """
 
     folder: Path = Path()
@@ -50,12 +50,12 @@ class Deadly(Square):
     opening: bool = False
 
     def open(self) -> None:
-        """Dies where told so."""
+        """Kill the worker if configured to."""
         if self.opening:
             os.kill(os.getpid(), signal.SIGKILL)
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """One row, or the end of the process."""
+        """Return one row, or kill the process."""
         died = self.folder / str(job.frame_id)
         if job.frame_id in self.always or (job.frame_id in self.once and not died.exists()):
             died.touch()
@@ -64,27 +64,27 @@ class Deadly(Square):
 
 
 class Shuffled:
-    """Serial, but frames come as they please."""
+    """A serial executor that returns outcomes in another order."""
 
     def __init__(self, seed: int = 0) -> None:
         self.generator = np.random.default_rng(seed)
 
     def map(self, function: FrameFunction, jobs: Iterable[FrameJob]) -> Iterator[Outcome]:
-        """One outcome per job, in another order."""
+        """Yield one outcome per job, in another order."""
         waiting = list(jobs)
         order = self.generator.permutation(len(waiting))
         return SerialExecutor().map(function, [waiting[i] for i in order])
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing."""
 
 
 @dataclass
 class Slow:
-    """Takes its time, and says on which node of a cluster it worked.
+    """Sleep per frame, and report the node of the cluster.
 
     Attributes:
-        folder: where it notes every frame that it begins.
+        folder: where it records every frame that it starts.
         seconds: per frame.
     """
 
@@ -92,10 +92,10 @@ class Slow:
     seconds: float
 
     def open(self) -> None:
-        """Needs nothing."""
+        """Do nothing."""
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """The node, as a row."""
+        """Return the node as a row."""
         import ray
 
         node = ray.get_runtime_context().get_node_id()

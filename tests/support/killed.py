@@ -1,14 +1,14 @@
-"""Trainings that end in the middle."""
+"""Trainings that are killed halfway."""
 
 from collections.abc import Callable
 
 
 class Killed(Exception):  # noqa: N818 - stands for a signal
-    """Ends a training in the middle."""
+    """Ends a training halfway."""
 
 
 def kill_at(last: int) -> Callable[[int, int, float], None]:
-    """A progress callback that ends the training after a step."""
+    """Return a progress callback that ends the training after a step."""
 
     def progress(step: int, steps: int, loss: float) -> None:
         if step == last:

@@ -1,4 +1,4 @@
-"""Made-up KITTI frames, as dicts for slow oracles and as `KittiObjects` for the code under test."""
+"""Synthetic KITTI frames: dicts for the slow oracle, `KittiObjects` for the tested code."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ LABELLED = ("Car", "Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Mis
 
 
 def car(x=0.0, z=20.0, **changes):
-    """One easy car, as a dict; `changes` replace its values."""
+    """Return one easy car as a dict; `changes` replace its values."""
     item = {
         "category": "Car",
         "truncated": 0.0,
@@ -25,7 +25,7 @@ def car(x=0.0, z=20.0, **changes):
 
 
 def to_objects(items):
-    """The dicts of one frame as `KittiObjects`."""
+    """Return the dicts of one frame as `KittiObjects`."""
 
     def column(name, width, dtype=np.float64):
         values = np.array([item[name] for item in items], dtype=dtype)
@@ -45,13 +45,13 @@ def to_objects(items):
 
 
 def random_frames(generator, count):
-    """Labels and results, lists of lists of dicts: crowded, with ties, copies and clutter."""
+    """Return labels and results per frame: crowded, with ties, copies and clutter."""
     labels = [random_labels(generator) for _ in range(count)]
     return labels, [random_results(generator, frame) for frame in labels]
 
 
 def random_labels(generator):
-    """Up to seven objects, some hidden, cut off, low in the image or regions without a 3D box."""
+    """Return up to seven objects: some occluded, truncated, too small, or DontCare regions."""
     items = []
     for category in generator.choice(LABELLED, generator.integers(8)):
         left, top = generator.uniform(0, 300, 2).round(1)
@@ -71,7 +71,7 @@ def random_labels(generator):
 
 
 def random_results(generator, labels):
-    """Copies and near copies of the labels, sometimes twice or renamed, and some from nowhere."""
+    """Return copies and near copies of the labels, some doubled or renamed, and false positives."""
     seen = [item for item in labels if item["category"] != "DontCare"]
     nowhere = [item for item in random_labels(generator)[:2] if item["category"] != "DontCare"]
     items = []

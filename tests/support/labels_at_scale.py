@@ -1,4 +1,4 @@
-"""A workspace with as many labels as asked for, every one with its evidence, and no frame files."""
+"""A workspace with any number of labels, all with evidence, without frame files."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,20 +14,20 @@ from support.stored_tuples import COLUMNS, store
 
 EACH = 50  # labels per frame
 BATCH_FRAMES = 2000
-DRAWN_FRAMES = 20_000  # others are copies of them, with slightly different numbers
+DRAWN_FRAMES = 20_000  # the others are copies of them, with slightly different numbers
 CATEGORIES = ("Car", "Pedestrian", "Cyclist")
 SHARES = (0.7, 0.2, 0.1)
 
 
 def filled_workspace(root: Path, frames: int, database: str | None = None) -> Workspace:
-    """A new workspace whose first round knows `EACH` labels of each frame."""
+    """Return a new workspace with `EACH` labels per frame in its first round."""
     run = {"database": database} if database else {}
     document = {"dataset": {"root": root}, "run": run}
     workspace = Workspace.create(root, make_config(document, "test"))
     with workspace.database.writing() as connection:
         store(connection, "frame", _frames(frames))
         store(connection, "round", [(1, 3, None, "{}", "0", 0)])
-    # An index by value that exists while millions of rows come makes each of them a seek.
+    # An index by value would cost a seek for each of the millions of inserted rows.
     indices = sorted(bulk.table("prediction").indexes, key=lambda index: str(index.name))
     with workspace.database.writing() as connection:
         for index in indices:
@@ -61,7 +61,7 @@ def _keys(first: int, end: int) -> list[bulk.Row]:
 def _evidence(
     generator: np.random.Generator, keys: list[bulk.Row]
 ) -> Iterator[tuple[str, list[bulk.Row]]]:
-    """The tables and their rows; every tenth label has no match."""
+    """Return the tables and their rows; every tenth label has no match."""
     count = len(keys)
     boxes = generator.normal(0, 10, (7, count)).tolist()
     categories = generator.choice(CATEGORIES, count, p=SHARES).tolist()
@@ -77,7 +77,7 @@ def _evidence(
 
 
 def _copies(first: int, count: int) -> Iterator[str]:
-    """Statements that repeat the first frames behind others; no weight comes twice."""
+    """Return statements that copy the first frames; all weights stay distinct."""
     shrunk = {name: f"{name} * {1 - 1e-9 * first!r}" for name in ("loss", "rho_diff", "score")}
     for name in ("prediction", "consistency", "point_prior", "semantic_prior"):
         chosen = {column: column for column in COLUMNS[name]}

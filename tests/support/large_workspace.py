@@ -1,4 +1,4 @@
-"""A workspace with millions of made-up labels, written by SQLite itself in one go."""
+"""A workspace with millions of synthetic labels, written by SQLite itself."""
 
 import sqlite3
 from contextlib import closing
@@ -14,7 +14,7 @@ from support.toys import toy_document, write_toy_kitti
 TOY_FRAMES = 12
 PER_FRAME = 50
 
-# Numbers from 0 to 1 that look random and are the same on every machine.
+# Pseudo-random numbers in [0, 1], the same on every machine.
 _DRAW = "(((f.id * 7919 + n.k * 104729 + {round} * 15485863 + {salt} * 32452843) % 9973) / 9973.0)"
 _ROWS = "FROM frame AS f CROSS JOIN n WHERE f.id > 1000 AND f.id % {share} = 0 ORDER BY f.id, n.k"
 _NUMBERS = (
@@ -22,12 +22,13 @@ _NUMBERS = (
 )
 
 
-# An index by value that exists while millions of rows come makes each of them a seek.
+# An index by value would cost a seek for each of the millions of inserted rows.
 _INDICES = (
     "SELECT name, sql FROM sqlite_master WHERE type = 'index' AND sql IS NOT NULL "
     "AND tbl_name IN ('prediction', 'weight') ORDER BY name"
 )
-# Columns and values per table; u0 to u3 are the draws of a label, place is that of all rounds.
+# Columns and values per table; u0 to u3 are random draws per label, place is its number over all
+# rounds.
 _VALUES = {
     "prediction": (
         "category, score, x, y, z, length, width, height, yaw",
@@ -54,15 +55,15 @@ _VALUES = {
 
 
 class EndlessKitti(KittiDataset):
-    """Any frame shows the files of one of a few."""
+    """A dataset in which every frame shows the files of one of a few."""
 
     def files(self, frame_id: str) -> FrameFiles:
-        """The files of the frame that stands for it."""
+        """Return the files of the frame that stands for it."""
         return super().files(f"{int(frame_id) % TOY_FRAMES:06d}")
 
 
 def large_workspace(folder: Path, labels: tuple[int, ...]) -> Workspace:
-    """A workspace with a number of labels in each of its rounds, weighted by pspsl."""
+    """Return a workspace with a number of labels in each of its rounds, weighted by pspsl."""
     write_toy_kitti(folder / "kitti", frames=TOY_FRAMES, val=4)
     (folder / "detector.txt").write_text("")
     document = toy_document(folder / "kitti", folder / "detector.txt")
@@ -82,7 +83,7 @@ def large_workspace(folder: Path, labels: tuple[int, ...]) -> Workspace:
             _add_round(connection, number, len(labels), max(frames * PER_FRAME // count, 1))
         for _, made in indices:
             connection.execute(made)
-        # As solve leaves the statistics; without them the planner walks through all weights.
+        # solve updates the statistics too; without them the planner scans all weights.
         connection.executescript("PRAGMA analysis_limit = 400; ANALYZE")
     return workspace
 
@@ -98,7 +99,7 @@ def _add_frames(connection: sqlite3.Connection, count: int) -> None:
 
 
 def _add_round(connection: sqlite3.Connection, number: int, rounds: int, share: int) -> None:
-    """The rows of a round for every `share`-th frame."""
+    """Insert the rows of a round for every `share`-th frame."""
     connection.execute(
         "INSERT INTO round (number, rounds, config, code_version, seed) VALUES (?, ?, '{}', '', 0)",
         (number, rounds),

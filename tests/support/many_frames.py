@@ -1,4 +1,4 @@
-"""A data set of as many recorded frames as one likes: every frame is a link to one of a few."""
+"""A dataset of any number of recorded frames; every frame is a link to one of a few."""
 
 import os
 from pathlib import Path
@@ -14,7 +14,7 @@ LABELED = 8
 
 
 def write_many_frames(root: Path, frames: int) -> Path:
-    """Tiny frames in KITTI's layout and what a detector answered for them; the path of the CSV."""
+    """Write tiny frames in KITTI's layout and recorded detections; return the path of the CSV."""
     write_toy_kitti(root, frames=TEMPLATES)
     home = root / "training"
     for path in (home / "image_2").glob("*.png"):
@@ -27,16 +27,16 @@ def write_many_frames(root: Path, frames: int) -> Path:
     (root / "ImageSets" / "train.txt").write_text("\n".join(names) + "\n")
     (root / "ImageSets" / "val.txt").write_text("")
     (root / "labeled.txt").write_text("\n".join(names[:LABELED]) + "\n")
-    answers = [_answers(home / "velodyne" / f"{i:06d}.bin") for i in range(TEMPLATES)]
+    detections = [_detections(home / "velodyne" / f"{i:06d}.bin") for i in range(TEMPLATES)]
     with (root / "detections.csv").open("w") as file:
         file.write(HEADER + "\n")
         for i, name in enumerate(names):
-            file.writelines(f"{name},{answer}\n" for answer in answers[i % TEMPLATES])
+            file.writelines(f"{name},{line}\n" for line in detections[i % TEMPLATES])
     return root / "detections.csv"
 
 
-def _answers(path: Path) -> list[str]:
-    """A box per object, for the frame as it is and for a mirrored copy."""
+def _detections(path: Path) -> list[str]:
+    """Return a box per object, for the frame and for a mirrored copy."""
     points = np.fromfile(path, dtype=np.float32).reshape(-1, 4)
     rows = []
     for view, sign in ((0, 1), (1, -1)):

@@ -1,7 +1,7 @@
-"""A tiny nuScenes: all tables of its schema, sensors that are turned, a vehicle that drives.
+"""A tiny nuScenes dataset: all tables of its schema, rotated sensors, a moving vehicle.
 
-What is in the LiDAR's frame is drawn first and then brought into the map by scipy's rotations, so
-that the reader, which goes the other way with its own arithmetic, can be wrong.
+Objects are placed in the LiDAR frame and transformed to the map by scipy's rotations. The reader
+under test does the inverse with its own arithmetic, so an error in it shows.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 CAMERAS = ("CAM_FRONT", "CAM_BACK")
 IMAGE_SIZE = (160, 90)
 INTRINSIC = [[80.0, 0, 80], [0, 80, 45], [0, 0, 1]]
-# nuScenes' LiDAR looks along y (x right); a box's yaw there is ours and a quarter more.
+# nuScenes' LiDAR has y forward and x right; its box yaw is ours plus a quarter turn.
 QUARTER = Rotation.from_euler("z", 90, degrees=True)
 OBJECTS = {
     "vehicle.car": (4.4, 1.9, 1.6),
@@ -26,20 +26,20 @@ OBJECTS = {
 
 
 def token(*parts) -> str:
-    """32 hexadecimal digits, as nuScenes' tokens are."""
+    """Return 32 hexadecimal digits, like nuScenes' tokens."""
     return hashlib.md5("/".join(map(str, parts)).encode(), usedforsecurity=False).hexdigest()
 
 
 @dataclass(frozen=True)
 class Mounted:
-    """A sensor on the vehicle: channel, where it stands, how it is turned."""
+    """A sensor on the vehicle: channel, translation, rotation."""
 
     channel: str
     place: tuple[float, float, float]
     turn: Rotation
 
     def record(self, **more) -> dict:
-        """Its record of calibrated_sensor."""
+        """Return its record of calibrated_sensor."""
         return {
             "token": token("mounted", self.channel),
             "sensor_token": token("sensor", self.channel),
@@ -49,11 +49,11 @@ class Mounted:
         } | more
 
 
-# x right, y forward, z up: the LiDAR's y is the vehicle's x; mounted a little askew.
+# x right, y forward, z up: the LiDAR's y is the vehicle's x; mounted slightly tilted.
 LIDAR = Mounted(
     "LIDAR_TOP", (0.9, 0.1, 1.84), Rotation.from_euler("zyx", [-89.6, 0.9, -0.7], degrees=True)
 )
-# Cameras look along z with x right and y down.
+# Camera frames have z forward, x right and y down.
 FORWARD = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 MOUNTED = (
     LIDAR,
@@ -63,21 +63,21 @@ MOUNTED = (
 
 
 def scalar_first(turn: Rotation) -> list[float]:
-    """w, x, y, z."""
+    """Return w, x, y, z."""
     x, y, z, w = turn.as_quat().tolist()
     return [w, x, y, z]
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the vehicle is in the map."""
+    """The pose of the vehicle in the map."""
 
     place: np.ndarray
     turn: Rotation
 
 
 def vehicle_pose(scene: int, step: int, seconds: float = 0.0) -> Pose:
-    """On a curve, on a road that is not quite level, far from the map's origin."""
+    """Return a pose on a curve, on a slightly tilted road, far from the map's origin."""
     along = 5.0 * (step * 0.5 + seconds)
     place = np.array([600.0 + 90 * scene + along, 1600.0 - 0.2 * along, 0.0])
     turn = Rotation.from_euler("zyx", [35.0 + 40 * scene + along, 1.2, -0.8], degrees=True)
@@ -85,9 +85,9 @@ def vehicle_pose(scene: int, step: int, seconds: float = 0.0) -> Pose:
 
 
 def into_map(boxes: np.ndarray, pose: Pose, lidar: Mounted = LIDAR) -> list[dict]:
-    """Translation, size (width, length, height) and rotation of boxes in our LiDAR frame.
+    """Return translation, size (width, length, height) and rotation of boxes in our LiDAR frame.
 
-    Our LiDAR frame is the sensor's with x forward, a quarter turn from its own axes.
+    Our LiDAR frame has x forward, a quarter turn from the sensor's own axes.
     """
     to_map = pose.turn * lidar.turn * QUARTER
     origin = pose.place + pose.turn.apply(lidar.place)
@@ -102,7 +102,7 @@ def into_map(boxes: np.ndarray, pose: Pose, lidar: Mounted = LIDAR) -> list[dict
 
 
 def into_camera(points: np.ndarray, scene: int, step: int, camera: Mounted) -> np.ndarray:
-    """Pixels and depth of points in our LiDAR frame, by way of the map."""
+    """Return pixels and depth of points in our LiDAR frame, computed through the map."""
     sweep, shot = vehicle_pose(scene, step), vehicle_pose(scene, step, 0.05)
     to_map = sweep.turn * LIDAR.turn * QUARTER
     world = sweep.place + sweep.turn.apply(LIDAR.place) + to_map.apply(points)
@@ -112,7 +112,7 @@ def into_camera(points: np.ndarray, scene: int, step: int, camera: Mounted) -> n
 
 
 def drawn_boxes(scene: int, step: int) -> np.ndarray:
-    """(4, 7) a car, a pedestrian and a bicycle ahead, a car behind, in our LiDAR frame."""
+    """Return (4, 7) a car, a pedestrian and a bicycle ahead, a car behind, in our LiDAR frame."""
     rng = np.random.default_rng([scene, step])
     sizes = [OBJECTS["vehicle.car"], *list(OBJECTS.values())[1:], OBJECTS["vehicle.car"]]
     x = [14.0, 9.0, 11.0, -15.0]
@@ -126,7 +126,7 @@ NAMES = ("vehicle.car", "human.pedestrian.adult", "vehicle.bicycle", "vehicle.ca
 
 
 def sweep_of(boxes: np.ndarray, seed: int) -> np.ndarray:
-    """(n, 5) float32 as in a file: points in the boxes and on the ground in the sensor's axes."""
+    """Return (n, 5) float32 as in a file: points in the boxes and on the ground, in sensor axes."""
     rng = np.random.default_rng(seed)
     clouds = [rng.uniform([-30, -30, -1.8], [30, 30, -1.8], (400, 3))]
     for box in boxes:
@@ -144,7 +144,7 @@ def write_nuscenes(
     steps: int = 2,
     version: str = "v1.0-mini",
 ) -> None:
-    """Two scenes of two key frames each, with sweeps between them, in nuScenes' layout."""
+    """Write two scenes of two key frames each, with sweeps between them, in nuScenes' layout."""
     tables: dict[str, list[dict]] = {
         "attribute": [{"token": token("moving"), "name": "vehicle.moving", "description": ""}],
         "calibrated_sensor": [each.record() for each in MOUNTED],
@@ -174,7 +174,7 @@ def write_nuscenes(
 
 
 def sample_token(scene: str, step: int) -> str:
-    """Of a key frame."""
+    """Return the token of a key frame."""
     return token("sample", scene, step)
 
 

@@ -1,4 +1,4 @@
-"""A database as an older curate has left it."""
+"""A database with the schema of an older curate."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import db
 
 
 def downgrade(connection: Connection, revision: str) -> None:
-    """Back to a schema; the views must be gone, or as they were then."""
+    """Downgrade to a schema; the views must be dropped, or be those of that schema."""
     config = Config()
     config.set_main_option("script_location", str(Path(db.__file__).parent / "migrations"))
     config.attributes["connection"] = connection

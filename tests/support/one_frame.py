@@ -1,4 +1,4 @@
-"""The least that predictions can belong to: an unlabeled frame and a round."""
+"""The minimum that predictions can refer to: an unlabeled frame and a round."""
 
 from sqlalchemy import Connection
 
@@ -6,6 +6,6 @@ from support.stored_tuples import store
 
 
 def add_one_frame(connection: Connection) -> None:
-    """Into an empty database; both have the key 1."""
+    """Insert both into an empty database, with key 1."""
     store(connection, "frame", [("kitti", "x", "unlabeled", "p", "i", "c", None)])
     store(connection, "round", [(1, 1, None, "{}", "0", 0)])

@@ -1,4 +1,4 @@
-"""Folders that tests need whatever their own place."""
+"""Folders that tests need, independent of the current folder."""
 
 from pathlib import Path
 

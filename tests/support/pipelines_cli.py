@@ -13,7 +13,7 @@ Curate = Callable[..., tuple[int, str, str]]
 
 
 def in_process(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Curate:
-    """A function that runs `curate`: exit code, standard output, standard error."""
+    """Return a function that runs `curate` and returns (exit code, stdout, stderr)."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["curate", *map(str, arguments)])
@@ -31,7 +31,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -
 
 
 def with_option(option: str) -> set[str]:
-    """The commands that have an option."""
+    """Return the commands that have an option."""
     root = get_command(app)
     found = set()
     for name in COMMANDS:

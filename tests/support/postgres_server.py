@@ -1,4 +1,4 @@
-"""A PostgreSQL server for the test run: its own data folder and socket, ended by its process id."""
+"""A PostgreSQL server for the test run, with its own data folder and socket."""
 
 import os
 import shutil
@@ -14,34 +14,34 @@ from pathlib import Path
 TEMPLATE = "curate_template"
 _PROGRAMS = ("initdb", "postgres")
 _LONGEST_START_S = 60
-# Nothing here outlives the test run, so nothing needs to reach the disk.
+# The data is not needed after the test run, so nothing has to be flushed to disk.
 _SETTINGS = ("fsync=off", "synchronous_commit=off", "full_page_writes=off", "listen_addresses=")
 
 
 def unavailable() -> str | None:
-    """Why no server can be started here; None where one can."""
+    """Return why no server can be started here, or None if one can."""
     if find_spec("psycopg") is None:
         return "psycopg is not installed: pip install 'curate-pseudo-labels[postgres]'"
     if _binaries() is None:
         return "no PostgreSQL binaries (initdb, postgres) in PATH or /usr/lib/postgresql"
     if os.geteuid() == 0 and _account() is None:
-        return "PostgreSQL refuses to run as root, and there is no account postgres or nobody"
+        return "PostgreSQL does not run as root, and there is no account postgres or nobody"
     return None
 
 
 class PostgresServer:
-    """A running server; it hands out URLs of databases."""
+    """A running server that creates databases."""
 
     def __init__(self, socket_folder: Path) -> None:
         self._folder = socket_folder
         self._drawn = 0
 
     def url(self, name: str) -> str:
-        """The URL of a database, whether it exists or not."""
+        """Return the URL of a database, whether it exists or not."""
         return f"postgresql+psycopg://curate@/{name}?host={self._folder}"
 
     def execute(self, statement: str, database: str = "postgres") -> None:
-        """Runs a statement outside any transaction."""
+        """Run a statement outside any transaction."""
         import psycopg
 
         with psycopg.connect(
@@ -50,7 +50,7 @@ class PostgresServer:
             connection.execute(statement)
 
     def new_database(self, template: str = "template1") -> str:
-        """The URL of a fresh database, a copy of the template."""
+        """Return the URL of a new database, a copy of the template."""
         self._drawn += 1
         name = f"test_{self._drawn}"
         self.execute(f"CREATE DATABASE {name} TEMPLATE {template}")
@@ -59,10 +59,10 @@ class PostgresServer:
 
 @contextmanager
 def running_server() -> Iterator[PostgresServer]:
-    """Starts a server and ends it, and removes what it kept."""
+    """Start a server; at the end stop it and remove its files."""
     binaries, account = _binaries(), _account()
     assert binaries is not None
-    # A socket's path has about a hundred characters at most, which pytest's folders can exceed.
+    # A socket path has about a hundred characters at most, and pytest's folders can exceed that.
     folder = Path(tempfile.mkdtemp(prefix="curate-pg-"))
     try:
         if account is not None:
@@ -83,7 +83,7 @@ def running_server() -> Iterator[PostgresServer]:
             _wait_for(found, server, folder / "log")
             yield found
         finally:
-            # Like a terminating server, but without waiting for connections that tests left open.
+            # Fast shutdown: do not wait for connections that tests left open.
             server.send_signal(signal.SIGINT)
             server.wait()
     finally:
@@ -106,7 +106,7 @@ def _wait_for(found: PostgresServer, server: subprocess.Popen, log: Path) -> Non
 
 
 def _binaries() -> Path | None:
-    """The folder of the newest server that is installed."""
+    """Return the folder of the newest installed server."""
     on_path = shutil.which("initdb")
     folders = [Path(on_path).resolve().parent] if on_path else []
     installed = Path("/usr/lib/postgresql").glob("*/bin")
@@ -116,10 +116,10 @@ def _binaries() -> Path | None:
 
 
 def _account() -> str | None:
-    """The account that the server runs under where we are root; None otherwise."""
+    """Return the account for the server if we are root, else None."""
     import pwd
 
     if os.geteuid() != 0:
         return None
-    known = {entry.pw_name for entry in pwd.getpwall()}
-    return next((name for name in ("postgres", "nobody") if name in known), None)
+    accounts = {entry.pw_name for entry in pwd.getpwall()}
+    return next((name for name in ("postgres", "nobody") if name in accounts), None)

@@ -1,4 +1,4 @@
-"""A command as a tree of processes: how much memory each needed at most."""
+"""A command as a tree of processes, and the peak memory of each."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from support.paths import ROOT
 
 
 def environment(**more: str) -> dict[str, str]:
-    """What a `curate` in a process of its own needs to find this tree and the toys."""
+    """Return the environment in which a `curate` process finds this tree and the toys."""
     import os
 
     path = f"{ROOT / 'tests'}:{ROOT}"
@@ -18,7 +18,7 @@ def environment(**more: str) -> dict[str, str]:
 
 
 def start(*arguments: object, **more: str) -> subprocess.Popen:
-    """`curate ARGUMENTS`, started; `more` goes into its environment."""
+    """Start `curate ARGUMENTS`; `more` is added to its environment."""
     return subprocess.Popen(
         [sys.executable, "-m", "pipelines", *map(str, arguments)],
         env=environment(**more),
@@ -29,7 +29,7 @@ def start(*arguments: object, **more: str) -> subprocess.Popen:
 
 
 def descendants(pid: int) -> list[int]:
-    """The processes below one, those that multiprocessing starts for itself included."""
+    """Return the processes below one, including the helper processes of multiprocessing."""
     try:
         text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
     except OSError:
@@ -39,12 +39,12 @@ def descendants(pid: int) -> list[int]:
 
 
 def workers(pid: int) -> list[int]:
-    """The worker processes of a command."""
+    """Return the worker processes of a command."""
     return [child for child in descendants(pid) if "spawn_main" in _command(child)]
 
 
 def peaks(process: subprocess.Popen) -> tuple[int, int]:
-    """The peak memory of a command and of its largest worker in KiB, once it has ended."""
+    """Return the peak memory of a command and of its largest worker in KiB, once it has ended."""
     parent, worker = 0, 0
     while process.poll() is None:
         parent = max(parent, peak(process.pid))
@@ -54,15 +54,15 @@ def peaks(process: subprocess.Popen) -> tuple[int, int]:
 
 
 def forget_peak() -> None:
-    """Lets the peak of this process begin anew, with what it has now."""
-    with suppress(OSError):  # only Linux tells peaks, and lets them be forgotten
+    """Reset the peak memory of this process to its current size."""
+    with suppress(OSError):  # only Linux can report peaks and reset them
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def peak(pid: int | str = "self") -> int:
-    """The peak memory of a process in KiB, 0 for none.
+    """Return the peak memory of a process in KiB, 0 if it has ended.
 
-    The greatest size that `getrusage` tells begins with that of the process which started it.
+    The peak that `getrusage` reports starts with that of the parent process, so it cannot be used.
     """
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()

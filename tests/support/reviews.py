@@ -9,13 +9,16 @@ CATEGORIES = ("Car", "Pedestrian", "Cyclist")
 
 
 def shown(category: str, box: tuple[float, ...], k: int = 0, **changes) -> ShownBox:
-    """A box that is asked about."""
+    """Return a box under review."""
     fields = {"score": 0.6, "weight": 0.5, "asked": True} | changes
     return ShownBox(k, category, box, **fields)
 
 
 def small_sheet(editor: str = "kitti") -> Sheet:
-    """Frame 000001 with a car, a pedestrian and a human label; frame 000002 with a cyclist."""
+    """Return frame 000001 with a car, a pedestrian and a human label.
+
+    Frame 000002 with a cyclist.
+    """
     human = shown("Car", (30.0, -6.0, -0.5, 4.2, 1.7, 1.5, 1.5), 1_000_000, asked=False, human=True)
     return Sheet(
         1,

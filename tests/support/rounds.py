@@ -1,4 +1,4 @@
-"""Stages and rounds as the tests run them: serial, silent, by name."""
+"""Stages and rounds, run serially and without progress output."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ def run_workspace(workspace: Workspace, rounds: int | None = None, **options: An
 
 
 def run(workspace: Workspace) -> dict[str, int]:
-    """Run everything; frames (or round stages) done anew, by stage."""
+    """Run everything; return the number of frames (or round stages) done, by stage."""
     return {report.stage: report.done for report in run_workspace(workspace)}
 
 
@@ -32,6 +32,6 @@ def run_stage(
 
 
 def state_of(workspace: Workspace, name: str, policy: str = "pspsl", number: int = 1) -> str:
-    """The state of a round stage."""
+    """Return the state of a round stage."""
     plan = open_plan(workspace, number)
     return plan.round_state(plan.graph.of_rounds(name), policy)

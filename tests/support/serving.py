@@ -17,7 +17,7 @@ from support.toys import toy_document, write_toy_kitti
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back; the names of headers are in small letters."""
+    """A response; the names of headers are in lower case."""
 
     status: int
     headers: Mapping[str, str]
@@ -25,7 +25,7 @@ class Answer:
 
     @property
     def text(self) -> str:
-        """The body as text."""
+        """Return the body as text."""
         return self.body.decode("utf-8", "replace")
 
 
@@ -35,7 +35,7 @@ class Pages:
 
     Attributes:
         port: on 127.0.0.1.
-        workspace: whose pages these are.
+        workspace: the workspace that is served.
     """
 
     port: int
@@ -43,7 +43,7 @@ class Pages:
 
     @property
     def url(self) -> str:
-        """Without a slash at the end."""
+        """Return the URL without a slash at the end."""
         return f"http://127.0.0.1:{self.port}"
 
     def get(
@@ -54,19 +54,19 @@ class Pages:
         body: str | None = None,
         **parameters: object,
     ) -> Answer:
-        """One request; the path goes out as it is written, dots and all."""
+        """Send one request; the path is sent as it is written, dots included."""
         query = f"?{urlencode(parameters, quote_via=quote)}" if parameters else ""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120)
         connection.request(method, path + query, body=body, headers=dict(headers or {}))
-        answer = connection.getresponse()
-        names = {name.lower(): value for name, value in answer.getheaders()}
-        found = Answer(answer.status, names, answer.read())
+        response = connection.getresponse()
+        names = {name.lower(): value for name, value in response.getheaders()}
+        found = Answer(response.status, names, response.read())
         connection.close()
         return found
 
 
 def weighted_workspace(folder: Path) -> Workspace:
-    """Toy frames with the weights of one round, an export and a failed frame."""
+    """Return toy frames with the weights of one round, an export and a failed frame."""
     write_toy_kitti(folder / "kitti", frames=12, val=4)
     weights = folder / "detector.txt"
     weights.write_text("")
@@ -78,7 +78,7 @@ def weighted_workspace(folder: Path) -> Workspace:
 
 @contextmanager
 def running(served: object, workspace: Workspace, host: str = "127.0.0.1") -> Iterator[Pages]:
-    """The server until the end of the block."""
+    """Return the server; it stops at the end of the block."""
     from pipelines.serving.application import application
     from pipelines.serving.server import listen, make_server
 

@@ -1,11 +1,11 @@
-"""Checks of shapes while the tests run: `make shapes`, jaxtyping's import hook with beartype.
+"""Check array shapes while the tests run: `make shapes`, jaxtyping's import hook with beartype.
 
     pytest --jaxtyping-packages=curate,support.shapes.check
 
-Two things need help. The hook wraps every function below its other decorators, where numba would
-have to compile the wrapper: kernels are left as they are, what calls them is checked. And beartype
-checks a method outside of its class, where `Self` means nothing to it: of the types of a function,
-only arrays and tensors are checked, all others are mypy's.
+Two things need help. The hook wraps every function below its other decorators, and numba cannot
+compile the wrapper: kernels are skipped, and only their callers are checked. Beartype checks a
+method outside of its class and cannot resolve `Self`: of the types of a function, only arrays and
+tensors are checked; mypy checks all others.
 """
 
 import ast
@@ -27,7 +27,7 @@ _import_hook._is_no_type_check = _is_skipped  # noqa: SLF001
 
 
 def check(function: Callable) -> Callable:
-    """Return a function whose arrays are checked against their shapes and types of numbers."""
+    """Return a function that checks the shapes and dtypes of its arrays."""
     function.__annotations__ = {
         name: hint if _has_shape(hint) else Any for name, hint in function.__annotations__.items()
     }
@@ -35,7 +35,7 @@ def check(function: Callable) -> Callable:
 
 
 def _has_shape(hint: Any) -> bool:
-    """Whether a type is an array with a shape, or made of such."""
+    """Return whether a type is an array with a shape, or contains one."""
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
         return True
     return any(map(_has_shape, get_args(hint)))

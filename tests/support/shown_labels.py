@@ -1,4 +1,4 @@
-"""Labels as pictures show them."""
+"""Labels as the plots show them."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from curate.viewing.tags import ShownLabels
 
 
 def labels(boxes, weights) -> ShownLabels:
-    """Cars with weights."""
+    """Return cars with weights."""
     boxes = np.array(boxes, dtype=np.float64).reshape(-1, 7)
     count = len(boxes)
     return ShownLabels(boxes, np.array(["Car"] * count, dtype=np.str_), np.full(count, 0.9),

@@ -1,4 +1,4 @@
-"""Progress that shows nothing."""
+"""Progress without output."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,9 +7,9 @@ from pipelines.engine.progress import Advance
 
 
 class Silent:
-    """Shows nothing."""
+    """Progress that prints nothing."""
 
     @contextmanager
     def track(self, what: str, total: int) -> Iterator[Advance]:
-        """Yields a function that does nothing."""
+        """Yield a function that does nothing."""
         yield lambda _step, _note: None

@@ -1,18 +1,18 @@
-"""What a run has stored; all of it in an order that does not depend on when it was written."""
+"""All rows that a run has stored, in an order that does not depend on when they were written."""
 
 from sqlalchemy import select
 
 from db.models import Base
 from pipelines.workspace.workspace import Workspace
 
-# Keys that the database draws, and times: two equal runs differ in them.
+# Keys that the database generates, and times: two equal runs differ in them.
 CHANCE = {"id", "seconds", "created_at", "imported_at", "decided_at"}
-# What was asked for, not what came out: it names executor and paths.
+# The input, not the result: it contains executor and paths.
 SETTINGS = {"config"}
 
 
 def dump(workspace: Workspace) -> list[tuple]:
-    """Every row of every table as (table, *values), floats to the last bit."""
+    """Return every row of every table as (table, *values), floats to the last bit."""
     rows = []
     for table in Base.metadata.sorted_tables:
         columns = [column for column in table.columns if column.name not in CHANCE | SETTINGS]
@@ -22,7 +22,7 @@ def dump(workspace: Workspace) -> list[tuple]:
 
 
 def rows(workspace: Workspace, sql: str) -> list[tuple]:
-    """The answer to a question."""
+    """Return the rows of a query."""
     with workspace.database.reading() as connection:
         return [tuple(row) for row in connection.exec_driver_sql(sql)]
 

@@ -1,4 +1,4 @@
-"""Rows that tests write as tuples, with the columns that the tuples stand for."""
+"""Rows that tests write as tuples, with their column names."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -35,7 +35,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 
 
 def as_columns(table: str, rows: Iterable[tuple]) -> dict[str, list[Any]]:
-    """The rows by column name."""
+    """Return the rows by column name."""
     rows, names = list(rows), COLUMNS[table]
     return {name: [row[i] for row in rows] for i, name in enumerate(names)}
 

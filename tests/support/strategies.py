@@ -15,7 +15,7 @@ offsets = st.one_of(st.floats(-4.0, 4.0), st.sampled_from([0.0, 0.5, 1.0, -1.0, 
 
 @st.composite
 def box_arrays(draw, min_size=0, max_size=6):
-    """(n, 7) boxes near the origin, often touching, nested, parallel, equal or flat."""
+    """Draw (n, 7) boxes near the origin, often touching, nested, parallel, equal or flat."""
     box = st.tuples(offsets, offsets, offsets, sides, sides, sides, angles)
     rows = draw(st.lists(box, min_size=min_size, max_size=max_size))
     return np.array(rows, dtype=np.float64).reshape(-1, 7)

@@ -19,19 +19,19 @@ TALL = 10_000
 
 @dataclass
 class Terminal:
-    """What a program printed in a terminal, complete once the terminal is closed."""
+    """The output of a program in a terminal, complete once the terminal is closed."""
 
     text: str = ""
 
     @property
     def lines(self) -> list[str]:
-        """The lines as they stand on the screen."""
+        """Return the lines as they appear on the screen."""
         return self.text.replace("\r\n", "\n").splitlines()
 
 
 @contextmanager
 def open_terminal(columns: int, lines: int) -> Iterator[tuple[Terminal, int]]:
-    """Open a terminal of this size: what is printed in it, and its end for a program."""
+    """Open a terminal of this size; return its output and the file descriptor for a program."""
     master, slave = pty.openpty()
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
     found, parts = Terminal(), []
@@ -40,7 +40,7 @@ def open_terminal(columns: int, lines: int) -> Iterator[tuple[Terminal, int]]:
         while True:
             try:
                 part = os.read(master, 65536)
-            except OSError:  # Linux reports the closed other end so
+            except OSError:  # Linux reports the closed other end as this error
                 return
             if not part:
                 return

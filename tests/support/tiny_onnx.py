@@ -19,7 +19,7 @@ def tiny_detector(
     scores: np.ndarray | None = None,
     labels: np.ndarray | None = None,
 ) -> None:
-    """Writes it.
+    """Write the ONNX file.
 
     Args:
         path: of the .onnx file.
@@ -28,7 +28,7 @@ def tiny_detector(
         shape: of the input.
         rows: (n, 7) what is added to the mean of the points, sizes and yaw included.
         scores: (n,) or (n, classes).
-        labels: (n,); left out where scores are per class.
+        labels: (n,); left out if scores are per class.
     """
     sizes = np.repeat(SIZES, boxes_per_category, axis=0)
     count = len(sizes)
@@ -38,9 +38,9 @@ def tiny_detector(
         scores = np.linspace(0.9, 0.15, len(rows))
     if labels is None and scores.ndim == 1:
         labels = np.repeat(np.arange(3), boxes_per_category)[: len(rows)]
-    held = {"rows": np.float32(rows), "three": np.array([3]), "zero": np.array([0])}
-    held |= {"axis": np.array([len(shape) - 1]), "pads": np.array([0, 0, 0, 4])}
-    held |= {"mean_of": np.array(list(range(len(shape) - 1)))}
+    constants = {"rows": np.float32(rows), "three": np.array([3]), "zero": np.array([0])}
+    constants |= {"axis": np.array([len(shape) - 1]), "pads": np.array([0, 0, 0, 4])}
+    constants |= {"mean_of": np.array(list(range(len(shape) - 1)))}
     nodes = [
         helper.make_node("Slice", ["points", "zero", "three", "axis"], ["places"]),
         helper.make_node("ReduceMean", ["places", "mean_of"], ["mean"], keepdims=0),
@@ -49,13 +49,13 @@ def tiny_detector(
         helper.make_node("Add", ["padded", "rows"], [names[0]]),
         helper.make_node("Identity", ["score_values"], [names[1]]),
     ]
-    held["score_values"] = np.float32(scores)
+    constants["score_values"] = np.float32(scores)
     outputs = [
         helper.make_tensor_value_info(names[0], TensorProto.FLOAT, rows.shape),
         helper.make_tensor_value_info(names[1], TensorProto.FLOAT, scores.shape),
     ]
     if labels is not None:
-        held["label_values"] = np.int64(labels)
+        constants["label_values"] = np.int64(labels)
         nodes.append(helper.make_node("Identity", ["label_values"], [names[2]]))
         outputs.append(helper.make_tensor_value_info(names[2], TensorProto.INT64, labels.shape))
     graph = helper.make_graph(
@@ -63,7 +63,7 @@ def tiny_detector(
         "tiny",
         [helper.make_tensor_value_info("points", TensorProto.FLOAT, shape)],
         outputs,
-        [numpy_helper.from_array(np.asarray(value), name) for name, value in held.items()],
+        [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
     onnx.save(model, str(path))

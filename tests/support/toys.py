@@ -1,4 +1,4 @@
-"""A toy world for tests of the pipeline: small frames in KITTI's layout and an honest detector."""
+"""A toy world for pipeline tests: small frames in KITTI's layout and a simple detector."""
 
 import os
 import time
@@ -30,19 +30,19 @@ INTENSITIES = {"Car": 0.9, "Pedestrian": 0.8, "Cyclist": 0.7}
 
 
 def toy_calibration() -> Calibration:
-    """A camera at the LiDAR's origin that looks along x."""
+    """Return the calibration of a camera at the LiDAR's origin that looks along x."""
     projection = np.array([[60.0, 0, 60, 0], [0, 60, 20, 0], [0, 0, 1, 0]])
     lidar_to_camera = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
     return Calibration(projection, lidar_to_camera)
 
 
 def empty_frame(name: str) -> Frame:
-    """A frame of which only the name matters."""
+    """Return a frame with a name and nothing else."""
     return Frame(name, np.zeros((0, 4), np.float32), toy_calibration(), IMAGE_SIZE)
 
 
 def write_toy_kitti(root: Path, frames: int, val: int = 0, *, labels: bool = True) -> None:
-    """Frames 000000.. with one object per category, each a cloud of equally bright points."""
+    """Write frames 000000.. with one object per category, each a cloud of equally bright points."""
     for folder in ("velodyne", "image_2", "calib", "label_2"):
         (root / "training" / folder).mkdir(parents=True, exist_ok=True)
     names = [f"{i:06d}" for i in range(frames)]
@@ -54,7 +54,7 @@ def write_toy_kitti(root: Path, frames: int, val: int = 0, *, labels: bool = Tru
 
 
 def toy_document(root: Path, weights_file: Path) -> dict:
-    """The settings of a toy workspace."""
+    """Return the settings of a toy workspace."""
     return {
         "dataset": {"root": root},
         "detector": {"name": "support.toys:ToyDetector", "path": weights_file},
@@ -94,10 +94,10 @@ def _write_frame(folder: Path, name: str, rng: np.random.Generator, *, labels: b
         )
 
 
-def dawdle() -> None:
-    """Lets a test stop the process in the middle of its work, or hold it at a gate: a file.
+def wait_if_requested() -> None:
+    """Let a test stop the process during its work, or make it wait at a gate, which is a file.
 
-    A process that has come to the gate leaves another file beside it, by its number.
+    A process that has reached the gate writes another file beside it, named by its number.
     """
     time.sleep(float(os.environ.get("TOY_DELAY_S", "0")))
     gate = Path(os.environ.get("TOY_GATE", "/no gate"))
@@ -107,23 +107,23 @@ def dawdle() -> None:
 
 
 def arrival(gate: Path, process: int) -> Path:
-    """The file that a process leaves at a gate."""
+    """Return the file that a process writes at a gate."""
     return gate.with_name(f"{gate.name}-{process}")
 
 
 class ToyDetector:
-    """Finds the bright clouds; its score is the share of 60 points that it saw.
+    """Find the bright clouds; the score is the share of 60 points that it saw.
 
     Args:
-        path: a file; a frame whose name is written in it raises.
+        path: a file; a frame whose name is in it raises.
     """
 
     def __init__(self, path: Path) -> None:
         self.poison = set(Path(path).read_text().split())
 
     def predict(self, frame: Frame) -> Detections:
-        """One box per category."""
-        dawdle()
+        """Return one box per category."""
+        wait_if_requested()
         if frame.frame_id in self.poison:
             raise RuntimeError("CUDA error: an illegal memory access\nwas encountered")
         found = []
@@ -140,7 +140,7 @@ class ToyDetector:
 
 
 class ToySegmenter:
-    """Sees a car in every pixel of the left half, a person in the right half."""
+    """Segment the left half of every image as car and the right half as person."""
 
     needs_image = True
 
@@ -148,8 +148,8 @@ class ToySegmenter:
         self.path = path
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """The semantic map."""
-        dawdle()
+        """Return the semantic map."""
+        wait_if_requested()
         width, height = frame.image_size
         class_ids = np.ones((height, width), dtype=np.uint8)
         class_ids[:, width // 2 :] = 2
@@ -158,7 +158,7 @@ class ToySegmenter:
 
 @dataclass(frozen=True)
 class ToyPrior(EvidenceSource):
-    """A prior of somebody else's: an integer and a real number are measured, a third follows."""
+    """A user-supplied prior: an integer and a real number are measured."""
 
     plenty: float = 12.0
     name: ClassVar[str] = "toy"
@@ -171,7 +171,7 @@ class ToyPrior(EvidenceSource):
     measured_columns: ClassVar[tuple[str, ...]] = ("near_points", "nearest")
 
     def measure(self, frame: Frame, detections: Detections) -> Measured:
-        """Distances from the centres."""
+        """Return distances from the centres."""
         centres = detections.boxes[:, None, :3]
         apart = np.linalg.norm(frame.points[None, :, :3] - centres, axis=-1)
         nearest = apart.min(axis=1, initial=np.inf)
@@ -181,7 +181,7 @@ class ToyPrior(EvidenceSource):
         }
 
     def rate(self, detections: Detections, measured: Measured) -> Evidence:
-        """Compare the count with what is plenty."""
+        """Return the trust from the measured count."""
         rho = np.minimum(np.asarray(measured["near_points"]) / self.plenty, 1.0)
         return {**measured, "rho_toy": rho}
 
@@ -191,7 +191,7 @@ class ToyPriorAgain(ToyPrior):
 
 
 class ToyTracks(SequenceSource):
-    """A source of somebody else's that counts how often a category occurs in the whole sequence."""
+    """A user-supplied source that counts how often a category occurs in the whole sequence."""
 
     name: ClassVar[str] = "toy_tracks"
     columns: ClassVar[tuple[Column, ...]] = (
@@ -212,11 +212,11 @@ class ToyTracks(SequenceSource):
 
 
 class ToySequences(KittiDataset):
-    """A KITTI data set in which three neighbouring frames are a sequence."""
+    """A KITTI dataset in which three neighbouring frames are a sequence."""
 
     @staticmethod
     def sequence_name(frame_id: str) -> str:
-        """The sequence of a frame."""
+        """Return the sequence of a frame."""
         return f"drive-{int(frame_id) // 3:04d}"
 
     def sequence_of(self, frame_id: str) -> str:

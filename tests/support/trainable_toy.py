@@ -1,4 +1,4 @@
-"""A trainable detector from outside: a linear scorer on a grid, in one small file."""
+"""A trainable external detector: a linear scorer on a grid, in one small file."""
 
 import io
 import json
@@ -18,23 +18,23 @@ from curate.errors import ModelError
 from curate.files.atomic import replace_file
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
-from support.toys import INTENSITIES, SIZES, dawdle
+from support.toys import INTENSITIES, SIZES, wait_if_requested
 
 CELL_M, CELLS, LEFT_M = 2.0, 16, -16.0
 FEATURES = len(INTENSITIES) + 1
 VERSION = "7"
 
 
-def look(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(cells, FEATURES) counts of bright points per cell, and (cells, 2) their mean place."""
+def cell_features(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (cells, FEATURES) counts of bright points, and (cells, 2) their mean position."""
     place = np.floor((points[:, :2] - [0.0, LEFT_M]) / CELL_M).astype(np.int64)
     inside = ((place >= 0) & (place < CELLS)).all(axis=1)
     cell, points = place[inside] @ [CELLS, 1], points[inside]
     seen = np.ones((CELLS * CELLS, FEATURES), dtype=np.float32)
     bright = points[:, 3] > 0.6
     for column, intensity in enumerate(INTENSITIES.values()):
-        alike = cell[np.abs(points[:, 3] - intensity) < 0.01]
-        seen[:, column] = np.log1p(np.bincount(alike, minlength=CELLS * CELLS))
+        same_intensity = cell[np.abs(points[:, 3] - intensity) < 0.01]
+        seen[:, column] = np.log1p(np.bincount(same_intensity, minlength=CELLS * CELLS))
     count = np.maximum(np.bincount(cell[bright], minlength=CELLS * CELLS), 1)
     sums = [np.bincount(cell[bright], points[bright, k], CELLS * CELLS) for k in range(2)]
     return seen, np.stack(sums, axis=1) / count[:, None]
@@ -42,17 +42,17 @@ def look(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass
 class GridStudent:
-    """Learns which cells hold a centre; boxes have the category's size."""
+    """Learns which cells contain a centre; boxes have the category's size."""
 
     preset: str
     categories: tuple[str, ...]
     network: nn.Module
 
     def encode(self, samples: Sequence[Sample], device: str) -> tuple[Tensor, Tensor, Tensor]:
-        """Features, truth and weights of the cells of all samples."""
+        """Return features, targets and weights of the cells of all samples."""
         seen, truth, weights = [], [], []
         for sample in samples:
-            seen.append(look(sample.points)[0])
+            seen.append(cell_features(sample.points)[0])
             truth.append(np.zeros((CELLS * CELLS, len(self.categories)), dtype=np.float32))
             weights.append(np.ones_like(truth[-1]))
             place = np.floor((sample.boxes[:, :2] - [0.0, LEFT_M]) / CELL_M).astype(np.int64)
@@ -65,8 +65,8 @@ class GridStudent:
         return a, b, c
 
     def loss(self, batch: tuple[Tensor, Tensor, Tensor], expected_objects: float) -> dict:
-        """Cross-entropy with random dropout, in terms of objects and background."""
-        dawdle()
+        """Return the cross-entropy with random dropout, as object and background terms."""
+        wait_if_requested()
         seen, truth, weights = batch
         logits = self.network(functional.dropout(seen, 0.1))
         each = weights * functional.binary_cross_entropy_with_logits(
@@ -77,7 +77,7 @@ class GridStudent:
         return {"loss": total, "objects": found, "background": total - found}
 
     def save(self, path: Path, weights: Mapping[str, Tensor]) -> None:
-        """One file for training and inference."""
+        """Write one file for training and inference."""
         about = json.dumps({"toy": VERSION, "preset": self.preset, "categories": self.categories})
         content = io.BytesIO()
         arrays = {name: tensor.cpu().numpy() for name, tensor in weights.items()}
@@ -98,25 +98,25 @@ class GridDetector:
 
     @classmethod
     def check_checkpoint(cls, checkpoint: Path) -> None:
-        """Reads the file."""
+        """Check the file by reading it."""
         read(checkpoint)
 
     @classmethod
     def new_student(cls, preset: str, categories: tuple[str, ...]) -> GridStudent:
-        """Random weights."""
+        """Return a student with random weights."""
         return GridStudent(preset, categories, nn.Linear(FEATURES, len(categories)))
 
     @classmethod
     def load_student(cls, checkpoint: Path) -> GridStudent:
-        """Those of a checkpoint."""
+        """Return the student of a checkpoint."""
         about, arrays = read(checkpoint)
         student = cls.new_student(about["preset"], tuple(about["categories"]))
         student.network.load_state_dict({name: torch.from_numpy(a) for name, a in arrays.items()})
         return student
 
     def predict(self, frame: Frame) -> Detections:
-        """A box per cell that scores."""
-        seen, centres = look(frame.points)
+        """Return a box per cell with a score above the threshold."""
+        seen, centres = cell_features(frame.points)
         scores = 1 / (1 + np.exp(-(seen @ self.arrays["weight"].T + self.arrays["bias"])))
         found = Detections.empty()
         parts = []
@@ -133,7 +133,7 @@ class GridDetector:
 
 
 def read(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
-    """What a checkpoint is, and its arrays."""
+    """Return the metadata and the arrays of a checkpoint."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)

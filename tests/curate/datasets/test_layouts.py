@@ -1,4 +1,4 @@
-"""Tests of KITTI raw and of the plain folder: the same frames as in KITTI's object layout."""
+"""KITTI raw and the plain folder: the same frames as in KITTI's object layout."""
 
 import shutil
 from pathlib import Path
@@ -21,7 +21,7 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_frames_are_those_of_kittis_layout(tmp_path, layout):
+def test_the_frames_equal_those_of_kittis_layout(tmp_path, layout):
     """Points, calibration, image size and ground truth, in every point format."""
     write, kind, prefix = LAYOUTS[layout]
     write(tmp_path / "other")
@@ -39,14 +39,14 @@ def test_the_frames_are_those_of_kittis_layout(tmp_path, layout):
 
 
 def test_a_raw_frame_without_image_is_left_out(tmp_path):
-    """Some drives lack one."""
+    """Some drives have frames without one."""
     write_toy_raw(tmp_path)
     image = f"2011_09_26/{DRIVE}/image_02/data/0000000001.png"
     (tmp_path / image).unlink()
     assert len(KittiRawDataset(tmp_path).frame_ids()) == 3
 
 
-def test_raw_calibration_is_named_where_it_is_wrong(tmp_path):
+def test_invalid_raw_calibration_is_reported(tmp_path):
     """Missing file, missing line, wrong count."""
     write_toy_raw(tmp_path)
     day = tmp_path / "2011_09_26"
@@ -82,8 +82,8 @@ def test_raw_calibration_is_named_where_it_is_wrong(tmp_path):
         ("[calibration]\n", "[calibration\n", "not TOML"),
     ],
 )
-def test_a_wrong_description_is_one_line(tmp_path, line, other, message):
-    """It names the file and the key."""
+def test_a_wrong_description_gives_a_one_line_error(tmp_path, line, other, message):
+    """It contains the file and the key."""
     write_toy_folder(tmp_path)
     path = tmp_path / "dataset.toml"
     assert line in path.read_text()
@@ -94,8 +94,8 @@ def test_a_wrong_description_is_one_line(tmp_path, line, other, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_of_lists_that_holds_none_is_named(tmp_path):
-    """A slip in its name must not turn val frames into training frames."""
+def test_a_folder_without_lists_is_rejected(tmp_path):
+    """A typo in its name must not turn val frames into training frames."""
     write_toy_folder(tmp_path)
     description = tmp_path / "dataset.toml"
     description.write_text('splits = "lists"\n' + description.read_text())
@@ -107,7 +107,7 @@ def test_a_folder_of_lists_that_holds_none_is_named(tmp_path):
 
 
 def test_frames_without_images_have_a_size(tmp_path):
-    """Points and boxes in the image need no pixels; who asks for them is told."""
+    """Points and boxes in the image need no pixels; reading the image raises."""
     write_toy_folder(tmp_path)
     expected = FolderDataset(tmp_path).read("000001")
     path = tmp_path / "dataset.toml"
@@ -124,8 +124,7 @@ def test_frames_without_images_have_a_size(tmp_path):
         bare.read("000001", image=True)
 
 
-def test_the_calibration_may_be_a_kitti_file(tmp_path):
-    """Named instead of written down."""
+def test_the_calibration_can_be_a_kitti_file(tmp_path):
     write_toy_folder(tmp_path)
     calib = tmp_path / "made" / "training" / "calib" / "000000.txt"
     calib.rename(tmp_path / "calib.txt")
@@ -140,8 +139,8 @@ def test_the_calibration_may_be_a_kitti_file(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".npy", ".pcd", ".ply"])
-def test_damaged_point_files_are_named(tmp_path, suffix):
-    """Garbage, in one line."""
+def test_damaged_point_files_are_rejected(tmp_path, suffix):
+    """In one line."""
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"no points at all!")
     with pytest.raises(DataError, match=f"a{suffix}: ") as caught:
@@ -159,7 +158,7 @@ def test_points_that_are_not_finite_are_left_out(tmp_path):
 
 @pytest.mark.kitti
 def test_real_frames_in_a_plain_folder(kitti_root: Path, tmp_path: Path):
-    """Those of a raw drive, described in three lines, are as KITTI's reader reads them."""
+    """Frames of a raw drive, described in three lines, equal those of KITTI's reader."""
     raw = kitti_root / "raw"
     name = KittiDataset(raw).frame_ids()[0]
     (tmp_path / "dataset.toml").write_text(

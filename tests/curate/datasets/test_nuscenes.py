@@ -1,4 +1,4 @@
-"""Tests of nuScenes' reader on a tiny nuScenes whose geometry is known."""
+"""The nuScenes reader on a tiny dataset with known geometry."""
 
 import json
 from pathlib import Path
@@ -28,8 +28,8 @@ FRAMES = [(number, scene, step) for number, scene in enumerate(SCENES) for step 
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory) -> Path:
-    """A folder that no test changes."""
+def unchanged_root(tmp_path_factory) -> Path:
+    """Return a folder that no test changes."""
     root = tmp_path_factory.mktemp("nuscenes")
     write_nuscenes(root)
     return root
@@ -37,22 +37,22 @@ def kept(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def root(tmp_path) -> Path:
-    """A folder to be damaged."""
+    """Return a folder that a test can damage."""
     write_nuscenes(tmp_path)
     return tmp_path
 
 
 def change(path: Path, edit) -> None:
-    """Rewrites a table whose records were edited."""
+    """Rewrite a table with edited records."""
     records = json.loads(path.read_text())
     for record in records:
         edit(record)
     path.write_text(json.dumps(records))
 
 
-def test_boxes_come_back_from_the_map(kept):
-    """Those that the camera sees, where they were drawn in the LiDAR's frame."""
-    dataset = NuScenesDataset(kept)
+def test_boxes_are_transformed_from_the_map(unchanged_root):
+    """Those in the camera's view, as they were placed in the LiDAR frame."""
+    dataset = NuScenesDataset(unchanged_root)
     for number, scene, step in FRAMES:
         truth = dataset.annotations(sample_token(scene, step))
         expected = drawn_boxes(number, step)[:3]
@@ -63,9 +63,9 @@ def test_boxes_come_back_from_the_map(kept):
         assert truth.occluded.tolist() == [2, 1, 1]
 
 
-def test_points_are_in_our_axes(kept):
-    """Forward is x, left is y, intensity in [0, 1]; the objects' points lie in their boxes."""
-    dataset = NuScenesDataset(kept)
+def test_points_are_in_our_axes(unchanged_root):
+    """Forward is x, left is y, intensity in [0, 1]; the boxes contain the objects' points."""
+    dataset = NuScenesDataset(unchanged_root)
     for number, scene, step in FRAMES:
         boxes = drawn_boxes(number, step)
         frame = dataset.read(sample_token(scene, step))
@@ -77,9 +77,9 @@ def test_points_are_in_our_axes(kept):
 
 
 @pytest.mark.parametrize("camera", ["CAM_FRONT", "CAM_BACK"])
-def test_points_project_by_way_of_the_map(kept, camera):
-    """The vehicle has moved on between the sweep and the image."""
-    dataset = NuScenesDataset(kept, camera=camera)
+def test_points_are_projected_through_the_map(unchanged_root, camera):
+    """The vehicle moves between the sweep and the image."""
+    dataset = NuScenesDataset(unchanged_root, camera=camera)
     mounted = next(each for each in MOUNTED if each.channel == camera)
     for number, scene, step in FRAMES:
         frame = dataset.read(sample_token(scene, step), image=True)
@@ -90,16 +90,20 @@ def test_points_project_by_way_of_the_map(kept, camera):
         assert frame.image_size == IMAGE_SIZE
 
 
-def test_the_camera_decides_which_objects_count(kept):
-    """The one behind is seen by the camera at the back alone."""
-    found = NuScenesDataset(kept, camera="CAM_BACK").annotations(sample_token(SCENES[0], 0))
+def test_the_camera_decides_which_objects_count(unchanged_root):
+    """Only the back camera sees the object behind."""
+    found = NuScenesDataset(unchanged_root, camera="CAM_BACK").annotations(
+        sample_token(SCENES[0], 0)
+    )
     np.testing.assert_allclose(found.boxes[:, :3], drawn_boxes(0, 0)[3:, :3], atol=1e-9)
     assert found.truncated.tolist() == pytest.approx([0.0], abs=1e-6)
 
 
-def test_the_pose_of_the_lidar_is_known(kept):
+def test_the_pose_of_the_lidar_is_read(unchanged_root):
     """Its origin in the map, and its x axis along the vehicle's."""
-    calibration = NuScenesDataset(kept).read(sample_token(SCENES[1], 1), points=False).calibration
+    calibration = (
+        NuScenesDataset(unchanged_root).read(sample_token(SCENES[1], 1), points=False).calibration
+    )
     pose, lidar = vehicle_pose(1, 1), MOUNTED[0]
     np.testing.assert_allclose(
         calibration.lidar_to_map[:3, 3], pose.place + pose.turn.apply(lidar.place)
@@ -110,33 +114,34 @@ def test_the_pose_of_the_lidar_is_known(kept):
     assert ahead[0] > 0.99
 
 
-def test_objects_without_points_are_left_out(kept):
-    """By num_lidar_pts, which the table counts."""
-    found = NuScenesDataset(kept, minimum_points=29).annotations(sample_token(SCENES[0], 0))
+def test_objects_without_points_are_left_out(unchanged_root):
+    """By num_lidar_pts of the table."""
+    found = NuScenesDataset(unchanged_root, minimum_points=29).annotations(
+        sample_token(SCENES[0], 0)
+    )
     assert found.categories.tolist() == ["Car", "Pedestrian"]
 
 
-def test_other_names_can_be_asked_for(kept):
+def test_other_class_names_can_be_requested(unchanged_root):
     """The task's own, for a detector that was trained on them."""
-    dataset = NuScenesDataset(kept, rename={})
+    dataset = NuScenesDataset(unchanged_root, rename={})
     found = dataset.annotations(sample_token(SCENES[0], 0))
     assert found.categories.tolist() == ["car", "pedestrian", "bicycle"]
 
 
-def test_scenes_are_whole_on_each_side(kept):
+def test_scenes_stay_whole(unchanged_root):
     """The official lists of v1.0-mini; other versions have none."""
-    dataset = NuScenesDataset(kept)
+    dataset = NuScenesDataset(unchanged_root)
     splits = dataset.splits()
     tokens = {scene: {sample_token(scene, step) for step in range(2)} for scene in SCENES}
     assert set(splits["train"]) == tokens["scene-0061"]
     assert set(splits["val"]) == tokens["scene-0103"]
     for scene, own in tokens.items():
         assert set(sequences_of(dataset, own).values()) == {scene}
-    assert dataset.sequence_of("stranger") is None
+    assert dataset.sequence_of("unknown") is None
 
 
 def test_another_version_has_no_lists(tmp_path):
-    """Not everything in nuScenes' layout is nuScenes."""
     write_nuscenes(tmp_path, version="v1.0-ours")
     assert NuScenesDataset(tmp_path).splits() == {}
     write_nuscenes(tmp_path / "full", version="v1.0-trainval", scenes=("scene-0001", "scene-0003"))
@@ -145,7 +150,7 @@ def test_another_version_has_no_lists(tmp_path):
 
 
 def test_key_frames_without_files_are_left_out(root):
-    """The data set comes in parts."""
+    """The dataset is downloaded in parts."""
     first = sample_token(SCENES[0], 0)
     files = NuScenesDataset(root).files(first)
     files.image.unlink()
@@ -157,8 +162,8 @@ def test_key_frames_without_files_are_left_out(root):
         NuScenesDataset(root).frame_ids()
 
 
-def test_the_version_and_the_camera_are_asked_for(root):
-    """By the names that there are."""
+def test_the_version_and_the_camera_must_be_specified(root):
+    """The error lists the available names."""
     with pytest.raises(ConfigError, match=r"camera 'CAM_TOP': use one of CAM_BACK, CAM_FRONT"):
         NuScenesDataset(root, camera="CAM_TOP").frame_ids()
     with pytest.raises(ConfigError, match=r"no version v1\.0-test; .* to one of v1\.0-mini"):
@@ -183,7 +188,7 @@ def test_the_version_and_the_camera_are_asked_for(root):
         ("sample", {"scene_token": "none"}, "is missing or has no valid scene"),
     ],
 )
-def test_a_record_that_cannot_be_is_named(root, table, edit, message):
+def test_an_invalid_record_is_reported(root, table, edit, message):
     """With its table, in one line."""
     change(root / "v1.0-mini" / f"{table}.json", lambda record: record.update(edit))
     with pytest.raises(DataError, match=message) as caught:
@@ -194,8 +199,8 @@ def test_a_record_that_cannot_be_is_named(root, table, edit, message):
 
 @pytest.mark.parametrize("table", ["scene", "sample_data", "sample_annotation"])
 @pytest.mark.parametrize("damage", ["cut", "gone", "words"])
-def test_a_damaged_table_is_named(root, table, damage):
-    """Missing, cut off in the middle, or something else."""
+def test_a_damaged_table_is_reported(root, table, damage):
+    """Missing, truncated, or of another format."""
     path, name = root / "v1.0-mini" / f"{table}.json", sample_token(SCENES[0], 0)
     content = path.read_bytes()
     dataset = NuScenesDataset(root)
@@ -208,7 +213,7 @@ def test_a_damaged_table_is_named(root, table, damage):
     assert "\n" not in str(caught.value)
 
 
-def test_an_instance_without_category_is_named(root):
+def test_an_instance_without_category_is_reported(root):
     """Its annotation has no name."""
     change(
         root / "v1.0-mini" / "instance.json", lambda record: record.update({"category_token": "x"})
@@ -217,14 +222,14 @@ def test_an_instance_without_category_is_named(root):
         NuScenesDataset(root).annotations(sample_token(SCENES[0], 0))
 
 
-def test_a_frame_that_does_not_exist_is_named(kept):
-    """Frames go by sample tokens, not by those of sample_data."""
+def test_a_frame_that_does_not_exist_is_reported(unchanged_root):
+    """Frame ids are sample tokens, not sample_data tokens."""
     with pytest.raises(DataError, match="no key frame 000001; frame ids are sample"):
-        NuScenesDataset(kept).read("000001")
+        NuScenesDataset(unchanged_root).read("000001")
 
 
-def test_truth_of_other_frames_is_not_decoded(root):
-    """A record of theirs may hold anything."""
+def test_annotations_of_other_frames_are_not_decoded(root):
+    """Their records may be invalid."""
     path = root / "v1.0-mini" / "sample_annotation.json"
     other = sample_token(SCENES[1], 0)
 
@@ -239,13 +244,13 @@ def test_truth_of_other_frames_is_not_decoded(root):
         dataset.annotations(other)
 
 
-def test_tables_may_be_larger_than_a_piece(kept, monkeypatch):
-    """Records that lie across two pieces are whole."""
+def test_tables_can_be_larger_than_a_block(unchanged_root, monkeypatch):
+    """Records that lie across two blocks are complete."""
     from curate.datasets.nuscenes import tables
 
-    whole = NuScenesDataset(kept)
+    whole = NuScenesDataset(unchanged_root)
     name = sample_token(SCENES[1], 1)
     monkeypatch.setattr(tables, "CHUNK_BYTES", 97)
-    pieces = NuScenesDataset(kept)
+    pieces = NuScenesDataset(unchanged_root)
     assert pieces.frame_ids() == whole.frame_ids()
     np.testing.assert_array_equal(pieces.annotations(name).boxes, whole.annotations(name).boxes)

@@ -1,4 +1,4 @@
-"""Tests of the detector that runs any exported model."""
+"""The detector that runs any exported ONNX model."""
 
 import numpy as np
 import onnx
@@ -16,23 +16,23 @@ POINTS = np.array([[9.0, 1, -1, 0.2], [11.0, 3, -1, 0.4]], dtype=np.float32)
 
 
 def frame(points=POINTS):
-    """Two points around (10, 2, -1)."""
+    """Return two points around (10, 2, -1)."""
     return Frame("000001", points, toy_calibration(), (120, 40))
 
 
-def answer(path, options=None, **graph):
-    """What a tiny model answers."""
+def detect(path, options=None, **graph):
+    """Return the detections of a tiny model."""
     tiny_detector(path, **graph)
     return OnnxDetector(path, **({"classes": CATEGORIES} | (options or {}))).predict(frame())
 
 
 def double(points):
-    """A step before the model, by name."""
+    """Preprocess: double the points."""
     return {"points": np.concatenate([points, points])}
 
 
 def upside_down(outputs):
-    """A step after the model, by name."""
+    """Postprocess: turn the boxes upside down."""
     return {
         "boxes": outputs["boxes"][::-1],
         "scores": outputs["scores"][::-1],
@@ -41,31 +41,31 @@ def upside_down(outputs):
 
 
 def summary_sentences(outputs):
-    """A postprocess that names the classes."""
+    """Postprocess: return class names."""
     return {**outputs, "labels": np.array(["Car"] * len(outputs["labels"]))}
 
 
 def between_classes(outputs):
-    """A postprocess whose labels are no whole numbers."""
+    """Postprocess: return labels that are not integers."""
     return {**outputs, "labels": outputs["labels"][:2] + 0.5} | {
         key: outputs[key][:2] for key in ("boxes", "scores")
     }
 
 
 def nonsense(_):
-    """Answers no mapping."""
+    """Return something that is not a mapping."""
     return 3
 
 
 @pytest.fixture
 def path(tmp_path):
-    """Where the model will be."""
+    """Return the path for the model."""
     return tmp_path / "model.onnx"
 
 
 def test_boxes_scores_and_labels_become_detections(path):
-    """By falling score, named by the classes."""
-    found = answer(path)
+    """Sorted by falling score, with class names."""
+    found = detect(path)
     assert found.categories.tolist() == ["Car", "Pedestrian", "Cyclist"]
     np.testing.assert_allclose(found.boxes[0], [10, 2, -1, 3.9, 1.6, 1.5, 0.3], atol=1e-5)
     np.testing.assert_allclose(found.scores, [0.9, 0.525, 0.15], atol=1e-6)
@@ -83,47 +83,47 @@ def test_boxes_scores_and_labels_become_detections(path):
         ({"yaw_offset_rad": 2 * np.pi}, [0, 0, 0, 3.9, 1.6, 1.5, 0.3]),
     ],
 )  # fmt: skip
-def test_declared_conventions_are_undone(path, convention, row):
-    """The same car, however the model writes it."""
-    found = answer(path, {"convention": convention}, rows=np.array([row]))
+def test_declared_conventions_are_converted(path, convention, row):
+    """The same car for every convention of the model."""
+    found = detect(path, {"convention": convention}, rows=np.array([row]))
     np.testing.assert_allclose(found.boxes, [[10, 2, -1, 3.9, 1.6, 1.5, 0.3]], atol=1e-5)
 
 
-def test_outputs_go_by_declared_names_and_inputs_may_have_a_batch(path):
-    """`[1, n, 3]` is fed x, y, z alone."""
+def test_outputs_are_found_by_name_and_inputs_can_have_a_batch(path):
+    """`[1, n, 3]` gets only x, y, z."""
     names = ("bbox", "confidence", "class")
     outputs = {"boxes": "bbox", "scores": "confidence", "labels": "class"}
-    found = answer(path, {"outputs": outputs}, names=names, shape=(1, "n", 3))
+    found = detect(path, {"outputs": outputs}, names=names, shape=(1, "n", 3))
     assert len(found) == 3
 
 
 def test_scores_per_class_and_logits(path):
-    """The best class of each box; the logistic function where scores are logits."""
+    """The best class of each box; the logistic function if scores are logits."""
     logits = np.array([[0.0, 2.0, -1.0], [-3.0, -4.0, 1.0]])
     rows = np.array([[0, 0, 0, 1, 1, 1, 0.0], [5, 0, 0, 1, 1, 1, 0.0]])
-    found = answer(path, {"sigmoid": True}, rows=rows, scores=logits)
+    found = detect(path, {"sigmoid": True}, rows=rows, scores=logits)
     assert found.categories.tolist() == ["Pedestrian", "Cyclist"]
     np.testing.assert_allclose(found.scores, 1 / (1 + np.exp([-2.0, -1.0])), atol=1e-6)
 
 
-def test_labels_may_start_at_one(path):
-    """As many frameworks number them."""
-    found = answer(path, {"first_label": 1}, labels=np.array([3, 1, 2]))
+def test_labels_can_start_at_one(path):
+    """As in many frameworks."""
+    found = detect(path, {"first_label": 1}, labels=np.array([3, 1, 2]))
     assert found.categories.tolist() == ["Cyclist", "Car", "Pedestrian"]
 
 
-def test_nms_where_the_export_left_it_out(path):
-    """The better of two boxes of a category stays; other categories are left alone."""
+def test_nms_can_be_added_to_an_export(path):
+    """The better of two boxes of a category stays; other categories do not change."""
     rows = np.tile([0, 0, 0, 3.9, 1.6, 1.5, 0.0], (3, 1))
     labels = np.array([0, 0, 1])
-    assert len(answer(path, rows=rows, labels=labels)) == 3
-    assert len(answer(path, {"nms_iou": 0.5}, rows=rows, labels=labels)) == 2
+    assert len(detect(path, rows=rows, labels=labels)) == 3
+    assert len(detect(path, {"nms_iou": 0.5}, rows=rows, labels=labels)) == 2
 
 
-def test_functions_of_the_user_come_before_and_after(path):
-    """Named as package.module:function."""
+def test_user_supplied_functions_run_before_and_after_the_model(path):
+    """Specified as package.module:function."""
     options = {"preprocess": f"{__name__}:double", "postprocess": f"{__name__}:upside_down"}
-    found = answer(path, options)
+    found = detect(path, options)
     assert found.categories.tolist() == ["Cyclist", "Pedestrian", "Car"]
 
 
@@ -153,21 +153,21 @@ def test_functions_of_the_user_come_before_and_after(path):
         ({"preprocess": f"{__name__}:POINTS"}, {}, ConfigError, "is no function"),
     ],
 )
-def test_what_does_not_fit_is_one_line(path, options, graph, error, message):
-    """With the model, what it has, and what to set."""
+def test_a_model_that_does_not_fit_gives_a_one_line_error(path, options, graph, error, message):
+    """With the model, its outputs, and the option to set."""
     with pytest.raises(error, match=message) as caught:
-        answer(path, options, **graph)
+        detect(path, options, **graph)
     assert "\n" not in str(caught.value)
 
 
-def test_a_sweep_without_points_is_not_shown_to_the_model(path):
+def test_a_sweep_without_points_is_not_passed_to_the_model(path):
     """Many exports fail on it."""
     tiny_detector(path)
     assert len(OnnxDetector(path, classes=CATEGORIES).predict(frame(POINTS[:0]))) == 0
 
 
-def test_a_model_that_fails_prints_nothing_itself(path, capfd):
-    """ONNX Runtime's own log is several coloured lines beside the one of the error."""
+def test_a_failing_model_prints_nothing_itself(path, capfd):
+    """ONNX Runtime would log several coloured lines beside the one-line error."""
     points = helper.make_tensor_value_info("points", TensorProto.FLOAT, ["n", 4])
     shape = numpy_helper.from_array(np.int64([10**13, 7]), "shape")
     names = ("boxes", "scores")

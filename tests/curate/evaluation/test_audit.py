@@ -1,4 +1,4 @@
-"""The figures of an audit, worked out by hand and against the functions that they come from."""
+"""The numbers of an audit, against values by hand and the functions that compute them."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from curate.evaluation.evaluated_labels import EvaluatedLabels
 
 
 def part(found, policy, category, name):
-    """The figures of a policy, category and slice."""
+    """Return the numbers of a policy, category and slice."""
     return next(
         each
         for each in found.figures
@@ -17,8 +17,8 @@ def part(found, policy, category, name):
     )
 
 
-def test_the_figures_by_hand():
-    """Right: 0.9, 0.8. Wrong: 0.15, 0.05, 0. The neutral label of 0.5 is left out."""
+def test_the_numbers_by_hand():
+    """Correct: 0.9, 0.8. Wrong: 0.15, 0.05, 0. The neutral label of 0.5 is left out."""
     good = small_audit().whole()["good"]
     assert (good.labels, good.neutral, good.right, good.objects) == (5, 1, 2, 5)
     assert good.share_right.value == 2 / 5
@@ -33,16 +33,16 @@ def test_the_figures_by_hand():
     assert good.bins.recall[[0, 8, 9]].tolist() == [0, 1 / 5, 1 / 5]
 
 
-def test_a_judge_that_is_always_wrong():
-    """Every wrong label weighs more than every right one: precision 1/4 and 2/5 where they come."""
+def test_a_weighting_that_is_always_wrong():
+    """Wrong labels weigh more than correct ones: precision 1/4 and 2/5 at the correct ones."""
     bad = small_audit().whole()["bad"]
     assert bad.auroc.value == 0
     assert bad.average_precision.value == pytest.approx((1 / 4 + 2 / 5) / 2)
     assert bad.weighted_precision.value == pytest.approx(0.3 / 3.1)
 
 
-def test_categories_are_looked_at_alone():
-    """The cyclist's only label is wrong, so nothing can be told apart; its object is missed."""
+def test_categories_are_evaluated_separately():
+    """The cyclist's only label is wrong, so the AUROC is undefined; its object is missed."""
     found = small_audit()
     car, cyclist = found.whole("Car")["good"], found.whole("Cyclist")["good"]
     assert (car.labels, car.neutral, car.right, car.objects) == (4, 1, 2, 4)
@@ -52,8 +52,8 @@ def test_categories_are_looked_at_alone():
     assert np.isnan(cyclist.auroc.low)
 
 
-def test_distances_and_points_break_the_labels_down():
-    """Each label in one range of each; objects are known by distance, not by points."""
+def test_labels_are_broken_down_by_distance_and_points():
+    """Each label is in one range of each; objects have a distance, but no number of points."""
     found = small_audit()
     near = part(found, "good", "all", "0-20 m")
     assert (near.labels, near.neutral, near.right, near.objects) == (2, 1, 1, 3)
@@ -72,8 +72,8 @@ def test_distances_and_points_break_the_labels_down():
         assert sum(each.labels for each in parts) == 5
 
 
-def test_comparisons_are_of_every_two_and_can_be_turned():
-    """The good judge exceeds the bad one by 1 in every draw where both are defined."""
+def test_every_two_policies_are_compared_in_both_directions():
+    """The good policy exceeds the bad one by 1 in every draw in which both are defined."""
     found = small_audit()
     compared = found.compare("good", "bad")
     assert (compared.difference.value, compared.difference.low, compared.difference.high) == (
@@ -86,7 +86,7 @@ def test_comparisons_are_of_every_two_and_can_be_turned():
     assert len([each for each in found.comparisons if each.category == "all"]) == 3
 
 
-def test_intervals_hold_the_figure_and_shrink_with_more_frames():
+def test_intervals_contain_the_value_and_shrink_with_more_frames():
     """Four times the frames, about half the width."""
     few, many = (audit_of(*many_labels(frames)).whole()["fair"] for frames in (50, 200))
     for name in ("share_right", "auroc", "average_precision", "weighted_precision"):
@@ -95,8 +95,8 @@ def test_intervals_hold_the_figure_and_shrink_with_more_frames():
         assert narrow.high - narrow.low < 0.7 * (wide.high - wide.low)
 
 
-def test_a_difference_beyond_chance_is_told_from_one_within_it():
-    """A good judge beats a blind one; two blind ones are not told apart."""
+def test_a_significant_difference_is_distinguished_from_chance():
+    """A good policy beats a random one; two random ones do not differ."""
     labels, weights = many_labels()
     weights["blind too"] = np.random.default_rng(9).random(len(labels))
     found = audit_of(labels, weights)
@@ -106,10 +106,10 @@ def test_a_difference_beyond_chance_is_told_from_one_within_it():
     assert abs(found.whole()["blind"].auroc.value - 0.5) < 0.1
 
 
-def test_the_interval_covers_the_truth_about_as_often_as_it_says():
-    """A judge whose AUROC is known, 80 % intervals of 60 data sets: between 65 and 95 % hold it.
+def test_the_coverage_of_the_interval_is_about_its_level():
+    """AUROC is known, 80 % intervals of 60 datasets: between 65 and 95 % contain it.
 
-    Right labels weigh u, wrong ones u * u' for uniform u, u': P(u > u'' u') = 3/4.
+    Correct labels weigh u, wrong ones u * u' for uniform u, u': P(u > u'' u') = 3/4.
     """
     hits = 0
     for seed in range(60):
@@ -124,7 +124,7 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says():
 
 
 def test_the_same_seed_gives_the_same_audit():
-    """To the last bit; another seed gives the same figures with other intervals."""
+    """To the last bit; another seed gives the same values with other intervals."""
     labels, weights = many_labels()
     one, same = audit_of(labels, weights), audit_of(labels, weights)
     assert [each.auroc for each in one.figures] == [each.auroc for each in same.figures]
@@ -133,7 +133,7 @@ def test_the_same_seed_gives_the_same_audit():
     assert one.whole()["good"].weighted_recall.low != other.whole()["good"].weighted_recall.low
 
 
-def test_the_order_of_frames_does_not_change_a_figure():
+def test_the_order_of_frames_does_not_change_the_numbers():
     """Frames renumbered backwards."""
     labels = six_labels()
     turned = EvaluatedLabels(
@@ -149,8 +149,8 @@ def test_the_order_of_frames_does_not_change_a_figure():
             assert values[0] == pytest.approx(values[1], nan_ok=True)
 
 
-def test_no_labels_and_no_objects_are_no_failure():
-    """Counts of 0 and figures that are undefined."""
+def test_no_labels_and_no_objects_do_not_fail():
+    """Counts of 0, and values that are undefined."""
     nothing = EvaluatedLabels.no_frames()
     found = small_audit({name: np.zeros(0) for name in WEIGHTS}, nothing).whole()["good"]
     assert (found.labels, found.right, found.objects) == (0, 0, 0)
@@ -159,5 +159,5 @@ def test_no_labels_and_no_objects_are_no_failure():
 
 
 def audit_of(labels, weights):
-    """The audit of many labels."""
+    """Return the audit of many labels."""
     return audit(labels, weights, ("Car",), np.random.default_rng(0), replicates=200)

@@ -1,4 +1,4 @@
-"""An audit in words and as plain numbers."""
+"""An audit in sentences and as plain numbers."""
 
 import json
 
@@ -11,13 +11,13 @@ from curate.evaluation.evaluated_labels import EvaluatedLabels
 
 
 def words(labels, weights, policies, evidence=()):
-    """All sentences as one text."""
+    """Return all sentences as one text."""
     found = audit(labels, weights, ("Car", "Cyclist"), np.random.default_rng(0), replicates=200)
     return " ".join(summary_sentences(found, policies, evidence))
 
 
-def test_it_says_how_much_is_right_and_what_was_left_out():
-    """In all and by category, with the neutral labels and a warning for few frames."""
+def test_it_describes_the_correct_labels_and_the_neutral_ones():
+    """In total and by category, with a warning for few frames."""
     text = " ".join(summary_sentences(small_audit(), ("good", "bad", "all"), ()))
     assert text.startswith("2 of 5 labels are correct, 40.0 % (")
     assert "on 3 frames with 5 objects (Car 50.0 %, Cyclist 0.0 %)" in text
@@ -25,8 +25,8 @@ def test_it_says_how_much_is_right_and_what_was_left_out():
     assert "With 3 frames the intervals are only approximate" in text
 
 
-def test_it_names_the_best_judge_and_the_next():
-    """With the difference, and whether that may be chance."""
+def test_it_describes_the_best_policy_and_the_next():
+    """With the difference, and whether it may be chance."""
     labels, weights = many_labels()
     text = words(labels, weights, ("blind", "good"))
     assert "Of the policies, good ranks the labels best: AUROC 1.000" in text
@@ -36,15 +36,15 @@ def test_it_names_the_best_judge_and_the_next():
     assert "is not significant" in words(labels, weights, ("blind", "as blind"))
 
 
-def test_it_says_where_the_weight_lies():
+def test_it_describes_where_the_weight_is():
     """The best policy by that measure first, with the share of each."""
     text = " ".join(summary_sentences(small_audit(), ("all", "good"), ()))
     assert "that good gives, 89.5 %" in text
     assert text.endswith("is on correct labels; all 40.0 %.")
 
 
-def test_evidence_that_judges_better_than_every_policy_is_not_hidden():
-    """Plainly named, with its difference; evidence that judges worse is not mentioned."""
+def test_evidence_better_than_every_policy_is_described():
+    """With its difference; worse evidence is not mentioned."""
     labels, weights = many_labels()
     text = words(labels, weights, ("fair",), ("good", "blind"))
     assert "good alone, without a policy, ranks the labels better than fair" in text
@@ -52,13 +52,13 @@ def test_evidence_that_judges_better_than_every_policy_is_not_hidden():
     assert "fair: AUROC" in text
 
 
-def test_evidence_without_a_policy_is_judged_too():
+def test_evidence_without_a_policy_is_evaluated_too():
     """As if each piece were a policy."""
     assert "good ranks the labels best" in words(*many_labels(), (), ("good", "blind"))
 
 
-def test_nothing_to_tell_apart_is_said():
-    """All wrong, and no labels at all."""
+def test_undefined_comparisons_are_described():
+    """All labels wrong, and no labels at all."""
     wrong = six_labels()
     wrong.correct[:] = False
     text = words(wrong, {"all": np.ones(6)}, ("all",))
@@ -70,7 +70,7 @@ def test_nothing_to_tell_apart_is_said():
 
 
 def test_the_numbers_are_strict_json():
-    """No NaN and no infinity: null where a figure is undefined or an edge is open."""
+    """No NaN and no infinity: null if a value is undefined or an edge is open."""
     numbers = as_numbers(small_audit())
     text = json.dumps(numbers, allow_nan=False)
     assert json.loads(text) == numbers

@@ -1,4 +1,4 @@
-"""Means, spreads and paired differences against hand-worked figures."""
+"""Means, spreads and paired differences against values by hand."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ def test_spread_is_the_mean_and_the_sample_standard_deviation() -> None:
     assert (found.mean, found.std, found.count) == (2.0, 1.0, 3)
 
 
-def test_what_is_not_measured_is_left_out() -> None:
+def test_missing_values_are_left_out() -> None:
     """A cell that is not finished; one value has no spread, none has no mean."""
     found = spread(np.array([4.0, np.nan]))
     assert (found.mean, found.count) == (4.0, 1)
@@ -20,7 +20,7 @@ def test_what_is_not_measured_is_left_out() -> None:
     assert np.isnan(spread(np.array([np.nan])).mean)
 
 
-def test_the_interval_of_a_paired_difference_is_students() -> None:
+def test_the_interval_of_a_paired_difference_is_students_t() -> None:
     """Differences 1, 2, 3: 2 ± 4.3027 * 1 / sqrt(3), the quantile of the printed t table."""
     found = paired_difference(np.array([11.0, 22.0, 33.0]), np.array([10.0, 20.0, 30.0]))
     assert found.mean == 2.0
@@ -28,22 +28,22 @@ def test_the_interval_of_a_paired_difference_is_students() -> None:
     assert found.mean - found.low == pytest.approx(found.high - found.mean)
 
 
-def test_what_a_seed_does_to_both_drops_out() -> None:
-    """Two methods that differ by 1 on seeds that differ by 100: no doubt is left."""
+def test_the_common_effect_of_a_seed_cancels() -> None:
+    """Two methods that differ by 1 on seeds that differ by 100: the interval has no width."""
     seeds = np.array([0.0, 100.0, 200.0])
     found = paired_difference(seeds + 1, seeds)
     assert (found.low, found.mean, found.high) == pytest.approx((1.0, 1.0, 1.0))
 
 
 def test_only_pairs_count() -> None:
-    """A seed that one of the two has not finished; one pair has no interval."""
+    """A seed that one of the two has not finished is left out; one pair has no interval."""
     found = paired_difference(np.array([3.0, 9.0]), np.array([1.0, np.nan]))
     assert (found.mean, found.count) == (2.0, 1)
     assert np.isnan([found.low, found.high]).all()
 
 
-def test_the_interval_covers_the_truth_as_often_as_it_says() -> None:
-    """4,000 experiments of 3 pairs whose differences are normal around 5."""
+def test_the_coverage_of_the_interval_is_its_level() -> None:
+    """4,000 experiments of 3 pairs with normally distributed differences around 5."""
     values = np.random.default_rng(0).normal(5, 2, (4000, 3))
     found = [paired_difference(row, np.zeros(3)) for row in values]
     covered = np.mean([each.low <= 5 <= each.high for each in found])

@@ -1,4 +1,4 @@
-"""Audited frames as columns, and the ranges that they are broken down by."""
+"""Audited frames as columns, and the ranges of distance and points."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from curate.evaluation.reliability import MatchSettings
 
 
 def frame(labels, truth, categories=None):
-    """A frame of cars at x and y; the annotations are cars unless told otherwise."""
+    """Return a frame of cars at x and y; the annotations are cars by default."""
 
     def boxes(places):
         return np.array([[x, y, 0, 4, 2, 1.5, 0] for x, y in places], dtype=float).reshape(-1, 7)
@@ -39,7 +39,7 @@ def frame(labels, truth, categories=None):
 
 
 def test_frames_become_columns():
-    """A right, a wrong and a neutral label; an object that is missed; a frame with nothing."""
+    """A correct, a wrong and a neutral label; a missed object; an empty frame."""
     found = evaluate_frames(
         [
             frame([(3, 4), (30, 0)], [(3, 4)]),
@@ -68,8 +68,7 @@ def test_parts_are_joined_frame_after_frame():
     assert whole.category.tolist() == 2 * six_labels().category.tolist()
 
 
-def test_no_frames_make_empty_columns():
-    """Nothing in, nothing out."""
+def test_no_frames_give_empty_columns():
     found = evaluate_frames([], MatchSettings())
     assert (found.frames, len(found), len(found.object_frame)) == (0, 0, 0)
 
@@ -77,14 +76,14 @@ def test_no_frames_make_empty_columns():
 def test_an_edge_belongs_to_the_range_above_it():
     """20 m is in 20-40 m; the last range is open."""
     by_distance = [part for part in slices(six_labels()) if part.by == "distance"]
-    held = [part.holds(np.array([0.0, 20, 39.9, 40, 300])).tolist() for part in by_distance]
-    assert np.array(held).sum(axis=0).tolist() == [1] * 5
-    assert held[1] == [False, True, True, False, False]
+    contained = [part.holds(np.array([0.0, 20, 39.9, 40, 300])).tolist() for part in by_distance]
+    assert np.array(contained).sum(axis=0).tolist() == [1] * 5
+    assert contained[1] == [False, True, True, False, False]
     assert [str(part) for part in (WHOLE, *by_distance)] == ["all", "0-20 m", "20-40 m", "40+ m"]
     assert str(Slice("points", 10, 50)) == "10-50"
 
 
 @pytest.mark.parametrize(("points", "kinds"), [((5.0,) * 6, 2), ((np.nan,) * 6, 1)])
-def test_points_are_looked_at_where_they_were_counted(points, kinds):
-    """Without the point prior nobody has counted."""
+def test_points_are_used_only_if_they_were_counted(points, kinds):
+    """Only the point prior counts them."""
     assert len({part.by for part in slices(six_labels(points))}) == kinds

@@ -1,4 +1,4 @@
-"""Tests of the checks of one frame."""
+"""The checks of one frame."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ QUARTER = np.array([0, 0, 0, 0, 0, 0, np.pi / 2])
 
 
 def street(boxes=BOXES, seed=0):
-    """A frame with points in boxes and on the ground."""
+    """Return a frame with points in boxes and on the ground."""
     rng = np.random.default_rng(seed)
     ground = np.column_stack([rng.uniform([2, -20], [40, 20], (2000, 2)), np.full(2000, -1.6)])
     points = [ground]
@@ -37,27 +37,27 @@ def street(boxes=BOXES, seed=0):
     return Frame("000001", cloud, toy_calibration(), (120, 40))
 
 
-def answer(boxes, names=("Car", "Car", "Car")):
-    """A detector's answer."""
+def detections(boxes, names=("Car", "Car", "Car")):
+    """Return detections."""
     return Detections(np.array(boxes), np.linspace(0.9, 0.5, len(boxes)), as_categories(names))
 
 
 def states(frame, found):
-    """The state of each check."""
+    """Return the state of each check."""
     return {one.check: one.state for one in examine_detections(frame, found, CATEGORIES)}
 
 
 def convention(frame, found, boxes):
-    """What is said of the convention of boxes in place of the found ones."""
+    """Return the message of the convention check for other boxes."""
     found = examine_detections(frame, replace(found, boxes=boxes), CATEGORIES)
     return next(one for one in found if one.check == "convention")
 
 
-def test_a_sound_frame_is_ok():
+def test_a_correct_frame_passes():
     """Every check, of data and of boxes."""
     frame = street()
     assert {one.state for one in examine_frame(frame)} == {"ok"}
-    assert set(states(frame, answer(BOXES)).values()) == {"ok"}
+    assert set(states(frame, detections(BOXES)).values()) == {"ok"}
 
 
 @pytest.mark.parametrize(
@@ -77,9 +77,9 @@ def test_a_sound_frame_is_ok():
         ),
     ],
 )
-def test_a_wrong_convention_is_named(change, message):
-    """Whichever of the usual ones it is."""
-    finding = convention(street(), answer(BOXES), change(BOXES))
+def test_a_wrong_convention_is_reported(change, message):
+    """Each of the common ones."""
+    finding = convention(street(), detections(BOXES), change(BOXES))
     assert finding.state == "wrong"
     assert message in finding.message
 
@@ -87,18 +87,18 @@ def test_a_wrong_convention_is_named(change, message):
 def test_names_points_and_projections_are_checked():
     """All wrong, some wrong."""
     frame = street()
-    assert states(frame, answer(BOXES, ("car",) * 3))["names"] == "wrong"
-    assert states(frame, answer(BOXES, ("Car", "Car", "Van")))["names"] == "suspect"
+    assert states(frame, detections(BOXES, ("car",) * 3))["names"] == "wrong"
+    assert states(frame, detections(BOXES, ("Car", "Car", "Van")))["names"] == "suspect"
     far = BOXES + np.array([200, 0, 0, 0, 0, 0, 0])
-    assert states(frame, answer(far))["boxes"] == "wrong"
-    assert states(frame, answer(BOXES * [-1, 1, 1, 1, 1, 1, 1]))["image"] == "wrong"
+    assert states(frame, detections(far))["boxes"] == "wrong"
+    assert states(frame, detections(BOXES * [-1, 1, 1, 1, 1, 1, 1]))["image"] == "wrong"
     mixed = np.vstack([BOXES[:1], far[:2]])
-    assert states(frame, answer(mixed))["boxes"] == "suspect"
+    assert states(frame, detections(mixed))["boxes"] == "suspect"
     assert states(frame, Detections.empty()) == {"detections": "suspect"}
 
 
-def test_data_that_cannot_be_is_seen():
-    """No points, a camera that looks elsewhere, intensities of 255, z that is not up."""
+def test_impossible_data_is_reported():
+    """No points, a camera that looks elsewhere, intensities of 255, z not up."""
     frame = street()
     assert [one.state for one in examine_frame(frame.with_points(frame.points[:0]))] == ["wrong"]
     behind = frame.with_points(frame.points * np.float32([-1, 1, 1, 1]))
@@ -111,8 +111,8 @@ def test_data_that_cannot_be_is_seen():
 
 
 @pytest.mark.kitti
-def test_real_boxes_are_sound_and_wrong_ones_are_found(kitti_root):
-    """A weak detector's cars on real sweeps: right, turned, too low and too high."""
+def test_real_boxes_pass_and_wrong_ones_fail(kitti_root):
+    """A weak detector's cars on real sweeps: correct, rotated, too low and too high."""
     dataset = KittiDataset(kitti_root)
     record = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv")
     changes = {
@@ -121,7 +121,7 @@ def test_real_boxes_are_sound_and_wrong_ones_are_found(kitti_root):
         "bottom": lambda boxes: boxes - boxes[:, 5:6] * np.array([0, 0, 0.5, 0, 0, 0, 0]),
         "high": lambda boxes: boxes + boxes[:, 5:6] * np.array([0, 0, 0.5, 0, 0, 0, 0]),
     }
-    said = {name: [] for name in changes}
+    messages = {name: [] for name in changes}
     for name in record.frame_ids():
         frame = dataset.read(name)
         frame = frame.with_points(
@@ -130,9 +130,11 @@ def test_real_boxes_are_sound_and_wrong_ones_are_found(kitti_root):
         found = record.predict(frame)
         for what, change in changes.items():
             if len(found) >= 3:
-                said[what].append(convention(frame, found, change(found.boxes)))
-    assert len(said["right"]) >= 12
-    assert {one.state for one in said["right"]} == {"ok"}
-    assert all("90 degrees" in one.message or "rotation_y" in one.message for one in said["turned"])
-    assert np.mean(["bottom" in one.message for one in said["bottom"]]) > 0.75
-    assert np.mean(["top of the box" in one.message for one in said["high"]]) > 0.65
+                messages[what].append(convention(frame, found, change(found.boxes)))
+    assert len(messages["right"]) >= 12
+    assert {one.state for one in messages["right"]} == {"ok"}
+    assert all(
+        "90 degrees" in one.message or "rotation_y" in one.message for one in messages["turned"]
+    )
+    assert np.mean(["bottom" in one.message for one in messages["bottom"]]) > 0.75
+    assert np.mean(["top of the box" in one.message for one in messages["high"]]) > 0.65

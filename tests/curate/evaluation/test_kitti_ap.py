@@ -1,4 +1,4 @@
-"""KITTI average precision: the official figures, a slow oracle, hand-worked cases, and limits."""
+"""KITTI average precision: the official values, a slow oracle, cases by hand, and limits."""
 
 import json
 from dataclasses import replace
@@ -20,30 +20,30 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def objects_of(frames):
-    """Lists of dicts as `KittiObjects`."""
+    """Return lists of dicts as `KittiObjects`."""
     return [to_objects(frame) for frame in frames]
 
 
 def with_scores(labels):
-    """The labels as perfectly sure detections."""
+    """Return the labels as detections with score 1."""
     return [replace(frame, scores=np.ones(len(frame))) for frame in labels]
 
 
 def ap_of_cars(labels, results, **options):
-    """The evaluation's (4, 3) R40 of cars."""
+    """Return the evaluation's (4, 3) R40 of cars."""
     return evaluate(objects_of(labels), objects_of(results), **options).ap_r40[0]
 
 
 @pytest.fixture(scope="module")
 def official(kitti_eval_root):
-    """Labels, results, and what the official program prints for them."""
+    """Return labels, results, and the values that the official program prints for them."""
     _, labels, results = read_folders(kitti_eval_root / "label_2", kitti_eval_root / "results")
     return labels, results, json.loads((kitti_eval_root / "expected.json").read_text())
 
 
 @pytest.mark.parametrize("kit_sampling", [False, True])
-def test_the_official_figures_are_reproduced(official, kit_sampling):
-    """Every figure of the devkit to 1e-4, in its own JSON shape."""
+def test_the_official_values_are_reproduced(official, kit_sampling):
+    """Every value of the devkit to 1e-4, in its own JSON shape."""
     labels, results, expected = official
     figures = evaluate(labels, results, kit_sampling=kit_sampling).as_dict()
     assert figures["thresholds"] == expected["thresholds"]
@@ -57,7 +57,7 @@ def test_the_official_figures_are_reproduced(official, kit_sampling):
 
 
 def test_ground_truth_against_itself_is_100(official):
-    """Exactly, in every figure, on all frames together and on each frame alone."""
+    """Exactly, in every value, on all frames together and on each frame alone."""
     labels = official[0]
     for frames in [labels, *([frame] for frame in labels[:60])]:
         evaluation = evaluate(frames, with_scores(frames))
@@ -71,7 +71,7 @@ def test_ground_truth_against_itself_is_100(official):
 @settings(max_examples=25)
 @given(seeds)
 def test_crowded_frames_equal_the_slow_oracle(seed):
-    """All categories, figures and difficulties of frames with copies, ties and clutter."""
+    """All categories, values and difficulties of frames with copies, ties and clutter."""
     labels, results = random_frames(np.random.default_rng(seed), 8)
     evaluation = evaluate(objects_of(labels), objects_of(results), kit_sampling=True)
     for c, (category, overlap) in enumerate(evaluation.min_overlaps.items()):
@@ -85,7 +85,7 @@ def test_crowded_frames_equal_the_slow_oracle(seed):
 
 
 def test_more_objects_than_positions_equal_the_slow_oracle():
-    """With more than 41 objects both ways of sampling are the kit's."""
+    """With more than 41 objects both ways of sampling are the devkit's."""
     labels, results = random_frames(np.random.default_rng(11), 150)
     evaluation = evaluate(objects_of(labels), objects_of(results))
     assert evaluation.objects[0, 2] > 41
@@ -109,8 +109,8 @@ def test_the_order_of_frames_does_not_matter(seed):
 
 @settings(max_examples=20)
 @given(seeds)
-def test_a_detection_below_all_scores_never_raises_the_precision_it_joins(seed):
-    """A false detection at the bottom changes no precision at any recall."""
+def test_a_false_positive_with_the_lowest_score_never_raises_precision(seed):
+    """At any recall."""
     labels, results = random_frames(np.random.default_rng(seed), 8)
     before = evaluate(objects_of(labels), objects_of(results))
     results[3] = [*results[3], car(x=40, z=60, score=0.001, box_2d=(900, 0, 999, 99))]
@@ -120,8 +120,8 @@ def test_a_detection_below_all_scores_never_raises_the_precision_it_joins(seed):
 
 @settings(max_examples=20)
 @given(seeds)
-def test_figures_are_percentages_and_orientation_is_below_image(seed):
-    """Within 0 and 100, never NaN, aos at most the image AP, harder IoU never finds more."""
+def test_values_are_percentages_and_orientation_is_below_image(seed):
+    """Within 0 and 100, never NaN, AOS at most the image AP, a stricter IoU never finds more."""
     labels, results = random_frames(np.random.default_rng(seed), 6)
     evaluation = evaluate(objects_of(labels), objects_of(results))
     for averages in (evaluation.ap_r11, evaluation.ap_r40):
@@ -131,7 +131,7 @@ def test_figures_are_percentages_and_orientation_is_below_image(seed):
 
 
 def test_half_of_the_objects_found_by_the_formula():
-    """Two cars, the better detection right, the other false: precision 1 up to recall 1/2."""
+    """Two cars, the better detection correct, the other false: precision 1 up to recall 1/2."""
     labels = [[car(), car(x=6)]]
     results = [[car(score=0.9), car(x=-6, score=0.8)]]
     averages = evaluate(objects_of(labels), objects_of(results))
@@ -139,12 +139,12 @@ def test_half_of_the_objects_found_by_the_formula():
     assert averages.ap_r11[0, 3].tolist() == pytest.approx([100 * 6 / 11] * 3)
     assert averages.recall_3d[0, :, 0].tolist() == [0.5, 0.5, 0.5]
     kit = evaluate(objects_of(labels), objects_of(results), kit_sampling=True)
-    assert kit.ap_r40[0, 3, 0] == 0  # one position, and R40 leaves out the first
+    assert kit.ap_r40[0, 3, 0] == 0  # one position, which R40 leaves out as the first
     assert kit.ap_r11[0, 3, 0] == pytest.approx(100 / 11)
 
 
 def test_a_false_detection_above_a_true_one_by_the_formula():
-    """Scores 0.9 right, 0.8 false, 0.7 right: precision 1 to recall 1/2, then 2/3."""
+    """Scores 0.9 true, 0.8 false, 0.7 true: precision 1 to recall 1/2, then 2/3."""
     labels = [[car(), car(x=6)]]
     results = [[car(score=0.9), car(x=-6, score=0.8), car(x=6, score=0.7)]]
     evaluation = evaluate(objects_of(labels), objects_of(results))
@@ -153,7 +153,7 @@ def test_a_false_detection_above_a_true_one_by_the_formula():
 
 
 def test_orientation_by_the_formula():
-    """A car that looks the wrong way round by 60 degrees is worth (1 + cos 60) / 2."""
+    """A car with a heading error of 60 degrees counts (1 + cos 60) / 2."""
     averages = ap_of_cars([[car(alpha=0.0)]], [[car(alpha=np.pi / 3)]])
     assert averages[FIGURES.index("image"), 0] == 100
     assert averages[FIGURES.index("aos"), 0] == pytest.approx(75)
@@ -161,7 +161,7 @@ def test_orientation_by_the_formula():
 
 @pytest.mark.parametrize(("along_z", "found"), [(-1, 100), (1, 0)])
 def test_rotation_y_turns_clockwise_seen_from_above(along_z, found):
-    """The nose of a car at rotation_y points to (cos, -sin) in x and z: there it is found."""
+    """The front of a car at rotation_y points to (cos, -sin) in x and z."""
     turn = 0.5
     long_car = car(rotation_y=turn, dimensions=(1.5, 1.0, 8.0), location=(0.0, 1.7, 20.0))
     nose = (3.5 * np.cos(turn), 1.7, 20 + along_z * 3.5 * np.sin(turn))
@@ -188,15 +188,15 @@ def test_rotation_y_turns_clockwise_seen_from_above(along_z, found):
     ],
 )
 def test_difficulty_decides_what_counts(change, counted):
-    """Occlusion, truncation and height set the difficulty; what is too hard is not missed."""
+    """Occlusion, truncation and height set the difficulty; harder objects are not missed."""
     evaluation = evaluate(objects_of([[car(**change)]]), [EMPTY])
     assert evaluation.objects[0].tolist() == counted
     assert evaluation.ap_r40[0].tolist() == [[0, 0, 0]] * 4
 
 
 @pytest.mark.parametrize("change", [{"category": "Van"}, {"occluded": 3}, {"truncated": 0.9}])
-def test_finding_what_is_ignored_is_no_false_positive(change):
-    """A detection on a van or a hidden car neither helps nor hurts."""
+def test_detecting_an_ignored_object_is_not_a_false_positive(change):
+    """A detection on a van or an occluded car does not change the AP."""
     labels = [[car(), car(x=6, **change)]]
     results = [[car(score=0.5), car(x=6, score=0.9)]]
     assert ap_of_cars(labels, results)[0].tolist() == [100, 100, 100]
@@ -204,7 +204,7 @@ def test_finding_what_is_ignored_is_no_false_positive(change):
     assert apart[0].tolist() == [50, 50, 50]
 
 
-def test_detections_in_dont_care_regions_are_forgiven_in_the_image_only():
+def test_detections_in_dont_care_regions_are_ignored_only_in_the_image():
     """By the share of the detection's 2D box; the region has no 3D box."""
     region = car(
         x=6,
@@ -219,7 +219,7 @@ def test_detections_in_dont_care_regions_are_forgiven_in_the_image_only():
     assert averages[FIGURES.index("3d"), 0] == 50
 
 
-def test_low_detections_are_ignored():
+def test_small_detections_are_ignored():
     """A detection below 25 pixels is never a false positive; at 30 it is, except for easy."""
     low = car(x=6, score=0.95, box_2d=(400, 100, 480, 124))
     assert ap_of_cars([[car()]], [[car(), low]])[3].tolist() == [100, 100, 100]
@@ -227,8 +227,8 @@ def test_low_detections_are_ignored():
     assert ap_of_cars([[car()]], [[car(), middle]])[3].tolist() == [100, 50, 50]
 
 
-def test_a_low_detection_of_another_category_takes_an_object_out():
-    """The kit's own quirk: too low comes before the category, and the higher score is asked."""
+def test_a_small_detection_of_another_category_can_match_an_object():
+    """As in the devkit: the height is checked before the category, and the higher score matches."""
     low = car(category="Pedestrian", score=0.9, box_2d=(400, 100, 480, 120))
     found = [[car(score=0.5), low]]
     assert ap_of_cars([[car()]], found)[3].tolist() == [0, 0, 0]
@@ -236,11 +236,10 @@ def test_a_low_detection_of_another_category_takes_an_object_out():
 
 
 def test_a_second_detection_of_the_same_object_is_false():
-    """One object is found once."""
     assert ap_of_cars([[car()]], [[car(score=0.9), car(score=0.9)]])[3, 0] == 50
 
 
-def test_equal_scores_enter_together():
+def test_detections_with_equal_scores_are_counted_together():
     """With one score for all, precision is the same at every recall."""
     labels = [[car()] for _ in range(60)]
     results = [[car(score=0.5), car(x=6, score=0.5)] for _ in range(60)]
@@ -248,7 +247,7 @@ def test_equal_scores_enter_together():
     assert curve.tolist() == [0.5] * 41
 
 
-def test_nothing_gives_zeros():
+def test_empty_input_gives_zeros():
     """No frames, no objects, no detections: zeros and counts, never NaN."""
     one = objects_of([[car()]])
     cases = (([], [], 0), ([EMPTY], [EMPTY], 0), ([EMPTY], one, 0), (one, [EMPTY], 3))
@@ -270,7 +269,6 @@ def test_without_orientation_there_is_no_aos():
 
 
 def test_chosen_categories_and_overlaps_are_used():
-    """Another overlap decides, and only the chosen categories are there."""
     shifted = [[car(x=0.8)]]
     strict = evaluate(objects_of([[car()]]), objects_of(shifted))
     loose = evaluate(objects_of([[car()]]), objects_of(shifted), min_overlaps={"Car": 0.3})
@@ -283,8 +281,8 @@ def test_chosen_categories_and_overlaps_are_used():
     }
 
 
-def test_results_without_scores_or_frames_are_refused():
-    """One line that says what is missing."""
+def test_results_without_scores_or_frames_are_rejected():
+    """In one line."""
     labels = objects_of([[car()]])
     with pytest.raises(DataError, match="results of frame 0, object 1: no score"):
         evaluate(labels, objects_of([[car(), car(score=np.nan)]]))

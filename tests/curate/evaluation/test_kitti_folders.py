@@ -12,7 +12,7 @@ LINE = "Car 0.00 0 0.50 100 100 180 160 1.5 1.6 4.0 0.0 1.7 20.0 0.3"
 
 @pytest.fixture
 def folders(tmp_path):
-    """Labels and results of three frames, the second without objects."""
+    """Return labels and results of three frames, the second without objects."""
     labels, results = tmp_path / "label_2", tmp_path / "results"
     for folder, score in ((labels, float("nan")), (results, 0.5)):
         folder.mkdir()
@@ -30,7 +30,7 @@ def test_frames_are_read_in_order(folders):
 
 
 def test_folders_are_evaluated(folders):
-    """By their names as text: the one car is found."""
+    """Given as text; the one car is found."""
     labels, results = map(str, folders)
     found = evaluate_folders(labels, results)
     assert found.objects[0].tolist() == [1, 1, 1]
@@ -38,20 +38,20 @@ def test_folders_are_evaluated(folders):
     assert evaluate_folders(labels, results, ["000001"]).objects.sum() == 0
 
 
-def test_only_the_named_frames_are_read(folders):
-    """Other frames may lack files then."""
+def test_only_the_listed_frames_are_read(folders):
+    """Other frames may then lack files."""
     (folders[1] / "000007.txt").unlink()
     assert read_folders(*folders, ["000002"])[0] == ("000002",)
 
 
-def test_hidden_files_are_no_frames(folders):
-    """Those beginning with ._ that macOS leaves beside the files that it copies."""
+def test_hidden_files_are_not_frames(folders):
+    """MacOS leaves files beginning with ._ beside the files that it copies."""
     (folders[0] / "._000002.txt").write_bytes(b"\x00\x05\x16\x07")
     assert read_folders(*folders)[0] == ("000001", "000002", "000007")
 
 
 def test_a_missing_result_file_is_an_error(folders):
-    """It names the first file and the remedy; a partial run is not scored as a whole one."""
+    """It contains the first file and what to do; an incomplete run is not evaluated."""
     (folders[1] / "000002.txt").unlink()
     (folders[1] / "000007.txt").unlink()
     with pytest.raises(DataError, match=r"results/000002\.txt.*and 1 other frames.*empty file"):
@@ -59,7 +59,7 @@ def test_a_missing_result_file_is_an_error(folders):
 
 
 def test_results_without_labels_are_an_error(folders):
-    """Also where the frame was asked for by name."""
+    """Also if the frame was requested."""
     write_objects(folders[1] / "000009.txt", to_objects([car()]))
     with pytest.raises(DataError, match=r"label_2/000009\.txt: no label file"):
         read_folders(*folders)
@@ -68,7 +68,7 @@ def test_results_without_labels_are_an_error(folders):
 
 
 @pytest.mark.parametrize(
-    ("line", "fault"),
+    ("line", "message"),
     [
         (LINE, "15 fields"),
         (f"{LINE} 0.5 1", "17 fields"),
@@ -76,16 +76,16 @@ def test_results_without_labels_are_an_error(folders):
         (f"{LINE.replace('1.5 1.6', '-1.5 1.6')} 0.5", "negative"),
     ],
 )
-def test_bad_result_lines_are_named(folders, line, fault):
-    """File, line and fault."""
+def test_invalid_result_lines_are_reported(folders, line, message):
+    """File, line and reason."""
     path = folders[1] / "000002.txt"
     path.write_text(f"{LINE} 0.5\n{line}\n")
-    with pytest.raises(DataError, match=rf"000002\.txt:2: .*{fault}"):
+    with pytest.raises(DataError, match=rf"000002\.txt:2: .*{message}"):
         read_folders(*folders)
 
 
-def test_folders_without_text_files_are_refused(folders, tmp_path):
-    """A wrong path is told from an empty folder."""
+def test_folders_without_text_files_are_rejected(folders, tmp_path):
+    """A wrong path and an empty folder give different errors."""
     with pytest.raises(DataError, match="no such folder"):
         read_folders(tmp_path / "absent", folders[1])
     (tmp_path / "empty").mkdir()

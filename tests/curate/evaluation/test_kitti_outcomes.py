@@ -1,4 +1,4 @@
-"""Per-object outcomes against the counts of the evaluation and hand-made frames."""
+"""Per-object outcomes against the counts of the evaluation and handmade frames."""
 
 import numpy as np
 import pytest
@@ -14,14 +14,14 @@ from curate.evaluation.kitti_outcomes import object_outcomes
 
 
 def outcomes_of(labels, results, **options):
-    """Outcomes of lists of lists of dicts."""
+    """Return the outcomes of lists of lists of dicts."""
     return object_outcomes(
         [to_objects(frame) for frame in labels], [to_objects(frame) for frame in results], **options
     )
 
 
 def test_each_object_has_its_outcome():
-    """Found, missed with a near miss, too hard, found twice, and from nowhere."""
+    """Found, missed with a near miss, too hard, found twice, and a false positive."""
     labels = [[], [car(), car(x=6), car(x=12, occluded=3), car(x=18, category="Van")]]
     results = [
         [car(score=0.4)],
@@ -44,16 +44,16 @@ def test_each_object_has_its_outcome():
     assert set(of_results.categories) == {"Car"}
 
 
-def test_an_object_that_only_a_low_detection_finds_is_left_out():
-    """It is neither found nor missed, and names the detection."""
+def test_an_object_found_only_by_a_small_detection_is_ignored():
+    """It is neither found nor missed, and refers to the detection."""
     low = car(box_2d=(100, 100, 180, 120))
     of_labels, of_results = outcomes_of([[car()]], [[low]])
     assert of_labels.outcomes.tolist() == of_results.outcomes.tolist() == ["ignored"]
     assert of_labels.matches.tolist() == of_results.matches.tolist() == [0]
 
 
-def test_detections_in_dont_care_regions_are_left_out_of_the_image_metric():
-    """What a label matches stays a true positive there; in 3D the region is unknown."""
+def test_detections_in_dont_care_regions_are_ignored_only_in_the_image():
+    """A match there stays a true positive; in 3D the region is unknown."""
     region = car(
         category="DontCare",
         dimensions=(-1, -1, -1),
@@ -65,8 +65,8 @@ def test_detections_in_dont_care_regions_are_left_out_of_the_image_metric():
     assert outcomes_of(*frames, metric="3d")[1].outcomes.tolist() == ["tp", "fp"]
 
 
-def test_detections_below_the_score_threshold_do_not_take_part():
-    """They have no row, and leave no overlap behind."""
+def test_detections_below_the_score_threshold_are_not_used():
+    """They have no row and no overlap."""
     of_labels, of_results = outcomes_of([[car()]], [[car(score=0.2)]], score_threshold=0.3)
     assert of_labels.outcomes.tolist() == ["fn"]
     assert of_labels.overlaps.tolist() == [0]
@@ -97,17 +97,17 @@ def test_outcomes_add_up_to_the_counts_of_the_oracle(seed, metric, difficulty, t
         ]
         hits, false, _ = np.sum([frame.tally(threshold) for frame in frames], axis=0)
         found = of_labels.outcomes[of_labels.categories == category].tolist()
-        answered = of_results.outcomes[of_results.categories == category].tolist()
-        assert found.count("tp") == answered.count("tp") == hits
-        assert answered.count("fp") == false
+        matched = of_results.outcomes[of_results.categories == category].tolist()
+        assert found.count("tp") == matched.count("tp") == hits
+        assert matched.count("fp") == false
         assert len(found) == sum(state != "absent" for frame in frames for state in frame.states)
 
 
-def test_matches_point_at_each_other():
-    """A found object's detection names that object, and both have one overlap."""
+def test_matches_refer_to_each_other():
+    """A found object's detection refers to that object, and both have the same overlap."""
     labels, results = random_frames(np.random.default_rng(2), 30)
     of_labels, of_results = outcomes_of(labels, results, metric="bev")
-    answered = {
+    matched = {
         (frame, index): row
         for row, (frame, index) in enumerate(
             zip(of_results.frames, of_results.indices, strict=True)
@@ -115,16 +115,16 @@ def test_matches_point_at_each_other():
         if of_results.outcomes[row] == "tp"
     }
     found = np.flatnonzero(of_labels.outcomes == "tp")
-    assert len(found) == len(answered) > 10
+    assert len(found) == len(matched) > 10
     for row in found:
-        other = answered[of_labels.frames[row], of_labels.matches[row]]
+        other = matched[of_labels.frames[row], of_labels.matches[row]]
         assert of_results.matches[other] == of_labels.indices[row]
         assert of_results.overlaps[other] == of_labels.overlaps[row]
         assert of_results.scores[other] == of_labels.scores[row]
 
 
 def test_misses_agree_with_the_recall():
-    """Without a score threshold, tp over tp and fn is the recall where none is ignored."""
+    """Without a score threshold, tp / (tp + fn) is the recall if none is ignored."""
     labels = [[car(), car(x=6)], [car()]]
     results = [[car()], [car(score=0.01)]]
     of_labels, _ = outcomes_of(labels, results)
@@ -135,14 +135,13 @@ def test_misses_agree_with_the_recall():
 
 
 def test_no_frames_and_no_objects_have_no_outcomes():
-    """Empty in, empty out."""
     for frames in ([], [KittiObjects.empty()]):
         of_labels, of_results = object_outcomes(frames, frames)
         assert len(of_labels) == len(of_results) == 0
 
 
 @pytest.mark.parametrize("wrong", [{"metric": "4d"}, {"difficulty": "harder"}])
-def test_unknown_names_are_refused(wrong):
-    """The message lists what there is."""
+def test_unknown_names_are_rejected(wrong):
+    """The message lists the known ones."""
     with pytest.raises(ConfigError, match="image, bev, 3d"):
         outcomes_of([], [], **wrong)

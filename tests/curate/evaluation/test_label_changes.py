@@ -1,4 +1,4 @@
-"""Tests of what became of labels between rounds."""
+"""Changes of labels between rounds."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from curate.geometry.overlap import bev_iou
 
 
 def labels(rows):
-    """From (frame, category, x, weight): cars of 4 x 2 m along x."""
+    """Return labels from (frame, category, x, weight): cars of 4 x 2 m along x."""
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     boxes = np.tile([0.0, 0, 0, 4, 2, 1.5, 0], (len(table), 1))
     boxes[:, 0] = table[:, 2]
@@ -17,7 +17,7 @@ def labels(rows):
 
 
 def test_labels_are_matched_within_frame_and_category():
-    """The nearer of two; another frame or category is no match."""
+    """The nearer of two; another frame or category is not a match."""
     before = labels([(0, 0, 10, 0.5), (0, 0, 30, 0.2), (1, 0, 10, 0.9), (2, 1, 5, 0.3)])
     after = labels([(0, 0, 11, 0.4), (0, 0, 10.5, 0.7), (1, 1, 10, 1.0), (2, 1, 5, 0.3)])
     found = compare_labels(before, after)
@@ -29,7 +29,7 @@ def test_labels_are_matched_within_frame_and_category():
 
 
 def test_the_largest_changes_come_first():
-    """A lost label falls to 0, a gained one rises from it; what stays is not listed."""
+    """A lost label falls to 0, a gained one rises from it; unchanged ones are not listed."""
     before = labels([(0, 0, 10, 0.5), (1, 0, 10, 0.9), (2, 1, 5, 0.3)])
     after = labels([(0, 0, 10, 0.7), (1, 1, 10, 1.0), (2, 1, 5, 0.3)])
     rows, change = compare_labels(before, after).largest(10)
@@ -39,15 +39,15 @@ def test_the_largest_changes_come_first():
 
 
 def test_no_labels():
-    """Of either round or both."""
+    """In either round or both."""
     some, none = labels([(0, 0, 10, 0.5)]), labels([])
     assert compare_labels(some, none).lost.tolist() == [0]
     assert compare_labels(none, some).gained.tolist() == [0]
     assert len(compare_labels(none, none).largest(5)[0]) == 0
 
 
-def test_greedy_against_a_plain_loop():
-    """Crowded random boxes: one to one, and no pair left that is larger than those it lost to."""
+def test_greedy_matching_equals_a_plain_loop():
+    """Crowded random boxes: one to one, and no unmatched pair overlaps more."""
     rng = np.random.default_rng(3)
     sides = [
         labels(np.column_stack([
@@ -69,7 +69,7 @@ def test_greedy_against_a_plain_loop():
     assert len(expected) > 20
 
 
-def test_an_overlap_without_meaning_is_refused():
+def test_an_invalid_overlap_is_rejected():
     """At 1 nothing could match."""
     with pytest.raises(ConfigError, match="minimum IoU"):
         compare_labels(labels([]), labels([]), 1.0)

@@ -1,4 +1,4 @@
-"""The difficulty of a data set, counted by hand."""
+"""The difficulty of a dataset, counted by hand."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from curate.evaluation.object_statistics import object_statistics
 
 
 def test_objects_are_counted_by_difficulty_occlusion_truncation_and_distance() -> None:
-    """Four cars in two frames: easy, occluded (moderate), cut off (hard), too low for any."""
+    """Four cars in two frames: easy, occluded (moderate), truncated (hard), too small for any."""
     frames = [
         to_objects([car(x=3, z=4), car(z=10, occluded=1), car(z=30, category="Cyclist")]),
         to_objects([car(z=20, truncated=0.4), car(z=30, occluded=2, box_2d=(0, 0, 50, 20))]),
@@ -24,7 +24,7 @@ def test_objects_are_counted_by_difficulty_occlusion_truncation_and_distance() -
     assert np.isnan(found["Pedestrian"].occluded)
 
 
-def test_a_van_is_no_car() -> None:
+def test_a_van_is_not_a_car() -> None:
     """KITTI ignores it in the evaluation, so it makes nothing harder."""
     found = object_statistics([to_objects([car(category="Van")])], ("Car",))
     assert found["Car"].objects == 0

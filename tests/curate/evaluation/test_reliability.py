@@ -1,4 +1,4 @@
-"""Reliability: right and wrong labels, and weights as their judge."""
+"""Reliability: correct and wrong labels, and how well weights separate them."""
 
 import numpy as np
 import pytest
@@ -21,12 +21,12 @@ from curate.evaluation.reliability import (
 
 
 def car_at(x, y=0.0, length=4.0, z=0.0):
-    """A box of that length, 2 m wide."""
+    """Return a box of that length, 2 m wide."""
     return [x, y, z, length, 2.0, 1.5, 0.0]
 
 
 def labels(boxes, scores=None, categories=None):
-    """Labels of cars unless told otherwise, with falling scores."""
+    """Return labels of cars by default, with falling scores."""
     n = len(boxes)
     return Detections(
         np.reshape(np.array(boxes, dtype=np.float64), (n, 7)),
@@ -36,7 +36,7 @@ def labels(boxes, scores=None, categories=None):
 
 
 def truth(boxes, categories=None, boxes_2d=None):
-    """Ground truth of cars unless told otherwise."""
+    """Return ground truth of cars by default."""
     n = len(boxes)
     return Annotations(
         np.reshape(np.array(boxes, dtype=np.float64), (n, 7)),
@@ -48,7 +48,7 @@ def truth(boxes, categories=None, boxes_2d=None):
     )
 
 
-def test_a_label_is_right_above_the_minimum_iou_of_its_category():
+def test_a_label_is_correct_above_the_minimum_iou_of_its_category():
     """A shift of 0.8 m along 4 m is an IoU of 2/3: enough for a cyclist, not for a car."""
     shifted = [car_at(0.8), car_at(20.8)]
     found = match_to_ground_truth(
@@ -68,8 +68,8 @@ def test_an_iou_equal_to_the_minimum_is_wrong():
     assert not match_to_ground_truth(labels([car_at(0)]), truth([car_at(0)]), settings_).correct[0]
 
 
-def test_height_counts_for_3d_only():
-    """The same footprint 0.5 m higher: right in BEV, wrong in 3D."""
+def test_height_counts_only_in_3d():
+    """The same footprint 0.5 m higher: correct in BEV, wrong in 3D."""
     lifted = labels([car_at(0, z=0.5)])
     assert match_to_ground_truth(lifted, truth([car_at(0)]), MatchSettings(overlap="bev")).correct[
         0
@@ -94,15 +94,15 @@ def test_a_label_takes_the_object_that_fits_best():
     assert found.matched.tolist() == [1, 0]
 
 
-def test_another_category_is_no_match():
+def test_another_category_is_not_a_match():
     """A perfect box with the wrong name is wrong."""
     found = match_to_ground_truth(labels([car_at(0)], categories=["Cyclist"]), truth([car_at(0)]))
     assert not found.correct[0]
     assert found.counted[0]
 
 
-def test_a_label_on_a_neighbour_is_neutral_or_right():
-    """A van under a car label is neither; by option it counts as a car to be found."""
+def test_a_label_on_a_neighbour_category_is_neutral_or_correct():
+    """A car label on a van is neutral; with an option it counts as a car."""
     van = truth([car_at(0), car_at(20)], ["Van", "Car"])
     twice = labels([car_at(0), car_at(0.1), car_at(20)])
     neutral = match_to_ground_truth(twice, van)
@@ -116,7 +116,7 @@ def test_a_label_on_a_neighbour_is_neutral_or_right():
 
 
 def test_labels_in_dont_care_regions_are_neutral():
-    """By the share of their own rectangle; invisible labels and right ones are counted."""
+    """By the share of their own rectangle; invisible labels and correct ones are counted."""
     regions = truth(
         [[np.nan] * 7, car_at(0)],
         ["DontCare", "Car"],
@@ -137,7 +137,7 @@ def test_labels_in_dont_care_regions_are_neutral():
 
 @pytest.mark.parametrize("n", [0, 2])
 @pytest.mark.parametrize("m", [0, 2])
-def test_empty_frames_are_judged(n, m):
+def test_empty_frames_are_evaluated(n, m):
     """No labels, no objects, or neither."""
     boxes = [car_at(0), car_at(20)]
     found = match_to_ground_truth(labels(boxes[:n]), truth(boxes[:m]), rectangles=np.zeros((n, 4)))
@@ -146,15 +146,13 @@ def test_empty_frames_are_judged(n, m):
     assert found.ground_truths["Car"] == m
 
 
-def test_a_category_without_minimum_iou_is_named():
-    """The error names the category."""
+def test_a_category_without_minimum_iou_is_reported():
     with pytest.raises(ConfigError, match="Tram"):
         match_to_ground_truth(labels([car_at(0)], categories=["Tram"]), truth([]))
 
 
 @pytest.mark.parametrize("wrong", [{"overlap": "image"}, {"neighbors_are": "wrong"}])
-def test_unknown_options_are_refused(wrong):
-    """The error names the option."""
+def test_unknown_options_are_rejected(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         MatchSettings(**wrong)
 
@@ -165,8 +163,8 @@ def test_unknown_options_are_refused(wrong):
     st.lists(st.integers(0, 12), max_size=6),
     st.randoms(use_true_random=False),
 )
-def test_judgement_is_one_to_one_and_blind_to_order(rows, places, random):
-    """Each object makes one label right at most; shuffled labels get the same verdicts."""
+def test_matching_is_one_to_one_and_independent_of_order(rows, places, random):
+    """Each object makes one label correct at most; shuffled labels get the same results."""
     detections = labels([car_at(x / 4) for x, _ in rows], [score for _, score in rows])
     objects = truth([car_at(x / 4) for x in places])
     found = match_to_ground_truth(detections, objects)
@@ -174,8 +172,8 @@ def test_judgement_is_one_to_one_and_blind_to_order(rows, places, random):
     assert len(set(taken)) == len(taken)
     order = np.array(random.sample(range(len(rows)), len(rows)), dtype=np.int64)
     again = match_to_ground_truth(detections.select(order), objects)
-    verdict = sorted(zip(rows, found.correct, strict=True))
-    assert verdict == sorted(zip([rows[i] for i in order], again.correct, strict=True))
+    outcome = sorted(zip(rows, found.correct, strict=True))
+    assert outcome == sorted(zip([rows[i] for i in order], again.correct, strict=True))
 
 
 WEIGHTED = st.lists(
@@ -186,12 +184,12 @@ WEIGHTED = st.lists(
 
 
 def columns(rows):
-    """Weights and rights as arrays."""
+    """Return weights and correctness as arrays."""
     return np.array([row[0] for row in rows]), np.array([row[1] for row in rows], dtype=bool)
 
 
 @given(WEIGHTED)
-def test_auroc_is_the_share_of_pairs_in_order(rows):
+def test_auroc_is_the_share_of_ordered_pairs(rows):
     """Against every pair, ties counted half."""
     weights, right = columns(rows)
     assume(right.any() and not right.all())
@@ -201,7 +199,7 @@ def test_auroc_is_the_share_of_pairs_in_order(rows):
 
 @given(WEIGHTED)
 def test_average_precision_steps_over_distinct_weights(rows):
-    """Against the definition, threshold by threshold; blind to the order of ties."""
+    """Against the definition, threshold by threshold; independent of the order of ties."""
     weights, right = columns(rows)
     assume(right.any())
     expected = ranking.average_precision(weights.tolist(), right.tolist())
@@ -210,14 +208,14 @@ def test_average_precision_steps_over_distinct_weights(rows):
 
 
 def test_weighted_precision_and_recall_worked_out():
-    """Weight on right labels over all weight, and over all objects."""
+    """Weight on correct labels over all weight, and over all objects."""
     weights, right = np.array([1.0, 0.5, 0.5, 0.0]), np.array([True, True, False, False])
     assert weighted_precision(weights, right) == 0.75
     assert weighted_recall(weights, right, 3) == 0.5
 
 
-def test_a_judge_that_is_always_right_scores_one():
-    """Weights that separate right from wrong, and weights that cannot."""
+def test_a_perfect_weighting_scores_one():
+    """Weights that separate correct from wrong labels, and weights that cannot."""
     right = np.array([True, True, False, False, False])
     assert auroc(np.array([0.9, 0.8, 0.7, 0.1, 0.0]), right) == 1.0
     assert average_precision(np.array([0.9, 0.8, 0.7, 0.1, 0.0]), right) == 1.0
@@ -226,8 +224,8 @@ def test_a_judge_that_is_always_right_scores_one():
 
 
 @pytest.mark.parametrize("right", [[], [True, True], [False, False]])
-def test_what_is_undefined_is_nan(right):
-    """No labels, all right, all wrong, no weight, no objects: NaN, never a crash."""
+def test_undefined_values_are_nan(right):
+    """No labels, all correct, all wrong, no weight, no objects: NaN, never an exception."""
     right = np.array(right, dtype=bool)
     weights = np.full(len(right), 0.25)
     assert np.isnan(auroc(weights, right))
@@ -240,7 +238,7 @@ def test_what_is_undefined_is_nan(right):
     assert np.isnan(reliability_bins(weights, right, 0).recall).all()
 
 
-def test_bins_hold_their_lower_edge_and_the_last_one_its_upper():
+def test_bins_contain_their_lower_edge_and_the_last_one_its_upper():
     """Every weight in [0, 1] is in one bin; recall over the bins adds up."""
     weights = np.array([0.0, 0.09, 0.1, 0.3, 0.7, 0.95, 1.0])
     right = np.array([False, False, True, False, True, True, True])
@@ -253,14 +251,14 @@ def test_bins_hold_their_lower_edge_and_the_last_one_its_upper():
 
 
 def test_calibration_error_worked_out():
-    """Two bins: weights 0.2 with a quarter right, weights 0.8 all right."""
+    """Two bins: weights 0.2 with a quarter correct, weights 0.8 all correct."""
     weights = np.array([0.2] * 4 + [0.8] * 4)
     right = np.array([True, False, False, False] + [True] * 4)
     assert expected_calibration_error(weights, right) == pytest.approx(0.5 * 0.05 + 0.5 * 0.2)
 
 
 def test_calibrated_weights_have_a_small_error_and_overconfident_ones_a_large_one():
-    """Rights drawn with the weight's own chance are recovered as calibrated."""
+    """Labels are correct with the probability of their weight."""
     generator = np.random.default_rng(11)
     weights = generator.random(20_000)
     right = generator.random(20_000) < weights

@@ -1,4 +1,4 @@
-"""The whole chain from recorded detections to judged weights, on real frames of KITTI."""
+"""The whole chain from recorded detections to evaluated weights, on real frames of KITTI."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ VAL = {f"{number:06d}" for number in (1, 4, 5, 8, 20, 23, 25, 28, 35)}
 
 @dataclass(frozen=True)
 class Judged:
-    """Evidence of all labels of the weak teacher, and which of them are right."""
+    """Evidence of all labels of the weak teacher, and which of them are correct."""
 
     evidence: Evidence
     right: np.ndarray
@@ -46,8 +46,11 @@ class Judged:
         pytest.param(("all", 341, 36), id="all", marks=pytest.mark.slow),
     ],
 )
-def judged(request, kitti_root):
-    """Cars of the weak teacher on labeled frames; right = BEV IoU > 0.7 with a Car or a Van."""
+def evaluated(request, kitti_root):
+    """Return cars of the weak teacher on labeled frames.
+
+    Correct = BEV IoU > 0.7 with a Car or a Van.
+    """
     split, labels, rights = request.param
     dataset = KittiDataset(kitti_root)
     detector = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv")
@@ -63,42 +66,42 @@ def judged(request, kitti_root):
     for index, frame_id in enumerate(sorted(VAL) if split == "val" else dataset.frame_ids()):
         frame = dataset.read(frame_id, image=True)
         found = detector.predict(frame)
-        ((similarity, answered),) = detector.views(frame_id)
+        ((similarity, repredicted),) = detector.views(frame_id)
         back = Detections(
-            similarity.invert_boxes(answered.boxes), answered.scores, answered.categories
+            similarity.invert_boxes(repredicted.boxes), repredicted.scores, repredicted.categories
         )
-        verdict = match_to_ground_truth(
+        outcome = match_to_ground_truth(
             found, dataset.annotations(frame_id), MatchSettings(neighbors_are="correct")
         )
         rows.append((
             np.full(len(found), index), found.categories, found.scores,
             consistency(found, back).loss,
             *(prior.score(frame, found)[prior.rho_column] for prior in priors),
-            verdict.correct,
+            outcome.correct,
         ))  # fmt: skip
     *columns, diff, anno, right = (np.concatenate(column) for column in zip(*rows, strict=True))
     evidence = Evidence(*columns, {"rho_diff": diff, "rho_anno": anno})
     return Judged(evidence, right, labels, rights)
 
 
-def test_a_few_labels_are_right_and_most_have_evidence(judged):
-    """Counts that a change of matching, judging or reading would move."""
-    assert len(judged.evidence) == judged.labels
-    assert judged.right.sum() == judged.rights
-    assert judged.evidence.matched.mean() == pytest.approx(0.775, abs=0.02)
+def test_a_few_labels_are_correct_and_most_have_evidence(evaluated):
+    """Counts that a change of matching, evaluation or reading would change."""
+    assert len(evaluated.evidence) == evaluated.labels
+    assert evaluated.right.sum() == evaluated.rights
+    assert evaluated.evidence.matched.mean() == pytest.approx(0.775, abs=0.02)
 
 
-def test_right_labels_have_smaller_losses(judged):
-    """Score and consistency loss each tell right from wrong well on their own."""
-    trust = -np.nan_to_num(judged.evidence.loss, nan=np.inf)
-    assert 0.95 < auroc(judged.evidence.score, judged.right) < 0.98
-    assert 0.95 < auroc(trust, judged.right) < 0.98
+def test_correct_labels_have_smaller_losses(evaluated):
+    """Score and consistency loss each separate correct from wrong labels well."""
+    trust = -np.nan_to_num(evaluated.evidence.loss, nan=np.inf)
+    assert 0.95 < auroc(evaluated.evidence.score, evaluated.right) < 0.98
+    assert 0.95 < auroc(trust, evaluated.right) < 0.98
 
 
 @pytest.mark.parametrize("age", AGES)
-def test_the_prior_is_what_makes_the_weights_precise(judged, age):
-    """PSPSL puts over twice as much of its weight on right labels as the score does."""
-    evidence, right = judged.evidence, judged.right
+def test_the_prior_makes_the_weights_precise(evaluated, age):
+    """PSPSL puts over twice as much of its weight on correct labels as the score does."""
+    evidence, right = evaluated.evidence, evaluated.right
     by_score = weighted_precision(evidence.score, right)
     spsl = weighted_precision(SPSL().weigh(evidence, age).v, right)
     weights = PSPSL().weigh(evidence, age).v

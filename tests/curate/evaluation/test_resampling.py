@@ -1,4 +1,4 @@
-"""The fast bootstrap against copied labels and hand-worked draws."""
+"""The fast bootstrap against copied labels and draws by hand."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from curate.evaluation.reliability import auroc, average_precision
 from curate.evaluation.resampling import draw_frames, ranked_replicates
 
 
-def test_a_draw_holds_as_many_frames_as_there_are():
-    """With replacement: some twice, some not at all, the sum is kept."""
+def test_a_draw_has_as_many_frames_as_there_are():
+    """With replacement: some twice, some not at all."""
     draws = draw_frames(np.random.default_rng(0), 12, 50)
     assert draws.shape == (50, 12)
     assert set(draws.sum(axis=1)) == {12}
@@ -19,18 +19,18 @@ def test_a_draw_holds_as_many_frames_as_there_are():
     assert draws.min() == 0
 
 
-def test_the_same_seed_draws_the_same():
-    """And another seed something else."""
+def test_the_same_seed_gives_the_same_draws():
+    """Another seed gives others."""
     one, same, other = (draw_frames(np.random.default_rng(seed), 9, 20) for seed in (1, 1, 2))
     assert np.array_equal(one, same)
     assert not np.array_equal(one, other)
 
 
 def test_multiplicities_by_hand():
-    """Frame 0 has a right label of weight 0.9 and a wrong one of 0.5, frame 1 a right one of 0.2.
+    """Frame 0 has correct label 0.9 and wrong label 0.5, frame 1 has correct label 0.2.
 
     Once each: the pairs are (0.9, 0.5) won and (0.2, 0.5) lost. Frame 1 twice: 1 of 3 pairs won;
-    precision is 1 at the first right label and 3/4 at the other two.
+    precision is 1 at the first correct label and 3/4 at the other two.
     """
     weights, right = np.array([0.9, 0.5, 0.2]), np.array([True, False, True])
     draws = np.array([[1.0, 1.0], [1.0, 2.0], [0.0, 2.0]])
@@ -42,8 +42,8 @@ def test_multiplicities_by_hand():
 
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 25))
-def test_it_equals_the_figures_of_copied_labels(seed, n):
-    """Ties, empty frames, draws without a right or without a wrong label."""
+def test_it_equals_the_values_of_copied_labels(seed, n):
+    """Ties, empty frames, draws without a correct or without a wrong label."""
     generator = np.random.default_rng(seed)
     weights = generator.choice([0.0, 0.2, 0.2, 0.7, generator.random()], n)
     right, frame = generator.random(n) < 0.4, generator.integers(6, size=n)
@@ -73,7 +73,7 @@ def test_its_interval_is_that_of_the_general_bootstrap():
     assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), abs=0.01)
 
 
-def test_no_frames_have_no_figures():
+def test_no_frames_have_no_values():
     """Every replicate is undefined."""
     draws = draw_frames(np.random.default_rng(0), 0, 5)
     nothing = np.zeros(0)

@@ -8,8 +8,8 @@ from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from curate.exporters.comma_separated import CsvExporter
 
 
-def test_every_column_comes_back_to_the_last_bit(tmp_path):
-    """In the order of the view; what is unknown is empty."""
+def test_every_column_is_read_back_to_the_last_bit(tmp_path):
+    """In the order of the view; unknown values are empty."""
     labels = toy_labels()
     CsvExporter().write(tmp_path / "labels.csv", labels)
     with (tmp_path / "labels.csv").open(newline="") as file:

@@ -29,7 +29,7 @@ FURTHER = (
 
 @pytest.fixture(params=EXPORTERS, ids=lambda exporter: exporter.name)
 def exporter(request):
-    """Each format that holds all labels with their weights."""
+    """Return each format that stores all labels with their weights."""
     if request.param is ParquetExporter:
         pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     return request.param()
@@ -37,13 +37,13 @@ def exporter(request):
 
 @pytest.fixture(params=LIBRARIES)
 def library(request):
-    """Each library."""
+    """Return each library."""
     pytest.importorskip(request.param, reason=f"{request.param} is not installed")
     return request.param
 
 
 def as_rows(table):
-    """The rows of a DataFrame; what is missing is None."""
+    """Return the rows of a DataFrame; missing values are None."""
     records = table.to_dicts() if hasattr(table, "to_dicts") else table.to_dict("records")
     return [
         {
@@ -62,8 +62,8 @@ def _plain(value):
     return None if pd.isna(value) else value
 
 
-def test_every_value_comes_back(tmp_path, exporter, library):
-    """To the last bit, in order, and "000001" is no number."""
+def test_every_value_is_read_back(tmp_path, exporter, library):
+    """To the last bit, in order, and "000001" is not a number."""
     labels = toy_labels()
     path = tmp_path / f"labels{exporter.suffix}"
     exporter.write(path, labels)
@@ -75,7 +75,7 @@ def test_every_value_comes_back(tmp_path, exporter, library):
 
 
 def test_types_are_those_of_the_columns(tmp_path, exporter, library):
-    """The same for every format, and whether or not a column holds missing values."""
+    """The same for every format, with or without missing values."""
     path = tmp_path / f"labels{exporter.suffix}"
     exporter.write(path, toy_labels())
     table = read_labels(path, library)
@@ -88,7 +88,7 @@ def test_types_are_those_of_the_columns(tmp_path, exporter, library):
 
 
 def test_an_export_without_labels_has_the_columns(tmp_path, exporter, library):
-    """And their types, so that a notebook needs no exception for it."""
+    """With their types, so that a notebook needs no special case."""
     path = tmp_path / f"labels{exporter.suffix}"
     exporter.write(path, toy_labels())
     types = list(map(str, read_labels(path, library).dtypes))
@@ -99,7 +99,7 @@ def test_an_export_without_labels_has_the_columns(tmp_path, exporter, library):
 
 
 def test_further_evidence_is_read(tmp_path, exporter, library):
-    """With its types: a name that looks like a number stays text."""
+    """With its types: text that looks like a number stays text."""
     more = [{"hits": None, "speed": 2.0, "track": "007"}, {"hits": 3, "speed": 0.5, "track": "1"}]
     rows = [label("000001", k) | own for k, own in enumerate(more)]
     columns = (*WEIGHTED_LABELS, *FURTHER)
@@ -122,7 +122,7 @@ def test_many_labels_are_read_in_blocks(tmp_path, exporter, library, monkeypatch
 
 
 def test_pandas_is_the_default(tmp_path):
-    """Where both are installed."""
+    """If both are installed."""
     pandas = pytest.importorskip("pandas", reason="pandas is not installed")
     SqliteExporter().write(tmp_path / "labels.sqlite", toy_labels())
     assert isinstance(read_labels(tmp_path / "labels.sqlite"), pandas.DataFrame)
@@ -136,15 +136,15 @@ def test_pandas_is_the_default(tmp_path):
         (None, "read_labels needs pandas or polars: pip install"),
     ],
 )
-def test_a_missing_library_is_named(tmp_path, monkeypatch, as_, message):
+def test_a_missing_library_is_reported(tmp_path, monkeypatch, as_, message):
     """With what to do."""
     monkeypatch.setattr(curate.exporters.data_frames, "find_spec", lambda _: None)
     with pytest.raises(ConfigError, match=message):
         read_labels(tmp_path / "labels.sqlite", as_)
 
 
-def test_what_holds_no_weighted_labels_is_rejected(tmp_path):
-    """A file that is missing, of another format, or of somebody else."""
+def test_a_file_without_weighted_labels_is_rejected(tmp_path):
+    """A missing file, another format, or a file of another program."""
     with pytest.raises(DataError, match="cannot be read: No such file"):
         read_labels(tmp_path / "labels.sqlite")
     CocoExporter().write(tmp_path / "labels.json", toy_labels())
@@ -168,8 +168,8 @@ def test_what_holds_no_weighted_labels_is_rejected(tmp_path):
         (b"Car", b"C\xffr", "cannot be read"),
     ],
 )
-def test_a_damaged_csv_is_named(tmp_path, old, new, message):
-    """With the line where it can be told."""
+def test_a_damaged_csv_is_reported(tmp_path, old, new, message):
+    """With the line if it is known."""
     path = tmp_path / "labels.csv"
     CsvExporter().write(path, toy_labels())
     path.write_bytes(path.read_bytes().replace(old, new, 1))
@@ -177,8 +177,8 @@ def test_a_damaged_csv_is_named(tmp_path, old, new, message):
         read_labels(path)
 
 
-def test_a_damaged_parquet_file_is_named(tmp_path):
-    """Cut off."""
+def test_a_damaged_parquet_file_is_reported(tmp_path):
+    """A truncated file."""
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     path = tmp_path / "labels.parquet"
     ParquetExporter().write(path, toy_labels())

@@ -1,4 +1,4 @@
-"""Tests of exports that are a folder: two at once, and what a killed one leaves."""
+"""Exports into a folder: two at once, and the remains of a killed one."""
 
 import json
 import os
@@ -18,8 +18,8 @@ write_folder(Path(sys.argv[1]), "toy", lambda folder: (folder / "other").write_t
 """
 
 
-def test_two_exports_to_one_place_do_not_mix(tmp_path):
-    """Another process that is done in the middle takes nothing away; the last one stands."""
+def test_two_exports_to_one_folder_do_not_mix(tmp_path):
+    """Another process that finishes first loses nothing; the last one stays."""
 
     def fill(folder):
         (folder / "first").write_text("")
@@ -36,8 +36,8 @@ def test_two_exports_to_one_place_do_not_mix(tmp_path):
 
 
 @pytest.mark.parametrize("runs", [True, False])
-def test_only_what_a_killed_export_left_is_removed(tmp_path, runs):
-    """A process that still runs goes on with its own."""
+def test_only_the_remains_of_a_killed_export_are_removed(tmp_path, runs):
+    """Those of a running process stay."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     process = os.getppid() if runs else ended.pid

@@ -1,4 +1,4 @@
-"""Tests of weighted labels as KITTI label files."""
+"""Weighted labels as KITTI label files."""
 
 import json
 
@@ -17,7 +17,7 @@ BOXES = np.array(
 
 
 def weighted_frame(name="000001", weights=(0.75, 0.0, 0.5), zero_weight="ignore"):
-    """Three labels, the second of which weighs 0."""
+    """Return three labels; the second has weight 0."""
     count = len(weights)
     labels = Detections(
         BOXES[:count],
@@ -30,7 +30,7 @@ def weighted_frame(name="000001", weights=(0.75, 0.0, 0.5), zero_weight="ignore"
 
 
 def files(directory):
-    """Every file below a folder, by its path there."""
+    """Return every file below a folder, by relative path."""
     paths = [path for path in directory.rglob("*") if path.is_file()]
     return {str(path.relative_to(directory)): path.read_text() for path in paths}
 
@@ -46,7 +46,7 @@ def test_labels_are_kitti_lines_with_their_weight(tmp_path):
 
 
 def test_a_label_of_weight_0_is_an_ignored_region(tmp_path):
-    """Its line keeps the rectangle only; category and 3D box are in the folder `weight`."""
+    """Its line keeps only the rectangle; category and 3D box are in the folder `weight`."""
     export_kitti(tmp_path / "out", [weighted_frame()])
     lines = (tmp_path / "out" / "label_2" / "000001.txt").read_text().splitlines()
     fields = lines[1].split()
@@ -62,7 +62,7 @@ def test_a_label_of_weight_0_is_an_ignored_region(tmp_path):
 
 
 def test_a_label_of_weight_0_that_is_background_has_no_line(tmp_path):
-    """It is in the folder `weight` alone, in its place; the marker says why."""
+    """It is only in the folder `weight`, in its position; the marker explains why."""
     out = tmp_path / "out"
     frames = [weighted_frame(zero_weight="background")]
     assert export_kitti(out, frames, zero_weight="background") == 3
@@ -77,7 +77,7 @@ def test_a_label_of_weight_0_that_is_background_has_no_line(tmp_path):
 @pytest.mark.parametrize(
     ("last_field", "scores"), [("weight", [0.75, 0, 0.5]), ("score", [0.9, 0.3, 0.6])]
 )
-def test_the_last_field_is_chosen(tmp_path, last_field, scores):
+def test_the_last_field_can_be_chosen(tmp_path, last_field, scores):
     """Weight or score in the 16th field."""
     export_kitti(tmp_path / "out", [weighted_frame()], last_field=last_field)
     objects = read_objects(tmp_path / "out" / "label_2" / "000001.txt", scored=True)
@@ -93,7 +93,7 @@ def test_without_a_last_field_they_are_plain_label_files(tmp_path):
 
 
 def test_frames_without_labels_get_empty_files(tmp_path):
-    """So that a trainer finds a file for every frame."""
+    """A trainer then finds a file for every frame."""
     export_kitti(tmp_path / "out", [weighted_frame(weights=())])
     assert files(tmp_path / "out") == {
         "label_2/000001.txt": "",
@@ -102,8 +102,8 @@ def test_frames_without_labels_get_empty_files(tmp_path):
     }
 
 
-def test_a_later_export_leaves_nothing_of_the_former(tmp_path):
-    """Files of frames that are no longer there are gone, and no partial folder is left."""
+def test_a_later_export_removes_the_earlier_one(tmp_path):
+    """Files of frames that no longer exist are removed, and no partial folder is left."""
     out = tmp_path / "out"
     export_kitti(out, [weighted_frame("000001"), weighted_frame("000002")])
     export_kitti(out, [weighted_frame("000003", (0.5,))])
@@ -113,8 +113,8 @@ def test_a_later_export_leaves_nothing_of_the_former(tmp_path):
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_an_export_that_fails_leaves_the_former_as_it_was(tmp_path):
-    """Whatever breaks in the middle of the frames."""
+def test_a_failed_export_leaves_the_earlier_one_unchanged(tmp_path):
+    """If an error occurs between two frames."""
     out = tmp_path / "out"
     export_kitti(out, [weighted_frame()])
     former = files(out)
@@ -130,8 +130,8 @@ def test_an_export_that_fails_leaves_the_former_as_it_was(tmp_path):
 
 
 @pytest.mark.parametrize("marker", [None, "{}", "[]", "no json", '{"format": "other"}'])
-def test_folders_that_are_no_former_export_are_left_alone(tmp_path, marker):
-    """A data set's own labels are never overwritten."""
+def test_folders_that_are_not_an_earlier_export_are_not_overwritten(tmp_path, marker):
+    """For example a dataset's own labels."""
     label = tmp_path / "training" / "label_2" / "000001.txt"
     label.parent.mkdir(parents=True)
     label.write_text("precious")
@@ -142,28 +142,27 @@ def test_folders_that_are_no_former_export_are_left_alone(tmp_path, marker):
     assert label.read_text() == "precious"
 
 
-def test_a_file_in_the_place_of_the_folder_is_left_alone(tmp_path):
-    """The same for a file."""
+def test_a_file_in_place_of_the_folder_is_not_overwritten(tmp_path):
     (tmp_path / "out").write_text("precious")
     with pytest.raises(ConfigError, match="not a previous export"):
         export_kitti(tmp_path / "out", [weighted_frame()])
 
 
-def test_an_empty_folder_is_taken(tmp_path):
-    """It holds nothing that could be lost."""
+def test_an_empty_folder_is_used(tmp_path):
+    """Nothing can be lost."""
     (tmp_path / "out").mkdir()
     export_kitti(tmp_path / "out", [weighted_frame()])
     assert "export.json" in files(tmp_path / "out")
 
 
 @pytest.mark.parametrize("weights", [(0.5, np.nan, 0.5), (0.5, 1.1, 0.5), (0.5, -0.1, 0.5)])
-def test_weights_out_of_range_are_refused(tmp_path, weights):
-    """The error names the frame."""
+def test_weights_out_of_range_are_rejected(tmp_path, weights):
+    """The error contains the frame."""
     with pytest.raises(DataError, match="frame 000001: needs one weight in"):
         export_kitti(tmp_path / "out", [weighted_frame(weights=weights)])
 
 
-def test_a_frame_that_occurs_twice_is_refused(tmp_path):
-    """Otherwise the first would be lost in silence."""
+def test_a_duplicate_frame_is_rejected(tmp_path):
+    """Otherwise the first one would be lost silently."""
     with pytest.raises(DataError, match="frame 000001 occurs twice"):
         export_kitti(tmp_path / "out", [weighted_frame(), weighted_frame()])

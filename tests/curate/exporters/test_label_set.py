@@ -1,4 +1,4 @@
-"""Tests of what no exporter is given."""
+"""Label sets: the input that no exporter accepts."""
 
 import json
 from dataclasses import replace
@@ -14,16 +14,16 @@ from curate.exporters.objects import frame_objects
 
 
 @pytest.mark.parametrize("weight", ["abc", b"\x00\xff", None])
-def test_weights_that_are_no_numbers_are_refused(weight):
-    """SQLite keeps what another program writes into a column of numbers."""
+def test_weights_that_are_not_numbers_are_rejected(weight):
+    """SQLite stores any value that another program writes into a numeric column."""
     rows = rows_of(toy_labels())
     labels = with_rows(toy_labels(), [*rows[:2], rows[2] | {"weight": weight}])
     with pytest.raises(DataError, match=r"frame 000001: label 2 has weight .*expected a number in"):
         list(labels.blocks())
 
 
-def test_columns_may_be_arrays_in_any_order():
-    """NaN in an array is unknown; what exporters get are plain values in the order of columns."""
+def test_columns_can_be_arrays_in_any_order():
+    """NaN in an array is unknown; exporters get plain values in the order of columns."""
     labels = toy_labels()
     [given] = labels.labels
     arrays = {name: np.array(given[name]) for name in reversed(given)}
@@ -42,16 +42,16 @@ def test_columns_may_be_arrays_in_any_order():
         lambda columns: columns.update(k=columns["k"][:-1]),
     ],
 )
-def test_a_block_with_other_columns_is_refused(change):
-    """One is missing, one is more than was declared, or one is shorter."""
+def test_a_block_with_other_columns_is_rejected(change):
+    """One is missing, one is undeclared, or one is shorter."""
     [columns] = toy_labels().labels
     change(columns)
     with pytest.raises(DataError, match="a block of labels has the columns round, frame"):
         list(replace(toy_labels(), labels=[columns]).blocks())
 
 
-def test_a_frame_may_continue_in_the_next_block():
-    """Its objects are the same, whatever the blocks."""
+def test_a_frame_can_continue_in_the_next_block():
+    """Its objects do not depend on the blocks."""
     labels = toy_labels()
     rows = rows_of(labels)
     for parts in ([rows[:1], rows[1:]], [[row] for row in rows], [rows[:2], [], rows[2:]]):
@@ -61,8 +61,8 @@ def test_a_frame_may_continue_in_the_next_block():
             np.testing.assert_array_equal(one.weights, other.weights)
 
 
-def test_labels_out_of_the_order_of_their_frames_are_refused():
-    """Otherwise those of a frame would be lost, or all would have to be held."""
+def test_labels_not_sorted_by_frame_are_rejected():
+    """Otherwise those of a frame would be lost, or all would have to be in memory."""
     names = ("000001", "000002")
     frames = [FrameFiles(name, "unlabeled", "p", "i", "c") for name in names]
     rows = [label("000001"), label("000002"), label("000001", 1)]
@@ -71,13 +71,13 @@ def test_labels_out_of_the_order_of_their_frames_are_refused():
         list(frame_objects(labels))
 
 
-def test_the_labels_are_walked_once(tmp_path):
-    """Each walk asks the database for all of them."""
+def test_the_labels_are_iterated_over_once(tmp_path):
+    """Each iteration queries the database for all of them."""
     labels = toy_labels()
     walks = []
 
     class Counted:
-        """Labels that note when they are walked."""
+        """Labels that count how often they are iterated over."""
 
         def __iter__(self):
             walks.append(1)
@@ -87,8 +87,8 @@ def test_the_labels_are_walked_once(tmp_path):
     assert len(walks) == 1
 
 
-def test_what_a_person_rejected_is_background_under_every_policy(tmp_path):
-    """A policy's own doubt is a region to ignore, a person's decision is none."""
+def test_labels_rejected_by_a_person_are_background_under_every_policy(tmp_path):
+    """A policy's uncertain labels are ignored, but a human decision is certain."""
     rows = rows_of(toy_labels())
     rows[0] |= {"provenance": "human", "weight": 0.0}
     labels = with_rows(toy_labels(zero_weight="ignore"), rows)

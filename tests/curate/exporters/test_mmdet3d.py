@@ -11,12 +11,12 @@ from curate.exporters.mmdet3d import MMDet3DExporter
 
 @pytest.fixture
 def infos(tmp_path):
-    """What a trainer reads."""
+    """Return what a trainer reads."""
     assert MMDet3DExporter().write(tmp_path / "out", toy_labels()) == 3
     return pickle.loads((tmp_path / "out" / "kitti_infos_train.pkl").read_bytes())
 
 
-def test_labels_come_back_with_their_weights(infos):
+def test_labels_are_stored_with_their_weights(infos):
     """The numbers of the categories are those of mmdetection3d's KittiDataset; -1 is ignored."""
     assert list(infos["metainfo"]["categories"])[:4] == ["Pedestrian", "Cyclist", "Car", "Van"]
     instances = infos["data_list"][1]["instances"]
@@ -29,7 +29,7 @@ def test_labels_come_back_with_their_weights(infos):
     assert [(each["bbox_label_3d"], each["weight"]) for each in truth] == [(2, 1.0), (3, 1.0)]
 
 
-def test_background_has_no_category_and_is_told_apart(tmp_path):
+def test_background_has_no_category_and_is_marked(tmp_path):
     """Label -1 is left out; a trainer that reads weights sees that it is not to be ignored."""
     MMDet3DExporter().write(tmp_path / "out", toy_labels(zero_weight="background"))
     infos = pickle.loads((tmp_path / "out" / "kitti_infos_train.pkl").read_bytes())
@@ -39,16 +39,16 @@ def test_background_has_no_category_and_is_told_apart(tmp_path):
     assert infos["metainfo"]["zero_weight"] == "background"
 
 
-def test_boxes_are_in_the_cameras_frame(infos):
+def test_boxes_are_in_the_camera_frame(infos):
     """Bottom centre, then length, height, width, and the yaw about y, by hand."""
-    # The toy camera stands at the LiDAR: right is -y, down is -z, ahead is x.
+    # The toy camera is at the LiDAR: right is -y, down is -z, ahead is x.
     x, y, z, length, width, height, _ = TRUE_BOX
     box = infos["data_list"][0]["instances"][0]["bbox_3d"]
     assert box == pytest.approx([-y, -z + height / 2, x, length, height, width, -np.pi / 2])
 
 
-def test_a_frame_names_its_files_and_its_calibration(infos):
-    """File names alone, which `data_prefix` completes; matrices as lists."""
+def test_a_frame_lists_its_files_and_its_calibration(infos):
+    """Only file names, which `data_prefix` completes; matrices as lists."""
     info = infos["data_list"][1]
     assert (info["sample_idx"], info["lidar_points"]["lidar_path"]) == (1, "000001.bin")
     camera = info["images"]["CAM2"]

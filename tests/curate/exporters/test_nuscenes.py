@@ -23,13 +23,13 @@ from curate.exporters.nuscenes import NuScenesExporter
 
 @pytest.fixture
 def dataset(tmp_path):
-    """A tiny nuScenes."""
+    """Return a tiny nuScenes dataset."""
     write_nuscenes(tmp_path / "nuscenes")
     return NuScenesDataset(tmp_path / "nuscenes")
 
 
 def labels_of(dataset, zero_weight="ignore"):
-    """The toy labels, of two frames of nuScenes."""
+    """Return the toy labels, of two frames of nuScenes."""
     labels = toy_labels(zero_weight=zero_weight)
     first, second = (sample_token("scene-0061", 0), sample_token("scene-0103", 1))
     names = {"000000": first, "000001": second}
@@ -37,7 +37,7 @@ def labels_of(dataset, zero_weight="ignore"):
 
 
 def test_boxes_are_in_the_map(dataset, tmp_path):
-    """As scipy brings them there; a label of weight 0 is not among the results."""
+    """As transformed by scipy; a label of weight 0 is not among the results."""
     assert NuScenesExporter().write(tmp_path / "a.json", labels_of(dataset)) == 3
     document = json.loads((tmp_path / "a.json").read_text())
     name = sample_token("scene-0103", 1)
@@ -58,7 +58,7 @@ def test_boxes_are_in_the_map(dataset, tmp_path):
 
 
 @pytest.mark.parametrize("zero_weight", ["ignore", "background"])
-def test_what_weighs_nothing_is_listed_as_what_it_is(dataset, tmp_path, zero_weight):
+def test_labels_of_weight_0_are_listed_separately(dataset, tmp_path, zero_weight):
     """As ignored or as background; the other list is empty."""
     NuScenesExporter().write(tmp_path / "a.json", labels_of(dataset, zero_weight))
     document = json.loads((tmp_path / "a.json").read_text())
@@ -69,8 +69,8 @@ def test_what_weighs_nothing_is_listed_as_what_it_is(dataset, tmp_path, zero_wei
         assert [box["k"] for box in boxes] == ([1] if meaning == zero_weight else [])
 
 
-def test_our_results_are_a_record(dataset, tmp_path):
-    """Written and read, the boxes are what they were."""
+def test_our_results_can_be_read_as_a_record(dataset, tmp_path):
+    """The boxes are the same."""
     NuScenesExporter().write(tmp_path / "a.json", labels_of(dataset))
     record = RecordedDetector(tmp_path / "a.json", frame_ids=dataset.frame_ids())
     found = record.predict(dataset.read(sample_token("scene-0103", 1), points=False))
@@ -80,15 +80,15 @@ def test_our_results_are_a_record(dataset, tmp_path):
     assert found.categories.tolist() == ["Car", "Car"]
 
 
-def test_another_data_set_is_refused(tmp_path):
+def test_another_dataset_is_rejected(tmp_path):
     """It has no map."""
     with pytest.raises(ConfigError, match="need the vehicle's poses"):
         NuScenesExporter().write(tmp_path / "a.json", toy_labels())
     assert toy_frame("000001").calibration.lidar_to_map is None
 
 
-def test_a_category_that_nuscenes_does_not_have_is_refused(dataset, tmp_path):
-    """Its tools would stop at it."""
+def test_an_unknown_category_is_rejected(dataset, tmp_path):
+    """The devkit would fail on it."""
     labels = labels_of(dataset)
     rows = [row | {"category": "Tram"} for row in rows_of(labels)]
     with pytest.raises(DataError, match="category 'Tram' is not in nuScenes'"):

@@ -13,17 +13,17 @@ from curate.exporters.openpcdet import OpenPCDetExporter
 
 @pytest.fixture
 def folder(tmp_path):
-    """An export."""
+    """Return an export."""
     assert OpenPCDetExporter().write(tmp_path / "out", toy_labels()) == 3
     return tmp_path / "out"
 
 
 def load(path):
-    """What a trainer reads."""
+    """Return what a trainer reads."""
     return pickle.loads(path.read_bytes())
 
 
-def test_labels_come_back_with_their_weights(folder):
+def test_labels_are_stored_with_their_weights(folder):
     """All arrays have one row per object, so that they can be filtered by one mask."""
     infos = load(folder / "kitti_infos_train.pkl")
     assert [info["point_cloud"]["lidar_idx"] for info in infos] == ["000000", "000001"]
@@ -38,7 +38,7 @@ def test_labels_come_back_with_their_weights(folder):
     np.testing.assert_array_equal(annos["gt_boxes_lidar"], BOXES)
 
 
-def test_background_is_left_out_by_name_and_told_apart(tmp_path):
+def test_background_has_the_name_dontcare_and_is_marked(tmp_path):
     """OpenPCDet drops DontCare; a trainer that reads weights sees that it is not to be ignored."""
     OpenPCDetExporter().write(tmp_path / "out", toy_labels(zero_weight="background"))
     annos = load(tmp_path / "out" / "kitti_infos_train.pkl")[1]["annos"]
@@ -48,7 +48,7 @@ def test_background_is_left_out_by_name_and_told_apart(tmp_path):
     assert marker["zero_weight"] == "background"
 
 
-def test_camera_boxes_lead_back_to_the_lidar_boxes(folder):
+def test_camera_boxes_convert_to_the_lidar_boxes(folder):
     """By the equations that OpenPCDet applies to location, dimensions (l, h, w), rotation_y."""
     info = load(folder / "kitti_infos_train.pkl")[1]
     annos, calib = info["annos"], info["calib"]
@@ -63,8 +63,8 @@ def test_camera_boxes_lead_back_to_the_lidar_boxes(folder):
     assert np.cos(boxes[:, 6]) == pytest.approx(np.cos(np.array(BOXES)[:, 6]))
 
 
-def test_ground_truth_weighs_1_and_has_kittis_difficulty(folder):
-    """A car 16 m ahead at full view is 12 pixels high in the toy image: beyond all levels."""
+def test_ground_truth_has_weight_1_and_kittis_difficulty(folder):
+    """A car 16 m ahead is 12 pixels high in the toy image: beyond all levels."""
     annos = load(folder / "kitti_infos_train.pkl")[0]["annos"]
     assert annos["weight"].tolist() == [1, 1]
     assert annos["score"].tolist() == [-1, -1]
@@ -72,8 +72,8 @@ def test_ground_truth_weighs_1_and_has_kittis_difficulty(folder):
     assert annos["difficulty"].tolist() == [-1, -1]
 
 
-def test_the_database_holds_the_objects_of_labeled_frames_only(folder):
-    """Their points lie about the origin; OpenPCDet adds the box centre again."""
+def test_the_database_has_only_objects_of_labeled_frames(folder):
+    """Their points are relative to the box centre, which OpenPCDet adds again."""
     database = load(folder / "kitti_dbinfos_train.pkl")
     assert {name: len(entries) for name, entries in database.items()} == {"Car": 1, "Van": 1}
     car = database["Car"][0]
@@ -85,8 +85,8 @@ def test_the_database_holds_the_objects_of_labeled_frames_only(folder):
     assert points[:, 1:] == pytest.approx(0, abs=1e-6)
 
 
-def test_any_numpy_reads_it_and_arrays_can_be_changed(folder):
-    """The pickle names nothing that only numpy 2 has."""
+def test_any_numpy_version_reads_it_and_arrays_are_writable(folder):
+    """The pickle uses no name that only numpy 2 has."""
     content = (folder / "kitti_infos_train.pkl").read_bytes()
     texts = {str(argument) for _, argument, _ in pickletools.genops(content)}
     assert "ndarray" in texts

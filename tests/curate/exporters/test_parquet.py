@@ -13,8 +13,8 @@ from curate.exporters.parquet import ParquetExporter
 parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
 
 
-def test_every_column_comes_back_to_the_last_bit(tmp_path):
-    """In the order of the view; what is unknown is null."""
+def test_every_column_is_read_back_to_the_last_bit(tmp_path):
+    """In the order of the view; unknown values are null."""
     labels = toy_labels()
     assert ParquetExporter().write(tmp_path / "a.parquet", labels) == 3
     table = parquet.read_table(tmp_path / "a.parquet")
@@ -23,7 +23,7 @@ def test_every_column_comes_back_to_the_last_bit(tmp_path):
 
 
 def test_columns_have_types_units_and_meanings(tmp_path):
-    """Whatever reads the file sees what a number is."""
+    """Readers of the file see them."""
     ParquetExporter().write(tmp_path / "a.parquet", toy_labels())
     schema = parquet.read_schema(tmp_path / "a.parquet")
     types = {field.name: str(field.type) for field in schema}
@@ -39,21 +39,23 @@ def test_columns_have_types_units_and_meanings(tmp_path):
     ]  # fmt: skip
 
 
-def test_the_file_says_what_it_is_about(tmp_path):
+def test_the_file_describes_itself(tmp_path):
     """Frame of reference, units, round, policy, version."""
     ParquetExporter().write(tmp_path / "a.parquet", toy_labels())
-    told = parquet.read_schema(tmp_path / "a.parquet").metadata
-    said = {key.decode().removeprefix("curate."): value.decode() for key, value in told.items()}
-    assert said["frame_of_reference"].startswith("LiDAR: x forward, y left, z up")
-    assert said["units"] == "metres, radians"
-    assert (said["round"], said["policy"], said["version"]) == ("1", "pspsl", "1")
-    assert (said["dataset"], said["root"]) == ("kitti", "/data")
-    assert said["zero_weight"] == "ignore"
-    assert json.loads(said["categories"]) == ["Car", "Pedestrian", "Cyclist"]
+    metadata = parquet.read_schema(tmp_path / "a.parquet").metadata
+    described = {
+        key.decode().removeprefix("curate."): value.decode() for key, value in metadata.items()
+    }
+    assert described["frame_of_reference"].startswith("LiDAR: x forward, y left, z up")
+    assert described["units"] == "metres, radians"
+    assert (described["round"], described["policy"], described["version"]) == ("1", "pspsl", "1")
+    assert (described["dataset"], described["root"]) == ("kitti", "/data")
+    assert described["zero_weight"] == "ignore"
+    assert json.loads(described["categories"]) == ["Car", "Pedestrian", "Cyclist"]
 
 
-def test_rows_are_written_in_groups(tmp_path):
-    """As they come, without holding all of them."""
+def test_rows_are_streamed_in_groups(tmp_path):
+    """Without holding all of them in memory."""
     labels = toy_labels()
 
     class Streamed:
@@ -77,7 +79,7 @@ def test_rows_are_written_in_groups(tmp_path):
         ("points", "many", "column points: not all values are of type int32"),
     ],
 )
-def test_a_value_that_does_not_fit_is_named(tmp_path, column, value, message):
+def test_an_invalid_value_is_reported(tmp_path, column, value, message):
     """In one line, and no file is left."""
     labels = toy_labels()
     rows = rows_of(labels)
@@ -88,8 +90,8 @@ def test_a_value_that_does_not_fit_is_named(tmp_path, column, value, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_pyarrow_the_extra_is_named(monkeypatch):
-    """One line that can be pasted."""
+def test_without_pyarrow_the_extra_is_reported(monkeypatch):
+    """With a command that can be pasted."""
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(ConfigError, match=r"pip install 'curate-pseudo-labels\[parquet\]'"):
         ParquetExporter()

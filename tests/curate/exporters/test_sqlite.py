@@ -1,4 +1,4 @@
-"""The label file: its schema, what it refuses, and that it is whole or absent."""
+"""The label file: its schema, what it rejects, and atomic writing."""
 
 import json
 import sqlite3
@@ -25,19 +25,19 @@ BOX = (10.0, 1.0, -0.8, 4.0, 1.6, 1.5, 0.5)
 
 
 def frame(name, split):
-    """A frame and its files."""
+    """Return a frame and its files."""
     return FrameFiles(
         name, split, f"velodyne/{name}.bin", f"image_2/{name}.png", f"calib/{name}.txt"
     )
 
 
 def truth(name, k=0):
-    """An object of ground truth."""
+    """Return a ground-truth object."""
     return exported.truth(name, k, BOX)
 
 
 def label(name, k=0, weight=0.5, **changes):
-    """A label of round 2."""
+    """Return a label of round 2."""
     return exported.label(name, k, BOX, round=2, weight=weight, **changes)
 
 
@@ -45,7 +45,7 @@ FRAMES = [frame("a", "labeled"), frame("b", "unlabeled"), frame("c", "unlabeled"
 
 
 def write(path, frames=FRAMES, ground_truth=(), labels=(), columns=WEIGHTED_LABELS):
-    """Writes a label file of blocks of one label."""
+    """Write a label file with blocks of one label."""
     names = [column.name for column in columns]
     given = LabelSet(
         DESCRIPTION,
@@ -60,13 +60,13 @@ def write(path, frames=FRAMES, ground_truth=(), labels=(), columns=WEIGHTED_LABE
 
 
 def select(path, query):
-    """All rows of a query on a label file."""
+    """Return all rows of a query on a label file."""
     with closing(sqlite3.connect(path)) as connection:
         return connection.execute(query).fetchall()
 
 
 def test_the_view_has_exactly_the_documented_columns_in_order(tmp_path):
-    """`weighted_labels` is what the data model promises, row by row as it was given."""
+    """`weighted_labels` follows the data model, row by row."""
     path = tmp_path / "exports" / "labels.sqlite"
     write(path, labels=[label("b"), label("b", 1, 0.0, loss=None)])
     with closing(sqlite3.connect(path)) as connection:
@@ -81,8 +81,8 @@ def test_the_view_has_exactly_the_documented_columns_in_order(tmp_path):
     )
 
 
-def test_meta_says_what_the_labels_are_about(tmp_path):
-    """Data set, root, categories, round, policy, versions."""
+def test_meta_describes_the_labels(tmp_path):
+    """Dataset, root, categories, round, policy, versions."""
     path = tmp_path / "labels.sqlite"
     write(path)
     meta = dict(select(path, "SELECT key, value FROM meta"))
@@ -98,28 +98,27 @@ def test_meta_says_what_the_labels_are_about(tmp_path):
     }
 
 
-def test_ground_truth_of_an_unlabeled_frame_is_refused_by_name(tmp_path):
-    """The leak is an error that names the frames, and no file is left."""
+def test_ground_truth_of_an_unlabeled_frame_is_rejected(tmp_path):
+    """The error lists the frames, and no file is left."""
     path = tmp_path / "labels.sqlite"
     with pytest.raises(LeakageError, match=r"ground truth of .* split: b, zz;"):
         write(path, ground_truth=[truth("a"), truth("b"), truth("zz"), truth("b", 1)])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_val_frames_are_refused(tmp_path):
-    """A frame of a third split cannot be written at all."""
+def test_val_frames_are_rejected(tmp_path):
     with pytest.raises(LeakageError, match="val"):
         write(tmp_path / "labels.sqlite", frames=[frame("a", "val")])
 
 
-def test_labels_of_labeled_frames_are_refused(tmp_path):
-    """Where there is ground truth there are no pseudo-labels."""
+def test_labels_of_labeled_frames_are_rejected(tmp_path):
+    """Frames with ground truth have no pseudo-labels."""
     with pytest.raises(DataError, match="labels of frames outside the unlabeled split: a"):
         write(tmp_path / "labels.sqlite", labels=[label("a")])
 
 
-def test_the_finished_file_refuses_ground_truth_of_unlabeled_frames_too(tmp_path):
-    """The schema itself ties ground truth to the labeled split, for whoever writes later."""
+def test_the_finished_file_rejects_ground_truth_of_unlabeled_frames_too(tmp_path):
+    """The schema itself restricts ground truth to the labeled split, for later writers as well."""
     path = tmp_path / "labels.sqlite"
     write(path)
     with closing(sqlite3.connect(path)) as connection:
@@ -143,21 +142,21 @@ def test_the_finished_file_refuses_ground_truth_of_unlabeled_frames_too(tmp_path
         label("b", points="many"),
     ],
 )
-def test_a_row_that_does_not_fit_is_refused(tmp_path, row):
-    """Weights outside [0, 1], NaN, sides below zero, and text for a number."""
+def test_a_row_that_does_not_fit_is_rejected(tmp_path, row):
+    """Weights outside [0, 1], NaN, negative sizes, and text for a number."""
     with pytest.raises(DataError, match=r"labels\.sqlite: a row|label 0 has weight (1\.5|None)"):
         write(tmp_path / "labels.sqlite", labels=[row])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_same_label_twice_is_refused(tmp_path):
-    """Frame and k name a label."""
+def test_a_duplicate_label_is_rejected(tmp_path):
+    """Frame and k identify a label."""
     with pytest.raises(DataError, match="UNIQUE"):
         write(tmp_path / "labels.sqlite", labels=[label("b"), label("b")])
 
 
 def test_a_failing_source_of_rows_leaves_the_old_file(tmp_path):
-    """When the rows break off, the file that was there is still there, whole."""
+    """The complete earlier file stays."""
     path = tmp_path / "labels.sqlite"
     write(path, labels=[label("b")])
 
@@ -172,15 +171,18 @@ def test_a_failing_source_of_rows_leaves_the_old_file(tmp_path):
 
 
 def test_a_frame_is_found_by_index(tmp_path):
-    """Asking for the labels of one frame does not scan the table."""
+    """A query for the labels of one frame does not scan the table."""
     path = tmp_path / "labels.sqlite"
     write(path, labels=[label(name, k) for name in "bc" for k in range(200)])
     plan = select(path, "EXPLAIN QUERY PLAN SELECT weight FROM weighted_labels WHERE frame = 'b'")
     assert "USING INDEX label_frame" in plan[0][3]
 
 
-def test_a_file_that_another_program_writes_is_not_taken_for_a_foreign_one(tmp_path):
-    """Neither where it would be replaced nor where it is read; once let go it is."""
+def test_a_file_locked_by_another_program_is_not_treated_as_invalid(tmp_path):
+    """Neither when it is replaced nor when it is read.
+
+    After the lock is released, it can be used.
+    """
     path = tmp_path / "labels.sqlite"
     SqliteExporter().write(path, toy_labels())
     with closing(sqlite3.connect(path, isolation_level=None, timeout=0)) as other:
@@ -198,8 +200,8 @@ VISIBILITY = (
 )
 
 
-def test_further_evidence_stands_behind_the_core_columns(tmp_path):
-    """Table, view and version follow from the columns; what a training reads stays the same."""
+def test_further_evidence_follows_the_core_columns(tmp_path):
+    """Table, view and version depend on the columns; what a training reads does not change."""
     path = tmp_path / "labels.sqlite"
     rows = [label("b", visible_faces=2, density=1.5), label("c", visible_faces=None, density=0.0)]
     assert write(path, labels=rows, columns=(*WEIGHTED_LABELS, *VISIBILITY)) == 2
@@ -213,8 +215,8 @@ def test_further_evidence_stands_behind_the_core_columns(tmp_path):
 
 
 @pytest.mark.parametrize("value", ["many", None])
-def test_further_evidence_that_does_not_fit_is_refused(tmp_path, value):
-    """Text for a number, nothing where something was declared."""
+def test_further_evidence_that_does_not_fit_is_rejected(tmp_path, value):
+    """Text for a number, or null in a declared column."""
     rows = [label("b", visible_faces=2, density=value)]
     with pytest.raises(
         DataError, match=r"labels\.sqlite: a row violates a constraint: .*label.density"
@@ -225,8 +227,8 @@ def test_further_evidence_that_does_not_fit_is_refused(tmp_path, value):
 @pytest.mark.parametrize(
     "column", ["density BLOB AS (zeroblob(1000000))", "density REAL DEFAULT 1", '"a b" REAL']
 )
-def test_only_plain_columns_may_stand_behind_the_core_ones(tmp_path, column):
-    """Whatever else the table has is not what an export makes."""
+def test_only_plain_columns_can_follow_the_core_ones(tmp_path, column):
+    """Anything else in the table was not written by an export."""
     path = tmp_path / "labels.sqlite"
     write(path)
     with closing(sqlite3.connect(path)) as connection:
@@ -239,7 +241,7 @@ def test_only_plain_columns_may_stand_behind_the_core_ones(tmp_path, column):
         read_frames(path)
 
 
-# As curate 1 made it before any format had further columns.
+# As curate 1 wrote it before any format had further columns.
 VERSION_1 = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
 CREATE TABLE frame (
@@ -310,8 +312,8 @@ ANALYZE;
 """
 
 
-def test_a_file_of_version_1_is_still_read(tmp_path):
-    """By the firewall, a training and a query; its weight of 0 is what it was: to be ignored."""
+def test_a_file_of_version_1_can_still_be_read(tmp_path):
+    """By the firewall, a training and a query; its weight 0 means ignored."""
     path = tmp_path / "labels.sqlite"
     with closing(sqlite3.connect(path)) as connection:
         connection.executescript(VERSION_1)

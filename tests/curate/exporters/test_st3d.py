@@ -11,8 +11,8 @@ from curate.errors import DataError
 from curate.exporters.st3d import ST3DExporter
 
 
-def test_pseudo_labels_come_back_with_their_weights(tmp_path):
-    """Of unlabeled frames only; the category counts from 1 and is negative where v = 0."""
+def test_pseudo_labels_are_stored_with_their_weights(tmp_path):
+    """Of unlabeled frames only; the category counts from 1 and is negative if v = 0."""
     assert ST3DExporter().write(tmp_path / "out", toy_labels()) == 3
     frames = pickle.loads((tmp_path / "out" / "ps_label_e0.pkl").read_bytes())
     assert list(frames) == ["000001"]
@@ -27,7 +27,7 @@ def test_pseudo_labels_come_back_with_their_weights(tmp_path):
 
 
 def test_background_is_left_out(tmp_path):
-    """ST3D would ignore a negative class; what is dropped is background there."""
+    """ST3D ignores a negative class; dropped labels are background there."""
     assert ST3DExporter().write(tmp_path / "out", toy_labels(zero_weight="background")) == 2
     frame = pickle.loads((tmp_path / "out" / "ps_label_e0.pkl").read_bytes())["000001"]
     assert frame["gt_boxes"][:, 7].tolist() == [1, 1]
@@ -35,8 +35,8 @@ def test_background_is_left_out(tmp_path):
     assert len(frame["cls_scores"]) == len(frame["memory_counter"]) == 2
 
 
-def test_a_category_without_a_number_is_refused(tmp_path):
-    """The error names the frame and what is configured."""
+def test_a_category_without_a_number_is_rejected(tmp_path):
+    """The error contains the frame and the configured categories."""
     labels = toy_labels()
     fewer = replace(labels, description=replace(labels.description, categories=("Car",)))
     with pytest.raises(DataError, match="frame 000001: category 'Pedestrian' is not in"):

@@ -1,28 +1,27 @@
-"""Tests of files that are either whole or absent."""
+"""Files that are written completely or not at all."""
 
 import pytest
 
 from curate.files.atomic import replace_file
 
 
-def test_writes_content_and_makes_missing_folders(tmp_path):
-    """The file holds the content, its folder is made, and nothing else is left in it."""
+def test_it_writes_content_and_creates_missing_folders(tmp_path):
+    """Nothing else is left in the folder."""
     path = tmp_path / "deep" / "er" / "file.txt"
     replace_file(path, b"content")
     assert path.read_bytes() == b"content"
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_replaces_an_existing_file(tmp_path):
-    """The later content wins."""
+def test_it_replaces_an_existing_file(tmp_path):
     path = tmp_path / "file.txt"
     replace_file(path, b"former")
     replace_file(path, b"later")
     assert path.read_bytes() == b"later"
 
 
-def test_a_failed_write_keeps_the_former_file(tmp_path, monkeypatch):
-    """Where the rename fails, the former file and no partial one is there."""
+def test_a_failed_write_keeps_the_earlier_file(tmp_path, monkeypatch):
+    """If the rename fails, no partial file is left."""
     path = tmp_path / "file.txt"
     replace_file(path, b"former")
 

@@ -1,4 +1,4 @@
-"""TOML that would take the memory or the time is refused; everything else is read as it is."""
+"""TOML that would use up memory or time is rejected; everything else is read unchanged."""
 
 import tomllib
 
@@ -16,8 +16,8 @@ from curate.files.toml_text import MOST_CHARACTERS, MOST_PARTS, parse_toml, toml
         "#" * (MOST_CHARACTERS + 1),
     ],
 )
-def test_what_grows_by_its_square_is_refused(text: str) -> None:
-    """Keys of many parts, however they are written, and texts without end."""
+def test_text_with_quadratic_cost_is_rejected(text: str) -> None:
+    """Keys of many parts, in any notation, and texts without end."""
     with pytest.raises(ValueError, match="more than"):
         parse_toml(text)
 
@@ -32,18 +32,18 @@ def test_what_grows_by_its_square_is_refused(text: str) -> None:
     ],
 )
 def test_ordinary_documents_are_read(text: str) -> None:
-    """Points in numbers and sentences make no key."""
+    """Dots in numbers and sentences are not keys."""
     assert parse_toml(text) == tomllib.loads(text)
 
 
 @pytest.mark.parametrize("text", ["a" * 1_000_000, "'" * 999_999, '"' * 999_999, "a\t" * 400_000])
-def test_the_look_itself_takes_no_time(text: str) -> None:
-    """It ends, where a pattern that goes back and forth would not."""
+def test_the_check_itself_is_fast(text: str) -> None:
+    """A backtracking pattern would not end."""
     with pytest.raises(tomllib.TOMLDecodeError):
         parse_toml(text)
 
 
-def test_a_mark_in_front_of_the_text_is_no_part_of_it() -> None:
+def test_a_byte_order_mark_is_ignored() -> None:
     """Some editors write one."""
     assert parse_toml("\ufeffa = 1\n") == {"a": 1}
 
@@ -60,13 +60,12 @@ def test_a_mark_in_front_of_the_text_is_no_part_of_it() -> None:
         {},
     ],
 )
-def test_what_is_written_is_read_again(value: object) -> None:
-    """Whatever the configuration can hold."""
+def test_written_values_are_read_back(value: object) -> None:
+    """All values that the configuration can contain."""
     assert parse_toml(f"x = {toml(value)}") == {"x": value}
 
 
 @pytest.mark.parametrize(("key", "written"), [("a-b_1", "a-b_1"), ("a.b", '"a.b"'), ("", '""')])
-def test_a_key_is_in_quotes_where_it_must_be(key: str, written: str) -> None:
-    """So that it stays one key."""
+def test_a_key_is_quoted_if_necessary(key: str, written: str) -> None:
     assert toml_key(key) == written
     assert parse_toml(f"{toml_key(key)} = 1") == {key: 1}

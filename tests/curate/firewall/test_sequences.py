@@ -1,4 +1,4 @@
-"""Sequences go into one split as a whole."""
+"""Whole sequences go into one split."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from curate.firewall.sequences import choose_sequences, shared_sequences
 
 @given(st.dictionaries(st.integers(0, 200).map(str), st.integers(0, 9).map(str), min_size=1),
        st.floats(0.01, 1), st.integers(0, 5))  # fmt: skip
-def test_a_choice_holds_whole_sequences(sequences: dict, share: float, seed: int) -> None:
-    """And about as many frames as were asked for: none could be left out or added to be nearer."""
+def test_a_choice_has_whole_sequences(sequences: dict, share: float, seed: int) -> None:
+    """With about as many frames as requested: no sequence added or removed would be closer."""
     count = max(1, round(share * len(sequences)))
     generator = np.random.default_rng(seed)
     sizes = [list(sequences.values()).count(name) for name in set(sequences.values())]
@@ -27,14 +27,13 @@ def test_a_choice_holds_whole_sequences(sequences: dict, share: float, seed: int
     assert abs(len(chosen) - count) <= max(sizes)
 
 
-def test_frames_without_a_sequence_stand_for_themselves() -> None:
-    """As in a data set of single shots."""
+def test_frames_without_a_sequence_are_their_own_sequence() -> None:
+    """As in a dataset of single frames."""
     chosen = choose_sequences({}, map(str, range(10)), 4, np.random.default_rng(0))
     assert len(chosen) == 4
 
 
-def test_shared_sequences_are_named_by_pair() -> None:
-    """Every pair of splits by itself."""
+def test_shared_sequences_are_reported_by_pair_of_splits() -> None:
     sequences = {"a1": "a", "a2": "a", "b1": "b", "c1": "c", "a3": "a"}
     splits = {"labeled": ["a1"], "unlabeled": ["b1", "a2"], "val": ["c1", "a3"]}
     assert shared_sequences(sequences, splits) == {

@@ -16,7 +16,7 @@ def test_a_box_along_x_has_the_corners_of_its_sides():
 
 
 def test_yaw_turns_counter_clockwise():
-    """A quarter turn brings the front to the left."""
+    """A quarter turn moves the front to the left."""
     front_left = bev_corners(np.array([[0, 0, 0, 4.0, 2.0, 1, np.pi / 2]]))[0, 0]
     assert front_left == pytest.approx([-1, 2])
 
@@ -34,7 +34,7 @@ def test_the_cuboid_stands_on_the_footprint(boxes):
 
 
 @pytest.mark.wrong_shapes
-def test_arrays_that_are_no_boxes_are_refused():
-    """Another number of columns is an error that names the shape."""
+def test_arrays_that_are_not_boxes_are_rejected():
+    """The error contains the shape."""
     with pytest.raises(ValueError, match=r"\(3, 6\)"):
         bev_corners(np.zeros((3, 6)))

@@ -1,4 +1,4 @@
-"""Tests of what is said of kernels that are not compiled yet."""
+"""The check whether kernels are compiled already."""
 
 import importlib.util
 import os
@@ -17,15 +17,15 @@ def doubled(numbers):
 
 
 def loaded(path):
-    """The kernel in a file, as a new process would see it."""
+    """Return the kernel in a file, as a new process would see it."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.doubled
 
 
-def test_a_kernel_is_compiled_once_it_was_called(tmp_path):
-    """And no more once its source has changed."""
+def test_a_kernel_is_compiled_after_its_first_call(tmp_path):
+    """And not any more once its source has changed."""
     path = tmp_path / "kernel.py"
     path.write_text(SOURCE)
     os.utime(path, (1_000_000_000, 1_000_000_000))

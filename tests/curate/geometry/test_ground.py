@@ -1,4 +1,4 @@
-"""The height of the ground, beside walls, under strays and where nothing was seen."""
+"""The height of the ground: beside walls, below outliers, and without points."""
 
 import numpy as np
 import pytest
@@ -7,39 +7,39 @@ from curate.geometry.ground import GroundMap
 
 
 def plane(slope=0.0):
-    """Points every metre on a plane that rises with x."""
+    """Return points every metre on a plane that rises with x."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0.0, 40), np.arange(-20.0, 20)))
     return np.column_stack([x, y, -1.7 + slope * x, np.zeros(len(x))])
 
 
 def test_a_plane_has_its_height_everywhere():
-    """On a gentle slope the height is that of the place, to a few centimetres."""
+    """On a gentle slope the height is that of the position, to a few centimetres."""
     places = np.array([[10.0, 0.0], [30.0, -10.0]])
     heights = GroundMap.of(plane(slope=0.01)).at(places)
     np.testing.assert_allclose(heights, [-1.6, -1.4], atol=0.06)
 
 
-def test_a_wall_beside_the_place_does_not_raise_the_ground():
-    """Where half of the surroundings are hidden by something high, the other half counts."""
+def test_a_wall_does_not_raise_the_ground_beside_it():
+    """If half of the surroundings are hidden by something high, the other half counts."""
     points = plane()
     points[points[:, 1] > 3, 2] = 2.0
     assert GroundMap.of(points).at(np.array([[20.0, 2.0]]))[0] == -1.7
 
 
-def test_one_stray_point_below_does_not_lower_it():
-    """A reflection from below the ground is passed over."""
-    stray = np.array([[20.0, 0.0, -9.0, 0.0]])
-    assert GroundMap.of(np.concatenate([plane(), stray])).at(stray[:, :2])[0] == -1.7
+def test_one_outlier_below_does_not_lower_the_ground():
+    """A reflection from below the ground is ignored."""
+    outlier = np.array([[20.0, 0.0, -9.0, 0.0]])
+    assert GroundMap.of(np.concatenate([plane(), outlier])).at(outlier[:, :2])[0] == -1.7
 
 
-def test_where_nothing_was_seen_the_height_is_unknown():
-    """Far from all points, also off the map, there is no height."""
+def test_without_points_the_height_is_unknown():
+    """Far from all points, also off the map."""
     heights = GroundMap.of(plane()).at(np.array([[500.0, 0.0], [-500.0, -500.0], [20.0, 0.0]]))
     assert np.isnan(heights).tolist() == [True, True, False]
 
 
-def test_lowered_and_raised_undo_each_other():
-    """On a slope the ground's own points come to lie at about 0, and go back to the last bit."""
+def test_lowering_and_raising_are_inverse():
+    """On a slope the ground's own points are moved to about 0, and back to the last bit."""
     points = plane(slope=0.02)
     ground = GroundMap.of(points)
     lowered = ground.lowered(points)
@@ -48,22 +48,22 @@ def test_lowered_and_raised_undo_each_other():
     np.testing.assert_allclose(ground.raised(lowered), points, rtol=0, atol=1e-12)
 
 
-def test_unseen_ground_is_as_high_as_most_of_the_rest():
-    """A box behind everything that was seen stands on ground of the usual height."""
+def test_ground_without_points_has_the_usual_height():
+    """A box behind all points stands on ground of the median height."""
     ground = GroundMap.of(plane())
     behind = np.array([[500.0, 0.0, -0.9, 4.0, 1.6, 1.6, 0.0]])
     assert ground.lowered(behind)[0, 2] == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_hardly_any_points_are_no_fault(count):
+def test_few_points_do_not_fail(count):
     """Without points the ground is unknown and nothing moves; one point is its own ground."""
     points = np.full((count, 4), 3.0)
     assert GroundMap.of(points).lowered(np.full((1, 7), 3.0))[0, 2] == (0.0 if count else 3.0)
 
 
-def test_points_out_of_this_world_do_not_make_the_map_large():
-    """A damaged file may name points light years away, or nowhere."""
+def test_points_at_absurd_distances_do_not_enlarge_the_map():
+    """A damaged file may have points light years away, or NaN."""
     odd = np.array([[1e30, 0, 0, 0], [0, -np.inf, 0, 0], [np.nan, 0, 0, 0]])
     ground = GroundMap.of(np.concatenate([plane(), odd]))
     assert ground.heights.size < 1000

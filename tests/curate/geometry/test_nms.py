@@ -16,7 +16,7 @@ from curate.geometry.nms import nms_bev
     st.lists(st.sampled_from([0.1, 0.5, 0.5000001, 0.9]), min_size=10, max_size=10),
     st.sampled_from([0.0, 0.123, 0.4321, 0.777]),
 )
-def test_keeps_what_the_definition_keeps(boxes, scores, threshold):
+def test_it_keeps_the_same_boxes_as_the_definition(boxes, scores, threshold):
     """Small sets, many of them touching or equal, with equal scores."""
     boxes = boxes[np.all(boxes[:, 3:6] > 0, axis=1)]
     scores = np.array(scores[: len(boxes)])
@@ -26,7 +26,7 @@ def test_keeps_what_the_definition_keeps(boxes, scores, threshold):
 
 
 @pytest.mark.parametrize("threshold", [0.05, 0.5, 0.7])
-def test_keeps_what_the_definition_keeps_over_a_wide_field(threshold):
+def test_it_keeps_the_same_boxes_over_a_wide_field(threshold):
     """Clusters over many grid cells, and one box larger than all others."""
     generator = np.random.default_rng(1)
     centres = generator.uniform(-60, 60, (25, 2))[generator.integers(25, size=200)]
@@ -39,13 +39,12 @@ def test_keeps_what_the_definition_keeps_over_a_wide_field(threshold):
 
 
 def test_equal_scores_are_ranked_by_index():
-    """Of two copies with the same score the first stays."""
+    """Of two copies with the same score the first is kept."""
     box = np.array([[0, 0, 0, 4.0, 2.0, 1.5, 0.5]])
     assert nms_bev(np.repeat(box, 3, axis=0), np.array([0.5, 0.7, 0.7]), 0.5).tolist() == [1]
 
 
-def test_no_boxes_stay_no_boxes():
-    """An empty frame is no error."""
+def test_no_boxes_give_no_boxes():
     assert nms_bev(np.zeros((0, 7)), np.zeros(0), 0.1).tolist() == []
 
 

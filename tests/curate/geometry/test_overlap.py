@@ -13,7 +13,7 @@ CAR = np.array([12.3, -4.7, -0.8, 4.2, 1.7, 1.55, 0.3])
 
 
 def by_clipping(overlap, boxes_a, boxes_b):
-    """(n, m) IoU by the oracle."""
+    """Return (n, m) IoU of the oracle."""
     return np.array([[overlap(a, b) for b in boxes_b] for a in boxes_a]).reshape(
         len(boxes_a), len(boxes_b)
     )
@@ -22,7 +22,7 @@ def by_clipping(overlap, boxes_a, boxes_b):
 @settings(max_examples=150)
 @given(box_arrays(), box_arrays())
 def test_iou_equals_polygon_clipping(boxes_a, boxes_b):
-    """Random and degenerate boxes, seen from above and in space."""
+    """Random and degenerate boxes, in BEV and in 3D."""
     expected = by_clipping(clipping.bev_iou, boxes_a, boxes_b)
     assert np.allclose(bev_iou(boxes_a, boxes_b), expected, rtol=0, atol=1e-6)
     expected = by_clipping(clipping.iou_3d, boxes_a, boxes_b)
@@ -32,7 +32,6 @@ def test_iou_equals_polygon_clipping(boxes_a, boxes_b):
 @settings(max_examples=150)
 @given(box_arrays(), box_arrays())
 def test_paired_iou_is_the_diagonal(boxes_a, boxes_b):
-    """Row by row the same as all against all."""
     n = min(len(boxes_a), len(boxes_b))
     expected = np.diagonal(iou_3d(boxes_a[:n], boxes_b[:n]))
     assert np.array_equal(paired_iou_3d(boxes_a[:n], boxes_b[:n]), expected)
@@ -41,7 +40,7 @@ def test_paired_iou_is_the_diagonal(boxes_a, boxes_b):
 @settings(max_examples=150)
 @given(box_arrays(), box_arrays())
 def test_iou_is_symmetric_and_within_0_and_1(boxes_a, boxes_b):
-    """Bit for bit the same both ways, never below 0 or above 1, never NaN."""
+    """Bit for bit the same in both orders, never NaN."""
     for overlap in (bev_iou, iou_3d):
         matrix = overlap(boxes_a, boxes_b)
         assert np.array_equal(matrix, overlap(boxes_b, boxes_a).T)
@@ -55,7 +54,7 @@ def test_iou_is_symmetric_and_within_0_and_1(boxes_a, boxes_b):
     angles,
 )
 def test_a_box_has_iou_exactly_1_with_itself(centre, sides, yaw):
-    """Also with its half turns, and with its quarter turn when the sides swap."""
+    """Also after half turns, and after a quarter turn with swapped sides."""
     length, width, height = sides
     half_turn = yaw + np.pi if yaw <= 0 else yaw - np.pi
     boxes = np.array(
@@ -70,8 +69,8 @@ def test_a_box_has_iou_exactly_1_with_itself(centre, sides, yaw):
     assert np.all(iou_3d(boxes, boxes) == 1.0)
 
 
-def test_random_points_see_the_same_overlap():
-    """A third opinion that knows nothing of polygons."""
+def test_random_points_give_the_same_overlap():
+    """An estimate that does not use polygons."""
     generator = np.random.default_rng(0)
     other = np.add(CAR, [0.6, 0.4, 0, 0.5, -0.2, 0, 0.7])
     expected = clipping.bev_iou_by_sampling(CAR, other, generator, 200_000)
@@ -79,14 +78,14 @@ def test_random_points_see_the_same_overlap():
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-15, 1e-13, 1e-11, 1e-9, 1e-6, 1e-3])
-def test_nearly_parallel_edges_do_not_jump(turn):
+def test_iou_is_continuous_for_nearly_parallel_edges(turn):
     """IoU changes no faster than the angle, also where the aligned case takes over."""
     copies = np.stack([CAR, np.add(CAR, [0, 0, 0, 0, 0, 0, turn])])
     assert bev_iou(copies, copies)[0, 1] == pytest.approx(1, abs=4 * turn + 1e-12)
 
 
 def test_boxes_that_touch_do_not_overlap():
-    """A shared side, a shared corner and a shared end face are no common area or volume."""
+    """A shared side, corner or end face has no area or volume."""
     box = np.array([[0, 0, 0, 2.0, 2.0, 2.0, 0]])
     beside = np.add(box, [2.0, 0, 0, 0, 0, 0, 0])
     corner = np.add(box, [2.0, 2.0, 0, 0, 0, 0, 0])
@@ -97,7 +96,7 @@ def test_boxes_that_touch_do_not_overlap():
 
 
 def test_a_nested_box_has_the_ratio_of_the_areas():
-    """A small turned box inside a large one."""
+    """A small rotated box inside a large one."""
     outer, inner = np.array([[5, 5, 0, 10.0, 8.0, 4.0, 0.4]]), np.array([[5, 5, 0, 2.0, 1, 1, 1.1]])
     assert bev_iou(outer, inner)[0, 0] == pytest.approx(2 / 80, rel=1e-12)
     assert iou_3d(outer, inner)[0, 0] == pytest.approx(2 / 320, rel=1e-12)
@@ -154,7 +153,6 @@ def test_pairs_of_groups_are_the_matrices_of_each_group():
     assert np.array_equal(volume, iou_3d(boxes_a, boxes_b)[rows, columns])
 
 
-def test_pairs_of_no_groups_are_none():
-    """No group at all is no error."""
+def test_no_groups_give_no_pairs():
     none, starts = np.zeros((0, 7)), np.zeros(1, dtype=np.int64)
     assert [len(part) for part in overlapping_pairs(none, starts, none, starts)] == [0, 0, 0, 0]

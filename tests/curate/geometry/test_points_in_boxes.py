@@ -15,7 +15,7 @@ from curate.geometry.points_in_boxes import (
 
 
 def assert_exact(points, boxes):
-    """All three functions agree with the oracle."""
+    """Check that all three functions agree with the oracle."""
     table = np.array([[contains(box, point) for point in points] for box in boxes], dtype=bool)
     table = table.reshape(len(boxes), len(points))
     counts = count_points_in_boxes(points, boxes)
@@ -29,7 +29,7 @@ def assert_exact(points, boxes):
 @settings(max_examples=60)
 @given(box_arrays(), st.integers(0, 2**32 - 1), st.sampled_from([np.float32, np.float64]))
 def test_random_points_are_counted_exactly(boxes, seed, dtype):
-    """Random points in and around overlapping, flat and turned boxes."""
+    """Random points in and around overlapping, flat and rotated boxes."""
     generator = np.random.default_rng(seed)
     assert_exact(generator.uniform(-6, 6, (60, 4)).astype(dtype), boxes)
 
@@ -46,7 +46,7 @@ def test_points_over_a_wide_field_are_counted_exactly():
 
 
 def test_the_boundary_belongs_to_the_box():
-    """Faces, edges and corners count; what lies beyond by rounding errors does not."""
+    """Faces, edges and corners count; points beyond by a rounding error do not."""
     box = np.array([[1.0, 2.0, 0.5, 4.0, 2.0, 1.0, 0.0]])
     inside = np.array([[3.0, 2, 0.5], [-1, 3, 1], [3, 1, 0], [1, 2, 0], [-1, 2, 0.5]])
     outside = np.array([[np.nextafter(3, 4), 2, 0.5], [1, 1 - 1e-12, 0.5], [1, 2, 1.01]])
@@ -64,7 +64,6 @@ def test_the_boundary_belongs_to_boxes_turned_by_quarters():
 
 
 def test_a_point_in_two_boxes_counts_in_both_and_belongs_to_the_first():
-    """Overlapping boxes do not compete for counts."""
     boxes = np.array([[9.0, 0, 0, 1, 1, 1, 0], [0, 0, 0, 2, 2, 2, 0.3], [0, 0, 0, 4, 4, 4, 0]])
     point = np.zeros((1, 4), dtype=np.float32)
     assert count_points_in_boxes(point, boxes).tolist() == [0, 1, 1]
@@ -72,8 +71,7 @@ def test_a_point_in_two_boxes_counts_in_both_and_belongs_to_the_first():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_is_in_no_box(value):
-    """NaN and infinite points and boxes contain and are contained in nothing."""
+def test_points_and_boxes_that_are_not_finite_do_not_count(value):
     box = np.array([0, 0, 0, 2.0, 2.0, 2.0, 0])
     points = np.zeros((4, 3))
     points[np.arange(3), np.arange(3)] = value
@@ -84,7 +82,7 @@ def test_what_is_not_finite_is_in_no_box(value):
             assert count_points_in_boxes(points, np.stack([broken, box])).tolist() == [0, 1]
 
 
-def test_nothing_in_nothing():
+def test_empty_points_and_boxes():
     """No points, no boxes, or neither."""
     box = np.array([[0, 0, 0, 1.0, 1, 1, 0]])
     assert count_points_in_boxes(np.zeros((0, 4), dtype=np.float32), box).tolist() == [0]
@@ -92,8 +90,8 @@ def test_nothing_in_nothing():
     assert box_of_points(np.zeros((2, 4)), box[:0]).tolist() == [-1, -1]
 
 
-def test_points_without_three_columns_are_refused():
-    """A wrong array is an error that names its shape."""
+def test_points_without_three_columns_are_rejected():
+    """The error contains the shape."""
     with pytest.raises(ValueError, match=r"\(5, 2\)"):
         count_points_in_boxes(np.zeros((5, 2)), np.zeros((0, 7)))
 

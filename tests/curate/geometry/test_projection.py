@@ -1,4 +1,4 @@
-"""Projection into the image: by hand, on the near plane, and on real KITTI frames."""
+"""Projection into the image: by hand, at the near plane, and on real KITTI frames."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from curate.frames import Calibration
 from curate.geometry.boxes import box_corners
 from curate.geometry.projection import image_rectangles, in_view, project_points
 
-# A camera at the LiDAR's place that looks along x: focal length 100, centre (50, 40).
+# A camera at the LiDAR's position that looks along x: focal length 100, centre (50, 40).
 CAMERA = Calibration(
     np.array([[100.0, 0, 50, 0], [0, 100, 40, 0], [0, 0, 1, 0]]),
     np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
@@ -18,7 +18,7 @@ CAMERA = Calibration(
 SIZE = (101, 81)
 
 
-def test_points_appear_where_the_pinhole_puts_them():
+def test_points_are_projected_by_the_pinhole_model():
     """Left in the world is left in the image, up is up, and depth is along x."""
     pixels, depth = project_points(np.array([[10.0, 0, 0], [10, 1, 0.5], [-5, 0, 0]]), CAMERA)
     assert pixels[:2].tolist() == [[50, 40], [40, 35]]
@@ -36,8 +36,8 @@ def test_only_points_before_the_camera_and_inside_the_image_are_in_view():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_view_is_that_of_the_projected_points(dtype):
-    """Point by point, those on the very border among them, as NumPy rounds them."""
+def test_the_view_mask_agrees_with_the_projected_points(dtype):
+    """Point by point, also on the border, as NumPy rounds them."""
     generator = np.random.default_rng(0)
     turn = np.linalg.qr(generator.normal(size=(3, 3)))[0]
     turned = Calibration(CAMERA.projection, CAMERA.lidar_to_camera @ np.eye(4))
@@ -61,7 +61,7 @@ def test_a_cube_ahead_has_the_rectangle_of_its_near_face():
     assert rectangle[0] == pytest.approx([50 - half, 40 - half, 50 + half, 40 + half])
 
 
-def test_a_box_that_reaches_out_of_the_image_is_clipped():
+def test_a_box_beyond_the_border_is_clipped():
     """The rectangle ends at the last pixels."""
     boxes = np.array([[10.0, 5, 0, 2, 2, 2, 0], [3.0, 0, 0, 1, 20, 20, 0]])
     rectangles = image_rectangles(boxes, CAMERA, SIZE)
@@ -69,15 +69,15 @@ def test_a_box_that_reaches_out_of_the_image_is_clipped():
     assert rectangles[1].tolist() == [0, 0, 100, 80]
 
 
-def test_boxes_behind_or_beside_the_image_have_none():
-    """All NaN, never a part."""
+def test_boxes_behind_or_beside_the_image_have_no_rectangle():
+    """All values are NaN, never only some."""
     boxes = np.array([[-10.0, 0, 0, 2, 2, 2, 0], [10.0, 50, 0, 2, 2, 2, 0], [0, 9, 0, 2, 2, 2, 0]])
     assert np.isnan(image_rectangles(boxes, CAMERA, SIZE)).all()
     assert image_rectangles(boxes[:0], CAMERA, SIZE).shape == (0, 4)
 
 
-def test_a_box_around_the_camera_plane_is_cut_at_the_near_plane():
-    """A long box on the left that passes the camera fills the left border and stays left."""
+def test_a_box_around_the_camera_plane_is_clipped_at_the_near_plane():
+    """A long box on the left that passes the camera covers the left border and stays left."""
     box = np.array([[0.0, 2.0, 0, 20.0, 1.0, 1.0, 0]])
     left, top, right, bottom = image_rectangles(box, CAMERA, SIZE)[0]
     assert (left, top, bottom) == (0, 0, 80)
@@ -85,7 +85,7 @@ def test_a_box_around_the_camera_plane_is_cut_at_the_near_plane():
 
 
 def by_sampling(box):
-    """Rectangle around many points of the box that lie before the near plane."""
+    """Return the rectangle around many points of the box that are beyond the near plane."""
     corners = box_corners(box[None])[0]
     shares = np.stack(np.meshgrid(*[np.linspace(0, 1, 41)] * 3), axis=-1).reshape(-1, 3)
     points = (
@@ -101,8 +101,8 @@ def by_sampling(box):
 
 @settings(max_examples=60)
 @given(box_arrays(min_size=1, max_size=3))
-def test_rectangles_hold_all_that_is_seen_of_the_box(boxes):
-    """No point of the box before the near plane appears outside the rectangle."""
+def test_rectangles_contain_all_visible_points_of_the_box(boxes):
+    """No point of the box beyond the near plane appears outside the rectangle."""
     boxes = np.add(boxes, [1.0, 0, 0, 0.1, 0.1, 0.1, 0])
     last = np.array(SIZE) - 1
     for box, rectangle in zip(boxes, image_rectangles(boxes, CAMERA, SIZE), strict=True):
@@ -120,7 +120,7 @@ def test_rectangles_hold_all_that_is_seen_of_the_box(boxes):
 
 @pytest.mark.kitti
 def test_projected_label_boxes_are_the_labels_of_real_frames(kitti_root):
-    """3D labels that lie whole in the image project onto their 2D labels."""
+    """3D labels that are completely in the image project onto their 2D labels."""
     data = KittiDataset(kitti_root)
     overlaps = []
     for frame_id in data.frame_ids():
@@ -135,7 +135,7 @@ def test_projected_label_boxes_are_the_labels_of_real_frames(kitti_root):
 
 @pytest.mark.kitti
 def test_points_of_real_objects_appear_inside_their_labels(kitti_root):
-    """LiDAR points inside a 3D label box are seen inside its 2D label, give or take pixels."""
+    """LiDAR points inside a 3D label box are inside its 2D label, within a few pixels."""
     from curate.geometry.points_in_boxes import box_of_points
 
     data = KittiDataset(kitti_root)
@@ -154,7 +154,7 @@ def test_points_of_real_objects_appear_inside_their_labels(kitti_root):
 
 
 def rectangle_iou(a, b):
-    """IoU of two rectangles; 0 where one is NaN."""
+    """Return the IoU of two rectangles; 0 if one is NaN."""
     width = min(a[2], b[2]) - max(a[0], b[0])
     height = min(a[3], b[3]) - max(a[1], b[1])
     if not (width > 0 and height > 0):

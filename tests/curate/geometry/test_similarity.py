@@ -13,7 +13,7 @@ from curate.geometry.similarity import Similarity, wrap_angle
 
 
 @given(similarities, box_arrays())
-def test_the_inverse_brings_boxes_back(similarity, boxes):
+def test_the_inverse_restores_boxes(similarity, boxes):
     """A^-1(A(x)) = x and A(A^-1(x)) = x, with the yaw in (-pi, pi]."""
     for there, back in (
         (similarity.apply_to_boxes, similarity.invert_boxes),
@@ -29,7 +29,7 @@ def test_the_inverse_brings_boxes_back(similarity, boxes):
 
 @given(similarities, st.integers(0, 2**32 - 1), st.sampled_from([np.float32, np.float64]))
 def test_points_keep_their_type_and_intensity(similarity, seed, dtype):
-    """And boxes that are moved back find them where they were."""
+    """Boxes that are moved back match the points."""
     points = np.random.default_rng(seed).normal(0, 10, (20, 4)).astype(dtype)
     moved = similarity.apply_to_points(points)
     assert moved.dtype == points.dtype
@@ -41,7 +41,7 @@ def test_points_keep_their_type_and_intensity(similarity, seed, dtype):
 
 @given(similarities, st.integers(0, 2**32 - 1))
 def test_points_and_boxes_move_together(similarity, seed):
-    """A box holds as many points after A as before, and overlaps stay."""
+    """A box contains as many points after A as before, and overlaps do not change."""
     generator = np.random.default_rng(seed)
     boxes = generator.uniform([-3, -3, -1, 1, 1, 1, -3], [3, 3, 1, 6, 3, 3, 3], (4, 7))
     points = generator.uniform(-4, 4, (200, 3))
@@ -63,7 +63,7 @@ def test_a_is_flip_then_rotation_then_scale():
 
 
 def test_recorded_view_is_the_transformed_frame(kitti_root):
-    """On real frames, recorded boxes of the view 1, mapped back, lie where view 0 has boxes."""
+    """On real frames, recorded boxes of view 1, mapped back, match boxes of view 0."""
     path = kitti_root / "recorded" / "pointgnn_T1.csv"
     rows = np.genfromtxt(path, delimiter=",", names=True, dtype=None, encoding="utf-8")
     names = ["x", "y", "z", "length", "width", "height", "yaw"]
@@ -86,8 +86,8 @@ def test_recorded_view_is_the_transformed_frame(kitti_root):
     assert np.median(overlaps) > 0.7
 
 
-def test_a_draw_depends_on_the_generator_only():
-    """The same seed gives the same A, within the limits asked for."""
+def test_a_draw_depends_only_on_the_generator():
+    """The same seed gives the same A, within the requested limits."""
     drawn = [Similarity.draw(np.random.default_rng(seed)) for seed in range(50)]
     assert drawn == [Similarity.draw(np.random.default_rng(seed)) for seed in range(50)]
     assert {similarity.flip_y for similarity in drawn} == {False, True}
@@ -96,7 +96,7 @@ def test_a_draw_depends_on_the_generator_only():
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
-def test_a_similarity_without_inverse_is_refused(scale):
+def test_a_similarity_without_inverse_is_rejected(scale):
     """Scale 0, negative or not finite is a one-line error."""
     with pytest.raises(ConfigError, match="positive scale"):
         Similarity(scale=scale)
@@ -112,7 +112,7 @@ def test_wrapping_keeps_the_direction(angle):
 
 
 def test_wrapping_at_the_seam():
-    """Minus pi becomes pi, the floats beside pi do not fall out, and what fits is untouched."""
+    """Minus pi becomes pi, floats next to pi stay in range, and angles in range do not change."""
     seam = np.array([-np.pi, np.pi, np.nextafter(np.pi, 4), -np.nextafter(np.pi, 4), 0.1, -3.0])
     wrapped = wrap_angle(seam)
     assert np.all((wrapped > -np.pi) & (wrapped <= np.pi))

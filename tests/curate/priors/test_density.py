@@ -1,4 +1,4 @@
-"""The density prior: what the sensor sees of a box, and what the sweep would give there."""
+"""The density prior: the visible area of a box, and the points expected there."""
 
 import numpy as np
 import pytest
@@ -17,19 +17,19 @@ STEP = np.deg2rad(0.2)
 
 
 def labels(*boxes: list[float]) -> Detections:
-    """Cars of score 1."""
+    """Return cars with score 1."""
     table = np.array(boxes, dtype=np.float64).reshape(-1, 7)
     return Detections(table, np.ones(len(table)), as_categories(["Car"] * len(table)))
 
 
 def frame(points: np.ndarray) -> Frame:
-    """A sweep of (n, 3) points."""
+    """Return a sweep of (n, 3) points."""
     sweep = np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
     return Frame("x", sweep, toy_calibration(), IMAGE_SIZE)
 
 
 def wall(distance: float, half_width_rad: float = 0.3) -> np.ndarray:
-    """A wall across x, seen by a sensor with one ray every 0.2 degrees."""
+    """Return a wall across x, seen by a sensor with one ray every 0.2 degrees."""
     angles = np.arange(-half_width_rad, half_width_rad, STEP)
     azimuth, elevation = (each.ravel() for each in np.meshgrid(angles, angles))
     rays = np.stack([np.ones_like(azimuth), np.tan(azimuth), np.tan(elevation)], axis=1)
@@ -53,8 +53,8 @@ def test_the_visible_area_is_that_of_the_outline(centre, size, yaw) -> None:
 
 
 @pytest.mark.parametrize("distance", [8.0, 20.0, 45.0])
-def test_a_wall_gives_what_is_expected_at_every_range(distance: float) -> None:
-    """Density falls with the square of the range, and so does what is expected."""
+def test_a_wall_has_the_expected_points_at_every_range(distance: float) -> None:
+    """Density falls with the square of the range, and so does the expectation."""
     side = 0.1 * distance
     plate = [distance, 0.0, 0.0, 0.02, side, side, 0.0]
     prior = DensityPrior()
@@ -65,7 +65,7 @@ def test_a_wall_gives_what_is_expected_at_every_range(distance: float) -> None:
     assert found["rho_density"][0] == 1.0
 
 
-def test_a_box_that_is_mostly_hidden_is_trusted_less() -> None:
+def test_a_mostly_hidden_box_has_less_trust() -> None:
     """A quarter of the points, half of the expectation needed: half the trust."""
     points = wall(20.0)
     plate = [20.0, 0.0, 0.0, 0.02, 1.2, 1.2, 0.0]
@@ -79,7 +79,7 @@ def test_a_box_that_is_mostly_hidden_is_trusted_less() -> None:
     assert strict["rho_density"][0] == pytest.approx(sparse["rho_density"][0] / 2)
 
 
-def test_nothing_expected_is_no_doubt() -> None:
+def test_without_expected_points_the_trust_is_full() -> None:
     """An empty sweep, a cone without points, a box around the sensor."""
     around, behind = [0.1, 0.0, 0.0, 4.0, 2.0, 1.5, 0.3], [-20.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.3]
     for points in (np.zeros((0, 3)), wall(20.0)):
@@ -91,7 +91,7 @@ def test_nothing_expected_is_no_doubt() -> None:
     assert len(DensityPrior().score(frame(wall(20.0)), labels())["rho_density"]) == 0
 
 
-def test_the_cone_is_as_wide_as_it_says() -> None:
+def test_the_cone_has_its_width() -> None:
     """A point just inside counts, one just outside does not."""
     box = np.array([[10.0, 0, 0, 4, 2, 1.5, 0]])
     for angle, found in ((0.99 * CONE_RAD, 1), (1.01 * CONE_RAD, 0)):
@@ -100,7 +100,7 @@ def test_the_cone_is_as_wide_as_it_says() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, -1.0, float("nan")])
-def test_a_share_without_meaning_is_refused(share: float) -> None:
+def test_a_zero_or_negative_share_is_rejected(share: float) -> None:
     """It divides the density."""
     with pytest.raises(ConfigError, match="share must be above 0"):
         DensityPrior(share=share)

@@ -14,19 +14,19 @@ from curate.priors.points import PointPrior, PointSettings, learn_thresholds, po
 
 
 def frame_with(*crowds):
-    """A frame with so many points around (10 i, 0, 0) for the i-th number."""
+    """Return a frame with n_i points around (10 i, 0, 0) for the i-th number."""
     points = np.zeros((sum(crowds), 4), dtype=np.float32)
     points[:, 0] = np.repeat(10.0 * np.arange(len(crowds)), crowds)
     return Frame("000000", points, Calibration(np.eye(3, 4), np.eye(4)), (10, 10))
 
 
 def boxes_at(*places):
-    """Boxes of 4 x 2 x 1.5 m around (10 i, 0, 0)."""
+    """Return boxes of 4 x 2 x 1.5 m around (10 i, 0, 0)."""
     return np.array([[10.0 * i, 0, 0, 4, 2, 1.5, 0.1] for i in places]).reshape(-1, 7)
 
 
 def annotations_at(places, categories):
-    """Ground truth at those places."""
+    """Return ground truth at those positions."""
     n = len(places)
     return Annotations(
         boxes_at(*places),
@@ -39,7 +39,7 @@ def annotations_at(places, categories):
 
 
 def detections_at(places, categories):
-    """Labels at those places."""
+    """Return labels at those positions."""
     return Detections(boxes_at(*places), np.full(len(places), 0.5), as_categories(categories))
 
 
@@ -53,19 +53,18 @@ def detections_at(places, categories):
         (PointSettings("fixed", fixed=12.0), 12.0),
     ],
 )
-def test_each_statistic_is_what_its_name_says(settings, expected):
+def test_each_statistic_has_its_value(settings, expected):
     """Median, mean, quantile and fixed, on four boxes."""
     assert points_threshold(np.array([25, 1, 11, 3]), settings) == pytest.approx(expected)
 
 
-def test_threshold_of_empty_boxes_is_one_point():
+def test_the_threshold_of_empty_boxes_is_one_point():
     """A median of 0 would divide by 0 and trust empty boxes."""
     assert points_threshold(np.zeros(9)) == 1.0
     assert points_threshold(np.array([0, 0, 1])) == 1.0
 
 
 def test_thresholds_are_learned_per_category_over_all_frames():
-    """Each category's statistic runs over its boxes of all labeled frames."""
     samples = [
         (frame_with(10, 3), annotations_at([0, 1], ["Car", "Cyclist"])),
         (frame_with(20, 40), annotations_at([0, 1], ["Car", "Car"])),
@@ -75,7 +74,7 @@ def test_thresholds_are_learned_per_category_over_all_frames():
     assert learned == {"Car": 20.0, "Cyclist": 3.0}
 
 
-def test_dont_care_and_foreign_categories_teach_nothing():
+def test_dont_care_and_unknown_categories_are_not_learned():
     """NaN boxes of DontCare regions and unconfigured categories are left out."""
     truth = annotations_at([0, 1, 0], ["Car", "Van", "DontCare"])
     truth.boxes[2] = np.nan
@@ -83,8 +82,8 @@ def test_dont_care_and_foreign_categories_teach_nothing():
     assert learned == {"Car": 8.0}
 
 
-def test_a_category_without_ground_truth_warns_and_falls_back(caplog):
-    """The warning names the category and the fallback that is used."""
+def test_a_category_without_ground_truth_uses_the_fallback_with_a_warning(caplog):
+    """The warning contains the category and the fallback."""
     with caplog.at_level(logging.WARNING):
         learned = learn_thresholds(
             [(frame_with(8), annotations_at([0], ["Car"]))],
@@ -98,7 +97,7 @@ def test_a_category_without_ground_truth_warns_and_falls_back(caplog):
 
 
 def test_a_fixed_threshold_needs_no_ground_truth(caplog):
-    """It is not a fallback, so nobody is warned."""
+    """It is not a fallback, so there is no warning."""
     learned = learn_thresholds([], ("Car",), PointSettings("fixed", fixed=9.0))
     assert learned == {"Car": 9.0}
     assert not caplog.records
@@ -116,15 +115,15 @@ def test_evidence_is_equation_8():
     assert found["rho_diff"].tolist() == [0.25, 1.0, 0.8, 0.0]
 
 
-def test_evidence_names_its_columns():
-    """The fields are the columns of the database, and rho is the one that the prior names."""
+def test_evidence_declares_its_columns():
+    """The fields are the columns of the database, and rho is the declared trust."""
     found = PointPrior({"Car": 2.0}).score(frame_with(1), detections_at([0], ["Car"]))
     assert list(found) == ["points", "points_threshold", "rho_diff"]
     assert PointPrior.rho_column in found
 
 
 @given(st.integers(0, 500), st.integers(0, 500), st.floats(1.0, 300.0))
-def test_more_points_are_never_trusted_less(few, more, threshold):
+def test_more_points_never_lower_the_trust(few, more, threshold):
     """rho_diff rises with m, stays in [0, 1], and is 1 from m_th on."""
     few, more = sorted((few, more))
     found = PointPrior({"Car": threshold}).score(
@@ -142,21 +141,19 @@ def test_an_empty_frame_has_empty_evidence():
     assert none_inside[prior.rho_column].tolist() == [0.0]
 
 
-def test_a_category_without_a_threshold_is_named():
-    """The error says which category and what to do."""
+def test_a_category_without_a_threshold_is_reported():
+    """The error contains the category and what to do."""
     with pytest.raises(ConfigError, match=r"Tram.*learn the thresholds again"):
         PointPrior({"Car": 3.0}).score(frame_with(1), detections_at([0], ["Tram"]))
 
 
 @pytest.mark.parametrize("wrong", [{"statistic": "mode"}, {"quantile": 1.5}, {"fallback": 0.0}])
-def test_settings_without_meaning_are_refused(wrong):
-    """A setting out of its range is named."""
+def test_invalid_settings_are_rejected(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         PointSettings(**wrong)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_a_threshold_must_be_a_positive_number(value):
-    """What cannot divide is refused before it does."""
     with pytest.raises(ConfigError, match="Car"):
         PointPrior({"Car": value})

@@ -32,23 +32,23 @@ BEHIND = [-10.0, 0.0, 0.0, 2.0, 4.0, 2.0, 0.0]
 
 @dataclass(frozen=True)
 class Painted:
-    """A segmenter that answers one map."""
+    """A segmenter that returns one map."""
 
     class_ids: np.ndarray
     needs_image: bool = False
 
     def segment(self, frame):
-        """The map, whatever the frame."""
+        """Return the map for every frame."""
         return SemanticMap(self.class_ids, CLASSES)
 
 
 def frame():
-    """A frame without points."""
+    """Return a frame without points."""
     return Frame("000007", np.zeros((0, 4), np.float32), CALIBRATION, (WIDTH, HEIGHT))
 
 
 def labels(boxes, scores, categories=None):
-    """Labels of cars unless told otherwise."""
+    """Return labels of cars by default."""
     names = ["Car"] * len(boxes) if categories is None else categories
     return Detections(np.reshape(boxes, (-1, 7)), np.array(scores), as_categories(names))
 
@@ -68,7 +68,7 @@ def test_evidence_counts_class_pixels_in_the_projected_rectangle():
     ("mean", "expected"),
     [("geometric", np.sqrt(0.64 * 0.25)), ("product", 0.16), ("arithmetic", 0.445)],
 )
-def test_each_mean_is_what_its_name_says(mean, expected):
+def test_each_mean_has_its_value(mean, expected):
     """Score 0.64, a quarter of the pixels."""
     rho = semantic_trust(
         np.array([0.64]), np.array([5]), np.array([20]), SemanticSettings(mean=mean)
@@ -78,8 +78,8 @@ def test_each_mean_is_what_its_name_says(mean, expected):
 
 @pytest.mark.parametrize("mean", ["geometric", "product", "arithmetic"])
 @pytest.mark.parametrize(("outside", "expected"), [("neutral", 0.3), ("drop", 0.0)])
-def test_boxes_that_the_image_does_not_show(mean, outside, expected):
-    """Behind the camera: rho_anno is the score or 0, whichever mean; other boxes are untouched."""
+def test_boxes_outside_the_image(mean, outside, expected):
+    """Behind the camera: rho_anno is the score or 0, whichever mean; other boxes do not change."""
     prior = SemanticPrior(
         Painted(np.full((HEIGHT, WIDTH), 7, np.uint8)), SemanticSettings(mean, outside)
     )
@@ -116,8 +116,8 @@ def test_counting_agrees_with_counting_one_by_one(seed, rows):
     assert list(zip(mask_pixels.tolist(), box_pixels.tolist(), strict=True)) == expected
 
 
-def test_the_whole_image_is_all_its_pixels():
-    """The rectangle 0, 0, width - 1, height - 1 holds every pixel once."""
+def test_the_whole_image_has_all_its_pixels():
+    """The rectangle 0, 0, width - 1, height - 1 contains every pixel once."""
     everything = np.array([[0.0, 0.0, WIDTH - 1.0, HEIGHT - 1.0]])
     semantic_map = SemanticMap(np.full((HEIGHT, WIDTH), 7, np.uint8), CLASSES)
     mask_pixels, box_pixels = count_pixels(everything, as_categories(["Car"]), semantic_map)
@@ -131,7 +131,7 @@ def test_the_whole_image_is_all_its_pixels():
     st.sampled_from(["geometric", "product", "arithmetic"]),
     st.sampled_from(["neutral", "drop"]),
 )
-def test_trust_stays_within_0_and_1_and_rises_with_the_pixels(rows, mean, outside):
+def test_trust_is_within_0_and_1_and_rises_with_the_pixels(rows, mean, outside):
     """Any score and counts; one more class pixel never lowers rho_anno."""
     scores = np.array([row[0] for row in rows])
     box_pixels = np.array([row[1] + row[2] for row in rows])
@@ -143,8 +143,8 @@ def test_trust_stays_within_0_and_1_and_rises_with_the_pixels(rows, mean, outsid
     assert (more >= rho).all()
 
 
-def test_evidence_names_its_columns():
-    """The fields are the columns of the database, and rho is the one that the prior names."""
+def test_evidence_declares_its_columns():
+    """The fields are the columns of the database, and rho is the declared trust."""
     prior = SemanticPrior(Painted(np.zeros((HEIGHT, WIDTH), np.uint8)))
     found = prior.score(frame(), labels([AHEAD], [0.5]))
     assert list(found) == ["mask_pixels", "box_pixels", "rho_anno"]
@@ -152,33 +152,32 @@ def test_evidence_names_its_columns():
 
 
 @pytest.mark.parametrize("needs_image", [True, False])
-def test_the_prior_needs_what_its_segmenter_needs(needs_image):
-    """Images are read only where somebody looks at them."""
+def test_the_prior_needs_the_inputs_of_its_segmenter(needs_image):
+    """Images are read only if they are needed."""
     assert SemanticPrior(Painted(np.zeros((1, 1)), needs_image)).needs_image is needs_image
 
 
 def test_an_empty_frame_is_not_segmented():
-    """Without labels there is nothing to ask the segmenter, which may be slow."""
+    """Without labels the segmenter, which may be slow, is not called."""
     found = SemanticPrior(Painted(np.zeros((1, 1)))).score(frame(), Detections.empty())
     assert [len(column) for column in found.values()] == [0, 0, 0]
 
 
-def test_a_map_of_another_size_is_refused():
-    """The error names the frame and both sizes."""
+def test_a_map_of_another_size_is_rejected():
+    """The error contains the frame and both sizes."""
     prior = SemanticPrior(Painted(np.zeros((HEIGHT, WIDTH - 1), np.uint8)))
     with pytest.raises(ModelError, match=r"000007.*79 x 40.*80 x 40"):
         prior.score(frame(), labels([AHEAD], [0.5]))
 
 
-def test_a_category_without_classes_is_refused():
-    """The error names the category."""
+def test_a_category_without_classes_is_rejected():
     prior = SemanticPrior(Painted(np.zeros((HEIGHT, WIDTH), np.uint8)))
     with pytest.raises(ConfigError, match="Tram"):
         prior.score(frame(), labels([AHEAD], [0.5], ["Tram"]))
 
 
 @pytest.mark.parametrize("wrong", [{"mean": "harmonic"}, {"outside": "guess"}])
-def test_unknown_options_are_refused(wrong):
-    """The error names the option and what there is."""
+def test_unknown_options_are_rejected(wrong):
+    """The error lists the known ones."""
     with pytest.raises(ConfigError, match=r"choose one of"):
         SemanticSettings(**wrong)

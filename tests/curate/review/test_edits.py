@@ -1,4 +1,4 @@
-"""What an edited frame says."""
+"""The decisions in an edited frame."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ FRAME = small_sheet().frames[0]
 
 
 def back(**changes: tuple[float, ...] | None) -> list[EditedBox]:
-    """The frame's boxes as they were shown, but for some by number; None for deleted."""
+    """Return the frame's boxes as exported, except some by number; None for deleted."""
     boxes = []
     for number, box in enumerate(FRAME.boxes, start=1):
         place = changes.get(f"box{number}", box.box)
@@ -21,85 +21,84 @@ def back(**changes: tuple[float, ...] | None) -> list[EditedBox]:
     return boxes
 
 
-def said(answer: FrameEdits) -> list[tuple[int | None, str]]:
-    """Numbers and decisions."""
-    return [(each.number, each.decision) for each in answer.decisions]
+def decisions_of(edits: FrameEdits) -> list[tuple[int | None, str]]:
+    """Return numbers and decisions."""
+    return [(each.number, each.decision) for each in edits.decisions]
 
 
-def test_an_unchanged_box_has_not_been_looked_at() -> None:
-    """Nothing becomes a human label by being sent back."""
-    answer = compare_frame(FRAME, back())
-    assert (said(answer), answer.untouched) == ([], 3)
+def test_an_unchanged_box_has_not_been_reviewed() -> None:
+    """Importing it does not make it a human label."""
+    edits = compare_frame(FRAME, back())
+    assert (decisions_of(edits), edits.untouched) == ([], 3)
 
 
-def test_rounding_is_no_change() -> None:
+def test_rounding_is_not_a_change() -> None:
     """A millimetre, and yaw by a whole turn."""
     rounded = (*(round(value, 3) for value in CAR[:6]), CAR[6] + 6.28319)
-    assert said(compare_frame(FRAME, back(box1=rounded)[::-1])) == []
+    assert decisions_of(compare_frame(FRAME, back(box1=rounded)[::-1])) == []
 
 
 def test_moved_deleted_and_new_boxes_are_decisions() -> None:
-    """What overlaps is the same object; the rest is gone or new."""
+    """Overlapping boxes are the same object; the others are deleted or new."""
     moved = (CAR[0] + 0.4, *CAR[1:])
     new = EditedBox("Cyclist", (12.0, 9.0, -0.6, 1.8, 0.6, 1.7, 0.0), "file:9")
-    answer = compare_frame(FRAME, [*back(box1=moved, box2=None), new])
-    assert said(answer) == [(1, "moved"), (2, "rejected"), (None, "added")]
-    first, second, third = answer.decisions
+    edits = compare_frame(FRAME, [*back(box1=moved, box2=None), new])
+    assert decisions_of(edits) == [(1, "moved"), (2, "rejected"), (None, "added")]
+    first, second, third = edits.decisions
     assert (first.box, first.seen) == (moved, CAR)
-    assert (second.box, third.seen, answer.untouched) == (WALKER, None, 1)
+    assert (second.box, third.seen, edits.untouched) == (WALKER, None, 1)
 
 
-def test_a_box_moved_out_of_its_place_is_rejected_there_and_added_here() -> None:
-    """Without overlap nobody can tell that it is the same."""
+def test_a_box_moved_without_overlap_is_rejected_and_added() -> None:
+    """Without overlap it cannot be identified as the same object."""
     far = (CAR[0] + 9, *CAR[1:])
-    assert said(compare_frame(FRAME, back(box1=far))) == [(1, "rejected"), (None, "added")]
+    assert decisions_of(compare_frame(FRAME, back(box1=far))) == [(1, "rejected"), (None, "added")]
 
 
 def test_another_category_is_a_correction() -> None:
     """The box stays."""
     edited = back()
     edited[1] = replace(edited[1], category="Cyclist")
-    answer = compare_frame(FRAME, edited)
-    assert said(answer) == [(2, "moved")]
-    assert (answer.decisions[0].category, answer.decisions[0].box) == ("Cyclist", WALKER)
+    edits = compare_frame(FRAME, edited)
+    assert decisions_of(edits) == [(2, "moved")]
+    assert (edits.decisions[0].category, edits.decisions[0].box) == ("Cyclist", WALKER)
 
 
-def test_words_accept_and_reject() -> None:
-    """The accepted box is the one that was shown, to the last digit."""
+def test_decisions_in_the_table_accept_and_reject() -> None:
+    """The accepted box is the exported one, to the last digit."""
     rounded = tuple(round(value, 3) for value in CAR)
-    answer = compare_frame(FRAME, back(box1=rounded), {1: "accepted", 2: "rejected"})
-    assert said(answer) == [(1, "accepted"), (2, "rejected")]
-    assert answer.decisions[0].box == CAR
+    edits = compare_frame(FRAME, back(box1=rounded), {1: "accepted", 2: "rejected"})
+    assert decisions_of(edits) == [(1, "accepted"), (2, "rejected")]
+    assert edits.decisions[0].box == CAR
 
 
-def test_accepting_the_rest_leaves_human_labels_alone() -> None:
+def test_accepting_the_rest_does_not_change_human_labels() -> None:
     """They are decided already."""
-    answer = compare_frame(FRAME, back(), accept_rest=True)
-    assert (said(answer), answer.untouched) == ([(1, "accepted"), (2, "accepted")], 1)
+    edits = compare_frame(FRAME, back(), accept_rest=True)
+    assert (decisions_of(edits), edits.untouched) == ([(1, "accepted"), (2, "accepted")], 1)
 
 
-def test_a_human_label_may_be_corrected() -> None:
-    """As any other box."""
-    assert said(compare_frame(FRAME, back(box3=None))) == [(3, "rejected")]
+def test_a_human_label_can_be_corrected() -> None:
+    """Like any other box."""
+    assert decisions_of(compare_frame(FRAME, back(box3=None))) == [(3, "rejected")]
 
 
 @pytest.mark.parametrize(
-    ("edited", "words", "fault"),
+    ("edited", "words", "message"),
     [
         (back(box1=None), {1: "accepted"}, "marked as accepted but deleted"),
         (back(box1=(CAR[0] + 0.4, *CAR[1:])), {1: "rejected"}, "file:1.*marked as rejected"),
     ],
 )
-def test_words_against_deeds_are_refused(
-    edited: list[EditedBox], words: dict[int, str], fault: str
+def test_contradictions_between_table_and_boxes_are_rejected(
+    edited: list[EditedBox], words: dict[int, str], message: str
 ) -> None:
-    """Which of both was meant is not guessed."""
-    with pytest.raises(DataError, match=fault):
+    with pytest.raises(DataError, match=message):
         compare_frame(FRAME, edited, words)
 
 
 @pytest.mark.parametrize(
-    ("category", "box", "fault"),
+    ("category", "box", "message"),
     [
         ("Tram", CAR, "unknown category 'Tram'; the categories of this review are Car"),
         ("Car", (float("nan"), *CAR[1:]), "not finite"),
@@ -108,9 +107,7 @@ def test_words_against_deeds_are_refused(
         ("Car", (481_000.0, *CAR[1:]), "another frame of reference"),
     ],
 )
-def test_boxes_that_cannot_be_are_refused(
-    category: str, box: tuple[float, ...], fault: str
-) -> None:
-    """With the place where they stand."""
-    with pytest.raises(DataError, match=f"^here: .*{fault}"):
+def test_invalid_boxes_are_rejected(category: str, box: tuple[float, ...], message: str) -> None:
+    """With their position."""
+    with pytest.raises(DataError, match=f"^here: .*{message}"):
         check_boxes([EditedBox(category, box, "here")], CATEGORIES)

@@ -11,7 +11,7 @@ from curate.review.sheet import MANIFEST, read_sheet, write_sheet
 from curate.review.table import TABLE, read_table, write_table
 
 
-def test_a_manifest_comes_back(tmp_path: Path) -> None:
+def test_a_manifest_is_read_back(tmp_path: Path) -> None:
     """To the last digit, with the same id."""
     write_sheet(tmp_path, small_sheet())
     again = read_sheet(tmp_path)
@@ -21,7 +21,7 @@ def test_a_manifest_comes_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "fault"),
+    ("before", "after", "message"),
     [
         ('"category": "Car"', '"category": "Van"', "changed since the export"),
         ('"frames"', '"pages"', "damaged"),
@@ -29,26 +29,26 @@ def test_a_manifest_comes_back(tmp_path: Path) -> None:
         ("{", "", "invalid JSON"),
     ],
 )
-def test_a_manifest_that_is_not_as_it_was_is_refused(
-    tmp_path: Path, before: str, after: str, fault: str
+def test_a_changed_manifest_is_rejected(
+    tmp_path: Path, before: str, after: str, message: str
 ) -> None:
-    """In one line that names it."""
+    """The one-line error contains the file."""
     write_sheet(tmp_path, small_sheet())
     path = tmp_path / MANIFEST
     path.write_text(path.read_text().replace(before, after, 1))
-    with pytest.raises(DataError, match=f"{MANIFEST}: .*{fault}") as error:
+    with pytest.raises(DataError, match=f"{MANIFEST}: .*{message}") as error:
         read_sheet(tmp_path)
     assert "\n" not in str(error.value)
 
 
-def test_a_folder_without_manifest_is_refused(tmp_path: Path) -> None:
-    """It says which folder to name."""
+def test_a_folder_without_manifest_is_rejected(tmp_path: Path) -> None:
+    """The error says which folder to specify."""
     with pytest.raises(DataError, match=r"no such file; import the folder that"):
         read_sheet(tmp_path)
 
 
 def edited(folder: Path, **decisions: str) -> None:
-    """Writes decisions into the table, by frame and box such as f000001_2 or f000001_all."""
+    """Write decisions into the table, by frame and box such as f000001_2 or f000001_all."""
     write_table(folder, small_sheet())
     lines = (folder / TABLE).read_text().splitlines()
     for key, word in decisions.items():
@@ -57,7 +57,7 @@ def edited(folder: Path, **decisions: str) -> None:
     (folder / TABLE).write_text("\n".join(lines) + "\n")
 
 
-def test_an_empty_column_says_nothing(tmp_path: Path) -> None:
+def test_an_empty_column_has_no_decisions(tmp_path: Path) -> None:
     """Nor does a missing table."""
     assert read_table(tmp_path, small_sheet()) == {}
     edited(tmp_path)
@@ -72,7 +72,7 @@ def test_decisions_are_read(tmp_path: Path) -> None:
     assert (words["000001"].accept_rest, words["000002"].accept_rest) == (False, True)
 
 
-def test_what_spreadsheets_do_to_a_table_does_no_harm(tmp_path: Path) -> None:
+def test_changes_by_spreadsheet_programs_are_tolerated(tmp_path: Path) -> None:
     """Semicolons, a byte order mark, no leading zeros."""
     edited(tmp_path, f000002_1="accept")
     text = (tmp_path / TABLE).read_text().replace(",", ";").replace("00000", "")
@@ -81,7 +81,7 @@ def test_what_spreadsheets_do_to_a_table_does_no_harm(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "word", "before", "after", "fault"),
+    ("key", "word", "before", "after", "message"),
     [
         ("f000001_1", "maybe", "", "", "3: invalid decision 'maybe'; write accept, reject"),
         ("f000001_all", "reject", "", "", "2: a whole frame cannot be rejected"),
@@ -96,12 +96,12 @@ def test_what_spreadsheets_do_to_a_table_does_no_harm(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_rows_without_meaning_are_refused(
-    tmp_path: Path, key: str, word: str, before: str, after: str, fault: str
+def test_invalid_rows_are_rejected(
+    tmp_path: Path, key: str, word: str, before: str, after: str, message: str
 ) -> None:
     """With file and line."""
     edited(tmp_path, **{key: word})
     path = tmp_path / TABLE
     path.write_text(path.read_text().replace(before or "\0", after))
-    with pytest.raises(DataError, match=f"{TABLE}:.*{fault}"):
+    with pytest.raises(DataError, match=f"{TABLE}:.*{message}"):
         read_table(tmp_path, small_sheet())

@@ -1,4 +1,4 @@
-"""Tests of the tables of semantic classes."""
+"""The tables of semantic classes."""
 
 import re
 
@@ -13,7 +13,7 @@ from curate.simulation.scene import SEMANTIC_CLASSES
 
 @pytest.mark.parametrize("name", sorted(CLASS_MAPS))
 def test_every_table_has_classes_for_every_category(name):
-    """No category of the project is left without pixels."""
+    """No category of the project is without pixels."""
     assert set(class_map(name)) == set(CATEGORIES)
     assert checked_classes(class_map(name)) == class_map(name)
 
@@ -23,7 +23,7 @@ def test_the_simulated_classes_are_those_of_the_simulator():
     assert class_map("simulated") == {name: (one,) for name, one in SEMANTIC_CLASSES.items()}
 
 
-def test_people_on_bicycles_are_no_pedestrians_where_the_classes_tell_them_apart():
+def test_riders_are_not_pedestrians_if_the_classes_differ():
     """Cityscapes has riders; VOC and COCO only persons, who count for both."""
     for name in ("cityscapes", "cityscapes-label-ids"):
         riders = class_map(name)
@@ -32,21 +32,20 @@ def test_people_on_bicycles_are_no_pedestrians_where_the_classes_tell_them_apart
         assert set(class_map(name)["Pedestrian"]) < set(class_map(name)["Cyclist"])
 
 
-def test_an_unknown_table_is_named_with_the_known_ones():
-    """The error lists what can be used."""
+def test_the_error_for_an_unknown_table_lists_the_known_ones():
     with pytest.raises(ConfigError, match="unknown class set 'ade': use one of cityscapes, city"):
         class_map("ade")
 
 
 @pytest.mark.parametrize("one", [-1, 256, 1.5, "7"])
-def test_ids_that_no_map_can_hold_are_refused(one):
+def test_ids_beyond_8_bits_are_rejected(one):
     """A semantic map has 8 bits per pixel."""
     with pytest.raises(ConfigError, match="of Car: an id is an integer from 0 to 255"):
         checked_classes({"Car": [one]})
 
 
 def test_the_page_shows_the_tables():
-    """docs/segmenters.md names the numbers that are built in."""
+    """docs/segmenters.md lists the built-in numbers."""
     page = (ROOT / "docs" / "segmenters.md").read_text()
     numbers = r" \| ([\d, ]+)" * 3
     rows = re.findall(rf"^\| `([\w-]+)`.*?{numbers} \|$", page, re.MULTILINE)

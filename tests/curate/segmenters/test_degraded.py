@@ -1,4 +1,4 @@
-"""Tests that the degraded truth errs as its error model says, and the same way every time."""
+"""The degraded ground truth follows its error model, reproducibly."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ NO_ERRORS = ErrorModel(
 
 @pytest.fixture
 def truth():
-    """Two cars, a pedestrian and a small cyclist."""
+    """Return a map with two cars, a pedestrian and a small cyclist."""
     class_ids = np.zeros((120, 300), dtype=np.uint8)
     class_ids[40:80, 20:90] = 1
     class_ids[40:80, 120:180] = 1
@@ -33,31 +33,31 @@ def truth():
 
 @pytest.fixture
 def folder(tmp_path, truth):
-    """The truth of frames 000000 and 000001 as semantic_2 holds it."""
+    """Return the ground truth of frames 000000 and 000001 as in semantic_2."""
     for name in ("000000", "000001"):
         cv2.imwrite(str(tmp_path / f"{name}.png"), truth)
     return tmp_path
 
 
 def frame(name="000000"):
-    """A frame without points or image."""
+    """Return a frame without points or image."""
     return Frame(
         name, np.zeros((0, 4), np.float32), Calibration(np.eye(3, 4), np.eye(4)), (300, 120)
     )
 
 
 def generators(count=40):
-    """Independent generators."""
+    """Return independent generators."""
     return [np.random.default_rng([1, number]) for number in range(count)]
 
 
-def test_without_errors_it_is_the_truth(truth):
+def test_without_errors_it_is_the_ground_truth(truth):
     """All rates at zero change nothing."""
     np.testing.assert_array_equal(degrade(truth, NO_ERRORS, np.random.default_rng(0)), truth)
 
 
-def test_missed_instances_vanish_whole(truth):
-    """Large regions go at their own rate, small ones at another."""
+def test_missed_instances_vanish_completely(truth):
+    """Large regions have their own rate, small ones another."""
     all_large = replace(NO_ERRORS, missed_instance=1.0)
     degraded = degrade(truth, all_large, np.random.default_rng(0))
     assert set(np.unique(degraded)) == {0, 3}
@@ -67,7 +67,7 @@ def test_missed_instances_vanish_whole(truth):
 
 
 def test_confused_instances_become_another_class(truth):
-    """Pedestrians and cyclists change places; a car becomes one of them."""
+    """Pedestrians and cyclists are exchanged; a car becomes one of them."""
     degraded = degrade(truth, replace(NO_ERRORS, confused=1.0), np.random.default_rng(0))
     assert set(np.unique(degraded[truth == 2])) == {3}
     assert set(np.unique(degraded[truth == 3])) == {2}
@@ -76,7 +76,7 @@ def test_confused_instances_become_another_class(truth):
 
 
 def test_outlines_move_by_at_most_the_limit(truth):
-    """What differs lies within the limit of an edge, and both directions occur."""
+    """All differences are within the limit of an edge, and both directions occur."""
     errors = replace(NO_ERRORS, boundary_px=3)
     areas = []
     for generator in generators():
@@ -101,8 +101,8 @@ def test_patches_only_erase_and_blobs_only_add(truth):
     assert (blotted[changed] > 0).all()
 
 
-def test_errors_depend_on_seed_and_frame_alone(folder):
-    """The order of the frames does not matter; another seed or frame errs differently."""
+def test_errors_depend_only_on_seed_and_frame(folder):
+    """The order of the frames does not matter; another seed or frame has other errors."""
     first = DegradedSegmenter(folder, seed=7)
     here, there = (first.segment(frame(name)).class_ids for name in ("000000", "000001"))
     again = DegradedSegmenter(folder, seed=7)
@@ -113,27 +113,27 @@ def test_errors_depend_on_seed_and_frame_alone(folder):
     assert (here != other).any()
 
 
-def test_the_default_errs_but_not_wildly(folder, truth):
-    """It needs no image, and most pixels stay what they are."""
+def test_the_default_has_moderate_errors(folder, truth):
+    """It needs no image, and most pixels do not change."""
     segmenter = DegradedSegmenter(folder)
-    answer = segmenter.segment(frame())
+    predicted = segmenter.segment(frame())
     assert not segmenter.needs_image
-    assert answer.category_classes["Cyclist"] == (3,)
-    assert 0.8 < (answer.class_ids == truth).mean() < 1
+    assert predicted.category_classes["Cyclist"] == (3,)
+    assert 0.8 < (predicted.class_ids == truth).mean() < 1
 
 
 @pytest.mark.parametrize(
     "rates",
     [{"confused": 1.5}, {"blobs": -1}, {"patch_px": 2.5}, {"missed": 0.1}, {"blobs": "many"}],
 )
-def test_impossible_rates_are_refused(folder, rates):
-    """One line that names the option."""
+def test_impossible_rates_are_rejected(folder, rates):
+    """The one-line error contains the option."""
     with pytest.raises(ConfigError, match=next(iter(rates))) as caught:
         DegradedSegmenter(folder, **rates)
     assert "\n" not in str(caught.value)
 
 
-def test_a_frame_without_truth_is_reported(folder):
-    """The missing file is named."""
+def test_a_frame_without_ground_truth_is_reported(folder):
+    """The error contains the missing file."""
     with pytest.raises(DataError, match="000009"):
         DegradedSegmenter(folder).segment(frame("000009"))

@@ -1,4 +1,4 @@
-"""Instance masks in COCO's JSON as semantic maps, and what the semantic prior makes of them."""
+"""Instance masks in COCO's JSON as semantic maps, and the semantic prior on them."""
 
 import json
 from pathlib import Path
@@ -21,21 +21,21 @@ FRAME = Frame("000007", np.zeros((0, 4), np.float32), toy_calibration(), (120, 4
 
 
 def rectangle(left: int, top: int, right: int, bottom: int) -> list[list[float]]:
-    """A polygon over whole pixels."""
+    """Return a polygon over whole pixels."""
     return [[left, top, right, top, right, bottom, left, bottom]]
 
 
 def encoded(class_ids: np.ndarray) -> dict:
-    """Compressed run lengths of what is not 0."""
+    """Return compressed run lengths of a mask of all non-zero pixels."""
     return {
         "size": list(class_ids.shape),
         "counts": run_lengths.compress(run_lengths.runs((class_ids > 0).tolist())),
     }
 
 
-def save(path: Path, held: object) -> Path:
-    """As JSON."""
-    path.write_text(json.dumps(held))
+def save(path: Path, content: object) -> Path:
+    """Write JSON."""
+    path.write_text(json.dumps(content))
     return path
 
 
@@ -45,7 +45,7 @@ GHOST = {**CAR, "segmentation": rectangle(0, 0, 120, 40), "score": 0.3}
 
 
 def expected() -> np.ndarray:
-    """The car over the person, and nothing of the ghost."""
+    """Return the map with the car over the person, without the low-score object."""
     class_ids = np.zeros((40, 120), np.uint8)
     class_ids[0:40, 25:40] = 1
     class_ids[5:25, 10:30] = 3
@@ -53,8 +53,8 @@ def expected() -> np.ndarray:
 
 
 @pytest.mark.parametrize("form", ["results", "document", "folder"])
-def test_every_form_says_the_same(tmp_path: Path, form: str) -> None:
-    """A list of results, COCO's document, a file per frame: higher scores on top, low ones out."""
+def test_every_format_gives_the_same_map(tmp_path: Path, form: str) -> None:
+    """A list of results, COCO's document, a file per frame; higher scores are on top."""
     objects = [CAR, GHOST, PERSON]
     if form == "results":
         path = save(tmp_path / "a.json", objects)
@@ -79,7 +79,7 @@ def test_run_lengths_and_polygons_are_the_same_object(tmp_path: Path) -> None:
 
 
 def test_an_object_of_another_class_hides_what_is_behind_it(tmp_path: Path) -> None:
-    """A bus in front of a car; its number means no category here."""
+    """A bus in front of a car; its number belongs to no category."""
     bus = {**CAR, "category_id": 6, "segmentation": rectangle(20, 0, 40, 40), "score": 0.95}
     found = InstanceSegmenter(save(tmp_path / "a.json", [bus, CAR]), COCO).segment(FRAME)
     assert (found.class_ids[:, 20:40] == 0).all()
@@ -103,7 +103,7 @@ def test_the_semantic_prior_counts_the_pixels_of_masks(tmp_path: Path) -> None:
 
 
 def test_a_frame_without_objects_is_not_a_frame_without_masks(tmp_path: Path) -> None:
-    """Listed among the images: an empty map. Not listed: an error with the remedy."""
+    """Listed among the images: an empty map. Not listed: an error that says what to do."""
     document = {"images": [{"id": 1, "file_name": "000007.png"}], "annotations": []}
     found = InstanceSegmenter(save(tmp_path / "a.json", document), COCO).segment(FRAME)
     assert not found.class_ids.any()
@@ -112,7 +112,7 @@ def test_a_frame_without_objects_is_not_a_frame_without_masks(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("held", "message"),
+    ("content", "message"),
     [
         ({"annotations": 3}, "expected a list of instance masks"),
         ([3], "expected a list of instance masks"),
@@ -124,9 +124,9 @@ def test_a_frame_without_objects_is_not_a_frame_without_masks(tmp_path: Path) ->
          "object 1: the mask is 60 x 20 pixels, the image is 120 x 40"),
     ],
 )  # fmt: skip
-def test_malformed_masks_are_named(tmp_path: Path, held: object, message: str) -> None:
-    """File, object and fault in one line."""
-    path = save(tmp_path / "a.json", held)
+def test_malformed_masks_are_reported(tmp_path: Path, content: object, message: str) -> None:
+    """File, object and reason in one line."""
+    path = save(tmp_path / "a.json", content)
     with pytest.raises(DataError) as caught:
         InstanceSegmenter(path, COCO).segment(FRAME)
     assert message in str(caught.value)
@@ -134,7 +134,7 @@ def test_malformed_masks_are_named(tmp_path: Path, held: object, message: str) -
     assert "\n" not in str(caught.value)
 
 
-def test_a_score_out_of_range_is_refused(tmp_path: Path) -> None:
+def test_a_score_out_of_range_is_rejected(tmp_path: Path) -> None:
     """Before any frame."""
     with pytest.raises(ConfigError, match=r"minimum_score 1\.5"):
         InstanceSegmenter(save(tmp_path / "a.json", []), COCO, minimum_score=1.5)

@@ -1,4 +1,4 @@
-"""Masks in COCO's forms against slow encoders, shapely, and a published example."""
+"""Masks in COCO's formats against slow encoders, shapely, and a published example."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ PUBLISHED = (
 
 
 def test_a_published_mask_has_its_published_area_and_box() -> None:
-    """2,211 x 2,097 pixels, of which 6,718 in a box of 117 x 75."""
+    """2,211 x 2,097 pixels, with 6,718 in a box of 117 x 75."""
     mask = decode_mask({"size": [2211, 2097], "counts": PUBLISHED}, (2097, 2211))
     rows, columns = np.nonzero(mask)
     assert len(rows) == 6718
@@ -28,8 +28,8 @@ def test_a_published_mask_has_its_published_area_and_box() -> None:
 
 
 @given(st.data())
-def test_masks_come_back_from_both_forms_of_run_lengths(data) -> None:
-    """Whatever is drawn; a mask that begins inside has a run of 0 first."""
+def test_masks_are_decoded_from_both_forms_of_run_lengths(data) -> None:
+    """A mask that begins inside has a first run of 0."""
     height, width = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9))
     pixels = data.draw(st.lists(st.booleans(), min_size=height * width, max_size=height * width))
     mask = np.array(pixels).reshape(height, width)
@@ -43,14 +43,14 @@ def test_masks_come_back_from_both_forms_of_run_lengths(data) -> None:
 
 @given(st.lists(st.integers(0, 2**31), max_size=8))
 def test_run_lengths_of_any_size_survive_compression(runs) -> None:
-    """Large numbers, and falling ones, whose differences are negative."""
+    """Large numbers, and falling ones with negative differences."""
     assert decompress(run_lengths.compress(runs)) == runs
 
 
 @given(st.lists(st.integers(-8, 56), min_size=6, max_size=14).filter(lambda p: len(p) % 2 == 0))
 @settings(max_examples=60)
-def test_polygons_hold_the_pixels_whose_centres_they_hold(eighths) -> None:
-    """Crossing themselves and running out of the image, too; corners never at a centre's height."""
+def test_polygons_contain_the_pixels_with_centres_inside(eighths) -> None:
+    """Self-intersecting and overhanging polygons too; no corner is at the height of a centre."""
     polygon = [value / 4 + 0.125 for value in eighths]
     mask = fill_polygon(polygon, (12, 10))
     expected = [
@@ -71,8 +71,8 @@ def test_a_polygon_agrees_with_shapely() -> None:
     np.testing.assert_array_equal(mask, inside.reshape(30, 40))
 
 
-def test_neighbours_share_no_pixel_and_polygons_unite() -> None:
-    """Two halves of the image whose edge runs through pixel centres are the whole image, once."""
+def test_adjacent_polygons_share_no_pixel() -> None:
+    """Two halves with an edge through pixel centres cover the image exactly once."""
     left, right = [0, 0, 4.5, 0, 4.5, 6, 0, 6], [4.5, 0, 9, 0, 9, 6, 4.5, 6]
     halves = [fill_polygon(half, (9, 6)) for half in (left, right)]
     assert (halves[0] ^ halves[1]).all()
@@ -99,7 +99,7 @@ def test_neighbours_share_no_pixel_and_polygons_unite() -> None:
         ("mask", "run lengths {size, counts} or a list of polygons"),
     ],
 )
-def test_what_is_no_mask_is_one_line(segmentation, message) -> None:
+def test_an_invalid_mask_gives_a_one_line_error(segmentation, message) -> None:
     """With what was expected."""
     with pytest.raises(DataError) as caught:
         decode_mask(segmentation, (9, 6))

@@ -1,4 +1,4 @@
-"""Tests of the ONNX segmenter with models made by hand, and DeepLab v3 on one real frame."""
+"""The ONNX segmenter with handmade models, and DeepLab v3 on one real frame."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ CLASSES = {"Car": (7,), "Pedestrian": (15,)}
 
 
 def model(path, nodes, shape, kind, constants=(), *, answer=TensorProto.INT64, rank=3, more=()):
-    """Saves a model from `image` to `answer`."""
+    """Save a model from `image` to `answer`."""
     inputs = [helper.make_tensor_value_info("image", kind, shape), *more]
     output = helper.make_tensor_value_info("answer", answer, [None] * rank)
     graph = helper.make_graph(
@@ -30,7 +30,7 @@ def model(path, nodes, shape, kind, constants=(), *, answer=TensorProto.INT64, r
 
 
 def red_channel_model(path, shape):
-    """A uint8 NHWC model; the class id of a pixel is its red channel."""
+    """Save a uint8 NHWC model; the class id of a pixel is its red channel."""
     nodes = [
         helper.make_node("Gather", ["image", "zero"], ["red"], axis=3),
         helper.make_node("Cast", ["red"], ["answer"], to=TensorProto.INT64),
@@ -39,7 +39,7 @@ def red_channel_model(path, shape):
 
 
 def brightest_channel_model(path, shape, *, channels_last=False):
-    """A float NCHW model; scores of three classes are the channels as the model sees them."""
+    """Save a float NCHW model; scores of three classes are the channels as the model sees them."""
     if channels_last:
         nodes = [helper.make_node("Transpose", ["image"], ["answer"], perm=[0, 2, 3, 1])]
     else:
@@ -48,12 +48,12 @@ def brightest_channel_model(path, shape, *, channels_last=False):
 
 
 def one_step_model(path, node, answer):
-    """A model that does one thing with a float image of 8 x 8 pixels."""
+    """Save a model with one operator on a float image of 8 x 8 pixels."""
     return model(path, [node], [1, 3, 8, 8], TensorProto.FLOAT, answer=answer, rank=4)
 
 
 def constant_model(path, class_ids):
-    """A uint8 NHWC model; the same class ids whatever the image."""
+    """Save a uint8 NHWC model; the same class ids for every image."""
     height, width = class_ids.shape
     nodes = [
         helper.make_node("ReduceMax", ["image", "axes"], ["most"], keepdims=1),
@@ -70,13 +70,13 @@ def constant_model(path, class_ids):
 
 
 def frame(image):
-    """A frame of which only the image matters."""
+    """Return a frame with an image and nothing else."""
     size = (image.shape[1], image.shape[0])
     return Frame("000001", np.zeros((0, 4), np.float32), toy_calibration(), size, image)
 
 
 def banded(height, width, bands):
-    """An image whose red channel is constant in vertical bands of equal width."""
+    """Return an image with a constant red channel in vertical bands of equal width."""
     image = np.zeros((height, width, 3), np.uint8)
     image[..., 0] = np.repeat(bands, -(-width // len(bands)))[:width]
     return image
@@ -85,7 +85,7 @@ def banded(height, width, bands):
 @pytest.mark.parametrize("shape", [[1, 20, 60, 3], [1, None, None, 3], ["n", "h", "w", 3]])
 @pytest.mark.parametrize("size", [(40, 120), (20, 60), (13, 31)])
 def test_whole_images_in_a_fixed_or_free_size(tmp_path, shape, size):
-    """The map has the size of the image, with each class where the image shows it."""
+    """The map has the size of the image, and each class is at its position."""
     segmenter = OnnxSegmenter(red_channel_model(tmp_path / "a.onnx", shape), CLASSES)
     image = banded(*size, [7, 0, 15])
     found = segmenter.segment(frame(image))
@@ -97,7 +97,7 @@ def test_whole_images_in_a_fixed_or_free_size(tmp_path, shape, size):
 
 
 def test_a_square_model_sees_a_wide_image_in_crops(tmp_path):
-    """Bands that one squeezed pass would blur come out at full resolution."""
+    """Bands that one squeezed pass would blur are resolved."""
     path = red_channel_model(tmp_path / "a.onnx", [1, 32, 32, 3])
     image = banded(32, 160, [7, 0] * 40)
     cropped = OnnxSegmenter(path, CLASSES).segment(frame(image)).class_ids
@@ -106,8 +106,8 @@ def test_a_square_model_sees_a_wide_image_in_crops(tmp_path):
     assert (squeezed != image[..., 0]).mean() > 0.2
 
 
-def test_crops_cover_the_image_and_own_what_is_nearest():
-    """Owned columns are a partition; each belongs to the crop whose centre is nearest."""
+def test_crops_cover_the_image_and_own_the_nearest_columns():
+    """Owned columns are a partition; each belongs to the crop with the nearest centre."""
     crops = cut_along(1242, 375, 5)
     assert crops[0].own_left == crops[0].left == 0
     assert crops[-1].own_right == crops[-1].right == 1242
@@ -121,7 +121,7 @@ def test_crops_cover_the_image_and_own_what_is_nearest():
     assert [crop.own_right for crop in crops[:-1]] == [crop.own_left for crop in crops[1:]]
 
 
-def test_more_crops_where_five_do_not_cover(tmp_path):
+def test_more_crops_are_used_if_five_do_not_cover(tmp_path):
     """An image of 10 : 1 is covered by ten square crops."""
     path = red_channel_model(tmp_path / "a.onnx", [1, 16, 16, 3])
     image = banded(16, 160, [7, 15] * 10)
@@ -129,8 +129,8 @@ def test_more_crops_where_five_do_not_cover(tmp_path):
     np.testing.assert_array_equal(found, image[..., 0])
 
 
-def test_a_class_that_counts_wins_where_crops_overlap(tmp_path):
-    """The nearest crop says nothing, the other one car: car. Other classes do not win so."""
+def test_a_category_wins_where_crops_overlap(tmp_path):
+    """The nearest crop predicts background, the other one car: car. Other classes do not win so."""
     class_ids = np.zeros((16, 16), np.uint8)
     class_ids[:8, :4] = 7
     class_ids[8:, :4] = 3
@@ -161,8 +161,8 @@ def test_scores_of_classes_in_either_order(tmp_path, channels_last):
     [("none", (150, 130, 120)), ("unit", (150 / 255, 130 / 255, 120 / 255)),
      ("imagenet", (0.4508, 0.2402, 0.2871))],
 )  # fmt: skip
-def test_float_models_get_the_scaling_they_want(tmp_path, monkeypatch, scaling, expected):
-    """The pixels that reach the model are 0 to 255, 0 to 1, or normalised as for ImageNet."""
+def test_float_models_get_the_scaling_they_need(tmp_path, monkeypatch, scaling, expected):
+    """The model gets pixels in 0 to 255, in 0 to 1, or normalised as for ImageNet."""
     path = brightest_channel_model(tmp_path / "a.onnx", [1, 3, 4, 6])
     segmenter = OnnxSegmenter(path, CLASSES, scaling=scaling)
     seen = {}
@@ -189,7 +189,7 @@ def test_float_models_get_the_scaling_they_want(tmp_path, monkeypatch, scaling, 
          (helper.make_tensor_value_info("second", TensorProto.FLOAT, [1]),)),
     ],
 )  # fmt: skip
-def test_an_unexpected_input_is_named_with_what_was_expected(tmp_path, shape, kind, more):
+def test_an_unexpected_input_is_reported_with_the_expected_one(tmp_path, shape, kind, more):
     """Wrong rank, channels, batch, type, or a second input: one line at the start."""
     nodes = [helper.make_node("Cast", ["image"], ["answer"], to=TensorProto.INT64)]
     path = model(tmp_path / "a.onnx", nodes, shape, kind, rank=len(shape), more=more)
@@ -199,8 +199,8 @@ def test_an_unexpected_input_is_named_with_what_was_expected(tmp_path, shape, ki
     assert "\n" not in str(caught.value)
 
 
-def test_an_answer_that_is_no_map_is_refused(tmp_path):
-    """A wrong rank is seen at the start, a wrong content with the first frame."""
+def test_an_output_that_is_not_a_map_is_rejected(tmp_path):
+    """A wrong rank at the start, wrong content with the first frame."""
     nodes = [helper.make_node("ReduceMax", ["image", "axes"], ["answer"], keepdims=0)]
     constants = [("axes", np.array([1, 2]))]
     path = model(
@@ -218,7 +218,7 @@ def test_an_answer_that_is_no_map_is_refused(tmp_path):
         OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
 
 
-def test_scores_that_are_nan_are_refused(tmp_path):
+def test_scores_that_are_nan_are_rejected(tmp_path):
     """They would be class 0 in every pixel, and no frame would fail."""
     node = helper.make_node("Log", ["image"], ["answer"])
     path = one_step_model(tmp_path / "a.onnx", node, TensorProto.FLOAT)
@@ -226,7 +226,7 @@ def test_scores_that_are_nan_are_refused(tmp_path):
         OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
 
 
-def test_names_of_classes_are_no_scores(tmp_path):
+def test_class_names_are_not_scores(tmp_path):
     """Text cannot be compared with numbers."""
     node = helper.make_node("Cast", ["image"], ["answer"], to=TensorProto.STRING)
     path = one_step_model(tmp_path / "a.onnx", node, TensorProto.STRING)
@@ -235,7 +235,7 @@ def test_names_of_classes_are_no_scores(tmp_path):
 
 
 @pytest.mark.parametrize("shape", [[1, 3, 200_000, 200_000], [1, 3, 0, 8], [1, "h", 1 << 26, 3]])
-def test_an_absurd_input_is_refused_before_a_frame_fills_the_memory(tmp_path, shape):
+def test_a_huge_input_is_rejected_before_a_frame_fills_the_memory(tmp_path, shape):
     """Every frame would be resized to what the model declares."""
     path = brightest_channel_model(tmp_path / "a.onnx", shape)
     with pytest.raises(
@@ -251,16 +251,16 @@ def test_a_model_of_one_column_has_crops_of_one(tmp_path):
     np.testing.assert_array_equal(found, banded(8, 16, [7, 15])[..., 0])
 
 
-def test_ids_beyond_a_map_are_refused(tmp_path):
-    """Class 300 does not fit into 8 bits and is not silently another class."""
+def test_ids_beyond_8_bits_are_rejected(tmp_path):
+    """Class 300 is not silently another class."""
     path = constant_model(tmp_path / "a.onnx", np.full((8, 8), 300))
     with pytest.raises(ModelError, match="expected class ids"):
         OnnxSegmenter(path, CLASSES).segment(frame(np.zeros((8, 8, 3), np.uint8)))
 
 
 @pytest.mark.parametrize("content", [b"", b"no model"])
-def test_a_file_that_is_no_model_is_named(tmp_path, content):
-    """ONNX Runtime's own errors do not leak."""
+def test_a_file_that_is_not_a_model_is_reported(tmp_path, content):
+    """ONNX Runtime's own errors are not shown."""
     path = tmp_path / "a.onnx"
     path.write_bytes(content)
     with pytest.raises(ModelError, match="not a usable ONNX model") as caught:
@@ -269,14 +269,14 @@ def test_a_file_that_is_no_model_is_named(tmp_path, content):
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_model_is_named(tmp_path):
+def test_a_missing_model_is_reported(tmp_path):
     """The error says what to set."""
     with pytest.raises(ModelError, match=r"a\.onnx: no such ONNX model; set segmenter\.path"):
         OnnxSegmenter(tmp_path / "a.onnx", CLASSES)
 
 
-def test_a_frame_without_its_image_is_refused(tmp_path):
-    """The segmenter says that it needs the image."""
+def test_a_frame_without_its_image_is_rejected(tmp_path):
+    """The segmenter declares that it needs the image."""
     segmenter = OnnxSegmenter(red_channel_model(tmp_path / "a.onnx", [1, 8, 8, 3]), CLASSES)
     assert segmenter.needs_image
     bare = replace(frame(np.zeros((8, 8, 3), np.uint8)), image=None)
@@ -288,8 +288,8 @@ def test_a_frame_without_its_image_is_refused(tmp_path):
     ("options", "message"),
     [({"scaling": "caffe"}, "use one of imagenet, unit, none"), ({"tiles": 0}, "at least 1")],
 )
-def test_options_out_of_range_are_refused(tmp_path, options, message):
-    """The error names what can be used."""
+def test_options_out_of_range_are_rejected(tmp_path, options, message):
+    """The error lists the accepted values."""
     path = red_channel_model(tmp_path / "a.onnx", [1, 8, 8, 3])
     with pytest.raises(ConfigError, match=message):
         OnnxSegmenter(path, CLASSES, **options)

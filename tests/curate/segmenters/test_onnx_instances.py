@@ -1,4 +1,4 @@
-"""Tests of the segmenter of instance models with graphs of a few constants."""
+"""The segmenter of instance models with graphs of a few constants."""
 
 from collections.abc import Mapping
 
@@ -21,15 +21,15 @@ WIDTH, HEIGHT = 12, 8
 KINDS = {"f": TensorProto.FLOAT, "i": TensorProto.INT64, "b": TensorProto.BOOL}
 
 
-def constant_model(path, answers: Mapping[str, np.ndarray], shape=(1, 3, HEIGHT, WIDTH)):
-    """A float model that answers the same arrays whatever the image."""
+def constant_model(path, results: Mapping[str, np.ndarray], shape=(1, 3, HEIGHT, WIDTH)):
+    """Save a float model that returns the same arrays for every image."""
     outputs = [
         helper.make_tensor_value_info(name, KINDS[values.dtype.kind], [None] * values.ndim)
-        for name, values in answers.items()
+        for name, values in results.items()
     ]
     nodes = [
         helper.make_node("Constant", [], [name], value=numpy_helper.from_array(values))
-        for name, values in answers.items()
+        for name, values in results.items()
     ]
     inputs = [helper.make_tensor_value_info("image", TensorProto.FLOAT, list(shape))]
     graph = helper.make_graph(nodes, "toy", inputs, outputs)
@@ -39,8 +39,8 @@ def constant_model(path, answers: Mapping[str, np.ndarray], shape=(1, 3, HEIGHT,
     return path
 
 
-def answers(boxes, labels, scores, masks) -> dict[str, np.ndarray]:
-    """Answers of Mask R-CNN's kind."""
+def outputs_of(boxes, labels, scores, masks) -> dict[str, np.ndarray]:
+    """Return outputs like those of Mask R-CNN."""
     return {
         "boxes": np.array(boxes, np.float32).reshape(-1, 4),
         "labels": np.array(labels, np.int64),
@@ -50,103 +50,103 @@ def answers(boxes, labels, scores, masks) -> dict[str, np.ndarray]:
 
 
 def frame(width=WIDTH, height=HEIGHT) -> Frame:
-    """A frame of which only the image matters."""
+    """Return a frame with an image and nothing else."""
     image = np.zeros((height, width, 3), np.uint8)
     return Frame("000001", np.zeros((0, 4), np.float32), toy_calibration(), (width, height), image)
 
 
-def asked(path, classes=COCO, *, of=None, **options) -> np.ndarray:
-    """The class ids that a model gives."""
+def classes_of(path, classes=COCO, *, of=None, **options) -> np.ndarray:
+    """Return the class ids of a model."""
     return OnnxInstanceSegmenter(path, classes, **options).segment(of or frame()).class_ids
 
 
 def rectangle(left, top, right, bottom, value, nothing=0, size=(HEIGHT, WIDTH)) -> np.ndarray:
-    """A map with one rectangle of a class."""
+    """Return a map with one rectangle of a class."""
     found = np.full(size, nothing, np.uint8)
     found[top:bottom, left:right] = value
     return found
 
 
-def test_a_mask_of_a_box_is_pasted_into_it(tmp_path):
+def test_a_mask_of_a_box_is_resized_into_it(tmp_path):
     """2 x 2 cells over 4 x 4 pixels: bilinear between the centres of the cells, by hand.
 
-    A pixel's place is (i + 0.5) / 2 - 0.5 cells: -0.25, 0.25, 0.75, 1.25. Along one axis the first
-    cell counts 0.75, 0.75, 0.25, 0, the second 0, 0.25, 0.75, 0.75.
+    A pixel's position is (i + 0.5) / 2 - 0.5 cells: -0.25, 0.25, 0.75, 1.25. Along one axis the
+    first cell counts 0.75, 0.75, 0.25, 0, the second 0, 0.25, 0.75, 0.75.
     """
     mask = np.array([[1.0, 0], [0, 0]])
     first = np.array([0.75, 0.75, 0.25, 0])
     expected = np.zeros((HEIGHT, WIDTH), np.uint8)
     expected[2:6, 3:7] = 3 * (np.outer(first, first) > 0.5)
     assert (expected > 0).sum() == 4
-    path = constant_model(tmp_path / "a.onnx", answers([[3, 2, 7, 6]], [3], [0.9], [mask]))
-    np.testing.assert_array_equal(asked(path), expected)
-    lower = asked(path, mask_threshold=0.1)
+    path = constant_model(tmp_path / "a.onnx", outputs_of([[3, 2, 7, 6]], [3], [0.9], [mask]))
+    np.testing.assert_array_equal(classes_of(path), expected)
+    lower = classes_of(path, mask_threshold=0.1)
     np.testing.assert_array_equal(lower[2:6, 3:7] > 0, np.outer(first, first) > 0.1)
 
 
 @pytest.mark.parametrize("form", [(1, 28, 28), (1, 1, 28, 28)])
 @pytest.mark.parametrize("batched", [False, True])
-def test_a_box_beyond_the_image_is_cut(tmp_path, form, batched):
-    """In each of the shapes in which masks come."""
-    found = answers([[-6, 4, 6, 20]], [3], [0.9], np.ones(form))
+def test_a_box_beyond_the_image_is_clipped(tmp_path, form, batched):
+    """For each shape of masks."""
+    found = outputs_of([[-6, 4, 6, 20]], [3], [0.9], np.ones(form))
     if batched:
         found = {name: values[None] for name, values in found.items()}
         found["masks"] = found["masks"].reshape(1, 1, 28, 28)
     path = constant_model(tmp_path / "a.onnx", found)
-    np.testing.assert_array_equal(asked(path), rectangle(0, 4, 6, 8, 3))
+    np.testing.assert_array_equal(classes_of(path), rectangle(0, 4, 6, 8, 3))
 
 
 @pytest.mark.parametrize("kind", [np.float32, bool, np.int64])
 def test_masks_of_the_whole_input(tmp_path, kind):
     """The mask counts, not the box."""
-    found = answers([[0, 0, 1, 1]], [1], [0.9], np.zeros((1, 1, HEIGHT, WIDTH)))
+    found = outputs_of([[0, 0, 1, 1]], [1], [0.9], np.zeros((1, 1, HEIGHT, WIDTH)))
     found["masks"][0, 0, 1:3, 5:9] = 1
     found["masks"] = found["masks"].astype(kind)
     path = constant_model(tmp_path / "a.onnx", found)
-    np.testing.assert_array_equal(asked(path), rectangle(5, 1, 9, 3, 1))
+    np.testing.assert_array_equal(classes_of(path), rectangle(5, 1, 9, 3, 1))
 
 
-def test_the_higher_score_is_on_top_and_other_classes_hide(tmp_path):
-    """Low scores are left out; a truck before a car hides it."""
+def test_higher_scores_are_on_top_and_other_classes_hide(tmp_path):
+    """Low scores are dropped; a truck in front of a car hides it."""
     ones = np.ones((4, 4, 4))
     boxes = [[0, 0, 8, 8], [4, 0, 12, 8], [6, 0, 8, 8], [0, 0, 12, 8]]
     path = constant_model(
-        tmp_path / "a.onnx", answers(boxes, [3, 1, 8, 2], [0.6, 0.7, 0.9, 0.4], ones)
+        tmp_path / "a.onnx", outputs_of(boxes, [3, 1, 8, 2], [0.6, 0.7, 0.9, 0.4], ones)
     )
     expected = rectangle(0, 0, 4, 8, 3)
     expected[:, 4:12] = 1
     expected[:, 6:8] = 0
-    np.testing.assert_array_equal(asked(path), expected)
+    np.testing.assert_array_equal(classes_of(path), expected)
 
 
-def test_scores_behind_the_boxes(tmp_path):
-    """As mmdetection's exports have them."""
-    found = answers([[0, 0, 4, 8]] * 2, [2, 0], [0, 0], np.ones((2, 4, 4)))
+def test_scores_can_follow_the_boxes(tmp_path):
+    """As in mmdetection's exports."""
+    found = outputs_of([[0, 0, 4, 8]] * 2, [2, 0], [0, 0], np.ones((2, 4, 4)))
     del found["scores"]
     found["boxes"] = np.column_stack([found["boxes"], np.float32([0.9, 0.2])])[None]
     path = constant_model(tmp_path / "a.onnx", found)
     outputs = {"boxes": "boxes", "labels": "labels", "masks": "masks"}
-    class_ids = asked(path, FROM_0, outputs=outputs)
-    # Class 0 is a person, so that nothing is another number.
+    class_ids = classes_of(path, FROM_0, outputs=outputs)
+    # Class 0 is a person, so that a 0 elsewhere is detected.
     np.testing.assert_array_equal(class_ids, rectangle(0, 0, 4, 8, 2, nothing=3))
 
 
-def test_a_larger_image_is_fitted_with_its_proportions(tmp_path):
-    """36 x 12 into 12 x 8: a third, in the upper left corner; boxes come back thrice as large."""
+def test_a_larger_image_is_scaled_with_its_proportions(tmp_path):
+    """36 x 12 into 12 x 8: a third, in the upper left corner; boxes become three times as large."""
     path = constant_model(
-        tmp_path / "a.onnx", answers([[1, 1, 3, 4]], [3], [0.9], np.ones((1, 4, 4)))
+        tmp_path / "a.onnx", outputs_of([[1, 1, 3, 4]], [3], [0.9], np.ones((1, 4, 4)))
     )
-    found = asked(path, of=frame(36, 12))
+    found = classes_of(path, of=frame(36, 12))
     np.testing.assert_array_equal(found, rectangle(3, 3, 9, 12, 3, size=(12, 36)))
     whole = np.zeros((1, HEIGHT, WIDTH))
     whole[0, :, 6:] = 1
-    path = constant_model(tmp_path / "b.onnx", answers([[0, 0, 1, 1]], [3], [0.9], whole))
-    found = asked(path, of=frame(36, 12))
+    path = constant_model(tmp_path / "b.onnx", outputs_of([[0, 0, 1, 1]], [3], [0.9], whole))
+    found = classes_of(path, of=frame(36, 12))
     np.testing.assert_array_equal(found, rectangle(18, 0, 36, 12, 3, size=(12, 36)))
 
 
-def test_prototypes_are_added_up_and_cut_to_their_boxes(tmp_path):
-    """Two prototypes, left and right half; the same object twice is one after suppression."""
+def test_prototypes_are_combined_and_cropped_to_their_boxes(tmp_path):
+    """Two prototypes, left and right half; the same object twice is one after NMS."""
     prototypes = np.full((1, 2, HEIGHT, WIDTH), -5, np.float32)
     prototypes[0, 0, :, :6] = prototypes[0, 1, :, 6:] = 5
     rows = [
@@ -161,17 +161,19 @@ def test_prototypes_are_added_up_and_cut_to_their_boxes(tmp_path):
     outputs = {"predictions": "output0", "prototypes": "output1"}
     expected = rectangle(2, 2, 6, 6, 2, nothing=3)
     expected[:, 9:11] = 0
-    np.testing.assert_array_equal(asked(path, FROM_0, outputs=outputs), expected)
+    np.testing.assert_array_equal(classes_of(path, FROM_0, outputs=outputs), expected)
 
 
 @pytest.mark.parametrize("shape", [(3, HEIGHT, WIDTH), ("n", 3, "h", "w"), (1, HEIGHT, WIDTH, 3)])
-def test_no_objects_in_any_input(tmp_path, shape):
-    """An empty answer is an empty map."""
-    path = constant_model(tmp_path / "a.onnx", answers([], [], [], np.zeros((0, 1, 28, 28))), shape)
-    assert not asked(path).any()
+def test_no_objects_in_any_input_format(tmp_path, shape):
+    """An empty output is an empty map."""
+    path = constant_model(
+        tmp_path / "a.onnx", outputs_of([], [], [], np.zeros((0, 1, 28, 28))), shape
+    )
+    assert not classes_of(path).any()
 
 
-GOOD = answers([[0, 0, 4, 4]], [3], [0.9], np.ones((1, 28, 28)))
+GOOD = outputs_of([[0, 0, 4, 4]], [3], [0.9], np.ones((1, 28, 28)))
 BAD = {
     "boxes of three numbers": ({"boxes": np.zeros((1, 3), np.float32)}, "returns boxes [1, 3], "),
     "one mask too few": (
@@ -189,34 +191,34 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_other_answers_are_refused_in_one_line(tmp_path, name):
-    """With what was answered."""
+def test_other_outputs_are_rejected_in_one_line(tmp_path, name):
+    """With the shapes of the outputs."""
     changed, message = BAD[name]
     path = constant_model(tmp_path / "a.onnx", GOOD | changed)
     with pytest.raises(ModelError) as caught:
-        asked(path)
+        classes_of(path)
     assert_one_line(caught.value)
     assert message in str(caught.value)
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_prototypes_that_are_nan_are_refused(tmp_path):
+def test_prototypes_that_are_nan_are_rejected(tmp_path):
     """They would leave the object without a single pixel."""
     found = {"predictions": np.full((1, 6, 1), 0.9, np.float32)}
     found["prototypes"] = np.full((1, 1, 4, 4), np.nan, np.float32)
     path = constant_model(tmp_path / "a.onnx", found)
     with pytest.raises(ModelError, match=r"a\.onnx: returns a mask that contains NaN"):
-        asked(path, {"Car": (0,)}, outputs={name: name for name in found})
+        classes_of(path, {"Car": (0,)}, outputs={name: name for name in found})
 
 
-def test_wrong_prototypes_are_refused(tmp_path):
-    """No classes are left between box and coefficients."""
+def test_wrong_prototypes_are_rejected(tmp_path):
+    """No columns are left for the classes."""
     found = {"a": np.zeros((1, 6, 9), np.float32), "b": np.zeros((1, 2, 4, 4), np.float32)}
     path = constant_model(tmp_path / "a.onnx", found)
     with pytest.raises(
         ModelError, match=r"predictions \[1, 6, 9\].*expected predictions \[1, 4 \+"
     ):
-        asked(path, outputs={"predictions": "a", "prototypes": "b"})
+        classes_of(path, outputs={"predictions": "a", "prototypes": "b"})
 
 
 @pytest.mark.parametrize(
@@ -231,15 +233,15 @@ def test_wrong_prototypes_are_refused(tmp_path):
         ({"minimum_score": 2}, "0 to 1"),
     ],
 )
-def test_wrong_options_are_named(tmp_path, options, message):
+def test_wrong_options_are_reported(tmp_path, options, message):
     """Before the first frame."""
     path = constant_model(tmp_path / "a.onnx", GOOD)
     with pytest.raises(ConfigError, match=message):
         OnnxInstanceSegmenter(path, COCO, **options)
 
 
-def test_an_empty_box_shows_nothing():
-    """Nor does one beside the image."""
+def test_an_empty_box_has_no_pixels():
+    """Nor does one outside the image."""
     for box in ((3, 3, 3, 5), (5, 3, 4, 6), (20, 20, 30, 30), (3.6, 3.6, 4.4, 4.4)):
         _, mask = paste_mask(np.ones((4, 4)), box, box, (WIDTH, HEIGHT), 0.5)
         assert mask.size == 0

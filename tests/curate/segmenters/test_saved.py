@@ -1,4 +1,4 @@
-"""Tests of saved semantic maps."""
+"""Saved semantic maps."""
 
 import cv2
 import numpy as np
@@ -15,11 +15,11 @@ CLASSES = {"Car": (7,)}
 
 
 def save(directory, class_ids):
-    """A map of the frame."""
+    """Save a map of the frame."""
     cv2.imwrite(str(directory / "000001.png"), class_ids)
 
 
-def test_reads_the_map_of_a_frame(tmp_path):
+def test_it_reads_the_map_of_a_frame(tmp_path):
     """The pixels of the PNG are the class ids; the image is not needed."""
     class_ids = np.random.default_rng(0).integers(0, 255, (5, 12), dtype=np.uint8)
     save(tmp_path, class_ids)
@@ -38,15 +38,15 @@ def test_reads_the_map_of_a_frame(tmp_path):
         (np.zeros((5, 12), np.uint16), "expected one channel of 8 bits"),
     ],
 )
-def test_a_map_that_does_not_fit_is_refused(tmp_path, class_ids, message):
-    """Wrong size, colours or depth: the error names the file."""
+def test_a_map_that_does_not_fit_is_rejected(tmp_path, class_ids, message):
+    """Wrong size, colours or depth: the error contains the file."""
     save(tmp_path, class_ids)
     with pytest.raises(DataError, match=message) as caught:
         SavedSegmenter(tmp_path, CLASSES).segment(FRAME)
     assert "000001.png" in str(caught.value)
 
 
-def test_instances_are_told_by_the_divisor(tmp_path):
+def test_instance_ids_are_divided_by_the_divisor(tmp_path):
     """Cityscapes' instanceIds: class * 1000 + instance, classes without instances as they are."""
     values = np.array([26001, 26999, 24000, 7, 255, 33001], np.uint16)
     save(tmp_path, np.tile(values, (5, 2)))
@@ -77,7 +77,7 @@ def test_instances_are_told_by_the_divisor(tmp_path):
         ("cityscapes-label-ids", 90, "class 90, .* cityscapes-label-ids are 0 to 33$"),
     ],
 )
-def test_maps_of_another_class_set_are_refused(tmp_path, declared, present, message):
+def test_maps_of_another_class_set_are_rejected(tmp_path, declared, present, message):
     """Cityscapes' label ids read as train ids would make every car a bus or nothing."""
     class_ids = np.zeros((5, 12), np.uint8)
     class_ids[0, :2] = present, 255
@@ -87,8 +87,8 @@ def test_maps_of_another_class_set_are_refused(tmp_path, declared, present, mess
     assert SavedSegmenter(tmp_path, class_map("coco")).segment(FRAME).class_ids[0, 0] == present
 
 
-def test_missing_and_unreadable_maps_are_named(tmp_path):
-    """No map, bytes that are none, and no folder."""
+def test_missing_and_unreadable_maps_are_reported(tmp_path):
+    """No map, invalid bytes, and no folder."""
     segmenter = SavedSegmenter(tmp_path, CLASSES)
     with pytest.raises(DataError, match=r"000001\.png: no such image file"):
         segmenter.segment(FRAME)

@@ -1,4 +1,4 @@
-"""A small simulated data set, and scenes made by hand."""
+"""A small simulated dataset, and handmade scenes."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ FRAMES, SEED = 8, 5
 
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory) -> Path:
-    """Eight frames, two of them for validation, made by one process."""
+    """Return eight frames, two of them for validation, simulated by one process."""
     root = tmp_path_factory.mktemp("simulated")
     simulate(root, FRAMES, SEED, workers=1)
     return root
@@ -26,19 +26,19 @@ def simulated(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def rig() -> CameraRig:
-    """A camera near KITTI's."""
+    """Return a camera similar to KITTI's."""
     return CameraRig.draw(np.random.default_rng(0))
 
 
 @pytest.fixture
 def flat_street() -> Street:
-    """A level, straight street."""
+    """Return a level, straight street."""
     return Street(0.0, 1, 3.5, 0.0, 0.0, 3.0, 5.0, None, 4.0, (0.0, 0.0), (0.0, 50.0, 0.0))
 
 
 @pytest.fixture
 def scene_of(flat_street):
-    """Makes a scene of cars, people or boxes: (kind, x, y, yaw) or (mesh, x, y, yaw)."""
+    """Return a function that builds a scene of (kind, x, y, yaw) or (mesh, x, y, yaw)."""
 
     def make(*things) -> Scene:
         placements = []

@@ -1,4 +1,4 @@
-"""Tests of the labels: by scenes made by hand, and by agreement with points and pixels."""
+"""Simulated labels: on handmade scenes, and their agreement with points and pixels."""
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ LAST = np.array([1241.0, 374.0, 1241.0, 374.0])
 
 @pytest.fixture
 def labels_of(scene_of, rig):
-    """The labels of a scene made by hand."""
+    """Return the labels of a handmade scene."""
 
     def make(*things):
         scene = scene_of(*things)
@@ -34,15 +34,15 @@ def labels_of(scene_of, rig):
 
 
 def frames_of(root):
-    """The data set, and each frame with its labels and those that have a 3D box."""
+    """Return the dataset, and each frame with its labels and those that have a 3D box."""
     dataset = KittiDataset(root)
     for frame_id in dataset.frame_ids():
         labels = dataset.annotations(frame_id)
         yield dataset.read(frame_id), labels, labels.select(labels.categories != "DontCare")
 
 
-def test_a_car_in_plain_view_is_whole(labels_of):
-    """Neither truncated nor occluded, with the box where it was put."""
+def test_a_fully_visible_car(labels_of):
+    """Neither truncated nor occluded, with the box at its position."""
     labels = labels_of(("Car", 15.0, 2.0, 0.4))
     assert labels.categories.tolist() == ["Car"]
     np.testing.assert_allclose(labels.boxes[0, [0, 1, 6]], [15.0, 2.0, 0.4], atol=1e-6)
@@ -50,8 +50,8 @@ def test_a_car_in_plain_view_is_whole(labels_of):
     assert labels.occluded[0] == 0
 
 
-def test_what_hides_a_car_decides_its_occlusion_level(labels_of):
-    """A board before none, a third, most or all of it gives 0, 1, 2 or no clear label."""
+def test_the_hidden_share_decides_the_occlusion_level(labels_of):
+    """A board that hides none, a third, most or all of it gives 0, 1, 2 or no clear label."""
     levels = []
     for width in (0.0, 0.35, 0.6, 2.6):
         board = box((0, 0, 1.5), (0.1, max(width, 0.01), 3.0), Material.WOOD)
@@ -64,8 +64,8 @@ def test_what_hides_a_car_decides_its_occlusion_level(labels_of):
     assert "Car" not in levels[3][0]
 
 
-def test_the_share_outside_the_image_is_truncation(labels_of):
-    """A car that slides out of view goes from 0 to almost 1, its box clipped to the image."""
+def test_the_share_outside_the_image_is_the_truncation(labels_of):
+    """A car that moves out of view goes from 0 to almost 1, its box clipped to the image."""
     labels = [labels_of(("Car", 8.0, y, 0.0)) for y in (3.0, 6.3, 7.2, 30.0)]
     shares = [float(label.truncated[0]) for label in labels[:3]]
     assert shares[0] == 0
@@ -75,22 +75,22 @@ def test_the_share_outside_the_image_is_truncation(labels_of):
 
 
 def test_a_car_beside_the_camera_has_a_box_within_the_image(labels_of):
-    """An object that reaches behind the camera is clipped, not turned inside out."""
+    """An object that reaches behind the camera is clipped, not mirrored."""
     labels = labels_of(("Car", 1.8, 3.0, 0.0))
     assert labels.truncated[0] > 0.9
     assert (labels.boxes_2d >= 0).all()
     assert (labels.boxes_2d <= LAST).all()
 
 
-def test_far_people_become_regions(labels_of):
-    """Someone too far away to be labelled in KITTI is a DontCare region."""
+def test_far_people_become_dontcare_regions(labels_of):
+    """KITTI does not label people at that distance."""
     labels = labels_of(("Pedestrian", 80.0, 0.0, 0.0), ("Car", 20.0, 6.0, 0.0))
     assert labels.categories.tolist() == ["Car", "DontCare"]
     assert np.isnan(labels.boxes[1]).all()
 
 
-def test_points_on_a_car_lie_in_its_box(scene_of, labels_of):
-    """The sweep of a car alone on the street fills its box, and only its box."""
+def test_points_on_a_car_are_in_its_box(scene_of, labels_of):
+    """The sweep of a single car on the street fills its box, and only its box."""
     scene = scene_of(("Car", 12.0, -2.0, 2.5))
     labels = labels_of(("Car", 12.0, -2.0, 2.5))
     caster = Caster(scene.vertices, scene.triangles)
@@ -102,8 +102,8 @@ def test_points_on_a_car_lie_in_its_box(scene_of, labels_of):
     assert count_points_in_boxes(raised, grown)[0] > 0.99 * len(raised)
 
 
-def test_objects_in_plain_view_have_points(simulated):
-    """Whatever is near and unhidden was hit by the sweep."""
+def test_visible_objects_have_points(simulated):
+    """Every near object that is not hidden was hit by the sweep."""
     checked = 0
     for frame, _, labels in frames_of(simulated):
         clear = (labels.occluded == 0) & (labels.truncated < 0.2) & (labels.boxes[:, 0] < 35)
@@ -114,7 +114,7 @@ def test_objects_in_plain_view_have_points(simulated):
 
 
 def test_2d_boxes_are_those_of_the_3d_boxes(simulated):
-    """The tight box of the object lies in the rectangle of its 3D box, and fills most of it."""
+    """The tight box of the object is in the rectangle of its 3D box, and fills most of it."""
     shares = []
     for frame, _, labels in frames_of(simulated):
         outer = image_rectangles(labels.boxes, frame.calibration, frame.image_size)
@@ -125,8 +125,8 @@ def test_2d_boxes_are_those_of_the_3d_boxes(simulated):
     assert np.median(shares) > 0.75
 
 
-def test_truncation_means_the_image_border(simulated):
-    """Exactly the boxes that reach the border are truncated; all levels are in KITTI's range."""
+def test_truncated_boxes_reach_the_image_border(simulated):
+    """And no others; all levels are in KITTI's range."""
     for _, _, labels in frames_of(simulated):
         assert ((labels.truncated >= 0) & (labels.truncated <= 1)).all()
         assert np.isin(labels.occluded, [0, 1, 2]).all()
@@ -135,8 +135,8 @@ def test_truncation_means_the_image_border(simulated):
         assert border[labels.truncated > 0.005].all()
 
 
-def test_alpha_is_the_angle_at_which_the_camera_sees_the_object(simulated):
-    """KITTI's definition: rotation_y less the direction of the object."""
+def test_alpha_is_the_observation_angle(simulated):
+    """KITTI's definition: rotation_y minus the direction of the object."""
     for path in sorted((simulated / "training" / "label_2").glob("*.txt")):
         objects = read_objects(path)
         objects = objects.select(objects.categories != "DontCare")
@@ -145,7 +145,7 @@ def test_alpha_is_the_angle_at_which_the_camera_sees_the_object(simulated):
         assert np.abs(difference).max(initial=0) < 0.01
 
 
-def test_pixels_of_a_class_lie_in_boxes_of_its_category(simulated):
+def test_pixels_of_a_class_are_in_boxes_of_its_category(simulated):
     """Every pixel of the semantic map belongs to a labelled object or a DontCare region."""
     for frame, labels, _ in frames_of(simulated):
         path = simulated / "training" / SEMANTIC_FOLDER / f"{frame.frame_id}.png"
@@ -160,7 +160,7 @@ def test_pixels_of_a_class_lie_in_boxes_of_its_category(simulated):
 
 
 def test_all_kinds_and_levels_occur(simulated):
-    """A few frames hold every category, hidden and truncated objects, and regions."""
+    """A few frames have every category, occluded and truncated objects, and regions."""
     labels = [labels for _, labels, _ in frames_of(simulated)]
     categories = np.concatenate([part.categories for part in labels])
     assert set(categories) == {"Car", "Pedestrian", "Cyclist", "DontCare"}

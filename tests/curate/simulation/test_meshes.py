@@ -1,4 +1,4 @@
-"""Tests that meshes are closed, turned outwards, and of the size that they claim."""
+"""Meshes are closed, oriented outwards, and of the stated size."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ STUFF = Material.METAL
 
 
 def volume(mesh):
-    """Signed: positive where triangles turn counter-clockwise seen from outside."""
+    """Return the signed volume: positive if triangles turn counter-clockwise seen from outside."""
     a, b, c = (mesh.vertices[mesh.triangles[:, k]].astype(float) for k in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
@@ -48,7 +48,7 @@ def test_merging_keeps_every_part():
     ],
 )
 def test_actors_have_plausible_and_different_sizes(category, low, high):
-    """Length, width and height of every variant are those of its kind, and they vary."""
+    """Length, width and height of every variant are typical for its kind, and they vary."""
     meshes = [actors.actor_mesh(category, number) for number in range(actors.VARIANTS[category])]
     sizes = np.array([mesh.size for mesh in meshes])
     assert (sizes >= low).all()
@@ -59,7 +59,7 @@ def test_actors_have_plausible_and_different_sizes(category, low, high):
 
 @pytest.mark.parametrize("kind", scenery.CLUTTER)
 def test_clutter_stands_on_the_ground(kind):
-    """It begins at or just below z = 0 and is no taller than what it is mistaken for."""
+    """It starts at or just below z = 0 and is not taller than the object that it resembles."""
     for number in range(scenery.VARIANTS):
         low, high = scenery.scenery_mesh(kind, number).bounds
         assert -0.4 <= low[2] <= 0.05

@@ -1,4 +1,4 @@
-"""Tests that Open3D is loaded in one place, and that a failure says what to install."""
+"""Open3D is imported in one module, and a failure says what to install."""
 
 import re
 import subprocess
@@ -12,12 +12,12 @@ from curate.simulation import open3d_loader, system_libraries
 
 
 def test_the_loaded_module_casts_rays():
-    """The module that comes back has the part of Open3D that the simulation needs."""
+    """It has the part of Open3D that the simulation needs."""
     scene = open3d_loader.load().t.geometry.RaycastingScene(nthreads=1)
     assert scene.add_triangles is not None
 
 
-def test_a_fresh_process_can_load_it():
+def test_a_new_process_can_load_it():
     """No other import has to come first."""
     code = "from curate.simulation.open3d_loader import load; print(load().__name__)"
     ended = subprocess.run(
@@ -27,7 +27,7 @@ def test_a_fresh_process_can_load_it():
 
 
 def fail_to_load(monkeypatch: pytest.MonkeyPatch, error: ImportError) -> str:
-    """Return the message of the loader where the import of open3d raises an error."""
+    """Return the message of the loader if the import of open3d raises an error."""
 
     class Failing:
         def find_spec(self, name, path=None, target=None):
@@ -46,7 +46,7 @@ NO_EGL = "libEGL.so.1: cannot open shared object file: No such file or directory
 
 
 def test_a_failure_lists_all_missing_libraries(monkeypatch):
-    """The linker names the first; the message has all of them and one command."""
+    """The linker reports the first; the message has all of them and one command."""
     lacking = {"libEGL.so.1", "libidn2.so.0"}
     monkeypatch.setattr(system_libraries, "loads", lambda library: library not in lacking)
     message = fail_to_load(monkeypatch, ImportError(NO_EGL))
@@ -55,7 +55,7 @@ def test_a_failure_lists_all_missing_libraries(monkeypatch):
 
 
 def test_a_failure_for_another_reason_is_quoted(monkeypatch):
-    """Nothing is missing in the table, so the linker's own words are all there is."""
+    """No library of the table is missing, so the message quotes the linker."""
     monkeypatch.setattr(system_libraries, "loads", lambda _: True)
     assert "something over two lines" in fail_to_load(
         monkeypatch, ImportError("something\nover two lines")
@@ -69,7 +69,7 @@ def test_a_missing_package_is_reported(monkeypatch):
 
 
 def test_only_the_loader_imports_open3d():
-    """Everything else uses the loader, which provides the missing library."""
+    """It provides the missing library."""
     pattern = re.compile(r"^\s*(import|from) open3d\b", re.MULTILINE)
     folders = (ROOT / name for name in ("curate", "db", "pipelines"))
     sources = [path for folder in folders for path in folder.rglob("*.py")]

@@ -1,4 +1,4 @@
-"""Tests of the sweep and the image against scenes made by hand."""
+"""The simulated sweep and image on handmade scenes."""
 
 import numpy as np
 
@@ -14,12 +14,12 @@ from curate.simulation.street import SENSOR_HEIGHT_M
 
 
 def points_of(scene, seed=0):
-    """The sweep of a scene."""
+    """Return the sweep of a scene."""
     return sweep(scene, Caster(scene.vertices, scene.triangles), np.random.default_rng(seed))
 
 
-def test_an_empty_street_returns_a_level_ground(scene_of):
-    """All points lie at the ground's height, within the noise, and within the sector."""
+def test_an_empty_street_returns_level_ground(scene_of):
+    """All points are at the ground's height, within the noise, and within the sector."""
     points = points_of(scene_of())
     near = points[np.hypot(points[:, 0], points[:, 1]) < 10]
     azimuths = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
@@ -32,7 +32,7 @@ def test_an_empty_street_returns_a_level_ground(scene_of):
 
 
 def test_a_wall_is_measured_at_its_distance_with_noise(scene_of):
-    """Ranges to a flat wall scatter by about two centimetres around the truth."""
+    """Ranges to a flat wall scatter by about two centimetres."""
     wall = box((0, 0, 2), (0.2, 12, 4), Material.CONCRETE)
     points = points_of(scene_of((wall, 20.1, 0.0, 0.0)))
     on_wall = points[(points[:, 2] > -1.5) & (np.abs(points[:, 1]) < 5)]
@@ -41,7 +41,7 @@ def test_a_wall_is_measured_at_its_distance_with_noise(scene_of):
 
 
 def test_far_and_dark_surfaces_lose_more_pulses(scene_of):
-    """Of a dark wall, fewer pulses return from 70 m than from 10 m."""
+    """A dark wall returns fewer pulses from 70 m than from 10 m."""
 
     def share(distance):
         wall = box((0, 0, 10), (0.2, 300, 40), Material.TRIM)
@@ -55,7 +55,7 @@ def test_far_and_dark_surfaces_lose_more_pulses(scene_of):
     assert share(70.0) < 0.75 * share(10.0)
 
 
-def test_retroreflectors_shine(scene_of):
+def test_retroreflectors_have_high_intensity(scene_of):
     """A plate of retroreflector returns more intensity than rubber."""
     plates = [box((0, 0, 1), (0.1, 3, 2), kind) for kind in (Material.RETROREFLECTOR, 5)]
     points = points_of(scene_of((plates[0], 12.0, 3.0, 0.0), (plates[1], 12.0, -3.0, 0.0)))
@@ -76,8 +76,8 @@ def test_the_sparse_cast_agrees_with_a_ray_per_pixel(rig):
     np.testing.assert_allclose(sparse.distance[hit], full.distance[hit], rtol=0.02)
 
 
-def test_pixels_show_what_projects_into_them(scene_of, rig):
-    """The middle of a car's side, projected by the calibration, is a car's pixel and only there."""
+def test_pixels_agree_with_the_projection(scene_of, rig):
+    """The middle of a car's side, projected by the calibration, is a pixel of the car."""
     scene = scene_of(("Car", 15.0, 3.0, 0.3))
     view = render(scene, Caster(scene.vertices, scene.triangles), rig, np.random.default_rng(0))
     middle = np.array([[15.0, 3.0, -SENSOR_HEIGHT_M + 0.6]])
@@ -92,7 +92,7 @@ def test_pixels_show_what_projects_into_them(scene_of, rig):
     assert (view.instances[view.semantic == 1] == 1).all()
 
 
-def test_light_and_grain_differ_between_frames(scene_of, rig):
+def test_light_and_noise_differ_between_frames(scene_of, rig):
     """The same scene under another generator has another brightness and noise."""
     scene = scene_of(("Car", 15.0, 3.0, 0.3))
     caster = Caster(scene.vertices, scene.triangles)

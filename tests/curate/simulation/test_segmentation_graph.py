@@ -1,4 +1,4 @@
-"""The segmentation network's ONNX graph answers what the network answers."""
+"""The segmentation network's ONNX graph agrees with the network."""
 
 import numpy as np
 import onnxruntime
@@ -9,7 +9,7 @@ from curate.simulation.segmentation_graph import build_graph
 
 
 def lively() -> SegmentationNet:
-    """A network whose batch norms are far from their first values."""
+    """Return a network with batch norms far from their initial values."""
     generator = torch.Generator().manual_seed(0)
     net = SegmentationNet().eval()
     with torch.no_grad():
@@ -26,8 +26,8 @@ def lively() -> SegmentationNet:
     return net
 
 
-def test_onnx_runtime_and_torch_name_the_same_classes():
-    """Of an image of odd height and width; only ties may fall the other way."""
+def test_onnx_runtime_and_torch_predict_the_same_classes():
+    """For an image of odd height and width; only ties may differ."""
     net, (width, height) = lively(), (53, 37)
     image = np.random.default_rng(0).integers(0, 255, (1, height, width, 3), dtype=np.uint8)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Tests of the simulated data set on disk: determinism, resuming, refusals."""
+"""The simulated dataset on disk: determinism, resuming, rejections."""
 
 import os
 import signal
@@ -21,7 +21,7 @@ FOLDERS = {"velodyne", "image_2", "semantic_2", "calib", "label_2"}
 
 
 def contents(root, frames):
-    """The bytes of every file of some frames."""
+    """Return the bytes of every file of some frames."""
     return {
         path.relative_to(root): path.read_bytes()
         for number in frames
@@ -30,7 +30,7 @@ def contents(root, frames):
 
 
 def test_the_kitti_reader_reads_it(simulated):
-    """Frames, splits, points, image and labels, as of any KITTI folder."""
+    """Frames, splits, points, image and labels, like any KITTI folder."""
     dataset = KittiDataset(simulated)
     names = tuple(f"{number:06d}" for number in range(FRAMES))
     assert dataset.frame_ids() == names
@@ -42,8 +42,8 @@ def test_the_kitti_reader_reads_it(simulated):
     assert len(dataset.annotations("000003")) > 0
 
 
-def test_calibration_is_in_kittis_form_and_differs_between_frames(simulated):
-    """R0_rect is a rotation and no identity, and no two frames share a rig."""
+def test_calibration_has_kittis_form_and_differs_between_frames(simulated):
+    """R0_rect is a rotation and not the identity, and every frame has its own rig."""
     rigs = [CameraRig.draw(np.random.default_rng([SEED, number, 2])) for number in range(2)]
     for number, rig in enumerate(rigs):
         found = read_calibration(simulated / "training" / "calib" / f"{number:06d}.txt")
@@ -57,22 +57,22 @@ def test_calibration_is_in_kittis_form_and_differs_between_frames(simulated):
 
 
 def test_workers_and_the_number_of_frames_change_nothing(simulated, tmp_path):
-    """Frame i is the same bytes, made by two processes in a data set of three frames."""
+    """Frame i has the same bytes, simulated by two processes in a dataset of three frames."""
     simulate(tmp_path / "other", 3, SEED, workers=2)
     expected = contents(simulated, range(3))
     assert len(expected) == 3 * len(FOLDERS)
     assert contents(tmp_path / "other", range(3)) == expected
 
 
-def test_another_seed_gives_another_world(simulated, tmp_path):
-    """No file of a frame is the same under another seed."""
+def test_another_seed_gives_other_files(simulated, tmp_path):
+    """No file of a frame is the same."""
     simulate(tmp_path / "other", 1, SEED + 1, workers=1)
     ours, theirs = contents(tmp_path / "other", [0]), contents(simulated, [0])
     assert all(ours[name] != theirs[name] for name in theirs)
 
 
-def test_a_killed_simulation_goes_on(simulated, tmp_path):
-    """After SIGKILL no worker stays, whole frames are kept, and the rest comes out the same."""
+def test_a_killed_simulation_resumes(simulated, tmp_path):
+    """After SIGKILL no worker stays, complete frames are kept, and the rest is the same."""
     root = tmp_path / "killed"
     code = f"""
 from pathlib import Path
@@ -99,8 +99,8 @@ simulate(Path({str(root)!r}), {FRAMES}, {SEED}, workers=2)
     assert not list(root.rglob("*.partial"))
 
 
-def test_a_script_without_main_guard_is_told_so(tmp_path):
-    """In the last line, without a page from every worker; nothing hangs."""
+def test_a_script_without_main_guard_is_reported(tmp_path):
+    """In the last line, without a traceback from every worker; nothing hangs."""
     script = tmp_path / "script.py"
     script.write_text(
         "from pathlib import Path\nfrom curate.simulation import simulate\n"
@@ -115,8 +115,8 @@ def test_a_script_without_main_guard_is_told_so(tmp_path):
     assert ended.stderr.count("Traceback") == 1
 
 
-def test_a_frame_that_lost_a_file_is_made_again(simulated, tmp_path):
-    """A label without its image is no whole frame."""
+def test_a_frame_with_a_missing_file_is_simulated_again(simulated, tmp_path):
+    """A label without its image is not a complete frame."""
     simulate(tmp_path / "data", 1, SEED, workers=1)
     (tmp_path / "data" / "training" / "image_2" / "000000.png").unlink()
     simulate(tmp_path / "data", 1, SEED, workers=1)
@@ -124,8 +124,8 @@ def test_a_frame_that_lost_a_file_is_made_again(simulated, tmp_path):
 
 
 @pytest.mark.parametrize("change", [{"seed": SEED + 1}, {"frames": FRAMES + 1}, {"val_frames": 1}])
-def test_a_directory_of_another_simulation_is_refused(simulated, change):
-    """One line that names both settings, and nothing is written."""
+def test_a_directory_of_another_simulation_is_rejected(simulated, change):
+    """The one-line error contains both settings, and nothing is written."""
     settings = {"frames": FRAMES, "seed": SEED} | change
     with pytest.raises(ConfigError, match=f"seed={SEED}") as caught:
         simulate(simulated, **settings, workers=1)
@@ -133,15 +133,15 @@ def test_a_directory_of_another_simulation_is_refused(simulated, change):
     assert len(KittiDataset(simulated).frame_ids()) == FRAMES
 
 
-def test_foreign_data_is_never_written_over(tmp_path):
-    """A folder with training/ but no simulation.json belongs to someone else."""
+def test_other_datasets_are_never_overwritten(tmp_path):
+    """A folder with training/ but without simulation.json is not a simulation."""
     (tmp_path / "training").mkdir()
     with pytest.raises(DataError, match="was not simulated"):
         simulate(tmp_path, 1, 0, workers=1)
 
 
-def test_a_place_that_cannot_be_written_is_reported(tmp_path):
-    """One line that names the directory."""
+def test_a_directory_that_cannot_be_written_is_reported(tmp_path):
+    """In one line."""
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="file: cannot be written"):
         simulate(tmp_path / "file", 1, 0, workers=1)
@@ -149,7 +149,7 @@ def test_a_place_that_cannot_be_written_is_reported(tmp_path):
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"seed": 1}'])
 def test_a_damaged_settings_file_is_reported(tmp_path, text):
-    """One line that names the file."""
+    """In one line."""
     (tmp_path / "simulation.json").write_text(text)
     with pytest.raises(DataError, match=r"simulation\.json: damaged"):
         simulate(tmp_path, 1, 0, workers=1)
@@ -164,7 +164,7 @@ def test_a_damaged_settings_file_is_reported(tmp_path, text):
         ({"workers": 0}, "workers must be"),
     ],
 )
-def test_numbers_out_of_range_are_refused(tmp_path, arguments, message):
+def test_numbers_out_of_range_are_rejected(tmp_path, arguments, message):
     """Before anything is written."""
     with pytest.raises(ConfigError, match=message):
         simulate(tmp_path / "data", **({"frames": 4, "seed": 0, "workers": 1} | arguments))
@@ -172,7 +172,7 @@ def test_numbers_out_of_range_are_refused(tmp_path, arguments, message):
 
 
 def wait_until(happened, seconds=600):
-    """Polls until something happened; fails the test if it does not."""
+    """Poll until a condition holds; fail the test if it does not."""
     end = time.monotonic() + seconds
     while not happened():
         assert time.monotonic() < end
@@ -180,7 +180,7 @@ def wait_until(happened, seconds=600):
 
 
 def is_running(pid):
-    """Whether a process exists and is no zombie."""
+    """Return whether a process exists and is not a zombie."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:

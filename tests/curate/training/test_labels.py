@@ -14,14 +14,14 @@ from curate.training.labels import WeightedLabels
 
 
 def change(path, statement):
-    """Changes a label file behind the writer's back."""
+    """Change a label file directly."""
     with closing(sqlite3.connect(path)) as connection:
         connection.execute(statement)
         connection.commit()
 
 
 def test_labeled_and_unlabeled_samples(make_labels):
-    """Ground truth weighs 1, pseudo-labels weigh what the file says, splits are told apart."""
+    """Ground truth has weight 1, pseudo-labels the weight of the file, and the split is known."""
     labels = WeightedLabels(make_labels(labeled=2, unlabeled=1, weight=0.25))
     assert isinstance(labels, torch.utils.data.Dataset)
     assert len(labels) == 3
@@ -34,8 +34,8 @@ def test_labeled_and_unlabeled_samples(make_labels):
     assert labels[0].points.dtype == np.float32
 
 
-def test_a_torch_loader_takes_the_labels(make_labels):
-    """The reader serves a user's own training loop."""
+def test_a_torch_loader_accepts_the_labels(make_labels):
+    """The reader works in a user's own training loop."""
     labels = WeightedLabels(make_labels(labeled=2))
     loader = torch.utils.data.DataLoader(labels, batch_size=2, collate_fn=list)
     assert [sample.frame_id for batch in loader for sample in batch] == ["000000", "000001"]
@@ -50,13 +50,13 @@ def test_only_points_in_the_camera_view_are_kept(make_labels):
 
 
 def test_weight_zero_is_marked_as_ignored(make_labels):
-    """A label of weight 0 is there, marked as a region to leave out where the file says so."""
+    """If the file says so, a label of weight 0 is a region to leave out."""
     sample = WeightedLabels(make_labels(labeled=1, unlabeled=1, weight=0.0))[1]
     assert sample.ignored.all()
     assert len(sample.boxes) == 3
 
 
-def test_weight_zero_is_not_ignored_where_it_is_background(make_labels):
+def test_weight_zero_is_not_ignored_if_it_is_background(make_labels):
     """It is there with its weight; its region is not left out."""
     path = make_labels(labeled=1, unlabeled=1, weight=0.0, zero_weight="background")
     sample = WeightedLabels(path)[1]
@@ -64,22 +64,22 @@ def test_weight_zero_is_not_ignored_where_it_is_background(make_labels):
     assert sample.weights.tolist() == [0.0, 0.0, 0.0]
 
 
-def test_what_a_person_rejected_is_background_under_every_policy(make_labels):
-    """No region is ignored for it, even where the policy's own doubt is."""
+def test_labels_rejected_by_a_person_are_background_under_every_policy(make_labels):
+    """Even if uncertain labels of the policy are ignored."""
     path = make_labels(labeled=1, unlabeled=1, weight=0.0, provenance="human")
     assert WeightedLabels(path)[1].boxes.shape == (0, 7)
 
 
-def test_another_meaning_of_weight_zero_is_refused(make_labels):
-    """A file that somebody has changed."""
+def test_another_meaning_of_weight_zero_is_rejected(make_labels):
+    """A file that was changed by hand."""
     path = make_labels(labeled=1)
     change(path, "UPDATE meta SET value = 'perhaps' WHERE key = 'zero_weight'")
     with pytest.raises(DataError, match=r"meta\.zero_weight is 'perhaps', expected background or"):
         WeightedLabels(path)
 
 
-def test_neighbour_categories_are_ignored_and_strangers_left_out(make_labels):
-    """A Van is neither Car nor background, a Tram is nothing to a detector of cars."""
+def test_neighbour_categories_are_ignored_and_others_left_out(make_labels):
+    """A Van is neither Car nor background, a Tram is left out for a detector of cars."""
     path = make_labels(labeled=1, categories=("Car",))
     change(path, "UPDATE ground_truth SET category = 'Van' WHERE category = 'Pedestrian'")
     sample = WeightedLabels(path)[0]
@@ -88,7 +88,7 @@ def test_neighbour_categories_are_ignored_and_strangers_left_out(make_labels):
 
 
 def test_a_labeled_frame_without_objects_is_a_sample_too(make_labels):
-    """It teaches what background looks like."""
+    """It is all background."""
     path = make_labels(labeled=2)
     change(path, "DELETE FROM ground_truth WHERE frame = '000001'")
     sample = WeightedLabels(path)[1]
@@ -98,8 +98,8 @@ def test_a_labeled_frame_without_objects_is_a_sample_too(make_labels):
     assert len(sample.points) > 0
 
 
-def test_a_reader_of_the_callers_own(make_labels, toy_kitti):
-    """Frames of any data set can be served by a function."""
+def test_a_user_supplied_reader(make_labels, toy_kitti):
+    """Frames of any dataset can be read by a function."""
     path = make_labels(labeled=1)
     reference = KittiDataset(toy_kitti).read("000000")
 
@@ -109,8 +109,8 @@ def test_a_reader_of_the_callers_own(make_labels, toy_kitti):
     assert len(WeightedLabels(path, read=read)[0].points) <= 50
 
 
-def test_the_data_set_may_have_moved(make_labels, toy_kitti, tmp_path):
-    """A root given by the caller counts instead of the one in the file."""
+def test_the_dataset_can_have_moved(make_labels, toy_kitti, tmp_path):
+    """A root given by the caller replaces the one in the file."""
     path = make_labels(labeled=1)
     toy_kitti.rename(tmp_path / "moved")
     with pytest.raises(DataError, match="kitti"):
@@ -118,16 +118,16 @@ def test_the_data_set_may_have_moved(make_labels, toy_kitti, tmp_path):
     assert len(WeightedLabels(path, root=tmp_path / "moved")[0].points)
 
 
-def test_smuggled_ground_truth_is_refused(make_labels):
-    """A file whose ground truth reaches an unlabeled frame is not read, and the frame is named."""
+def test_ground_truth_of_unlabeled_frames_is_rejected(make_labels):
+    """The error contains the frame, and the file is not read."""
     path = make_labels(labeled=1, unlabeled=1)
     change(path, "UPDATE ground_truth SET frame = '000001' WHERE k = 0")
     with pytest.raises(LeakageError, match="000001"):
         WeightedLabels(path)
 
 
-def test_files_that_are_no_label_files(tmp_path, make_labels):
-    """Missing, not SQLite, without the tables, of another version: one line that says so."""
+def test_files_that_are_not_label_files(tmp_path, make_labels):
+    """Missing, not SQLite, without the tables, of another version: a one-line error."""
     with pytest.raises(DataError, match=r"none\.sqlite: no such label file"):
         WeightedLabels(tmp_path / "none.sqlite")
     (tmp_path / "text.sqlite").write_text("round,frame,weight\n" * 100)
@@ -143,7 +143,7 @@ def test_files_that_are_no_label_files(tmp_path, make_labels):
 
 
 def test_a_batch_concatenates_frames(make_labels):
-    """Points and boxes know their frame, categories are numbers, weights are beside them."""
+    """Points and boxes have their frame index, categories are numbers, weights are an array."""
     labels = WeightedLabels(make_labels(labeled=1, unlabeled=1, weight=0.25))
     loader = torch.utils.data.DataLoader(labels, batch_size=2, collate_fn=labels.collate)
     [batch] = loader
@@ -162,8 +162,8 @@ def test_a_batch_concatenates_frames(make_labels):
 
 
 @pytest.mark.parametrize(("zero_weight", "boxes"), [("background", 0), ("ignore", 3)])
-def test_a_weight_of_zero_in_a_batch_means_ignore(make_labels, zero_weight, boxes):
-    """Background is left out, as all that no box covers."""
+def test_weight_zero_in_a_batch_means_ignore(make_labels, zero_weight, boxes):
+    """Background labels are left out, like everything without a box."""
     path = make_labels(labeled=1, unlabeled=1, weight=0.0, zero_weight=zero_weight)
     labels = WeightedLabels(path)
     batch = labels.collate([labels[1]])
@@ -171,8 +171,8 @@ def test_a_weight_of_zero_in_a_batch_means_ignore(make_labels, zero_weight, boxe
     assert batch.weights.tolist() == [0.0] * boxes
 
 
-def test_a_batch_may_hold_no_boxes(make_labels):
-    """Frames without objects teach background."""
+def test_a_batch_can_have_no_boxes(make_labels):
+    """Frames without objects are background."""
     path = make_labels(labeled=1)
     change(path, "DELETE FROM ground_truth")
     labels = WeightedLabels(str(path))

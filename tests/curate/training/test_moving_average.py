@@ -10,7 +10,7 @@ from curate.training.moving_average import MovingAverage, step_decay
 
 
 def filled(value):
-    """A network all of whose weights and statistics are one number."""
+    """Return a network with one number for all weights and statistics."""
     network = PillarNetwork(PRESETS["small"], 1)
     with torch.no_grad():
         for tensor in network.state_dict().values():
@@ -19,7 +19,7 @@ def filled(value):
 
 
 def values(network):
-    """The distinct numbers in the network's floats, and in its counters."""
+    """Return the distinct numbers in the network's floats, and in its counters."""
     state = network.state_dict().values()
     floats = [tensor.flatten() for tensor in state if tensor.is_floating_point()]
     counters = [tensor.flatten() for tensor in state if not tensor.is_floating_point()]
@@ -38,14 +38,13 @@ def test_it_starts_at_the_student_and_follows_it():
 
 
 def test_a_decay_of_0_is_the_student():
-    """Nothing of the past is kept."""
     average = MovingAverage(filled(8.0), 0.0, steps=100)
     average.follow(filled(1.0))
     assert values(average.network)[0].tolist() == [1.0]
 
 
-def test_the_student_is_left_alone():
-    """The average is a copy and learns nothing itself."""
+def test_the_student_is_not_modified():
+    """The average is a copy without gradients."""
     student = filled(8.0)
     average = MovingAverage(student, 0.5, steps=10_000)
     average.follow(filled(0.0))
@@ -54,7 +53,7 @@ def test_the_student_is_left_alone():
 
 
 @pytest.mark.parametrize("steps", [10, 1200, 10_000, 200_000])
-def test_the_average_looks_back_over_the_same_share_of_any_training(steps):
-    """After a tenth of the steps 0.999 ** 1000 of what was there is left: 37 %."""
+def test_the_average_covers_the_same_share_of_any_training(steps):
+    """After a tenth of the steps 0.999 ** 1000 of the earlier value is left: 37 %."""
     assert step_decay(0.999, steps) ** (steps / 10) == pytest.approx(0.999**1000)
     assert step_decay(0.999, 10_000) == pytest.approx(0.999)

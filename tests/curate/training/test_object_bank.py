@@ -1,4 +1,4 @@
-"""Cut-and-paste: where the bank comes from, and what a paste leaves behind."""
+"""Cut-and-paste augmentation: the object bank, and the frame after a paste."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from curate.training.object_bank import ObjectBank, paste_objects
 
 
 def wall(distance, half_width=30.0):
-    """Points of a wall across the view, from the ground to 2 m above the sensor."""
+    """Return points of a wall across the view, from the ground to 2 m above the sensor."""
     y, z = np.meshgrid(np.arange(-half_width, half_width, 0.1), np.arange(-1.7, 2, 0.1))
     points = np.stack([np.full(y.size, distance), y.ravel(), z.ravel(), np.zeros(y.size)], axis=1)
     inside_view = np.abs(points[:, 1]) < 0.8 * points[:, 0]
@@ -24,20 +24,20 @@ def wall(distance, half_width=30.0):
 
 
 def sample_of(points, boxes=(), name="000000", **changes):
-    """A labeled sample of cars with weight 1."""
+    """Return a labeled sample of cars with weight 1."""
     boxes = np.array(boxes, dtype=float).reshape(-1, 7)
     n = len(boxes)
     base = Sample(name, True, points, boxes, np.array(["Car"] * n, dtype=np.str_), np.ones(n))
     return replace(base, **changes)
 
 
-# A little slack for points on a side.
+# A small margin for points on a side.
 GROWTH = np.array([0, 0, 0, 0.01, 0.01, 0.01, 0])
 CAR = [15.0, 3.0, -0.9, 4.0, 1.6, 1.5, 0.4]
 
 
 def car_points(count=60, seed=0):
-    """Points inside CAR."""
+    """Return points inside CAR."""
     rng = np.random.default_rng(seed)
     local = rng.uniform(-0.49, 0.49, (count, 3)) * CAR[3:6]
     cos, sin = np.cos(CAR[6]), np.sin(CAR[6])
@@ -47,12 +47,12 @@ def car_points(count=60, seed=0):
 
 @pytest.fixture
 def bank():
-    """One car of 60 points."""
+    """Return a bank with one car of 60 points."""
     return ObjectBank.build([sample_of(car_points(), [CAR])], ("Car", "Tram"))
 
 
-def test_the_bank_holds_objects_with_their_points(bank):
-    """Box and points of each object are cut out as they were seen."""
+def test_the_bank_contains_objects_with_their_points(bank):
+    """Box and points of each object are cut out unchanged."""
     (car,) = bank.objects["Car"]
     assert car.box.tolist() == CAR
     assert len(car.points) == 60
@@ -60,26 +60,26 @@ def test_the_bank_holds_objects_with_their_points(bank):
 
 
 def test_objects_with_few_points_or_weight_zero_are_left_out():
-    """What can hardly be seen, or is not sure to be an object, is no example."""
+    """Barely visible or uncertain objects are not examples."""
     few = sample_of(car_points(4), [CAR])
     ignored = sample_of(car_points(), [CAR], weights=np.zeros(1))
     assert ObjectBank.build([few, ignored], ("Car",), 5).objects["Car"] == ()
 
 
 def test_an_unlabeled_frame_in_the_bank_is_a_leak():
-    """Pseudo-labels never become examples; the frame is named."""
+    """Pseudo-labels never become examples; the error contains the frame."""
     with pytest.raises(LeakageError, match="000077"):
         ObjectBank.build([sample_of(car_points(), [CAR], "000077", labeled=False)], ("Car",))
 
 
 def paste(sample, bank, count=3, seeds=range(12)):
-    """The results of several pastes that added something."""
+    """Return the results of several pastes that added something."""
     results = [paste_objects(sample, bank, count, np.random.default_rng(seed)) for seed in seeds]
     return [result for result in results if len(result.boxes) > len(sample.boxes)]
 
 
 def test_a_pasted_object_keeps_its_points_and_its_distance(bank):
-    """It comes with weight 1 and all its points, as far from the sensor as it was."""
+    """It has weight 1 and all its points, at the same distance from the sensor."""
     results = paste(sample_of(wall(40)), bank)
     assert results
     for result in results:
@@ -92,8 +92,8 @@ def test_a_pasted_object_keeps_its_points_and_its_distance(bank):
         assert count_points_in_boxes(result.points, grown[None])[0] == 60
 
 
-def test_a_pasted_object_hides_what_lies_behind_it(bank):
-    """The wall has a hole in the object's shadow and is untouched beside it."""
+def test_a_pasted_object_hides_points_behind_it(bank):
+    """The wall has a hole in the object's shadow and is unchanged beside it."""
     scene = wall(40)
     for result in paste(sample_of(scene), bank):
         box = result.boxes[0]
@@ -111,7 +111,7 @@ def test_a_pasted_object_hides_what_lies_behind_it(bank):
 
 
 def test_nothing_is_pasted_behind_a_wall(bank):
-    """A place that the sensor could not see stays empty."""
+    """The sensor could not see that position."""
     assert paste(sample_of(wall(8)), bank) == []
 
 
@@ -128,8 +128,8 @@ def test_nothing_is_pasted_onto_a_box_or_onto_another_pasted_object(bank):
         assert overlap.max() == 0
 
 
-def test_nothing_is_pasted_into_what_stands_there(bank):
-    """A thicket of posts that no box tells of leaves no place; its stumps on the ground do."""
+def test_nothing_is_pasted_onto_unlabeled_obstacles(bank):
+    """Dense posts without a box leave no free position; low stumps do."""
     x, y = np.meshgrid(np.arange(5, 40, 0.7), np.arange(-30, 30, 0.7))
     for top, possible in ((CAR[2], False), (CAR[2] - CAR[5] / 2 + 0.2, True)):
         posts = np.stack([x, y, np.full(x.shape, top), np.zeros(x.shape)], axis=-1)
@@ -142,7 +142,7 @@ def test_nothing_is_pasted_into_what_stands_there(bank):
 
 @st.composite
 def streets(draw):
-    """A narrow view of bare ground, some posts, and boxes of any weight."""
+    """Draw a narrow view of bare ground, some posts, and boxes of any weight."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     bottom = CAR[2] - CAR[5] / 2
     ground = np.column_stack([rng.uniform(4, 45, 3000), rng.uniform(-12, 12, 3000)])
@@ -162,7 +162,7 @@ def streets(draw):
 
 
 def bank_of_three():
-    """A near car, a far one and a farther one, so that one can hide another."""
+    """Return a near car, a far one and a farther one, so that one can hide another."""
     samples = []
     for distance in (9.0, 18.0, 27.0):
         box, points = list(CAR), car_points(120)
@@ -174,8 +174,8 @@ def bank_of_three():
 
 @settings(max_examples=60)
 @given(streets())
-def test_what_a_paste_may_and_may_not_do(street):
-    """No overlap with any box, nothing but ground in the place, nothing seen through an object."""
+def test_the_invariants_of_a_paste(street):
+    """No overlap with any box, only ground at the position, nothing visible through an object."""
     sample, seed = street
     result = paste_objects(sample, bank_of_three(), 3, np.random.default_rng(seed))
     old, new = result.boxes[: len(sample.boxes)], result.boxes[len(sample.boxes) :]
@@ -204,7 +204,7 @@ def test_what_a_paste_may_and_may_not_do(street):
 
 
 def test_one_pasted_object_hides_another():
-    """In a view just wide enough for one car some paste puts one behind another, unseen."""
+    """In a view just wide enough for one car, some paste puts one hidden behind another."""
     ground = wall(60, half_width=60.0)
     narrow = ground[np.abs(ground[:, 1]) < 0.3 * ground[:, 0]]
     hidden = 0
@@ -214,8 +214,8 @@ def test_one_pasted_object_hides_another():
     assert hidden > 0
 
 
-def test_a_place_of_weight_zero_is_taken_even_where_it_counts_as_background(bank):
-    """The ignored label is no target, and yet nothing is pasted onto it."""
+def test_nothing_is_pasted_onto_a_label_of_weight_zero(bank):
+    """Even if it counts as background and is not a target."""
     standing = [[15.0, y, -0.9, 4.0, 4.0, 1.5, 0.0] for y in np.arange(-9, 10, 4.5)]
     sample = sample_of(wall(40), standing, labeled=False, weights=np.zeros(5))
     for zero, boxes in (("ignore", 5), ("background", 0)):
@@ -230,7 +230,7 @@ def test_a_place_of_weight_zero_is_taken_even_where_it_counts_as_background(bank
 
 
 def test_a_pasted_object_stands_on_the_ground(bank):
-    """On a field that lies half a metre higher the object is lifted with its points."""
+    """On ground half a metre higher the object is lifted with its points."""
     x, y = np.meshgrid(np.arange(5, 40, 0.5), np.arange(-30, 30, 0.5))
     bottom = CAR[2] - CAR[5] / 2
     field = np.stack([x, y, np.full(x.shape, bottom + 0.5), np.zeros(x.shape)], axis=-1)
@@ -243,7 +243,7 @@ def test_a_pasted_object_stands_on_the_ground(bank):
 
 
 def test_nothing_is_pasted_onto_a_roof(bank):
-    """Where the lowest points are metres above the ground there is no place to stand."""
+    """If the lowest points are metres above the ground, the position is not used."""
     roof = wall(40)
     roof[:, 0] = np.random.default_rng(0).uniform(8, 40, len(roof))
     roof[:, 2] = 3.0
@@ -251,13 +251,12 @@ def test_nothing_is_pasted_onto_a_roof(bank):
 
 
 def test_pasting_stays_in_view(bank):
-    """An object that would stick out of the view's sides is not placed."""
+    """An object that would extend beyond the view is not placed."""
     for result in paste(sample_of(wall(40, half_width=8.0)), bank, seeds=range(40)):
         assert np.abs(result.points[:, 1] / result.points[:, 0]).max() < 8.1 / 40
 
 
-def test_pasting_is_repeatable_and_leaves_the_sample_alone(bank):
-    """The same generator gives the same result; the given sample is not changed."""
+def test_pasting_is_reproducible_and_does_not_change_the_sample(bank):
     sample = sample_of(wall(40))
     before = sample.points.copy()
     first, second = (paste_objects(sample, bank, 2, np.random.default_rng(3)) for _ in range(2))
@@ -265,8 +264,8 @@ def test_pasting_is_repeatable_and_leaves_the_sample_alone(bank):
     np.testing.assert_array_equal(sample.points, before)
 
 
-def test_no_points_no_paste(bank):
-    """An empty frame, or a count of 0, is given back as it is."""
+def test_without_points_nothing_is_pasted(bank):
+    """An empty frame, or a count of 0, is returned unchanged."""
     empty = sample_of(np.zeros((0, 4), dtype=np.float32))
     assert paste_objects(empty, bank, 3, np.random.default_rng(0)) is empty
     full = sample_of(wall(40))
@@ -284,8 +283,8 @@ def test_augmentation_moves_points_and_boxes_together(bank):
         assert (changed.weights == 1).all()
 
 
-def test_what_is_not_seen_is_ignored(bank):
-    """An object with too few points is neither taught nor background."""
+def test_objects_with_too_few_points_are_ignored(bank):
+    """They are neither targets nor background."""
     augmentation = Augmentation(0.0, 0.0, (1.0, 1.0), pasted=0, fewest_points=5)
     sample = sample_of(np.concatenate([wall(40), car_points(4)]), [CAR])
     assert augmentation.apply(sample, bank, np.random.default_rng(0)).weights.tolist() == [0.0]

@@ -1,4 +1,4 @@
-"""Training: it learns, it goes on after a kill, and it refuses what it cannot use."""
+"""Training: it learns, resumes after a kill, and rejects invalid input."""
 
 import logging
 import pickle
@@ -24,29 +24,29 @@ from curate.training.trainer import train as train_detector
 
 
 def quick(tiny, **changes):
-    """Settings of a training of a second or so."""
+    """Return settings of a training of about a second."""
     settings = {"preset": tiny, "steps": 6, "batch_size": 2, "pasted": 1, "snapshot_seconds": 0.0}
     return TrainingSettings(**(settings | changes))
 
 
 def train(labels, output, settings, **options):
-    """Trains the pillar detector."""
+    """Train the pillar detector."""
     return train_detector(PillarDetector, labels, output, settings, **options)
 
 
 def encoded(labels, settings, step=0):
-    """The batch of a step as the pillar detector takes it."""
+    """Return the batch of a step as the pillar detector encodes it."""
     student = PillarDetector.new_student(settings.preset, labels.categories)
     return student.encode(Batches(labels, settings)[step], "cpu")
 
 
 def weights_of(path):
-    """All tensors of a checkpoint."""
+    """Return all tensors of a checkpoint."""
     return load_checkpoint(path).weights
 
 
 def assert_same_weights(path_a, path_b):
-    """Two checkpoints are equal to the last bit."""
+    """Check that two checkpoints are equal to the last bit."""
     a, b = weights_of(path_a), weights_of(path_b)
     assert a.keys() == b.keys()
     for name in a:
@@ -54,7 +54,7 @@ def assert_same_weights(path_a, path_b):
 
 
 def test_a_training_learns_its_frames(make_labels, tiny, toy_kitti, tmp_path):
-    """After a few seconds every object of two labeled frames is found where it is."""
+    """After a few seconds every object of two labeled frames is detected."""
     path = tmp_path / "teacher.safetensors"
     settings = quick(
         tiny, steps=120, learning_rate=1e-2, pasted=0, flip_probability=0.0,
@@ -75,7 +75,7 @@ def test_a_training_learns_its_frames(make_labels, tiny, toy_kitti, tmp_path):
 
 
 def test_a_labeled_frame_without_objects_is_all_background(make_labels, tiny, tmp_path):
-    """It takes its turns in the batches, and every cell of it says that there is no object."""
+    """It is used in the batches, and every cell of it is background."""
     labels, settings = make_labels(labeled=2), quick(tiny, pasted=0)
     with closing(sqlite3.connect(labels)) as connection:
         connection.execute("DELETE FROM ground_truth WHERE frame = '000001'")
@@ -88,8 +88,8 @@ def test_a_labeled_frame_without_objects_is_all_background(make_labels, tiny, tm
     assert train(labels, tmp_path / "out.safetensors", settings).labeled_frames == 2
 
 
-def test_statistics_describe_every_few_steps_and_the_last(make_labels, tiny, tmp_path):
-    """The loss is the sum of its terms, and a killed training keeps what it had noted."""
+def test_statistics_are_recorded_every_few_steps_and_at_the_end(make_labels, tiny, tmp_path):
+    """The loss is the sum of its terms, and a killed training keeps its records."""
     labels, settings = make_labels(labeled=2), quick(tiny, statistics_steps=4)
     whole = train(labels, tmp_path / "whole.safetensors", settings)
     by_step = {}
@@ -110,7 +110,7 @@ def test_statistics_describe_every_few_steps_and_the_last(make_labels, tiny, tmp
 
 @pytest.mark.parametrize("teacher", ["student", "ema"])
 def test_a_killed_training_ends_with_the_same_weights(make_labels, tiny, tmp_path, teacher):
-    """Killed after step 4 and called again, it goes on there and ends as if nothing happened."""
+    """Killed after step 4 and called again, it resumes there."""
     labels, settings = make_labels(labeled=3, unlabeled=2), quick(tiny, teacher=teacher)
     whole, killed = tmp_path / "whole.safetensors", tmp_path / "killed.safetensors"
     whole_report = train(labels, whole, settings)
@@ -126,7 +126,7 @@ def test_a_killed_training_ends_with_the_same_weights(make_labels, tiny, tmp_pat
 
 @pytest.mark.parametrize("change", ["settings", "labels", "start", "damage", "pickle"])
 def test_a_snapshot_of_another_training_is_not_used(make_labels, tiny, tmp_path, change):
-    """With other settings, labels or start, or a damaged snapshot, a training begins anew."""
+    """With other settings, labels or start, or a damaged snapshot, a training starts anew."""
     labels, output = make_labels(labeled=2), tmp_path / "out.safetensors"
     settings, start = quick(tiny), None
     train(labels, tmp_path / "start.safetensors", quick(tiny, steps=1))
@@ -145,8 +145,8 @@ def test_a_snapshot_of_another_training_is_not_used(make_labels, tiny, tmp_path,
     assert train(labels, output, settings, start=start).resumed_at == 0
 
 
-def test_fine_tuning_begins_with_the_teacher(make_labels, tiny, tmp_path):
-    """With a vanishing rate the student is the teacher, up to the running means of its norms."""
+def test_fine_tuning_starts_from_the_teacher(make_labels, tiny, tmp_path):
+    """At a tiny learning rate the student is the teacher, up to the running means of its norms."""
     labels, teacher = make_labels(labeled=2), tmp_path / "teacher.safetensors"
     student = tmp_path / "student.safetensors"
     train(labels, teacher, quick(tiny))
@@ -156,7 +156,7 @@ def test_fine_tuning_begins_with_the_teacher(make_labels, tiny, tmp_path):
             np.testing.assert_allclose(weights_of(student)[name], array, atol=1e-6)
 
 
-def test_the_average_of_the_student_is_what_is_left(make_labels, tiny, tmp_path):
+def test_the_average_of_the_student_is_saved(make_labels, tiny, tmp_path):
     """After one step with half of the start kept: the mean of the start and the plain student."""
     labels = make_labels(labeled=2)
     start, student, average = (tmp_path / f"{name}.safetensors" for name in ("start", "one", "ema"))
@@ -170,8 +170,8 @@ def test_the_average_of_the_student_is_what_is_left(make_labels, tiny, tmp_path)
         np.testing.assert_allclose(array, expected, rtol=1e-4, atol=1e-6)
 
 
-def test_a_start_that_does_not_fit_is_refused(make_labels, tiny, tmp_path):
-    """A teacher of other categories or of another preset is an error of one line."""
+def test_a_start_that_does_not_fit_is_rejected(make_labels, tiny, tmp_path):
+    """A teacher of other categories or of another preset gives a one-line error."""
     teacher = tmp_path / "teacher.safetensors"
     train(make_labels(labeled=2), teacher, quick(tiny, steps=1))
     cars = make_labels(labeled=2, name="cars.sqlite", categories=("Car",))
@@ -184,8 +184,8 @@ def test_a_start_that_does_not_fit_is_refused(make_labels, tiny, tmp_path):
         train(make_labels(), tmp_path / "out.safetensors", quick(tiny), start=teacher)
 
 
-def test_the_result_depends_on_the_seed_only(make_labels, tiny, tmp_path):
-    """Same seed, same weights, whatever torch's global generator holds; another seed, others."""
+def test_the_result_depends_only_on_the_seed(make_labels, tiny, tmp_path):
+    """Same seed, same weights, whatever torch's global generator contains."""
     labels = make_labels(labeled=2)
     paths = [tmp_path / f"{name}.safetensors" for name in "abc"]
     for path, seed in zip(paths, (1, 1, 2), strict=True):
@@ -198,7 +198,7 @@ def test_the_result_depends_on_the_seed_only(make_labels, tiny, tmp_path):
     assert not np.array_equal(weights_of(paths[0])[name], weights_of(paths[2])[name])
 
 
-def test_frames_of_x_u_come_besides_those_of_x_l(make_labels, tiny):
+def test_unlabeled_frames_are_added_to_the_labeled_ones(make_labels, tiny):
     """Each step sees as many labeled frames with an unlabeled split as without one."""
     settings = quick(tiny, batch_size=2, unlabeled_batch_size=3)
     mixed = Batches(WeightedLabels(make_labels(2, 6)), settings)
@@ -212,7 +212,7 @@ def test_frames_of_x_u_come_besides_those_of_x_l(make_labels, tiny):
 
 
 def test_labels_of_weight_zero_can_become_background(make_labels, tiny):
-    """`background` forgets them, `ignore` blanks their regions."""
+    """`background` drops them, `ignore` masks their regions."""
     files = {
         zero: make_labels(
             labeled=1, unlabeled=1, weight=0.0, name=f"{zero}.sqlite", zero_weight=zero
@@ -231,7 +231,7 @@ def test_labels_of_weight_zero_can_become_background(make_labels, tiny):
 
 
 def test_frames_that_do_not_fit_into_memory_are_read_again(make_labels, tiny):
-    """Without room in the cache the batches are the same."""
+    """Without cache the batches are the same."""
     labels = WeightedLabels(make_labels(labeled=3))
     with_room = encoded(labels, quick(tiny), 2)
     without = encoded(labels, quick(tiny, cache_bytes=0), 2)
@@ -239,14 +239,14 @@ def test_frames_that_do_not_fit_into_memory_are_read_again(make_labels, tiny):
     assert torch.equal(with_room.targets.heatmap, without.targets.heatmap)
 
 
-def test_without_labeled_frames_there_is_no_training(make_labels, tiny, tmp_path):
-    """A label file of pseudo-labels alone is refused."""
+def test_training_needs_labeled_frames(make_labels, tiny, tmp_path):
+    """A label file with pseudo-labels only is rejected."""
     with pytest.raises(DataError, match="no labeled frame"):
         train(make_labels(0, 2), tmp_path / "out.safetensors", quick(tiny))
 
 
-def test_a_category_without_ground_truth_is_announced(make_labels, tiny, tmp_path, caplog):
-    """A category that X_l never shows is a warning that names it."""
+def test_a_category_without_ground_truth_gives_a_warning(make_labels, tiny, tmp_path, caplog):
+    """The warning contains the category."""
     labels = make_labels(labeled=1, categories=("Car", "Tram"))
     with caplog.at_level(logging.WARNING):
         train(labels, tmp_path / "out.safetensors", quick(tiny, steps=1))
@@ -254,15 +254,15 @@ def test_a_category_without_ground_truth_is_announced(make_labels, tiny, tmp_pat
 
 
 def test_an_empty_frame_can_be_trained_on(make_labels, tiny, toy_kitti, tmp_path):
-    """A sweep without a single point breaks nothing."""
+    """A sweep without points."""
     labels = make_labels(labeled=1, unlabeled=1)
     (toy_kitti / "training" / "velodyne" / "000001.bin").write_bytes(b"")
     report = train(labels, tmp_path / "out.safetensors", quick(tiny, steps=2))
     assert np.isfinite(report.loss)
 
 
-def test_the_rate_rises_and_falls():
-    """One cycle: a tenth of the peak first, the peak after three tenths, nothing in the end."""
+def test_the_learning_rate_rises_and_falls():
+    """One cycle: a tenth of the peak first, the peak after three tenths, zero at the end."""
     rates = [one_cycle(step, 100, 2.0) for step in range(100)]
     assert rates[0] == pytest.approx(0.2)
     assert max(rates) == rates[30] == pytest.approx(2.0)
@@ -280,19 +280,18 @@ def test_the_rate_rises_and_falls():
         ({"teacher": "perhaps"}, "choose student or ema"),
     ],
 )
-def test_settings_that_no_training_can_use(wrong, message):
-    """A wrong setting is named before anything is read."""
+def test_invalid_settings_are_rejected(wrong, message):
+    """Before anything is read."""
     with pytest.raises(ConfigError, match=message):
         TrainingSettings(**wrong)
 
 
-def test_an_unknown_preset_is_named_before_anything_is_read(tmp_path):
+def test_an_unknown_preset_is_reported_before_anything_is_read(tmp_path):
     """The known presets are listed; the label file does not even exist."""
     with pytest.raises(ConfigError, match="unknown preset 'huge'; choose one of small, kitti"):
         train(tmp_path / "none.sqlite", tmp_path / "out.safetensors", quick("huge"))
 
 
-def test_an_unknown_device_is_named(make_labels, tiny, tmp_path):
-    """A device that is not there is a configuration error."""
+def test_an_unknown_device_is_a_configuration_error(make_labels, tiny, tmp_path):
     with pytest.raises(ConfigError, match="cuda:99"):
         train(make_labels(), tmp_path / "out.safetensors", quick(tiny, device="cuda:99"))

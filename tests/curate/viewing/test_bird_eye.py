@@ -1,4 +1,4 @@
-"""Tests of the bird's eye view."""
+"""The bird's eye view."""
 
 import numpy as np
 import pytest
@@ -12,10 +12,10 @@ from curate.viewing.tags import ShownLabels
 REGION = Region(0, 40, -20, 20, 10)
 
 
-def near(picture, place, colour, reach=2):
-    """Whether a colour is seen close to a place (x, y in metres)."""
+def near(image, place, colour, reach=2):
+    """Return whether a colour appears near a position (x, y in metres)."""
     column, row = np.rint(REGION.to_pixels(np.array(place, dtype=np.float64))).astype(int)
-    around = picture[row - reach : row + reach + 1, column - reach : column + reach + 1]
+    around = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
     return (np.abs(around.astype(int) - colour).max(axis=2) < 40).any()
 
 
@@ -28,17 +28,17 @@ def test_forward_is_up_and_left_is_left():
 
 
 def test_footprints_have_the_colour_of_their_weight():
-    """The outline of a turned box is where its corners are."""
+    """The outline of a rotated box is at its corners."""
     box = [20, 5, 0, 4, 2, 1.5, np.pi / 2]
-    picture = draw_bird_eye(np.zeros((0, 4)), labels([box], [0.6]), region=REGION)
+    image = draw_bird_eye(np.zeros((0, 4)), labels([box], [0.6]), region=REGION)
     colour = weight_colours(np.array([0.6]))[0].astype(int)
     for corner in ((21, 7), (19, 7), (19, 3), (21, 3)):
-        assert near(picture, corner, colour)
-    assert not near(picture, (22, 5), colour)
+        assert near(image, corner, colour)
+    assert not near(image, (22, 5), colour)
 
 
-def test_ground_truth_is_white_and_may_be_unknown():
-    """Regions without a box are left out."""
+def test_ground_truth_is_white_and_can_be_nan():
+    """DontCare regions without a box are left out."""
     truth = np.array([[30.0, 0, 0, 4, 2, 1.5, 0], [np.nan] * 7])
     with_truth = draw_bird_eye(np.zeros((0, 4)), labels([], []), truth, region=REGION)
     without = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
@@ -46,27 +46,27 @@ def test_ground_truth_is_white_and_may_be_unknown():
     assert not near(without, (32, 1), np.array(GROUND_TRUTH))
 
 
-def test_points_are_seen():
-    """Points in the region brighten their place; those outside do no harm."""
+def test_points_are_drawn():
+    """Points in the region brighten their position; those outside are ignored."""
     points = np.array([[15.3, -7.2, 1.0, 0], [500, 500, 0, 0], [-5, 0, 0, 0]])
     empty = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
-    picture = draw_bird_eye(points, labels([], []), region=REGION)
-    rows, columns = np.nonzero((picture != empty).any(axis=2))
+    image = draw_bird_eye(points, labels([], []), region=REGION)
+    rows, columns = np.nonzero((image != empty).any(axis=2))
     place = REGION.to_pixels(points[0, :2])
     assert len(rows) > 0
     assert np.hypot(columns - place[0], rows - place[1]).max() < 3
 
 
-def test_titles_are_written():
-    """The strip above the picture changes with the title."""
+def test_titles_are_drawn():
+    """The strip above the plot changes with the title."""
     plain = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
     titled = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION, title="frame 000008")
     assert (plain[:TITLE_HEIGHT] != titled[:TITLE_HEIGHT]).any()
     assert (plain[TITLE_HEIGHT:] == titled[TITLE_HEIGHT:]).all()
 
 
-def test_the_region_grows_to_where_labels_are():
-    """Behind the LiDAR, far ahead, and at the sides; without need it is the usual one."""
+def test_the_region_grows_to_contain_all_labels():
+    """Behind the LiDAR, far ahead, and at the sides; otherwise it is the default."""
     usual = Region()
     ahead = np.array([[30.0, 5, 0, 4, 2, 1.5, 0]])
     width = usual.size[0]
@@ -87,27 +87,27 @@ def test_labels_behind_the_vehicle_are_drawn():
     """In the colour of their weight, with their points."""
     shown = labels([[-12.0, 3, 0, 4, 2, 1.5, 0]], [0.6])
     points = np.array([[-11.0, 8.0, 1.0, 0]])
-    picture = draw_bird_eye(points, shown)
+    image = draw_bird_eye(points, shown)
     region = region_around([shown.boxes], Region().size[0])
     colour = weight_colours(np.array([0.6]))[0].astype(int)
     column, row = np.rint(region.to_pixels(np.array([-14.0, 4.0]))).astype(int)
-    assert (np.abs(picture[row - 2 : row + 3, column - 2 : column + 3].astype(int) - colour)
+    assert (np.abs(image[row - 2 : row + 3, column - 2 : column + 3].astype(int) - colour)
             .max(axis=2) < 40).any()  # fmt: skip
     without = draw_bird_eye(np.zeros((0, 4)), shown)
-    assert (picture != without).any()
+    assert (image != without).any()
 
 
-def test_the_paper_style_has_a_white_ground():
+def test_the_paper_style_has_a_white_background():
     """And its own colours."""
     shown = labels([[20, 5, 0, 4, 2, 1.5, 0]], [0.6])
-    picture = draw_bird_eye(np.zeros((0, 4)), shown, region=REGION, style=PAPER)
-    assert (picture == 255).all(axis=2).mean() > 0.7
-    assert near(picture, (22, 6), weight_colours(np.array([0.6]), PAPER)[0].astype(int))
+    image = draw_bird_eye(np.zeros((0, 4)), shown, region=REGION, style=PAPER)
+    assert (image == 255).all(axis=2).mean() > 0.7
+    assert near(image, (22, 6), weight_colours(np.array([0.6]), PAPER)[0].astype(int))
 
 
 @pytest.mark.parametrize("frame_id", ["000008", "000023"])
 def test_real_frames(kitti_root, frame_id):
-    """A crowded and a usual frame are drawn whole."""
+    """A crowded and a usual frame are drawn completely."""
     from curate.datasets.kitti.dataset import KittiDataset
     from curate.detectors.recorded import RecordedDetector
 
@@ -115,6 +115,6 @@ def test_real_frames(kitti_root, frame_id):
     frame = dataset.read(frame_id)
     found = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv").predict(frame)
     shown = ShownLabels(found.boxes, found.categories, found.scores, found.scores)
-    picture = draw_bird_eye(frame.points, shown, dataset.annotations(frame_id).boxes)
-    assert picture.shape[2] == 3
-    assert (picture.max(axis=2) > 90).mean() > 0.01
+    image = draw_bird_eye(frame.points, shown, dataset.annotations(frame_id).boxes)
+    assert image.shape[2] == 3
+    assert (image.max(axis=2) > 90).mean() > 0.01

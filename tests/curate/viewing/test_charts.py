@@ -1,4 +1,4 @@
-"""Charts: what is drawn where, and what their files hold."""
+"""Charts: positions of what is drawn, and contents of the files."""
 
 import subprocess
 import sys
@@ -28,29 +28,29 @@ BINS = (np.array([0.05, np.nan, 0.52, 0.93]), np.array([0.0, np.nan, 0.5, 0.9]),
 
 
 def drawn(axes, gid):
-    """The artists with a name."""
+    """Return the artists with a name."""
     return axes.findobj(lambda artist: artist.get_gid() == gid)
 
 
 def places(axes, gid="dot"):
-    """(n, 2) places of the dots, from left to right."""
+    """Return (n, 2) positions of the dots, from left to right."""
     return np.array(sorted(tuple(dot.get_xydata()[0]) for dot in drawn(axes, gid)))
 
 
 def texts(figure):
-    """Every text of a figure."""
+    """Return every text of a figure."""
     from matplotlib.text import Text
 
     return [found.get_text() for found in figure.findobj(Text) if found.get_visible()]
 
 
 def curve(name, *means, std=1.0):
-    """A line with error bars of even length."""
+    """Return a line with error bars of constant length."""
     return Curve(name, np.array(means), np.full(len(means), std))
 
 
 def test_bars_are_as_high_as_their_counts():
-    """The axes name what is counted; a mark outside the edges is left out."""
+    """The axes are labelled; a mark outside the edges is left out."""
     marks = [Mark(1.0, "λ 1"), Mark(3.0, "λ 3")]
     figure = histogram("loss", np.array([4, 0, 2, 1]), np.linspace(0, 2, 5), "L", marks).figure
     [axes] = figure.axes
@@ -61,7 +61,7 @@ def test_bars_are_as_high_as_their_counts():
     assert "λ 3" not in texts(figure)
 
 
-def test_a_histogram_of_nothing_is_flat():
+def test_a_histogram_without_data_is_flat():
     """And still a chart."""
     [axes] = histogram("v", np.zeros(3, int), np.linspace(0, 1, 4), "v").figure.axes
     assert [bar.get_height() for bar in axes.patches] == [0, 0, 0]
@@ -69,7 +69,7 @@ def test_a_histogram_of_nothing_is_flat():
 
 
 def test_bins_are_dots_with_intervals_and_counts():
-    """Nothing joins the bins; few labels make a hollow dot and a long interval."""
+    """No line connects the bins; few labels give a hollow dot and a long interval."""
     above, below = reliability("r", *BINS).figure.axes
     assert places(above) == pytest.approx(np.array([[0.05, 0], [0.52, 0.5], [0.93, 0.9]]))
     joined = [line for line in above.lines if len(line.get_xdata()) > 1]
@@ -85,8 +85,8 @@ def test_bins_are_dots_with_intervals_and_counts():
     assert {"4", "2000", "50k"} <= {found.get_text() for found in below.texts}
 
 
-def test_honest_weights_lie_on_the_diagonal():
-    """A judge whose weight is the chance to be correct."""
+def test_calibrated_weights_lie_on_the_diagonal():
+    """If the weight is the probability of a correct label."""
     labels, _ = many_labels(frames=200)
     generator = np.random.default_rng(0)
     weights = generator.random(len(labels))
@@ -113,7 +113,7 @@ def test_every_policy_has_its_panel_and_its_auroc(policies):
     assert set(some) <= set(texts(figure))
 
 
-def test_undefined_figures_are_drawn_as_nothing():
+def test_undefined_values_are_not_drawn():
     """All labels wrong, and no labels at all."""
     wrong = six_labels()
     wrong.correct[:] = False
@@ -126,7 +126,7 @@ def test_undefined_figures_are_drawn_as_nothing():
         assert chart.content("png")
 
 
-def test_the_legend_is_in_the_order_of_the_ends():
+def test_the_legend_is_in_the_order_of_the_line_ends():
     """With the last value; a method without results is not in it."""
     nothing = Curve("none", np.full(3, np.nan), np.full(3, np.nan))
     panel = CurvePanel("AP", SHARES, [curve("worse", 20, 20, 21), nothing, curve("best", 1, 2, 60)])
@@ -139,7 +139,7 @@ def test_the_legend_is_in_the_order_of_the_ends():
 
 @pytest.mark.parametrize("shares", [SHARES[:1], SHARES])
 def test_missing_values_are_left_out(shares):
-    """A method without spread, one with a gap, a single share; no axis begins below 0."""
+    """A method without spread, one with a gap, a single share; no axis starts below 0."""
     some = np.full(len(shares), 0.5)
     gap = some.copy()
     gap[0] = np.nan
@@ -152,8 +152,8 @@ def test_missing_values_are_left_out(shares):
         assert lengths == [count for count in (len(shares), len(shares) - 1) if count]
 
 
-def test_no_two_of_many_lines_look_alike():
-    """Colour and marker tell twenty methods apart."""
+def test_lines_have_different_colours_and_markers():
+    """For twenty methods."""
     curves = [curve(str(number), *(SHARES + number)) for number in range(20)]
     [axes] = curves_chart([CurvePanel("AP", SHARES, curves)], "title", "note").figure.axes
     assert len({(line.get_color(), line.get_marker()) for line in axes.lines}) == 20
@@ -162,7 +162,7 @@ def test_no_two_of_many_lines_look_alike():
 @pytest.mark.parametrize(
     ("suffix", "start"), [("svg", b"<?xml"), ("png", b"\x89PNG"), ("pdf", b"%PDF")]
 )
-def test_files_have_their_format_and_equal_data_gives_equal_bytes(tmp_path, suffix, start):
+def test_files_have_their_format_and_are_reproducible(tmp_path, suffix, start):
     """No date, no random id."""
     for name in ("a", "b"):
         reliability("r", *BINS).save(tmp_path / f"{name}.{suffix}")
@@ -174,7 +174,7 @@ def test_files_have_their_format_and_equal_data_gives_equal_bytes(tmp_path, suff
 
 
 def test_an_inline_chart_takes_its_colours_from_the_page():
-    """It is well-formed, says what it shows, and loads nothing."""
+    """It is well-formed, describes itself, and loads nothing."""
     text = histogram("loss", np.array([1, 2]), np.array([0, 0.5, 1]), 'a < "b"').inline()
     root = ET.fromstring(text)  # noqa: S314
     assert root.get("aria-label") == 'a < "b": histogram of 3 labels'
@@ -186,7 +186,7 @@ def test_an_inline_chart_takes_its_colours_from_the_page():
 
 
 def test_an_inline_chart_has_no_ids_that_could_repeat():
-    """The marks of its axes are drawn all the same."""
+    """The tick marks of its axes are drawn nevertheless."""
     root = ET.fromstring(reliability("r", *BINS).inline())  # noqa: S314
     assert not [each for each in root.iter() if each.get("id")]
     assert not root.findall(".//use")
@@ -201,8 +201,8 @@ def test_an_unknown_format_is_an_error():
         check_format("gif")
 
 
-def test_matplotlib_is_imported_only_to_draw_and_stays_as_it_was():
-    """Not by importing the charts; never pyplot; its settings are the caller's afterwards."""
+def test_matplotlib_is_imported_only_to_draw_and_its_settings_are_restored():
+    """Not when the charts are imported; pyplot is never imported."""
     code = """
 import sys
 import numpy as np

@@ -1,4 +1,4 @@
-"""Tests of the picture of a whole frame, and of its line styles."""
+"""The image of a whole frame, and its line styles."""
 
 import numpy as np
 import pytest
@@ -15,23 +15,23 @@ BOX = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3]])
 
 
 def frame(image=True):
-    """A grey frame without points."""
-    picture = np.full((40, 120, 3), 90, np.uint8) if image else None
-    return Frame("000000", np.zeros((0, 4), np.float32), toy_calibration(), (120, 40), picture)
+    """Return a grey frame without points."""
+    pixels = np.full((40, 120, 3), 90, np.uint8) if image else None
+    return Frame("000000", np.zeros((0, 4), np.float32), toy_calibration(), (120, 40), pixels)
 
 
 def shown(weight):
-    """One car."""
+    """Return one car."""
     return ShownLabels(BOX, np.array(["Car"]), np.array([0.9]), np.array([weight]), np.array([7]))
 
 
-def has(picture, colour):
-    """Whether some pixel is nearly of a colour."""
-    return (np.abs(picture.astype(int) - np.array(colour)).max(axis=2) < 12).any()
+def has(pixels, colour):
+    """Return whether some pixel has nearly this colour."""
+    return (np.abs(pixels.astype(int) - np.array(colour)).max(axis=2) < 12).any()
 
 
-def test_image_and_bird_eye_are_one_picture():
-    """As wide as the overlay; truth and repredictions add to what is drawn."""
+def test_image_and_bird_eye_view_are_one_image():
+    """As wide as the overlay; ground truth and repredictions are drawn too."""
     plain = draw_frame(frame(), shown(0.9))
     assert plain.shape[1] == 1200
     moved = BOX + np.array([3.0, 3, 0, 0, 0, 0, 0])
@@ -54,14 +54,14 @@ def test_a_label_without_weight_has_its_own_colour():
     assert weight_colours(np.array([np.nan]))[0].tolist() == list(UNWEIGHTED)
 
 
-def test_without_an_image_there_is_no_picture():
-    """The error names the frame."""
+def test_a_frame_without_image_is_rejected():
+    """The error contains the frame."""
     with pytest.raises(DataError, match="000000"):
         draw_frame(frame(image=False), shown(0.5))
 
 
-def test_dashes_leave_gaps_and_end_with_the_picture():
-    """About half of the pixels; a stroke from far outside still crosses the picture."""
+def test_dashes_have_gaps_and_end_with_the_image():
+    """About half of the pixels; a stroke from far outside still crosses the image."""
     canvas = Canvas(200, 20, (0, 0, 0))
     canvas.dashes(np.array([[[-100_000.0, 10], [100_000, 10]]]), (255, 255, 255), 1.0, (5.0, 5.0))
     row = canvas.finish()[10, :, 0] > 100
@@ -74,7 +74,7 @@ def test_dashes_leave_gaps_and_end_with_the_picture():
 
 
 def test_a_jpeg_is_smaller_than_its_pixels():
-    """And starts as one does."""
+    """And has the header of a JPEG."""
     content = jpeg(np.full((64, 64, 3), 120, np.uint8))
     assert content[:2] == b"\xff\xd8"
     assert len(content) < 2000

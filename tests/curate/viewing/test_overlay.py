@@ -1,4 +1,4 @@
-"""Tests of the image overlay."""
+"""The image overlay."""
 
 import numpy as np
 import pytest
@@ -15,14 +15,14 @@ SIZE = (1200, 400)
 
 
 def calibration():
-    """The toy camera with a focal length for a large image."""
+    """Return the toy camera with a focal length for a large image."""
     toy = toy_calibration()
     toy.projection[:] = [[600, 0, 600, 0], [0, 600, 200, 0], [0, 0, 1, 0]]
     return toy
 
 
 def test_strokes_are_the_edges_of_the_projected_box():
-    """Twelve edges whose ends are the projected corners, the front face first."""
+    """Twelve edges between the projected corners, the front face first."""
     box = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3]])
     [strokes] = box_strokes(box, calibration(), SIZE)
     corners, _ = project_points(box_corners(box)[0], calibration())
@@ -47,45 +47,44 @@ def test_boxes_behind_the_camera_have_no_strokes():
     assert np.isfinite(partly).all()
 
 
-def test_no_boxes():
-    """An empty frame is drawn as it is."""
+def test_without_boxes_the_frame_is_unchanged():
     image = np.full((400, 1200, 3), 90, np.uint8)
-    picture = draw_overlay(image, calibration(), labels([], []), np.zeros((0, 7)))
-    assert picture.shape == (400 + TITLE_HEIGHT + STRIP_HEIGHT, 1200, 3)
-    assert (picture[TITLE_HEIGHT:-STRIP_HEIGHT] == 90).all()
+    drawn = draw_overlay(image, calibration(), labels([], []), np.zeros((0, 7)))
+    assert drawn.shape == (400 + TITLE_HEIGHT + STRIP_HEIGHT, 1200, 3)
+    assert (drawn[TITLE_HEIGHT:-STRIP_HEIGHT] == 90).all()
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
 def test_boxes_have_the_colour_of_their_weight(weight):
-    """The colour is seen along an edge, on the image."""
+    """Checked along an edge, on the image."""
     shown = labels([[15.0, 1, 0, 4, 2, 1.5, 0.3]], [weight])
-    picture = draw_overlay(np.full((400, 1200, 3), 90, np.uint8), calibration(), shown)
+    drawn = draw_overlay(np.full((400, 1200, 3), 90, np.uint8), calibration(), shown)
     stroke = box_strokes(shown.boxes, calibration(), SIZE)[0][1]
     column, row = np.rint(stroke.mean(axis=0)).astype(int)
-    around = picture[row + TITLE_HEIGHT - 2 : row + TITLE_HEIGHT + 3, column - 2 : column + 3]
+    around = drawn[row + TITLE_HEIGHT - 2 : row + TITLE_HEIGHT + 3, column - 2 : column + 3]
     colour = weight_colours(np.array([weight]))[0].astype(int)
     assert (np.abs(around.astype(int) - colour).max(axis=2) < 30).any()
 
 
 def test_small_images_are_enlarged():
-    """By a whole factor, so that captions can be read."""
-    picture = draw_overlay(np.zeros((40, 500, 3), np.uint8), calibration(), labels([], []))
-    assert picture.shape[:2] == (40 * 3 + TITLE_HEIGHT + STRIP_HEIGHT, 1500)
+    """By an integer factor, so that captions can be read."""
+    drawn = draw_overlay(np.zeros((40, 500, 3), np.uint8), calibration(), labels([], []))
+    assert drawn.shape[:2] == (40 * 3 + TITLE_HEIGHT + STRIP_HEIGHT, 1500)
 
 
-def test_ground_truth_may_be_drawn():
-    """It changes the picture; regions without a box are left out."""
+def test_ground_truth_can_be_drawn():
+    """It changes the image; regions without a box are left out."""
     image = np.full((400, 1200, 3), 90, np.uint8)
     truth = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3], [np.nan] * 7])
     nothing = draw_overlay(image, calibration(), labels([], []), np.zeros((0, 7)))
-    picture = draw_overlay(image, calibration(), labels([], []), truth)
-    changed = picture[(picture != nothing).any(axis=2)]
+    drawn = draw_overlay(image, calibration(), labels([], []), truth)
+    changed = drawn[(drawn != nothing).any(axis=2)]
     assert len(changed) > 100
     assert changed.max() > 230
 
 
-def test_a_box_as_large_as_the_universe_is_drawn_within_limits():
-    """What is cut at the near plane lies on it, whatever the sum of so large numbers leaves."""
+def test_a_huge_box_is_drawn_within_limits():
+    """Points clipped at the near plane lie on it, despite rounding errors of huge numbers."""
     boxes = np.array([[20.0, 0, 0, 3e38, 3e38, 3e38, 0.3], [3e38, 0, 0, 3e38, 3e38, 3e38, 0.3]])
     for strokes in box_strokes(boxes, calibration(), SIZE):
         assert np.isfinite(strokes).all()

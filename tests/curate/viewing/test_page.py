@@ -1,4 +1,4 @@
-"""Tests of pages and their charts: well-formed, self-contained, every text escaped."""
+"""Pages and their charts: well-formed, self-contained, all text escaped."""
 
 import re
 from html.parser import HTMLParser
@@ -16,30 +16,30 @@ EVIL = "<script>alert('x')</script> & \"q\""
 
 
 class Reader(HTMLParser):
-    """Checks that tags close in order, and collects tags and links."""
+    """Checks that tags are closed in order, and collects tags and links."""
 
     def __init__(self):
         super().__init__()
         self.open, self.tags, self.links = [], [], []
 
     def handle_starttag(self, tag, attrs):
-        """Remembers what is open."""
+        """Push the opened tag."""
         self.tags.append(tag)
         self.links += [value for key, value in attrs if key in {"src", "href"}]
         if tag not in {"meta", "img"}:
             self.open.append(tag)
 
     def handle_startendtag(self, tag, attrs):
-        """Nothing is left open."""
+        """Do nothing: the tag is closed at once."""
         self.tags.append(tag)
 
     def handle_endtag(self, tag):
-        """The last that was opened closes first."""
+        """Check that the last opened tag is closed first."""
         assert self.open.pop() == tag
 
 
 def test_a_page_is_well_formed_and_loads_nothing():
-    """Hostile texts stay texts; the only source is the picture inside."""
+    """Hostile text is escaped; the only source is the embedded image."""
     picture = Figure.of_image(np.zeros((8, 8, 3), np.uint8), EVIL)
     chart = histogram("a", np.array([1, 2]), np.array([0, 0.5, 1]), EVIL)
     figures = [picture, Figure.of_chart(chart, EVIL)]
@@ -57,8 +57,8 @@ def test_a_page_is_well_formed_and_loads_nothing():
     assert "prefers-color-scheme: dark" in text
 
 
-def test_numbers_are_written_to_be_read():
-    """Thousands are parted, sums stand out, words stand to the left."""
+def test_numbers_are_formatted():
+    """Thousands separators, highlighted sums, left-aligned text."""
     section = Section("t", columns=("a", "b"), rows=[("Car", 1234567), ("all", 98765.4)])
     text = render_page("t", "", [section])
     assert '<td class="text">Car</td><td>1,234,567</td>' in text
@@ -66,8 +66,8 @@ def test_numbers_are_written_to_be_read():
 
 
 @pytest.mark.parametrize("place", [(12.0, 1.0), (12.0, 11.9), (-5.0, 0.0)])
-def test_a_close_up_shows_a_label_wherever_it_is(place):
-    """Also at the image's edge and outside of it; the former box is drawn too."""
+def test_a_close_up_shows_a_label_anywhere(place):
+    """Also at the image border and outside; the earlier box is drawn too."""
     rng = np.random.default_rng(0)
     points = rng.uniform([-20, -20, -2, 0], [40, 20, 1, 1], (3000, 4)).astype(np.float32)
     image = rng.integers(0, 255, (40, 120, 3), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Tests of the colour scales."""
+"""The colour scales."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from curate.viewing.palette import (
 
 
 def lightness(colours):
-    """CIE L* of (n, 3) sRGB colours, 0 to 100."""
+    """Return CIE L* of (n, 3) sRGB colours, 0 to 100."""
     linear = np.where(
         colours <= 10, colours / 255 / 12.92, ((colours / 255 + 0.055) / 1.055) ** 2.4
     )
@@ -25,13 +25,13 @@ def lightness(colours):
 
 
 def test_a_higher_weight_is_a_lighter_colour():
-    """Lightness rises all along the scale, and by a lot from end to end."""
+    """Lightness rises along the whole scale, with a large range."""
     steps = lightness(weight_colours(np.linspace(0.001, 1, 200)).astype(float))
     assert (np.diff(steps) > -0.4).all()
     assert steps[-1] - steps[0] > 40
 
 
-def test_every_weight_stands_out_from_the_ground():
+def test_every_weight_is_distinct_from_the_background():
     """The lowest weight is still far lighter than the background."""
     lowest = lightness(weight_colours(np.array([0.001])).astype(float))
     assert lowest - lightness(np.array([BACKGROUND], dtype=float)) > 25
@@ -46,15 +46,15 @@ def test_weight_0_is_not_on_the_scale():
     assert weight_colours(np.zeros(0)).shape == (0, 3)
 
 
-def test_points_are_lighter_the_higher_they_are():
-    """And remain within 8 bits outside the usual heights."""
+def test_higher_points_are_lighter():
+    """They remain within 8 bits outside the usual heights."""
     shades = height_shades(np.array([-50.0, -1.7, 0.0, 1.5, 50.0]))
     assert (np.diff(shades.astype(int), axis=0) >= 0).all()
     assert shades[0].tolist() < shades[2].tolist() < shades[4].tolist()
 
 
-def test_on_paper_a_higher_weight_is_darker_and_all_are_darker_than_the_ground():
-    """So that a print in grey keeps their order."""
+def test_on_paper_a_higher_weight_is_darker_and_all_are_darker_than_the_background():
+    """A grey print keeps their order."""
     steps = lightness(weight_colours(np.linspace(0.001, 1, 200), PAPER).astype(float))
     assert (np.diff(steps) < 0.4).all()
     assert steps[0] - steps[-1] > 40
@@ -62,8 +62,8 @@ def test_on_paper_a_higher_weight_is_darker_and_all_are_darker_than_the_ground()
 
 
 @pytest.mark.parametrize("style", [DARK, PAPER])
-def test_what_is_read_stands_out_from_its_ground(style):
-    """WCAG's contrast of 4.5 for texts, 3 for lines."""
+def test_text_and_lines_have_enough_contrast(style):
+    """WCAG's contrast of 4.5 for text, 3 for lines."""
 
     def contrast(colour):
         one, other = (

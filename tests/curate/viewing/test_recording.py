@@ -33,7 +33,7 @@ NOTHING = ShownRepredictions(np.zeros((0, 7)), np.zeros(0))
 
 
 def seen_frame(count: int, *, image: bool = True) -> Frame:
-    """A frame with some points."""
+    """Return a frame with some points."""
     generator = np.random.default_rng(count)
     points = generator.uniform(-20, 20, (count, 4)).astype(np.float32)
     pixels = generator.integers(0, 255, (40, 120, 3), dtype=np.uint8) if image else None
@@ -42,7 +42,7 @@ def seen_frame(count: int, *, image: bool = True) -> Frame:
 
 @pytest.fixture
 def full() -> RecordedFrame:
-    """Two labels, one of them ignored, one reprediction, ground truth with a DontCare."""
+    """Return two labels, one of them ignored, one reprediction, ground truth with a DontCare."""
     labels = ShownLabels(
         BOXES, np.array(["Car", "Pedestrian"]), np.array([0.9, 0.2]), np.array([0.63, 0.0]),
         np.array([120, 3]),
@@ -60,22 +60,24 @@ def full() -> RecordedFrame:
 
 
 def read_back(path: Path) -> dict[str, list[dict]]:
-    """What each entity holds, per row of the time line `frame`: components by name."""
+    """Return the components of each entity, per row of the time line `frame`."""
     rerun = pytest.importorskip("rerun.chunk", reason="the extra [rerun] is not installed")
     found: dict[str, list[dict]] = {}
     for chunk in rerun.RrdReader(path).store().stream():
         for row in chunk.to_record_batch().to_pylist():
-            held = {name.split(":")[-1]: value for name, value in row.items() if value is not None}
-            found.setdefault(str(chunk.entity_path).strip("/"), []).append(held)
+            content = {
+                name.split(":")[-1]: value for name, value in row.items() if value is not None
+            }
+            found.setdefault(str(chunk.entity_path).strip("/"), []).append(content)
     return {
         place: sorted(rows, key=lambda row: row.get("frame", -1)) for place, rows in found.items()
     }
 
 
-def test_a_recording_holds_points_boxes_weights_and_evidence(
+def test_a_recording_contains_points_boxes_weights_and_evidence(
     tmp_path: Path, full: RecordedFrame
 ) -> None:
-    """Counts, places, colours, captions and numbers come back from the file."""
+    """Counts, positions, colours, captions and numbers are read from the file."""
     pytest.importorskip("rerun", reason="the extra [rerun] is not installed")
     assert write_recording(tmp_path / "a.rrd", iter([full])) == 1
     found = read_back(tmp_path / "a.rrd")
@@ -101,14 +103,14 @@ def test_a_recording_holds_points_boxes_weights_and_evidence(
 
 
 def as_rgba(colours: np.ndarray) -> list[int]:
-    """(n, 3) uint8 as rerun stores them: one number 0xRRGGBBAA each."""
+    """Return (n, 3) uint8 as rerun stores them: one number 0xRRGGBBAA each."""
     return [int.from_bytes([*colour.tolist(), 255], "big") for colour in colours]
 
 
-def test_a_frame_without_labels_shows_none_of_the_frame_before(
+def test_a_frame_without_labels_shows_none_of_the_previous_frame(
     tmp_path: Path, full: RecordedFrame
 ) -> None:
-    """A viewer shows the latest value of each place: what is not there must be cleared."""
+    """A viewer shows the latest value of each entity: missing ones must be cleared."""
     pytest.importorskip("rerun", reason="the extra [rerun] is not installed")
     bare = RecordedFrame(seen_frame(7), NOBODY, {"loss": np.zeros(0)}, NOTHING)
     assert write_recording(tmp_path / "a.rrd", iter([full, bare, full])) == 3
@@ -121,18 +123,18 @@ def test_a_frame_without_labels_shows_none_of_the_frame_before(
 
 
 def test_the_image_is_that_of_the_frame(tmp_path: Path, full: RecordedFrame) -> None:
-    """As a JPEG at the camera; no camera where the frame was read without its image."""
+    """As a JPEG at the camera; no camera if the frame was read without its image."""
     pytest.importorskip("rerun", reason="the extra [rerun] is not installed")
     write_recording(tmp_path / "a.rrd", iter([full]))
-    [held] = read_back(tmp_path / "a.rrd")[f"{CAMERA}/image"]
-    blob = np.frombuffer(bytes(held["blob"][0]), np.uint8)
+    [content] = read_back(tmp_path / "a.rrd")[f"{CAMERA}/image"]
+    blob = np.frombuffer(bytes(content["blob"][0]), np.uint8)
     assert cv2.imdecode(blob, cv2.IMREAD_COLOR).shape == (40, 120, 3)
     blind = RecordedFrame(seen_frame(9, image=False), NOBODY, {}, NOTHING)
     write_recording(tmp_path / "b.rrd", iter([blind]))
     assert not any(place.startswith(CAMERA) for place in read_back(tmp_path / "b.rrd"))
 
 
-def test_a_camera_stands_where_its_projection_says() -> None:
+def test_the_camera_pose_matches_its_projection() -> None:
     """K R^T (x - c) are the homogeneous pixels of x, up to their scale."""
     intrinsics, rotation, centre = camera_pose(CALIBRATION)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
@@ -144,18 +146,16 @@ def test_a_camera_stands_where_its_projection_says() -> None:
     assert (found[:, 2] > 0).all()
 
 
-def test_a_caption_leaves_out_what_is_unknown(full: RecordedFrame) -> None:
-    """NaN says nothing."""
+def test_a_caption_leaves_out_unknown_values(full: RecordedFrame) -> None:
+    """NaN is not shown."""
     assert captions(full.labels, full.evidence) == [
         "k 0  weight 0.63\nCar 0.90  120 pts\nloss 0.42",
         "k 1\nPedestrian 0.20  3 pts",
     ]
 
 
-def test_a_fault_in_the_middle_leaves_the_former_recording(
-    tmp_path: Path, full: RecordedFrame
-) -> None:
-    """Whole, or not at all."""
+def test_an_error_keeps_the_earlier_recording(tmp_path: Path, full: RecordedFrame) -> None:
+    """The file is written completely or not at all."""
     pytest.importorskip("rerun", reason="the extra [rerun] is not installed")
     path = tmp_path / "a.rrd"
     path.write_bytes(b"former")
@@ -170,18 +170,18 @@ def test_a_fault_in_the_middle_leaves_the_former_recording(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_without_rerun_the_extra_is_named(
+def test_without_rerun_the_extra_is_reported(
     tmp_path: Path, full: RecordedFrame, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One line, before anything is written."""
+    """In one line, before anything is written."""
     monkeypatch.setitem(__import__("sys").modules, "rerun", None)
     with pytest.raises(ConfigError, match=r"pip install 'curate-pseudo-labels\[rerun\]'"):
         recording.write_recording(tmp_path / "a.rrd", iter([full]))
     assert not list(tmp_path.iterdir())
 
 
-def test_where_nothing_can_be_written_is_named(tmp_path: Path, full: RecordedFrame) -> None:
-    """A folder that is not there."""
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path, full: RecordedFrame) -> None:
+    """It does not exist."""
     pytest.importorskip("rerun", reason="the extra [rerun] is not installed")
     with pytest.raises(ConfigError, match="a recording cannot be written there"):
         write_recording(tmp_path / "gone" / "a.rrd", iter([full]))

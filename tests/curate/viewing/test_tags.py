@@ -1,4 +1,4 @@
-"""Tests of captions."""
+"""Captions."""
 
 from dataclasses import replace
 
@@ -12,25 +12,25 @@ BOUNDS = np.array([0.0, 0, 400, 300])
 
 
 def labels(count, weights, points=None):
-    """Labels of which only the captions matter."""
+    """Return labels with values for captions."""
     categories, scores = np.array(["Car"] * count), np.full(count, 0.87)
     return ShownLabels(np.zeros((count, 7)), categories, scores, np.array(weights), points)
 
 
 def drawn(shown, anchors):
-    """Which pixels the captions cover."""
+    """Return which pixels the captions cover."""
     canvas = Canvas(400, 300, (255, 255, 255))
     draw_tags(canvas, shown, np.array(anchors, dtype=np.float64), BOUNDS)
     return (canvas.finish() < 250).any(axis=2)
 
 
 def placed(shown, anchors):
-    """Captions and their places."""
+    """Return captions and their positions."""
     return place_tags(Canvas(400, 300, (0, 0, 0)), shown, np.array(anchors, dtype=float), BOUNDS)
 
 
 def common_areas(tags):
-    """Areas that every two captions share."""
+    """Return the common areas of all pairs of captions."""
     return [
         np.prod(np.maximum(np.minimum(a.place, b.place)[2:] - np.maximum(a.place, b.place)[:2], 0))
         for i, a in enumerate(tags)
@@ -38,8 +38,8 @@ def common_areas(tags):
     ]
 
 
-def test_captions_begin_with_k():
-    """Then the weight; the points are there only where they were counted."""
+def test_captions_start_with_k():
+    """Then the weight; the points only if they were counted."""
     assert labels(1, [0.5], np.array([12])).caption(0) == ("k0  0.50", "Car 0.87  12 pts")
     assert labels(1, [0.5]).caption(0) == ("k0  0.50", "Car 0.87")
     assert labels(2, [0.5, 0.0]).caption(1) == ("", "k1  Car 0.87")
@@ -49,7 +49,7 @@ def test_captions_begin_with_k():
     assert shown.short_caption(0) == "k7"
 
 
-def test_a_caption_stands_beside_its_box():
+def test_a_caption_is_beside_its_box():
     """Near the box, but not over it."""
     covered = drawn(labels(1, [0.5]), [[180, 140, 220, 160]])
     assert covered.any()
@@ -61,14 +61,14 @@ def test_a_caption_stands_beside_its_box():
     assert columns.max() < 310
 
 
-def test_boxes_that_are_not_seen_have_no_caption():
+def test_invisible_boxes_have_no_caption():
     """NaN anchors are left out."""
     assert not drawn(labels(1, [0.5]), [[np.nan] * 4]).any()
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_every_label_shows_its_k_and_none_covers_another(seed):
-    """In a crowd, the highest weights have whole captions, the others their number at least."""
+def test_every_label_shows_its_k_and_captions_do_not_overlap(seed):
+    """In a crowd, the highest weights have full captions, the others at least their number."""
     generator = np.random.default_rng(seed)
     low = generator.uniform([0, 0], [380, 280], (25, 2))
     anchors = np.concatenate([low, low + generator.uniform(5, 60, (25, 2))], axis=1)
@@ -85,24 +85,23 @@ def test_every_label_shows_its_k_and_none_covers_another(seed):
     assert whole == sorted(whole, reverse=True)
 
 
-def test_where_all_boxes_are_at_one_place_lines_lead_to_their_numbers():
-    """Up to four captions fit around the box; the other numbers stand farther away."""
+def test_lines_connect_crowded_boxes_with_their_numbers():
+    """Up to four captions fit around the box; the other numbers are farther away."""
     tags = placed(labels(20, np.linspace(0.1, 1, 20)), [[190, 140, 210, 160]] * 20)
     assert 2 <= sum(bool(tag.lines[0]) for tag in tags) <= 4
     assert sum(not tag.beside for tag in tags) >= 12
     assert not any(common_areas(tags))
-    # The lines begin in the middle of the box.
+    # The lines start in the middle of the box.
     assert drawn(labels(20, np.linspace(0.1, 1, 20)), [[190, 140, 210, 160]] * 20)[150, 200]
     assert not drawn(labels(1, [1.0]), [[190, 140, 210, 160]])[150, 200]
 
 
-def test_a_box_that_fills_the_picture_has_its_number_inside():
-    """There is no room beside it."""
+def test_a_box_that_fills_the_image_has_its_number_inside():
+    """There is no space beside it."""
     [tag] = placed(labels(1, [0.5]), [[-100, -100, 500, 400]])
     assert tag.lines == ("", "k0")
     assert (tag.place >= 0).all()
 
 
-def test_no_labels():
-    """Nothing is drawn."""
+def test_without_labels_nothing_is_drawn():
     assert not drawn(labels(0, []), np.zeros((0, 4))).any()

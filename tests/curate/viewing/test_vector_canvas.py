@@ -1,4 +1,4 @@
-"""The canvas of vectors: it draws what the raster canvas draws, and keeps texts as texts."""
+"""The vector canvas: it draws the same as the raster canvas, and keeps text as text."""
 
 import re
 import zlib
@@ -20,7 +20,7 @@ BLACK, WHITE, RED = (0, 0, 0), (255, 255, 255), (255, 0, 0)
 
 
 def paint(kind):
-    """Everything a canvas can do, half of it in a part of a part."""
+    """Draw everything that a canvas supports, half of it in a part of a part."""
     canvas = kind(120, 90, BLACK)
     canvas.box(5, 5, 30, 15, RED)
     canvas.lines(np.array([[40.0, 5], [110, 15]]), WHITE, 2)
@@ -35,8 +35,8 @@ def paint(kind):
     return canvas.finish().astype(int)
 
 
-def test_it_draws_what_the_raster_canvas_draws():
-    """Up to a pixel at the edges of strokes; what leaves a part is cut in both."""
+def test_it_draws_the_same_as_the_raster_canvas():
+    """Up to a pixel at the edges of strokes; both clip what leaves a part."""
     raster, vector = paint(Canvas), paint(VectorCanvas)
     assert raster.shape == vector.shape
     seen = [picture.max(axis=2).astype(np.uint8) > 60 for picture in (raster, vector)]
@@ -48,8 +48,8 @@ def test_it_draws_what_the_raster_canvas_draws():
     assert not vector[18:29].any()
 
 
-def test_text_is_as_wide_as_foretold():
-    """And stands on its baseline."""
+def test_text_has_the_predicted_width():
+    """And is on its baseline."""
     canvas = VectorCanvas(200, 40, BLACK)
     canvas.text(10, 30, "Car $0.87", WHITE, 14)
     seen = canvas.finish().max(axis=2) > 60
@@ -61,7 +61,7 @@ def test_text_is_as_wide_as_foretold():
 
 
 def painted(kind):
-    """A frame with a car, as the content of a file."""
+    """Return a frame with a car, as the content of a file."""
     points = np.random.default_rng(0).uniform(-20, 20, (500, 4)).astype(np.float32)
     image = np.full((40, 120, 3), 90, np.uint8)
     frame = Frame("000000", points, toy_calibration(), (120, 40), image)
@@ -80,8 +80,8 @@ def test_equal_frames_give_equal_files(kind):
     assert b"dc:date" not in content
 
 
-def test_a_pdf_holds_text_vectors_and_few_images():
-    """Fonts are embedded; the image and the points are all that is not drawn as vectors."""
+def test_a_pdf_contains_text_vectors_and_few_images():
+    """Fonts are embedded; only the image and the points are not vectors."""
     content = painted("pdf")
     assert content.startswith(b"%PDF")
     assert b"/FontFile2" in content

@@ -1,4 +1,4 @@
-"""Evidence, age and weights: what policies share."""
+"""Evidence, age and weights, which policies share."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from curate.weighting.base import Age, Evidence, Weights
 
 
 def evidence(**changes):
-    """Two labels with evidence in order, but for the changes."""
+    """Return two labels with valid evidence, except for the changes."""
     columns = {
         "frame_index": np.array([0, 4]),
         "category": as_categories(["Car", "Cyclist"]),
@@ -29,18 +29,18 @@ def test_rho_det_is_the_product_of_the_priors():
 
 
 def test_rho_det_leaves_out_a_prior_that_has_not_scored():
-    """NaN is no opinion, and not a veto."""
+    """NaN neither raises nor lowers the product."""
     half = {"rho_diff": np.array([0.5, np.nan]), "rho_anno": np.array([np.nan, np.nan])}
     assert evidence(rho=half).rho_det.tolist() == [0.5, 1.0]
 
 
-def test_matched_is_where_there_is_a_loss():
+def test_labels_with_a_loss_are_matched():
     """NaN means that no reprediction matched."""
     assert evidence().matched.tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"score": np.array([0.1])}, "score"),
         ({"frame_index": np.zeros((2, 1))}, "frame_index"),
@@ -52,9 +52,9 @@ def test_matched_is_where_there_is_a_loss():
         ({"rho": {"rho_anno": np.array([-1.0, 0.5])}}, "rho_anno of label 0"),
     ],
 )
-def test_evidence_out_of_shape_or_range_is_refused(changes, said):
-    """The error names the column and the label."""
-    with pytest.raises(DataError, match=said):
+def test_evidence_out_of_shape_or_range_is_rejected(changes, message):
+    """The error contains the column and the label."""
+    with pytest.raises(DataError, match=message):
         evidence(**changes)
 
 
@@ -65,7 +65,7 @@ def test_age_is_the_share_of_rounds():
 
 
 @pytest.mark.parametrize(("e", "rounds"), [(0, 3), (4, 3), (-1, 3), (1, 0)])
-def test_rounds_that_do_not_exist_are_refused(e, rounds):
+def test_rounds_that_do_not_exist_are_rejected(e, rounds):
     """Rounds count from 1 to E."""
     with pytest.raises(ConfigError, match=f"round {e} of {rounds}"):
         Age(e, rounds)

@@ -1,4 +1,4 @@
-"""Training on X_l alone."""
+"""Training on X_l only."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from curate.weighting.base import Age, Evidence
 from curate.weighting.baseline import Baseline
 
 
-def test_no_label_counts_and_no_unlabeled_frame_is_used():
+def test_all_labels_have_weight_0_and_no_unlabeled_frame_is_used():
     """Not even a perfect label."""
     labels = Evidence(np.array([0]), as_categories(["Car"]), np.array([1.0]), np.array([0.0]))
     weights = Baseline().weigh(labels, Age(3, 3))

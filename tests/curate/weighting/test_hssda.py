@@ -16,7 +16,7 @@ NAN = float("nan")
 
 
 def labels(scores, losses, category=None):
-    """Labels of one frame, by default cars."""
+    """Return labels of one frame, by default cars."""
     n = len(scores)
     return Evidence(
         np.zeros(n, int), as_categories(category or ["Car"] * n), np.array(scores, dtype=float),
@@ -47,7 +47,7 @@ def test_no_other_split_has_less_variance_within(values):
     assert nearest <= min(map(within, splits)) + 1e-9
 
 
-def test_sure_ambiguous_and_poor_labels():
+def test_certain_ambiguous_and_poor_labels():
     """The scores cluster at 0.2 and 0.8, the agreements exp(-L) at 0.25 and 0.75."""
     agreement = np.array([0.80, 0.80, 0.70, 0.70, 0.30, 0.30, 0.20, 0.20])
     scores = np.array([0.85, 0.75, 0.85, 0.75, 0.25, 0.15, 0.25, 0.15])
@@ -60,8 +60,8 @@ def test_sure_ambiguous_and_poor_labels():
     assert ignored.dropped.tolist() == weights.dropped.tolist()
 
 
-def test_what_did_not_match_is_dropped_and_moves_no_threshold():
-    """However high its score."""
+def test_unmatched_labels_are_dropped_and_do_not_move_thresholds():
+    """However high their score."""
     matched = labels([0.9, 0.8, 0.2, 0.1], [0.1, 0.2, 1.0, 2.0])
     more = labels([0.9, 0.8, 0.2, 0.1, 1.0, 1.0], [0.1, 0.2, 1.0, 2.0, NAN, NAN])
     alone, together = (HSSDA().weigh(of, Age(1, 3)) for of in (matched, more))
@@ -70,7 +70,7 @@ def test_what_did_not_match_is_dropped_and_moves_no_threshold():
 
 
 def test_categories_have_their_own_thresholds():
-    """Poor pedestrians among themselves do not suffer from good cars."""
+    """The thresholds of pedestrians do not depend on cars."""
     scores, losses = [0.9, 0.9, 0.8, 0.3, 0.3, 0.2], [0.1, 0.1, 0.2, 0.5, 0.5, 0.9]
     names = ["Car"] * 3 + ["Pedestrian"] * 3
     weights = HSSDA().weigh(labels(scores, losses, names), Age(1, 3))
@@ -78,14 +78,17 @@ def test_categories_have_their_own_thresholds():
     assert all(one >= other for one, other in pairwise(weights.v[:3]))
 
 
-def test_a_rare_category_is_in_doubt():
-    """Two matched labels make no clusters: they weigh their score, an unmatched one is dropped."""
+def test_labels_of_a_rare_category_are_ambiguous():
+    """Two matched labels give no clusters: their weight is the score.
+
+    An unmatched one is dropped.
+    """
     weights = HSSDA().weigh(labels([0.9, 0.4, 0.5], [0.1, 0.2, NAN]), Age(1, 3))
     assert weights.v.tolist() == [0.9, 0.4, 0.0]
     assert weights.dropped.tolist() == [False, False, True]
 
 
-def test_an_unknown_setting_is_refused():
-    """The error names what there is."""
+def test_an_unknown_setting_is_rejected():
+    """The error lists the known ones."""
     with pytest.raises(ConfigError, match=r"hssda.*hard.*soft or ignore"):
         HSSDA("hard")

@@ -10,7 +10,7 @@ from curate.weighting.iou_match import IoUMatch
 
 
 def labels(*rows):
-    """Labels of (category, score, iou)."""
+    """Return labels of (category, score, iou)."""
     categories, scores, ious = zip(*rows, strict=True)
     n = len(rows)
     return Evidence(
@@ -40,8 +40,8 @@ def test_categories_can_have_their_own_thresholds():
     assert policy.weigh(found, Age(1, 1)).v.tolist() == [1, 1, 0]
 
 
-def test_a_detector_without_estimates_is_refused_in_one_line():
-    """It says how many labels lack one, and what to do."""
+def test_a_detector_without_iou_estimates_is_rejected():
+    """The error contains how many labels have none, and what to do."""
     with pytest.raises(ConfigError, match=r"3dioumatch: 1 of 2 labels have no estimate") as info:
         IoUMatch().weigh(labels(("Car", 0.9, 0.9), ("Car", 0.9, np.nan)), Age(1, 1))
     assert "\n" not in str(info.value)
@@ -50,7 +50,7 @@ def test_a_detector_without_estimates_is_refused_in_one_line():
 @pytest.mark.parametrize(
     "wrong", [{"score": 1.1}, {"iou": -0.1}, {"iou_per_category": {"Car": 2.0}}]
 )
-def test_thresholds_that_are_no_shares_are_refused(wrong):
-    """The error names policy and setting."""
+def test_thresholds_outside_0_and_1_are_rejected(wrong):
+    """The error contains policy and setting."""
     with pytest.raises(ConfigError, match=r"3dioumatch: (score|iou) for"):
         IoUMatch(**wrong)

@@ -1,4 +1,4 @@
-"""SPSL-3D and PSPSL-3D against their objectives, and at their edges."""
+"""SPSL-3D and PSPSL-3D against their objectives, and their limit cases."""
 
 import numpy as np
 import pytest
@@ -11,14 +11,14 @@ from curate.errors import ConfigError
 from curate.weighting.base import Age, Evidence
 from curate.weighting.self_paced import PSPSL, SPSL, age_parameter, easiness
 
-# Losses far enough from 0 that the objective's minimum can be told on a grid, and exact zeros.
+# Losses far enough from 0 that the objective's minimum can be found on a grid, and exact zeros.
 LOSSES = st.one_of(st.just(0.0), st.just(np.nan), st.floats(1e-3, 20.0))
 AGES = st.sampled_from([Age(1, 1), Age(1, 3), Age(2, 3), Age(1, 10), Age(10, 10)])
 SCOPES = st.sampled_from(["round", "category", "frame"])
 
 
 def evidence(loss, rho=(), frame_index=None, category=None):
-    """Evidence of labels of one frame and category unless told otherwise."""
+    """Return evidence of labels, by default of one frame and category."""
     n = len(loss)
     return Evidence(
         frame_index=np.zeros(n, np.int64) if frame_index is None else np.array(frame_index),
@@ -31,7 +31,7 @@ def evidence(loss, rho=(), frame_index=None, category=None):
 
 @st.composite
 def rounds(draw):
-    """Evidence of a few labels over a few frames and categories."""
+    """Draw evidence of a few labels over a few frames and categories."""
     rows = draw(
         st.lists(
             st.tuples(
@@ -49,7 +49,7 @@ def rounds(draw):
 
 
 def same(found, expected):
-    """Whether two columns agree, NaN with NaN."""
+    """Return whether two columns agree, NaN with NaN."""
     return np.allclose(found, np.array(expected, dtype=np.float64), equal_nan=True)
 
 
@@ -70,7 +70,7 @@ def test_equation_11_minimises_its_objective_in_v_over_rho(loss, lambda_u, rho):
 @settings(max_examples=60)
 @given(rounds(), AGES, SCOPES)
 def test_equation_4_is_the_aged_mean_and_maximum_of_each_group(labels, age, scope):
-    """Lambda against plain Python, group by group, NaN where nothing matched."""
+    """Lambda against plain Python, group by group, NaN if nothing matched."""
     group = {
         "round": np.zeros(len(labels)),
         "category": labels.category,
@@ -82,7 +82,7 @@ def test_equation_4_is_the_aged_mean_and_maximum_of_each_group(labels, age, scop
 
 @settings(max_examples=60)
 @given(rounds(), AGES, SCOPES, st.floats(0.01, 1.0))
-def test_a_quantile_takes_the_place_of_the_maximum(labels, age, scope, quantile):
+def test_a_quantile_can_replace_the_maximum(labels, age, scope, quantile):
     """Lambda with NumPy's own quantile, group by group; never above the maximum."""
     group = {
         "round": np.zeros(len(labels)),
@@ -101,8 +101,8 @@ def test_a_quantile_takes_the_place_of_the_maximum(labels, age, scope, quantile)
 
 @settings(max_examples=60)
 @given(rounds(), AGES, SCOPES, st.none() | st.floats(0.01, 1.0))
-def test_every_round_keeps_the_rules_of_weights(labels, age, scope, quantile):
-    """Within [0, 1], PSPSL = rho_det * SPSL, unmatched labels weigh 0, easier never weighs less."""
+def test_the_invariants_of_the_weights(labels, age, scope, quantile):
+    """In [0, 1], PSPSL = rho_det * SPSL, unmatched labels weigh 0, easier never weighs less."""
     spsl = SPSL(scope, quantile).weigh(labels, age)
     pspsl = PSPSL(scope, quantile).weigh(labels, age)
     assert ((spsl.v >= 0) & (spsl.v <= 1)).all()
@@ -116,8 +116,7 @@ def test_every_round_keeps_the_rules_of_weights(labels, age, scope, quantile):
         assert (np.diff(v) <= 0).all()
 
 
-def test_weights_follow_the_labels_when_they_are_shuffled():
-    """The order of the rows does not matter."""
+def test_the_order_of_the_labels_does_not_matter():
     generator = np.random.default_rng(5)
     n = 50
     loss = np.where(generator.random(n) < 0.2, np.nan, generator.exponential(size=n))
@@ -143,8 +142,8 @@ def test_worked_example():
     assert weights.lambda_u == pytest.approx([2.5] * 4)
 
 
-def test_the_schedule_admits_more_labels_as_it_ages():
-    """From the mean in early rounds to the maximum in the last: no weight ever falls."""
+def test_no_weight_falls_with_age():
+    """Lambda goes from the mean in early rounds to the maximum in the last."""
     labels = evidence([0.2, 1.0, 2.0, 6.0])
     by_round = np.array([SPSL().weigh(labels, Age(e, 4)).v for e in range(1, 5)])
     assert (np.diff(by_round, axis=0) >= 0).all()
@@ -154,8 +153,8 @@ def test_the_schedule_admits_more_labels_as_it_ages():
 
 @pytest.mark.parametrize("scope", ["round", "category", "frame"])
 @pytest.mark.parametrize("age", [Age(1, 3), Age(3, 3)])
-def test_losses_that_are_all_zero_weigh_fully(scope, age):
-    """Lambda = 0: v = 1 for SPSL, rho_det for PSPSL, and 0 for what did not match."""
+def test_losses_that_are_all_zero_give_full_weight(scope, age):
+    """Lambda = 0: v = 1 for SPSL, rho_det for PSPSL, and 0 for unmatched labels."""
     labels = evidence([0.0, 0.0, np.nan], [[0.3, 1.0, 1.0]])
     assert SPSL(scope).weigh(labels, age).v.tolist() == [1.0, 1.0, 0.0]
     weights = PSPSL(scope).weigh(labels, age)
@@ -165,7 +164,7 @@ def test_losses_that_are_all_zero_weigh_fully(scope, age):
 
 @pytest.mark.parametrize("scope", ["round", "category", "frame"])
 @pytest.mark.parametrize("quantile", [None, 0.9])
-def test_no_match_at_all_weighs_nothing(scope, quantile):
+def test_without_any_match_all_weights_are_zero(scope, quantile):
     """All unmatched: v = 0 and no lambda."""
     weights = PSPSL(scope, quantile).weigh(evidence([np.nan, np.nan]), Age(1, 3))
     assert weights.v.tolist() == [0.0, 0.0]
@@ -174,13 +173,12 @@ def test_no_match_at_all_weighs_nothing(scope, quantile):
 
 @pytest.mark.parametrize("scope", ["round", "category", "frame"])
 @pytest.mark.parametrize("quantile", [None, 0.9])
-def test_no_label_at_all(scope, quantile):
-    """An empty round has an empty answer."""
+def test_an_empty_round_has_no_weights(scope, quantile):
     weights = PSPSL(scope, quantile).weigh(evidence([]), Age(1, 3))
     assert weights.v.shape == weights.lambda_u.shape == (0,)
 
 
-def test_a_group_without_a_match_leaves_the_others_alone():
+def test_a_group_without_a_match_does_not_affect_the_others():
     """Frame 8 has no evidence, frame 9 has."""
     labels = evidence([np.nan, 1.0, 3.0], frame_index=[8, 9, 9])
     weights = SPSL("frame").weigh(labels, Age(1, 1))
@@ -191,13 +189,13 @@ def test_a_group_without_a_match_leaves_the_others_alone():
 
 @pytest.mark.parametrize("scope", ["round", "category", "frame"])
 @pytest.mark.parametrize("age", [Age(1, 3), Age(2, 3), Age(3, 3), Age(3, 10)])
-def test_equal_losses_weigh_exactly_nothing(scope, age):
-    """L < lambda fails for all of them, and no rounding of the mean lets them pass."""
+def test_equal_losses_have_weight_exactly_zero(scope, age):
+    """L < lambda fails for all of them, despite rounding of the mean."""
     labels = evidence(
         [0.1] * 3 + [0.7] * 7, category=["a"] * 3 + ["b"] * 7, frame_index=[1] * 3 + [2] * 7
     )
-    lonely = evidence([0.1] * 7)
-    assert SPSL().weigh(lonely, age).v.tolist() == [0.0] * 7
+    isolated = evidence([0.1] * 7)
+    assert SPSL().weigh(isolated, age).v.tolist() == [0.0] * 7
     if scope != "round":
         assert SPSL(scope).weigh(labels, age).v.tolist() == [0.0] * 10
 
@@ -210,18 +208,18 @@ def test_a_tiny_lambda_does_not_overflow():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [({"scope": "batch"}, "batch"), ({"quantile": 0.0}, "quantile"), ({"quantile": 1.1}, "1.1")],
 )
 @pytest.mark.parametrize("policy", [SPSL, PSPSL])
-def test_settings_without_meaning_are_refused(policy, wrong, said):
-    """The error names the policy and the setting."""
-    with pytest.raises(ConfigError, match=rf"{policy.name}.*{said}"):
+def test_invalid_settings_are_rejected(policy, wrong, message):
+    """The error contains the policy and the setting."""
+    with pytest.raises(ConfigError, match=rf"{policy.name}.*{message}"):
         policy(**wrong)
 
 
-def test_without_the_self_paced_term_the_priors_alone_decide():
-    """It is rho_det where a reprediction matched, in every round, and no lambda."""
+def test_without_the_self_paced_term_only_the_priors_count():
+    """The weight is rho_det if a reprediction matched, in every round, and there is no lambda."""
     labels = evidence([0.2, 9.0, np.nan], [[0.5, 0.4, 1.0], [0.5, 1.0, 1.0]])
     for e in (1, 3):
         weights = PSPSL(self_paced=False).weigh(labels, Age(e, 3))
@@ -229,8 +227,8 @@ def test_without_the_self_paced_term_the_priors_alone_decide():
         assert np.isnan(weights.lambda_u).all()
 
 
-def test_without_a_second_pass_the_priors_alone_weigh_every_label():
-    """Where no label has a loss, nobody was asked again; with the self-paced term all weigh 0."""
+def test_without_a_second_pass_every_label_has_its_prior_as_weight():
+    """If no label has a loss, there was no second pass; with the self-paced term all weigh 0."""
     labels = evidence([np.nan, np.nan], [[0.5, 0.4], [0.5, 1.0]])
     assert PSPSL(self_paced=False).weigh(labels, Age(1, 3)).v.tolist() == [0.25, 0.4]
     assert PSPSL().weigh(labels, Age(1, 3)).v.tolist() == [0.0, 0.0]
@@ -238,7 +236,7 @@ def test_without_a_second_pass_the_priors_alone_weigh_every_label():
 
 @pytest.mark.parametrize("name", ["rho_diff", "rho_anno"])
 def test_each_prior_alone(name):
-    """The other one is not asked, so it does not count."""
+    """The other one is not used."""
     labels = evidence([0.0, 2.0])
     labels = Evidence(
         labels.frame_index, labels.category, labels.score, labels.loss, {name: np.array([0.5, 1.0])}

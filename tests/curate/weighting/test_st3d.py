@@ -1,4 +1,4 @@
-"""Bands of confidence, and what is remembered of the round before."""
+"""Confidence bands, and the memory of the previous round."""
 
 import numpy as np
 import pytest
@@ -12,12 +12,12 @@ KEEP, IGNORE, DROP = "keep", "ignore", "drop"
 
 
 def car(x, frame=0, category="Car"):
-    """Frame, category and box of a label 4 m long at x."""
+    """Return frame, category and box of a label 4 m long at x."""
     return frame, category, [x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]
 
 
 def common(places, scores, ious=None):
-    """The columns that evidence and memory share."""
+    """Return the columns that evidence and memory share."""
     frames, categories, boxes = zip(*places, strict=True) if places else ((), (), ())
     return {
         "frame_index": np.array(frames, dtype=np.int64),
@@ -29,7 +29,7 @@ def common(places, scores, ious=None):
 
 
 def bands(places, scores, past=None, policy=None, ious=None):
-    """The band of each label, where `past` is (places, scores) of the round before."""
+    """Return the band of each label; `past` is (positions, scores) of the previous round."""
     memory = None if past is None else Memory(**common(*past), v=np.ones(len(past[0])))
     labels = Evidence(
         **common(places, scores, ious), loss=np.full(len(places), np.nan), memory=memory
@@ -49,8 +49,8 @@ def test_without_a_memory_the_score_decides():
     assert bands(places, [0.6, 0.59, 0.25, 0.24]) == [KEEP, IGNORE, IGNORE, DROP]
 
 
-def test_an_object_remembered_with_a_better_score_is_lifted():
-    """Cars moved by half a metre overlap enough; a remembered worse score changes nothing."""
+def test_a_remembered_object_with_a_better_score_raises_the_band():
+    """Cars moved by half a metre overlap enough; a worse remembered score changes nothing."""
     places = [car(0), car(20), car(40), car(60)]
     past = ([car(0.5), car(20.5), car(40.5)], [0.9, 0.3, 0.3])
     assert bands(places, [0.1, 0.1, 0.7, 0.1], past) == [KEEP, IGNORE, KEEP, DROP]
@@ -59,12 +59,12 @@ def test_an_object_remembered_with_a_better_score_is_lifted():
 @pytest.mark.parametrize(
     "other", [car(0, frame=1), car(0, category="Van"), car(3.8), car(50)], ids=str
 )
-def test_what_is_remembered_elsewhere_does_not_count(other):
-    """Another frame, another category, an overlap below 0.1, or another place."""
+def test_other_remembered_objects_do_not_count(other):
+    """Another frame, another category, an overlap below 0.1, or another position."""
     assert bands([car(0)], [0.1], ([other], [0.9])) == [DROP]
 
 
-def test_one_remembered_object_lifts_one_label():
+def test_one_remembered_object_raises_one_label():
     """The one that overlaps it most."""
     places = [car(0), car(1.0)]
     assert bands(places, [0.1, 0.1], ([car(0.9)], [0.9])) == [DROP, KEEP]
@@ -72,34 +72,34 @@ def test_one_remembered_object_lifts_one_label():
 
 
 def test_of_two_remembered_objects_the_nearer_counts():
-    """Not the surer one."""
+    """Not the one with the higher score."""
     past = ([car(0.1), car(1.5)], [0.3, 0.9])
     assert bands([car(0)], [0.1], past) == [IGNORE]
 
 
-def test_an_empty_memory_is_none():
-    """Where the policy kept nothing in the round before."""
+def test_an_empty_memory_equals_no_memory():
+    """The policy kept nothing in the previous round."""
     assert bands([car(0)], [0.7], ([], [])) == [KEEP]
     assert bands([], [], ([car(0)], [0.7])) == []
 
 
 def test_the_confidence_can_be_the_estimated_iou():
-    """As in the paper; a detector without estimates is refused."""
+    """As in the paper; a detector without estimates is rejected."""
     policy = ST3D(keep=0.5, ignore=0.2, confidence="iou")
     assert bands([car(0), car(20)], [0.0, 0.9], policy=policy, ious=[0.5, 0.1]) == [KEEP, DROP]
     with pytest.raises(ConfigError, match="st3d: the detector estimates no IoU"):
         bands([car(0)], [0.9], policy=policy)
 
 
-def test_a_memory_without_boxes_beside_it_is_an_error():
-    """There is nothing to match it with."""
+def test_a_memory_without_current_boxes_is_an_error():
+    """It cannot be matched."""
     memory = Memory(**common([car(0)], [0.9]), v=np.ones(1))
     with pytest.raises(DataError, match="needs the boxes"):
         Evidence(np.zeros(1, int), as_categories(["Car"]), np.ones(1), np.ones(1), memory=memory)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ({"keep": 0.2}, "ascending"),
         ({"keep": 1.2}, "1.2"),
@@ -107,7 +107,7 @@ def test_a_memory_without_boxes_beside_it_is_an_error():
         ({"minimum_iou": 0.0}, "minimum_iou"),
     ],
 )
-def test_settings_without_meaning_are_refused(wrong, said):
-    """The error names the policy and the setting."""
-    with pytest.raises(ConfigError, match=f"st3d.*{said}"):
+def test_invalid_settings_are_rejected(wrong, message):
+    """The error contains the policy and the setting."""
+    with pytest.raises(ConfigError, match=f"st3d.*{message}"):
         ST3D(**wrong)

@@ -17,8 +17,8 @@ LABELS = Evidence(
 
 
 @pytest.mark.parametrize("age", [Age(1, 3), Age(3, 3)])
-def test_scores_from_the_threshold_on_count_fully(age):
-    """The threshold itself passes; the round, the loss and a missing match do not matter."""
+def test_scores_at_or_above_the_threshold_have_weight_1(age):
+    """The round, the loss and a missing match do not matter."""
     weights = Threshold().weigh(LABELS, age)
     assert weights.v.tolist() == [0.0, 1.0, 1.0, 1.0]
     assert np.isnan(weights.lambda_u).all()
@@ -31,10 +31,9 @@ def test_a_category_can_have_its_own_threshold():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [({"threshold": 1.5}, "1.5"), ({"per_category": {"Cyclist": -0.1}}, "Cyclist")],
 )
-def test_a_threshold_that_is_no_score_is_refused(wrong, said):
-    """The error names what is wrong."""
-    with pytest.raises(ConfigError, match=said):
+def test_a_threshold_that_is_not_a_score_is_rejected(wrong, message):
+    with pytest.raises(ConfigError, match=message):
         Threshold(**wrong)

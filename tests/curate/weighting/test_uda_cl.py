@@ -13,7 +13,7 @@ NAN = float("nan")
 
 
 def taken(losses, e, rounds):
-    """The weights of labels with these losses."""
+    """Return the weights of labels with these losses."""
     n = len(losses)
     labels = Evidence(np.zeros(n, int), as_categories(["Car"] * n), np.ones(n), np.array(losses))
     return UDACurriculum().weigh(labels, Age(e, rounds)).v.tolist()
@@ -27,14 +27,14 @@ def test_the_easiest_third_then_two_thirds_then_all():
     assert taken(losses, 3, 3) == [1, 1, 1, 1, 1, 1]
 
 
-def test_equal_losses_come_in_together():
-    """Half of four has room for one label of loss 0.1, but not for the three of loss 0.2."""
+def test_equal_losses_are_added_together():
+    """Half of four includes one label of loss 0.1, but not the three of loss 0.2."""
     assert taken([0.2, 0.1, 0.2, 0.2], 1, 2) == [0, 1, 0, 0]
     assert taken([0.1, 0.1, 0.2, 0.2], 1, 2) == [1, 1, 0, 0]
 
 
-def test_unmatched_labels_wait_for_the_last_round():
-    """They are as hard as can be, also where nothing else is there."""
+def test_unmatched_labels_are_added_in_the_last_round():
+    """They count as hardest, even if there are no others."""
     assert taken([NAN, NAN, NAN], 2, 3) == [0, 0, 0]
     assert taken([NAN, NAN, NAN], 3, 3) == [1, 1, 1]
 
@@ -44,7 +44,7 @@ def test_unmatched_labels_wait_for_the_last_round():
     st.integers(1, 7).flatmap(lambda rounds: st.tuples(st.integers(1, rounds), st.just(rounds))),
 )
 def test_never_more_than_the_share_and_never_a_harder_one_first(losses, age):
-    """Whatever the losses; and the last round takes all."""
+    """For any losses; the last round takes all."""
     e, rounds = age
     weights = np.array(taken(losses, e, rounds))
     assert weights.sum() * rounds <= len(losses) * e
@@ -56,7 +56,7 @@ def test_never_more_than_the_share_and_never_a_harder_one_first(losses, age):
 
 
 @pytest.mark.parametrize("rounds", [3, 7, 49])
-def test_the_share_does_not_suffer_from_rounding(rounds):
+def test_the_share_is_exact_despite_rounding(rounds):
     """Round e of E takes exactly e of E labels with different losses."""
     losses = np.random.default_rng(0).permutation(rounds).astype(float)
     for e in range(1, rounds + 1):

@@ -7,7 +7,7 @@ from curate.weighting.base import Age, Evidence
 from curate.weighting.uniform import Uniform
 
 
-def test_every_label_counts_fully():
+def test_every_label_has_weight_1():
     """Even one with a low score that did not match."""
     labels = Evidence(
         np.array([0, 1]),

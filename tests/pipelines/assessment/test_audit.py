@@ -1,4 +1,4 @@
-"""`curate audit`: the same stages, the same weights, and only then the truth."""
+"""`curate audit`: the same stages and weights as for unlabeled frames, then the ground truth."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ BIN = "SELECT low, labels, precision FROM audit_bin WHERE category = 'all' AND p
 
 
 def audit(workspace: Workspace, **request: object):
-    """An audit with few draws, and the names of the stages that did something."""
+    """Run an audit with few bootstrap draws; return the names of the stages that did something."""
     done: list[str] = []
     found = run_audit(
         workspace,
@@ -33,12 +33,12 @@ def audit(workspace: Workspace, **request: object):
 
 
 def count(workspace: Workspace, sql: str) -> int:
-    """A number from the database."""
+    """Return a number from the database."""
     with workspace.database.reading() as connection:
         return connection.exec_driver_sql(sql).scalar_one()
 
 
-def test_val_frames_are_treated_as_if_they_were_unlabeled(workspace: Workspace) -> None:
+def test_val_frames_are_processed_like_unlabeled_frames(workspace: Workspace) -> None:
     """Every stage runs on the four val frames; a second audit does nothing again."""
     found, done = audit(workspace)
     assert done == ["predict", "repredict", "points", "semantic"]
@@ -50,8 +50,11 @@ def test_val_frames_are_treated_as_if_they_were_unlabeled(workspace: Workspace) 
     assert again.figures.whole()["pspsl"].auroc == some.auroc
 
 
-def test_the_weights_are_those_that_solve_would_give_these_frames(workspace: Workspace) -> None:
-    """Eq. 11 written out, with lambda over the val labels alone; right by the nearest object."""
+def test_the_weights_equal_those_of_solve(workspace: Workspace) -> None:
+    """Eq. 11 written out, with lambda over the val labels only.
+
+    Correctness by the nearest object.
+    """
     found, _ = audit(workspace)
     context = open_round(workspace)
     keys = workspace.frames("val")
@@ -74,8 +77,8 @@ def test_the_weights_are_those_that_solve_would_give_these_frames(workspace: Wor
     assert some.weighted_precision.value == pytest.approx(weights[right].sum() / weights.sum())
 
 
-def test_the_audit_leaves_the_unlabeled_frames_alone(workspace: Workspace) -> None:
-    """Neither labels nor weights of X_u appear, and weighted_labels hides those of val."""
+def test_the_audit_does_not_change_the_unlabeled_frames(workspace: Workspace) -> None:
+    """No labels or weights of X_u appear, and weighted_labels hides those of val."""
     audit(workspace)
     assert count(workspace, "SELECT count(*) FROM weighted_labels") == 0
     assert count(workspace, "SELECT count(*) FROM weight") == 0
@@ -84,7 +87,10 @@ def test_the_audit_leaves_the_unlabeled_frames_alone(workspace: Workspace) -> No
 
 
 def test_folds_are_workspaces_inside_the_workspace(workspace: Workspace) -> None:
-    """Each holds out other labeled frames; together all of them, none twice; then they are kept."""
+    """Each holds out other labeled frames; together they cover all of them once.
+
+    Then they are kept.
+    """
     found, done = audit(workspace, folds=2)
     assert found.figures.frames == 2
     assert done[:2] == ["predict 1/2", "repredict 1/2"]
@@ -92,11 +98,11 @@ def test_folds_are_workspaces_inside_the_workspace(workspace: Workspace) -> None
     folds = list(open_folds(workspace, 2))
     home = workspace.root / "reports" / "audit" / "2-folds-seed-0"
     assert [fold.root for fold in folds] == [home / "fold-1", home / "fold-2"]
-    held = [set(fold.frames("val")) for fold in folds]
+    val_frames = [set(fold.frames("val")) for fold in folds]
     labeled = set(workspace.frames("labeled"))
-    assert held[0] | held[1] == labeled
-    assert not held[0] & held[1]
-    for fold, own in zip(folds, held, strict=True):
+    assert val_frames[0] | val_frames[1] == labeled
+    assert not val_frames[0] & val_frames[1]
+    for fold, own in zip(folds, val_frames, strict=True):
         assert set(fold.frames("labeled")) == labeled - own
         assert fold.database.url != workspace.database.url
         assert count(fold, "SELECT count(*) FROM prediction") == 3
@@ -104,17 +110,17 @@ def test_folds_are_workspaces_inside_the_workspace(workspace: Workspace) -> None
     assert audit(workspace, folds=2)[1] == []
 
 
-def test_a_changed_setting_reaches_the_folds(workspace: Workspace) -> None:
-    """Only what depends on it is done again there."""
+def test_a_changed_setting_is_applied_to_the_folds(workspace: Workspace) -> None:
+    """Only the stages that depend on it run again."""
     audit(workspace, folds=2)
     changed = workspace.with_settings("points", statistic="mean")
     assert audit(changed, folds=2)[1] == ["points 1/2", "points 2/2"]
 
 
-def test_the_labeled_frames_can_be_audited_with_a_detector_that_never_saw_them(
+def test_labeled_frames_can_be_audited_if_the_detector_was_not_trained_on_them(
     workspace: Workspace,
 ) -> None:
-    """The toy detector learned from nothing."""
+    """The toy detector is not trained."""
     found, _ = audit(workspace, split="labeled")
     assert found.figures.frames == 2
 
@@ -128,24 +134,22 @@ def test_the_labeled_frames_can_be_audited_with_a_detector_that_never_saw_them(
         ({"names": ("nonsense",)}, ConfigError, "unknown policy 'nonsense'"),
     ],
 )
-def test_what_cannot_be_audited_is_refused_before_anything_runs(
+def test_an_impossible_audit_is_rejected_before_any_work(
     workspace: Workspace, request_of: dict, error: type, message: str
 ) -> None:
-    """In one line."""
     with pytest.raises(error, match=message):
         audit(workspace, **request_of)
     assert count(workspace, "SELECT count(*) FROM task") == 0
 
 
-def test_the_frames_that_a_teacher_learned_from_are_refused(workspace: Workspace) -> None:
-    """A detector that curate trains knows the labeled frames; the remedy is named."""
+def test_the_frames_that_a_teacher_was_trained_on_are_rejected(workspace: Workspace) -> None:
+    """A detector trained by curate has seen the labeled frames; the error says what to do."""
     trained = workspace.with_settings("detector", name="pillars")
     with pytest.raises(LeakageError, match="--folds"):
         audit(trained, split="labeled")
 
 
-def test_without_val_frames_folds_are_offered(curate: Curate, tmp_path: Path) -> None:
-    """A one-line error."""
+def test_without_val_frames_the_error_suggests_folds(curate: Curate, tmp_path: Path) -> None:
     write_toy_kitti(tmp_path / "none", frames=4)
     (tmp_path / "d.txt").write_text("")
     detector = ("--detector", "support.toys:ToyDetector", "--detector-path", tmp_path / "d.txt")
@@ -156,16 +160,18 @@ def test_without_val_frames_folds_are_offered(curate: Curate, tmp_path: Path) ->
     assert "--folds" in err
 
 
-def test_the_command_tells_draws_and_stores(curate: Curate, workspace: Workspace) -> None:
-    """Sentences, a picture, rows that a query finds; a second run replaces them."""
+def test_the_command_prints_plots_and_stores_the_audit(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """Sentences, a plot, and rows that a query finds; a second run replaces them."""
     for _ in range(2):
         code, out, err = curate("audit", "-w", workspace.root, "--replicates", "50")
         assert (code, err) == (0, "")
     assert "of 12 labels are correct" in out
     assert "Of the policies, " in out
-    picture = workspace.root / "reports" / "audit-round-01-val-bev.png"
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert str(picture) in out
+    plot = workspace.root / "reports" / "audit-round-01-val-bev.png"
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert str(plot) in out
     sql = "SELECT policy, category, labels, auroc FROM audit"
     rows = json.loads(curate("query", sql, "--json", "-w", workspace.root)[1])
     assert len(rows) == 7 * 4
@@ -175,8 +181,8 @@ def test_the_command_tells_draws_and_stores(curate: Curate, workspace: Workspace
     assert count(workspace, "SELECT count(*) FROM audit_slice") == 7 * 4 * 7
 
 
-def test_the_json_says_the_same_as_the_tables(curate: Curate, workspace: Workspace) -> None:
-    """Strict JSON and nothing else on standard output."""
+def test_the_json_has_the_same_values_as_the_tables(curate: Curate, workspace: Workspace) -> None:
+    """Standard output has strict JSON and nothing else."""
     arguments = ("--policy", "pspsl", "--policy", "score", "--overlap", "3d", "--json")
     code, out, _ = curate("audit", "-w", workspace.root, *arguments)
     assert code == 0
@@ -185,19 +191,19 @@ def test_the_json_says_the_same_as_the_tables(curate: Curate, workspace: Workspa
     sql = "SELECT policy, category, auroc, auroc_low FROM audit WHERE overlap = '3d'"
     rows = json.loads(curate("query", sql, "--json", "-w", workspace.root)[1])
     stored = {(row["policy"], row["category"]): (row["auroc"], row["auroc_low"]) for row in rows}
-    told = {
+    printed = {
         (each["policy"], each["category"]): (each["auroc"]["value"], each["auroc"]["low"])
         for each in found["figures"]
         if each["slice"]["by"] == "all"
     }
-    assert stored == told
+    assert stored == printed
     assert len(stored) == 2 * 4
 
 
 def test_a_failed_frame_is_left_out_and_counted(
     curate: Curate, workspace: Workspace, toy_kitti: Path
 ) -> None:
-    """The audit ends with what there is, and a non-zero exit."""
+    """The audit continues without it and exits with a non-zero code."""
     frame = next(iter(workspace.frames("val")))
     (toy_kitti / "training" / "velodyne" / f"{frame}.bin").write_bytes(b"odd")
     code, out, err = curate("audit", "-w", workspace.root, "--replicates", "10")
@@ -206,10 +212,10 @@ def test_a_failed_frame_is_left_out_and_counted(
     assert "on 3 frames with 9 objects" in out
 
 
-def test_frames_without_labels_count_their_objects(
+def test_the_objects_of_frames_without_labels_are_missed(
     curate: Curate, workspace: Workspace, toy_kitti: Path
 ) -> None:
-    """Empty sweeps: nothing found, nothing failed, everything missed."""
+    """Empty sweeps: no labels, no failed frame, every object is missed."""
     for frame in workspace.frames("val"):
         (toy_kitti / "training" / "velodyne" / f"{frame}.bin").write_bytes(b"")
     code, out, _ = curate("audit", "-w", workspace.root, "--replicates", "10")
@@ -220,7 +226,7 @@ def test_frames_without_labels_count_their_objects(
 def test_an_audit_without_the_point_prior_has_no_point_slices(
     curate: Curate, workspace: Workspace
 ) -> None:
-    """Nobody has counted the points."""
+    """The points per label were not counted."""
     path = workspace.root / "curate.toml"
     path.write_text(path.read_text().replace('["points", "semantic"]', '["semantic"]'))
     code, _, err = curate("audit", "-w", workspace.root, "--replicates", "10")
@@ -229,7 +235,7 @@ def test_an_audit_without_the_point_prior_has_no_point_slices(
     assert count(workspace, sql) == 0
 
 
-def test_an_unknown_overlap_is_refused(curate: Curate, workspace: Workspace) -> None:
-    """The message lists what there is."""
+def test_an_unknown_overlap_is_rejected(curate: Curate, workspace: Workspace) -> None:
+    """The message lists the known ones."""
     code, _, err = curate("audit", "-w", workspace.root, "--overlap", "2d")
     assert (code, err) == (ConfigError.exit_code, "error: --overlap 2d: use bev or 3d\n")

@@ -1,4 +1,4 @@
-"""Tests of the command that checks one frame."""
+"""The command that checks one frame."""
 
 import json
 import pickle
@@ -11,7 +11,7 @@ from curate.datasets.kitti.dataset import KittiDataset
 
 
 def write_results(path: Path, root: Path, change=None) -> Path:
-    """OpenPCDet results that are the truth, or a change of it."""
+    """Write OpenPCDet results equal to the ground truth, or a changed copy."""
     dataset = KittiDataset(root)
     entries = []
     for name in dataset.frame_ids():
@@ -24,7 +24,7 @@ def write_results(path: Path, root: Path, change=None) -> Path:
 
 
 def begin(curate: Curate, work: Path, root: Path, results: Path) -> None:
-    """A workspace with recorded results."""
+    """Create a workspace with recorded results."""
     code, _, err = curate(
         "init", work, "--root", root, "--labeled", "0.25",
         "--detector", "recorded", "--detector-path", results,
@@ -32,8 +32,8 @@ def begin(curate: Curate, work: Path, root: Path, results: Path) -> None:
     assert code == 0, err
 
 
-def test_a_sound_chain_passes(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
-    """Only the second pass that is not there is remarked."""
+def test_a_correct_chain_passes(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
+    """The only remark is the missing second pass."""
     begin(curate, tmp_path / "w", toy_kitti, write_results(tmp_path / "a.pkl", toy_kitti))
     code, out, err = curate("doctor", "-w", tmp_path / "w")
     assert code == 0, out + err
@@ -42,7 +42,7 @@ def test_a_sound_chain_passes(curate: Curate, tmp_path: Path, toy_kitti: Path) -
 
 
 def test_a_wrong_convention_fails(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
-    """Boxes at their bottom; as JSON for scripts too; an unknown frame is an error."""
+    """Boxes with their origin at the bottom, also as JSON; an unknown frame is an error."""
     results = write_results(
         tmp_path / "a.pkl", toy_kitti, lambda b: b - b[:, 5:6] * [0, 0, 0.5, 0, 0, 0, 0]
     )
@@ -59,7 +59,7 @@ def test_a_wrong_convention_fails(curate: Curate, tmp_path: Path, toy_kitti: Pat
     assert "frame 999999 is not in the workspace" in err
 
 
-def test_what_cannot_be_opened_is_a_finding(
+def test_a_file_that_cannot_be_opened_is_a_finding(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
     """A pickle that would run code, or a damaged frame."""

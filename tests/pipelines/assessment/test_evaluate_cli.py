@@ -1,4 +1,4 @@
-"""`curate evaluate`: the official figures, bad input in one line, outcomes in SQL."""
+"""`curate evaluate`: the official AP, one-line errors, outcomes in SQL."""
 
 import json
 from dataclasses import replace
@@ -22,7 +22,7 @@ MISSED = "SELECT frame, k, category, iou FROM evaluation WHERE outcome = 'fn'"
 
 @pytest.fixture
 def workspace(tmp_path: Path, toy_kitti: Path, weights_file: Path) -> Workspace:
-    """The toy workspace seen by a sharper camera, in which no object is too low to count."""
+    """Return the toy workspace with a sharper camera, so that no object is too small to count."""
     calibration = toy_calibration()
     sharp = np.diag([10.0, 10.0, 1.0]) @ calibration.projection
     for frame in range(12):
@@ -38,7 +38,7 @@ def workspace(tmp_path: Path, toy_kitti: Path, weights_file: Path) -> Workspace:
 
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path]:
-    """Labels and results of two frames: a car that is found, and nothing."""
+    """Return labels and results of two frames: one has a detected car, one is empty."""
     labels, results = tmp_path / "label_2", tmp_path / "results"
     for folder, line in ((labels, LINE), (results, f"{LINE} 0.5")):
         folder.mkdir()
@@ -48,12 +48,14 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def evaluate(curate: Curate, folders: tuple[Path, Path], *more: object) -> tuple[int, str, str]:
-    """The command on two folders."""
+    """Run the command on two folders."""
     return curate("evaluate", "--labels", folders[0], "--results", folders[1], *more)
 
 
-def test_it_prints_what_the_official_program_prints(curate: Curate, kitti_eval_root: Path) -> None:
-    """The oracle's shape, to 1e-4 for categories with 41 objects or more."""
+def test_it_prints_the_same_values_as_the_official_program(
+    curate: Curate, kitti_eval_root: Path
+) -> None:
+    """Values agree to 1e-4 for categories with 41 objects or more."""
     code, out, _ = evaluate(
         curate, (kitti_eval_root / "label_2", kitti_eval_root / "results"), "--json"
     )
@@ -69,7 +71,7 @@ def test_it_prints_what_the_official_program_prints(curate: Curate, kitti_eval_r
 
 
 def test_it_shows_r40_and_r11_side_by_side(curate: Curate, folders: tuple[Path, Path]) -> None:
-    """And the recall; a found car is exactly 100."""
+    """And the recall; a detected car is exactly 100."""
     code, out, _ = evaluate(curate, folders)
     assert code == 0
     lines = {tuple(line.split()[:2]): line.split()[2:] for line in out.splitlines() if line.strip()}
@@ -78,20 +80,20 @@ def test_it_shows_r40_and_r11_side_by_side(curate: Curate, folders: tuple[Path, 
     assert "recall 3d > 0.7" in out
 
 
-def test_a_first_evaluation_says_that_it_is_compiled(
+def test_the_first_evaluation_reports_that_kernels_are_compiled(
     curate: Curate, folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In one line beside the figures, which stay JSON."""
+    """The line goes to standard error, so standard output stays JSON."""
     monkeypatch.setattr("curate.geometry.compiled.is_compiled", lambda _kernel: False)
     code, out, err = evaluate(curate, folders, "--json")
     assert (code, err) == (0, "compiling the evaluation code (first use only, about ten seconds)\n")
     assert json.loads(out)["objects"]["Car"]
 
 
-def test_a_list_names_the_frames_to_compare(
+def test_a_list_selects_the_frames_to_compare(
     curate: Curate, folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """Labels of a whole data set, results of its val split."""
+    """Labels of a whole dataset, results of its val split."""
     (folders[0] / "000003.txt").write_text(LINE + "\n")
     assert evaluate(curate, folders)[0] == DataError.exit_code
     (tmp_path / "val.txt").write_text("000001\r\n000002\r\n")
@@ -101,10 +103,10 @@ def test_a_list_names_the_frames_to_compare(
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff\x00"])
-def test_a_list_of_frames_without_frames_is_refused(
+def test_an_empty_list_of_frames_is_rejected(
     curate: Curate, folders: tuple[Path, Path], tmp_path: Path, content: bytes
 ) -> None:
-    """In one line that names the file."""
+    """The one-line error contains the file."""
     (tmp_path / "val.txt").write_bytes(content)
     code, _, err = evaluate(curate, folders, "--frames", tmp_path / "val.txt")
     assert code == DataError.exit_code
@@ -112,8 +114,7 @@ def test_a_list_of_frames_without_frames_is_refused(
     assert err.count("\n") == 1
 
 
-def test_a_checkpoint_that_is_not_there_is_one_line(curate: Curate, workspace: Workspace) -> None:
-    """Whatever the detector would make of it."""
+def test_a_missing_checkpoint_gives_a_one_line_error(curate: Curate, workspace: Workspace) -> None:
     code, _, err = curate("evaluate", "-w", workspace.root, "--checkpoint", "nowhere")
     assert code == WorkspaceError.exit_code
     assert err == "error: --checkpoint nowhere: no such file\n"
@@ -137,11 +138,11 @@ def test_a_checkpoint_that_is_not_there_is_one_line(curate: Curate, workspace: W
         ("results/000009.txt", f"{LINE} 0.5", "label_2/000009.txt", "no label file"),
     ],
 )
-def test_bad_files_end_in_one_line_that_names_the_place(
+def test_invalid_files_give_a_one_line_error_with_the_position(
     curate: Curate, tmp_path: Path, folders: tuple[Path, Path],
     file: str, text: str, place: str, message: str,
 ) -> None:  # fmt: skip
-    """File, line and fault; nothing on standard output."""
+    """File, line and reason; nothing on standard output."""
     (tmp_path / file).write_text(text + "\n")
     code, out, err = evaluate(curate, folders)
     assert (code, out) == (DataError.exit_code, "")
@@ -150,8 +151,10 @@ def test_bad_files_end_in_one_line_that_names_the_place(
     assert err.count("\n") == 1
 
 
-def test_a_missing_result_file_is_no_empty_one(curate: Curate, folders: tuple[Path, Path]) -> None:
-    """A partial run is not scored as a whole one; the remedy is named."""
+def test_a_missing_result_file_is_not_treated_as_empty(
+    curate: Curate, folders: tuple[Path, Path]
+) -> None:
+    """An incomplete run is not evaluated; the error says what to do."""
     (folders[1] / "000002.txt").unlink()
     code, _, err = evaluate(curate, folders)
     assert code == DataError.exit_code
@@ -159,10 +162,10 @@ def test_a_missing_result_file_is_no_empty_one(curate: Curate, folders: tuple[Pa
 
 
 @pytest.mark.parametrize("empty", [(0,), (1,), (0, 1)])
-def test_no_detections_or_no_ground_truth_is_zero(
+def test_without_detections_or_ground_truth_every_value_is_zero(
     curate: Curate, folders: tuple[Path, Path], empty: tuple[int, ...]
 ) -> None:
-    """On either side or on both: 0 in every figure, never NaN, and the count of objects."""
+    """On either side or on both: 0, never NaN, and the number of objects."""
     for side in empty:
         (folders[side] / "000001.txt").write_text("")
     code, out, _ = evaluate(curate, folders, "--json")
@@ -173,8 +176,10 @@ def test_no_detections_or_no_ground_truth_is_zero(
     assert evaluate(curate, folders)[0] == 0
 
 
-def test_equal_scores_enter_together(curate: Curate, folders: tuple[Path, Path]) -> None:
-    """Their order does not matter: with a false one of the same score, half is right."""
+def test_detections_with_equal_scores_are_counted_together(
+    curate: Curate, folders: tuple[Path, Path]
+) -> None:
+    """With a false positive of the same score, the precision is 1/2 in any order."""
     far = LINE.replace("0.0 1.7 20.0", "9.0 1.7 40.0").replace("100 100 180 160", "300 100 380 160")
     answers = []
     for lines in ([LINE, far], [far, LINE]):
@@ -193,35 +198,37 @@ def test_equal_scores_enter_together(curate: Curate, folders: tuple[Path, Path])
         (("--round", "1", "--checkpoint", "x"), "--round or --checkpoint"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(
+def test_conflicting_options_are_rejected(
     curate: Curate, arguments: tuple[str, ...], message: str
 ) -> None:
-    """Before anything is opened."""
+    """Before any file is opened."""
     code, _, err = curate("evaluate", *arguments)
     assert code == ConfigError.exit_code
     assert message in err
 
 
-def test_a_round_without_val_predictions_names_the_command(
+def test_without_val_predictions_the_error_contains_the_command(
     curate: Curate, workspace: Workspace
 ) -> None:
-    """A one-line error."""
     curate("predict", "-w", workspace.root)
     code, _, err = curate("evaluate", "--round", "1", "-w", workspace.root)
     assert code == WorkspaceError.exit_code
     assert "curate predict --split val --round 1" in err
 
 
-def test_the_missed_objects_can_be_asked_for(curate: Curate, workspace: Workspace) -> None:
-    """Of a round's val predictions: found and missed add up, as the recall says; then replaced."""
+def test_missed_objects_can_be_queried(curate: Curate, workspace: Workspace) -> None:
+    """Found and missed objects of a round's val predictions match the recall.
+
+    A new run replaces them.
+    """
     curate("predict", "--split", "val", "-w", workspace.root)
     for _ in range(2):
         code, out, _ = curate("evaluate", "--round", "1", "--store", "-w", workspace.root)
         assert code == 0
     assert "stored as source 'round 1'" in out
     figures = json.loads(curate("evaluate", "--round", "1", "--json", "-w", workspace.root)[1])
-    missed = ask(curate, workspace, MISSED)
-    found = ask(curate, workspace, "SELECT * FROM evaluation WHERE outcome = 'tp'")
+    missed = query_rows(curate, workspace, MISSED)
+    found = query_rows(curate, workspace, "SELECT * FROM evaluation WHERE outcome = 'tp'")
     objects = [row for row in found if row["side"] == "object"]
     for category, overlap in (("Car", "0.7"), ("Pedestrian", "0.5"), ("Cyclist", "0.5")):
         tp = sum(row["category"] == category for row in objects)
@@ -232,15 +239,15 @@ def test_the_missed_objects_can_be_asked_for(curate: Curate, workspace: Workspac
     assert objects
     assert all(row["iou"] <= 0.7 for row in missed)
     sql = "SELECT ap_r40 FROM evaluation_ap WHERE figure = '3d' AND category = 'Cyclist'"
-    stored = [row["ap_r40"] for row in ask(curate, workspace, sql)]
+    stored = [row["ap_r40"] for row in query_rows(curate, workspace, sql)]
     assert sorted(stored) == pytest.approx(sorted(figures["AP_R40"]["Cyclist"]["3d"]))
 
 
-def test_outcomes_carry_the_boxes_they_are_about(curate: Curate, workspace: Workspace) -> None:
-    """Of ground truth and of predictions; matches point at each other."""
+def test_outcomes_contain_their_boxes(curate: Curate, workspace: Workspace) -> None:
+    """Of ground truth and of predictions; matches refer to each other."""
     curate("predict", "--split", "val", "-w", workspace.root)
     curate("evaluate", "--round", "1", "--store", "-w", workspace.root)
-    rows = ask(curate, workspace, "SELECT * FROM evaluation")
+    rows = query_rows(curate, workspace, "SELECT * FROM evaluation")
     truth = workspace.ground_truth("val")
     stored = workspace.predictions(1, list(workspace.frames("val").values()))
     for row in rows:
@@ -262,7 +269,7 @@ def test_outcomes_carry_the_boxes_they_are_about(curate: Curate, workspace: Work
 def test_a_checkpoint_is_stored_under_its_path(
     curate: Curate, workspace: Workspace, weights_file: Path
 ) -> None:
-    """Beside the round's."""
+    """Beside the outcomes of the round."""
     curate("predict", "--split", "val", "-w", workspace.root)
     curate("evaluate", "--round", "1", "--store", "-w", workspace.root)
     code, _, err = curate("evaluate", "--store", "-w", workspace.root)
@@ -270,11 +277,11 @@ def test_a_checkpoint_is_stored_under_its_path(
     once = "compiling the evaluation code (first use only, about ten seconds)\n"
     assert (code, err.removeprefix(once)) == (0, "")
     sql = "SELECT source, count(*) AS n FROM evaluation GROUP BY source ORDER BY source"
-    rows = ask(curate, workspace, sql)
+    rows = query_rows(curate, workspace, sql)
     assert [row["source"] for row in rows] == sorted([str(weights_file), "round 1"])
     assert rows[0]["n"] == rows[1]["n"]
 
 
-def ask(curate: Curate, workspace: Workspace, sql: str) -> list[dict]:
-    """The rows of a query."""
+def query_rows(curate: Curate, workspace: Workspace, sql: str) -> list[dict]:
+    """Return the rows of a query."""
     return json.loads(curate("query", sql, "--json", "-w", workspace.root)[1])

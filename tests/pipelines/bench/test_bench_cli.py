@@ -1,4 +1,4 @@
-"""curate bench from the command line: a grid that is killed and goes on, and what is refused."""
+"""`curate bench`: a grid that is killed and resumed, and invalid input."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
-from support.bench_results import made_up, make_bench
+from support.bench_results import make_bench, synthetic_result
 from support.paths import ROOT
 from support.pipelines_cli import Curate
 
@@ -27,7 +27,7 @@ from pipelines.stages.methods import METHODS
 from pipelines.workspace.setup import initialise
 
 GIVE_UP_S = 3600
-# Two rounds of few steps, snapshots that a kill finds, and labels although nothing was learned yet.
+# Two rounds of few steps, snapshots for the kill, and a low score so that there are labels.
 OPTIONS = (
     *("--methods", "baseline,pspsl", "--ratios", "0.25", "--seeds", "3"),
     *("--steps", "3", "--rounds", "2", "--workers", "1"),
@@ -36,14 +36,14 @@ OPTIONS = (
 
 
 def start(folder: Path, *options: object) -> subprocess.Popen:
-    """`curate bench` as a process of its own."""
+    """Start `curate bench` as a new process."""
     command = [sys.executable, "-m", "pipelines", "bench", str(folder), *map(str, options)]
     env = os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 def wait_for(what, process: subprocess.Popen) -> None:
-    """Waits until something is there; fails where the process ends before."""
+    """Wait until a condition holds; fail if the process ends before."""
     until = time.monotonic() + GIVE_UP_S
     while not what():
         assert process.poll() is None, process.communicate()
@@ -52,18 +52,18 @@ def wait_for(what, process: subprocess.Popen) -> None:
 
 
 def figures(result: JobResult) -> dict:
-    """All of a result but its times."""
+    """Return all of a result but its times."""
     return result.model_dump(exclude={"seconds", "resumed", "timings"})
 
 
 def weights(root: Path, job: Job) -> list[tuple]:
-    """A cell's rows of `weight`."""
+    """Return a cell's rows of `weight`."""
     with sqlite3.connect(job.folder(root) / "curate.db") as database:
         return database.execute("SELECT * FROM weight ORDER BY 1, 2, 3, 4").fetchall()
 
 
 def first_round(root: Path, job: Job) -> list[tuple]:
-    """What a cell has of the shared work, with the times at which and in which it was done."""
+    """Return the rows of the shared work in a cell, with the times of its tasks."""
     folder = job.folder(root)
     written = (folder / "checkpoints" / "round-00.safetensors").stat().st_mtime_ns
     query = (
@@ -74,11 +74,11 @@ def first_round(root: Path, job: Job) -> list[tuple]:
         return [(written,), *database.execute(query)]
 
 
-def test_a_killed_grid_goes_on_and_ends_as_if_it_had_not_been(
+def test_a_killed_grid_resumes_and_ends_like_an_uninterrupted_one(
     toy_kitti: Path, tmp_path: Path
 ) -> None:
-    """SIGKILL while a cell trains: its process ends too, and nothing finished is redone."""
-    (toy_kitti / "simulation.json").write_text("{}")  # so that its labels are judged
+    """SIGKILL while a cell trains: its process ends too, and finished work is kept."""
+    (toy_kitti / "simulation.json").write_text("{}")  # so that its labels are evaluated
     folder = tmp_path / "killed"
     process = start(folder, "--data", toy_kitti, *OPTIONS)
     wait_for(lambda: list(folder.glob("cells/*/checkpoints/.*.training")), process)
@@ -93,14 +93,14 @@ def test_a_killed_grid_goes_on_and_ends_as_if_it_had_not_been(
     shared = Job(0.25, 3)
     before = shared.result(folder).stat().st_mtime_ns
 
-    ended = start(folder)  # the folder knows its options
+    ended = start(folder)  # the folder has stored its options
     out, err = ended.communicate(timeout=GIVE_UP_S)
     assert ended.returncode == 0, err.decode()
     assert shared.result(folder).stat().st_mtime_ns == before
     assert "teacher" in out.decode()
     assert (folder / "results.md").is_file()
 
-    whole = make_whole(tmp_path / "whole", folder)
+    whole = run_serially(tmp_path / "whole", folder)
     for job in jobs(whole.axes):
         assert figures(read_result(folder, job)) == figures(read_result(whole.root, job))
     assert weights(folder, Job(0.25, 3, "pspsl")) == weights(whole.root, Job(0.25, 3, "pspsl"))
@@ -114,14 +114,14 @@ def test_a_killed_grid_goes_on_and_ends_as_if_it_had_not_been(
 
 
 def later_frames(root: Path, job: Job) -> int:
-    """How many frames a cell has predicted in rounds of its own."""
+    """Return how many frames a cell has predicted in its own rounds."""
     with sqlite3.connect(job.folder(root) / "curate.db") as database:
         query = "SELECT count(*) FROM task WHERE stage = 'predict' AND round > 1"
         return database.execute(query).fetchone()[0]
 
 
-def make_whole(root: Path, like: Path) -> Bench:
-    """The same bench, job after job in this process."""
+def run_serially(root: Path, like: Path) -> Bench:
+    """Run the same bench, job after job, in this process."""
     stored = read_bench(like)
     assert stored is not None
     bench = Bench(root, stored.settings, stored.axes)
@@ -131,7 +131,7 @@ def make_whole(root: Path, like: Path) -> Bench:
 
 
 def test_methods_share_the_teacher_and_its_evidence(toy_kitti: Path, tmp_path: Path) -> None:
-    """No method's settings make stale what was prepared once for all of them."""
+    """No method's settings make the shared work stale."""
     bench = make_bench(tmp_path, toy_kitti)
     workspace = initialise(tmp_path / "work", bench.config(0), "0.25", "")
     teacher = Teacher(workspace.root / "curate.toml", "0" * 64)
@@ -146,17 +146,17 @@ def test_methods_share_the_teacher_and_its_evidence(toy_kitti: Path, tmp_path: P
     assert len({tuple(each) for each in prints.values()}) == 1, prints
 
 
-def test_a_report_of_what_is_finished_runs_nothing(
+def test_a_report_of_finished_jobs_runs_nothing(
     curate: Curate, toy_kitti: Path, tmp_path: Path
 ) -> None:
-    """Tables on the terminal, the same as JSON; a folder without a bench is refused."""
+    """Tables on the terminal, the same as JSON; a folder without a bench is rejected."""
     code, _, err = curate("bench", tmp_path / "none", "--report")
     assert (code, err.count("\n")) == (WorkspaceError.exit_code, 1)
     bench = make_bench(tmp_path, toy_kitti)
     code, out, err = curate("bench", tmp_path, "--report")
     assert (code, out, err) == (0, "", "no cell is finished yet\n")
     for method, car in (("baseline", 40.0), ("pspsl", 58.0)):
-        write_result(bench.root, made_up(Job(0.25, 0, method), car))
+        write_result(bench.root, synthetic_result(Job(0.25, 0, method), car))
     code, out, _ = curate("bench", tmp_path, "--report")
     assert code == 0
     assert "+6.0" in out
@@ -168,10 +168,10 @@ def test_a_report_of_what_is_finished_runs_nothing(
     assert not (tmp_path / "shared").exists()
 
 
-def test_changed_settings_are_refused_in_one_line(
+def test_changed_settings_are_rejected_in_one_line(
     curate: Curate, toy_kitti: Path, tmp_path: Path
 ) -> None:
-    """Nothing of the folder is touched."""
+    """The folder is not changed."""
     make_bench(tmp_path / "bench", toy_kitti)
     before = (tmp_path / "bench" / "bench.json").read_bytes()
     for options in (("--steps", 5), ("--set", "train.batch_size=4"), ("--rounds", 2)):
@@ -193,10 +193,9 @@ def test_changed_settings_are_refused_in_one_line(
         (("--overlaps", "strict"), "--overlaps strict"),
     ],
 )
-def test_wrong_options_are_refused_before_anything_is_made(
+def test_wrong_options_are_rejected_before_the_bench_is_created(
     curate: Curate, toy_kitti: Path, tmp_path: Path, options: tuple, message: str
 ) -> None:
-    """In one line."""
     code, out, err = curate("bench", tmp_path / "bench", "--data", toy_kitti, *options)
     assert code == ConfigError.exit_code
     assert message in err
@@ -204,20 +203,20 @@ def test_wrong_options_are_refused_before_anything_is_made(
     assert not (tmp_path / "bench").exists()
 
 
-def test_a_folder_without_val_frames_is_refused(
+def test_a_folder_without_val_frames_is_rejected(
     curate: Curate, toy_kitti: Path, tmp_path: Path
 ) -> None:
-    """Before a cell is started."""
+    """Before any cell starts."""
     (toy_kitti / "ImageSets" / "val.txt").write_text("")
     code, _, err = curate("bench", tmp_path / "bench", "--data", toy_kitti)
     assert code == DataError.exit_code
     assert "ImageSets/val.txt is missing or empty" in err
 
 
-def test_a_failing_cell_ends_in_its_own_exit_code(
+def test_a_failed_cell_has_its_own_exit_code(
     curate: Curate, toy_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The rest is told all the same."""
+    """The other cells are still reported."""
     from support.bench_results import ToyJobs
 
     def jobs_of(root: Path) -> ToyJobs:
@@ -232,7 +231,7 @@ def test_a_failing_cell_ends_in_its_own_exit_code(
 
 
 def test_the_command_of_a_single_cell_is_hidden(curate: Curate) -> None:
-    """Only the grid calls it."""
+    """Only the grid uses it."""
     code, out, _ = curate("--help")
     assert code == 0
     assert " bench " in out

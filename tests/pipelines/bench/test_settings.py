@@ -1,4 +1,4 @@
-"""What a bench's cells share: how it is read, merged, refused and kept."""
+"""The settings that the cells of a bench share: reading, merging, checking, storing."""
 
 from pathlib import Path
 
@@ -13,11 +13,11 @@ AXES = Axes(methods=("baseline",), ratios=(0.5,), seeds=(0,))
 
 
 def bench_with(toy_kitti: Path, tmp_path: Path, *overrides: str) -> Bench:
-    """A bench with some overrides."""
+    """Return a bench with some overrides."""
     return Bench(tmp_path, BenchSettings(data=str(toy_kitti), overrides=overrides), AXES)
 
 
-def test_overrides_reach_every_methods_configuration(toy_kitti: Path, tmp_path: Path) -> None:
+def test_overrides_reach_the_configuration_of_every_method(toy_kitti: Path, tmp_path: Path) -> None:
     """Numbers, words, lists and tables of options, each in TOML's notation or as a bare word."""
     bench = bench_with(
         toy_kitti,
@@ -49,10 +49,13 @@ def test_overrides_reach_every_methods_configuration(toy_kitti: Path, tmp_path: 
         ("detector.name=recorded", "needs a detector that it can train"),
     ],
 )
-def test_wrong_overrides_are_refused(
+def test_wrong_overrides_are_rejected(
     toy_kitti: Path, tmp_path: Path, override: str, message: str
 ) -> None:
-    """The configuration's own model checks them; the grid keeps what is its own."""
+    """The configuration's model checks them.
+
+    Keys that the grid sets itself cannot be overridden.
+    """
     with pytest.raises(ConfigError, match=message.replace(".", r"\.")):
         bench_with(toy_kitti, tmp_path, override).config(0, "baseline")
 
@@ -67,21 +70,21 @@ def test_wrong_overrides_are_refused(
         ({"seeds": (-1,)}, "--seeds -1"),
     ],
 )
-def test_wrong_axes_are_refused(axes: dict, message: str) -> None:
-    """In one line that names the option."""
+def test_wrong_axes_are_rejected(axes: dict, message: str) -> None:
+    """The one-line error contains the option."""
     with pytest.raises(ConfigError, match=message):
         check_axes(AXES.model_copy(update=axes))
 
 
-def test_a_bench_is_read_as_it_was_claimed(toy_kitti: Path, tmp_path: Path) -> None:
-    """And there is none where nobody claimed one."""
+def test_the_stored_settings_of_a_bench_are_read_back(toy_kitti: Path, tmp_path: Path) -> None:
+    """A folder without settings has none."""
     assert read_bench(tmp_path) is None
     bench = make_bench(tmp_path, toy_kitti, overrides=("train.batch_size=4",))
     assert read_bench(tmp_path) == bench
 
 
-def test_a_grid_may_grow_but_its_settings_stay(toy_kitti: Path, tmp_path: Path) -> None:
-    """More seeds are welcome; other steps would make cells that cannot be compared."""
+def test_a_grid_can_grow_but_its_settings_cannot_change(toy_kitti: Path, tmp_path: Path) -> None:
+    """More seeds are allowed; with other steps the cells could not be compared."""
     make_bench(tmp_path, toy_kitti)
     make_bench(tmp_path, toy_kitti, seeds=(0, 1))
     with pytest.raises(WorkspaceError, match=r"steps 4 instead of 5; .* another folder"):
@@ -91,8 +94,8 @@ def test_a_grid_may_grow_but_its_settings_stay(toy_kitti: Path, tmp_path: Path) 
     assert (found.settings.steps, found.axes.seeds) == (4, (0, 1))
 
 
-def test_damaged_settings_are_named(toy_kitti: Path, tmp_path: Path) -> None:
-    """With the file."""
+def test_damaged_settings_are_reported(toy_kitti: Path, tmp_path: Path) -> None:
+    """The error contains the file."""
     claim(make_bench(tmp_path, toy_kitti))
     (tmp_path / "bench.json").write_text('{"settings": {"steps": 0}}')
     with pytest.raises(DataError, match=r"bench\.json: is damaged"):

@@ -1,11 +1,11 @@
-"""The tables against hand-made results, and the files of a report."""
+"""The tables against handmade results, and the files of a report."""
 
 import json
 import math
 from pathlib import Path
 
 import pytest
-from support.bench_results import made_up, make_bench
+from support.bench_results import make_bench, synthetic_result
 
 from pipelines.bench.grid import Job
 from pipelines.bench.report import BenchReport, shown
@@ -22,24 +22,27 @@ CARS = {
 
 @pytest.fixture
 def finished() -> Finished:
-    """Two methods, two ratios, two seeds, of which one is not finished at the second ratio."""
-    cells = [made_up(Job(ratio, seed, method), car) for (method, ratio, seed), car in CARS.items()]
-    return Finished([made_up(Job(0.25, 0), 30.0), *cells])
+    """Return two methods, two ratios, two seeds; one cell at the second ratio is not finished."""
+    cells = [
+        synthetic_result(Job(ratio, seed, method), car)
+        for (method, ratio, seed), car in CARS.items()
+    ]
+    return Finished([synthetic_result(Job(0.25, 0), 30.0), *cells])
 
 
 def row(table: Table, name: str) -> list[str]:
-    """A row as it is printed, without its name."""
+    """Return a row as it is printed, without its name."""
     [found] = [row for row in table.rows if row[0] == name]
     return [shown(value) for value in found[1:]]
 
 
 def table(finished: Finished, title: str) -> Table:
-    """The table whose title starts so."""
+    """Return the table with a title that starts so."""
     return next(each for each in all_tables(finished) if each.title.startswith(title))
 
 
 def test_the_table_of_a_ratio(finished: Finished) -> None:
-    """Easy cars: 49, 62 are 55.5 ± 9.2, 13.5 above 40, 44; a third of the gain in the mean."""
+    """Easy cars: 49, 62 are 55.5 ± 9.2, 13.5 above 40, 44; the mean has a third of the gain."""
     found = table(finished, "3D AP, IoU 0.7/0.5/0.5: 25 % labeled (2 of 8 frames)")
     assert found.columns[2:5] == ("Car\neasy", "Car\nmod.", "Car\nhard")
     assert row(found, "pspsl")[:3] == ["2", "55.5±9.2", "45.5±9.2"]
@@ -53,7 +56,7 @@ def test_the_table_of_a_ratio(finished: Finished) -> None:
 
 
 def test_the_summary_has_a_column_per_ratio(finished: Finished) -> None:
-    """The mean of nine figures: (49 + 39 + 29) / 9 = 13 and (62 + 52 + 42) / 9 = 17.3."""
+    """The mean of nine values: (49 + 39 + 29) / 9 = 13 and (62 + 52 + 42) / 9 = 17.3."""
     found = table(finished, "mean 3D AP, IoU 0.7/0.5/0.5, by labeled ratio")
     assert found.columns == ("method", "25 %", "50 %")
     assert row(found, "pspsl") == ["15.2±3.1", "18.7"]
@@ -69,9 +72,9 @@ def test_differences_are_paired_by_seed(finished: Finished) -> None:
 
 
 def test_the_papers_methods_are_compared_with_all_others() -> None:
-    """The others with the baseline alone; no pair twice."""
+    """The others only with the baseline; no pair twice."""
     methods = ("baseline", "uda", "spsl", "pspsl")
-    cells = [made_up(Job(0.1, 0, method), 50.0) for method in methods]
+    cells = [synthetic_result(Job(0.1, 0, method), 50.0) for method in methods]
     found = table(Finished(cells), "differences of mean BEV AP")
     assert [name for name, *_ in found.rows] == [
         "uda - baseline", "spsl - baseline", "pspsl - baseline",
@@ -80,7 +83,7 @@ def test_the_papers_methods_are_compared_with_all_others() -> None:
 
 
 def test_labels_and_times(finished: Finished) -> None:
-    """Undefined precision is a dash; a cell takes two minutes."""
+    """An undefined precision is a dash; a cell takes two minutes."""
     labels = table(finished, "pseudo-labels of the last round")
     assert row(labels, "pspsl") == ["100±0", "0±0", "-", "0.0±0.0", "50.0±0.0"]
     times = table(finished, "minutes per cell")
@@ -88,18 +91,17 @@ def test_labels_and_times(finished: Finished) -> None:
 
 
 def test_without_a_baseline_there_are_no_gains() -> None:
-    """And nothing breaks."""
-    tables = all_tables(Finished([made_up(Job(0.1, 0, "pspsl"), 50.0)]))
+    tables = all_tables(Finished([synthetic_result(Job(0.1, 0, "pspsl"), 50.0)]))
     assert not any(each.title.startswith("differences") for each in tables)
     assert row(tables[0], "pspsl") == ["13.3"]
     assert all_tables(Finished([])) == []
 
 
-def test_the_report_leaves_markdown_numbers_and_a_picture(toy_kitti: Path, tmp_path: Path) -> None:
-    """Markdown with gains in every cell, JSON without NaN, the command that repeats it."""
+def test_the_report_writes_markdown_json_and_a_plot(toy_kitti: Path, tmp_path: Path) -> None:
+    """Markdown with gains in every cell, JSON without NaN, the command that repeats the bench."""
     bench = make_bench(tmp_path, toy_kitti, ratios=(0.25, 0.5), seeds=(0, 1))
     for (method, ratio, seed), car in CARS.items():
-        write_result(tmp_path, made_up(Job(ratio, seed, method), car))
+        write_result(tmp_path, synthetic_result(Job(ratio, seed, method), car))
     assert [path.name for path in BenchReport(bench).write()] == [
         "results.md", "results.json", "curve.png",
     ]  # fmt: skip
@@ -117,8 +119,8 @@ def test_the_report_leaves_markdown_numbers_and_a_picture(toy_kitti: Path, tmp_p
     assert "](curve.pdf)" in (tmp_path / "results.md").read_text()
 
 
-def test_entries_without_values() -> None:
-    """A dash, and no gain."""
+def test_cells_without_values() -> None:
+    """They show a dash and no gain."""
     from curate.evaluation.comparison import Spread
 
     assert Entry(Spread(math.nan, math.nan, 0)).full == "-"

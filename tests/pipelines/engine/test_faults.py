@@ -1,4 +1,4 @@
-"""Faults of the machine, made for real: each ends in one line, and nothing is lost."""
+"""Real failures of the machine: each gives a one-line error, and nothing is lost."""
 
 import os
 import shutil
@@ -28,7 +28,7 @@ connection.execute("BEGIN IMMEDIATE")
 print("locked", flush=True)
 time.sleep(float(sys.argv[2]))
 """
-# A clock that was set back by ten years, for everything that asks the C library.
+# A clock set back by ten years, for every caller of the C library.
 CLOCK = """
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -58,7 +58,7 @@ time_t time(time_t *out) {
 
 @pytest.fixture
 def whole(tmp_path: Path, workspace: Workspace) -> list[tuple]:
-    """What a run stores that nothing disturbs."""
+    """Return what an undisturbed run stores."""
     other = initialise(tmp_path / "whole", workspace.config, "0.25", "")
     run_workspace(other)
     return dump(other)
@@ -66,7 +66,7 @@ def whole(tmp_path: Path, workspace: Workspace) -> list[tuple]:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of four megabytes of our own."""
+    """Mount a disk of four megabytes."""
     folder = tmp_path / "disk"
     folder.mkdir()
     if shutil.which("mount") is None or not _mount("-t", "tmpfs", "-o", "size=4m", "tmpfs", folder):
@@ -81,41 +81,44 @@ def _mount(*arguments: object) -> bool:
     ).returncode
 
 
-def refuse_traceback(code: int, err: str, *codes: int) -> None:
-    """One line, and the exit code of its class."""
+def require_one_line(code: int, err: str, *codes: int) -> None:
+    """Check that the error is one line without a traceback and has the exit code of its class."""
     assert code in codes, err
     assert err.count("\n") == 1, err
     assert err.startswith("error: ")
 
 
 @pytest.mark.parametrize("free_kb", [0, 16, 64, 160])
-def test_a_full_disk_costs_nothing_but_time(
+def test_a_run_continues_after_a_full_disk(
     curate: Curate, workspace: Workspace, whole: list[tuple], small_disk: Path, free_kb: int
 ) -> None:
-    """It fills up sooner or later in the run; with room again the run ends as if it never had."""
+    """It fills up during the run.
+
+    With space again the run ends as if it had not been interrupted.
+    """
     tight = initialise(small_disk / "work", workspace.config, "0.25", "")
     tight.database.close()
     ballast = small_disk / "ballast"
     free = os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_bsize
     ballast.write_bytes(b"\0" * max(0, free - free_kb * 1024))
     code, _, err = curate("run", "-w", tight.root)
-    refuse_traceback(code, err, CurateError.exit_code, DatabaseError.exit_code, 3)
+    require_one_line(code, err, CurateError.exit_code, DatabaseError.exit_code, 3)
     assert "space" in err or "full" in err
     ballast.unlink()
     assert curate("run", "-w", tight.root)[0] == 0
     assert dump(tight) == whole
 
 
-def test_a_read_only_workspace_is_said_to_be_one(
+def test_a_read_only_workspace_is_reported(
     curate: Curate, workspace: Workspace, small_disk: Path
 ) -> None:
-    """What only reads still answers, where SQLite can."""
+    """Commands that only read still work if SQLite can read the file."""
     fixed = initialise(small_disk / "work", workspace.config, "0.25", "")
     fixed.database.close()
     assert _mount("-o", "remount,ro", small_disk)
     for command in ("predict", "run", "status"):
         code, _, err = curate(command, "-w", fixed.root)
-        refuse_traceback(code, err, DatabaseError.exit_code)
+        require_one_line(code, err, DatabaseError.exit_code)
         assert "curate.db" in err
         assert "writ" in err
     assert _mount("-o", "remount,rw", small_disk)
@@ -123,10 +126,11 @@ def test_a_read_only_workspace_is_said_to_be_one(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_corrupted_database_is_detected_and_the_remedy_named(
-    curate: Curate, workspace: Workspace, seed: int
-) -> None:
-    """Whatever pages are overwritten, a command works or ends in one line; never a traceback."""
+def test_a_corrupted_database_is_detected(curate: Curate, workspace: Workspace, seed: int) -> None:
+    """Whatever pages are overwritten, a command works or gives one line with the fix.
+
+    Never a traceback.
+    """
     run_workspace(workspace)
     _checkpoint(workspace)
     path = workspace.root / "curate.db"
@@ -139,7 +143,7 @@ def test_a_corrupted_database_is_detected_and_the_remedy_named(
     for command in (("run",), ("status",), ("solve", "--policy", "uniform"), ("export",)):
         code, _, err = curate(*command, "-w", workspace.root)
         if code:
-            refuse_traceback(code, err, DatabaseError.exit_code)
+            require_one_line(code, err, DatabaseError.exit_code)
             assert "curate.db" in err
             assert "restore" in err
         codes.add(code)
@@ -147,7 +151,7 @@ def test_a_corrupted_database_is_detected_and_the_remedy_named(
 
 
 def _checkpoint(workspace: Workspace) -> None:
-    """Everything lies in the one file."""
+    """Move all data from the journal to the database file."""
     with workspace.database.engine.connect() as connection:
         connection.exec_driver_sql("COMMIT")
         connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -155,20 +159,20 @@ def _checkpoint(workspace: Workspace) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/locks").exists(), reason="the system does not tell who locks")
-def test_a_locked_database_says_who_holds_it(
+def test_the_error_of_a_locked_database_contains_the_owner(
     curate: Curate, workspace: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By process and command line; when it is gone, the command goes on."""
+    """With process id and command line; when the owner ends, the command works."""
     monkeypatch.setattr(session, "BUSY_TIMEOUT_MS", 300)
     with _lock(workspace, 600) as holder:
         code, _, err = curate("predict", "-w", workspace.root)
-        refuse_traceback(code, err, DatabaseError.exit_code)
+        require_one_line(code, err, DatabaseError.exit_code)
         assert f"process {holder.pid} ({sys.executable} -c" in err
     assert curate("predict", "-w", workspace.root)[0] == 0
 
 
-def test_a_locked_database_is_waited_for(curate: Curate, workspace: Workspace) -> None:
-    """A lock that is given up within half a minute is no error."""
+def test_a_command_waits_for_a_locked_database(curate: Curate, workspace: Workspace) -> None:
+    """A lock that is released within half a minute is not an error."""
     with _lock(workspace, 1) as holder:
         assert curate("predict", "-w", workspace.root)[0] == 0
         assert holder.wait() == 0
@@ -187,15 +191,15 @@ def _lock(workspace: Workspace, seconds: float) -> Iterator[subprocess.Popen]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="workers are found in /proc")
-def test_workers_that_the_kernel_kills_cost_nothing(
+def test_workers_killed_by_the_kernel_are_replaced(
     workspace: Workspace, whole: list[tuple]
 ) -> None:
-    """SIGKILL for one worker after the other; the command ends well, with every frame."""
+    """SIGKILL for one worker after the other; the command succeeds with every frame."""
     running = start("run", "-w", workspace.root, "--workers", 2, TOY_DELAY_S="0.3")
     killed: set[int] = set()
     while running.poll() is None and len(killed) < 3:
         fresh = [pid for pid in workers(running.pid) if pid not in killed]
-        if fresh and any(row[0] == "task" for row in dump(workspace)):  # work has begun
+        if fresh and any(row[0] == "task" for row in dump(workspace)):  # work has started
             os.kill(fresh[0], 9)
             killed.add(fresh[0])
         time.sleep(0.2)
@@ -209,7 +213,7 @@ def test_workers_that_the_kernel_kills_cost_nothing(
 def test_a_clock_that_was_set_back_changes_nothing(
     workspace: Workspace, whole: list[tuple], tmp_path: Path
 ) -> None:
-    """Half of the work now, the other half ten years ago."""
+    """Half of the work now, the other half ten years earlier."""
     if shutil.which("cc") is None:
         pytest.skip("another clock needs a C compiler")
     (tmp_path / "clock.c").write_text(CLOCK)
@@ -229,10 +233,10 @@ def test_a_clock_that_was_set_back_changes_nothing(
     assert dump(workspace) == whole
 
 
-def test_a_workspace_that_was_moved_goes_on_where_it_was(
+def test_a_moved_workspace_resumes(
     curate: Curate, workspace: Workspace, whole: list[tuple], tmp_path: Path
 ) -> None:
-    """Nothing that was done is done again."""
+    """Finished work is not repeated."""
     assert curate("predict", "-w", workspace.root)[0] == 0
     workspace.database.close()
     moved = tmp_path / "elsewhere" / "it"

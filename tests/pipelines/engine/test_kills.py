@@ -1,4 +1,4 @@
-"""SIGKILL in every stage: what was killed and runs again ends like what was never killed."""
+"""SIGKILL in every stage: a killed and resumed run ends like an undisturbed one."""
 
 import os
 import shlex
@@ -26,7 +26,7 @@ from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
 
-# The commands, and before which stage they begin: all before it are up to date.
+# The commands, and the stage that they start with: all stages before it are up to date.
 COMMANDS = {
     "init": None,
     "predict": "predict",
@@ -59,7 +59,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="commands are fo
 
 @pytest.fixture(scope="module")
 def forks() -> Iterator[CommandForks]:
-    """Starts commands."""
+    """Return what starts the commands."""
     made = CommandForks()
     yield made
     made.close()
@@ -67,7 +67,7 @@ def forks() -> Iterator[CommandForks]:
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The toy data set and its detector."""
+    """Return the toy dataset and its detector."""
     home = tmp_path_factory.mktemp("kills")
     write_toy_kitti(home / "kitti", frames=12, val=4)
     (home / "detector.txt").write_text("")
@@ -75,14 +75,14 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Case:
-    """A command, a workspace in which it has work to do, and what must be there in the end.
+    """A command, a workspace in which it has work to do, and the expected final contents.
 
     Args:
-        home: data set and detector.
+        home: dataset and detector.
         folder: for its workspaces.
         name: one of `COMMANDS`.
         forks: starts commands.
-        generator: draws the moments.
+        generator: draws the times of the kills.
     """
 
     def __init__(
@@ -101,27 +101,30 @@ class Case:
         self.expected = self._results()
 
     def kill_and_resume(self, kills: int) -> list[tuple]:
-        """Kills the command some times, lets it end; what is there then."""
+        """Kill the command a few times, let it finish, and return what is stored then."""
         self.workspace = self._fresh("killed")
         for _ in range(kills):
             pid = self._start()
             time.sleep(self.generator.uniform(0, self.span_s))
-            os.kill(pid, signal.SIGKILL)  # its key stays taken until it is waited for
+            os.kill(pid, signal.SIGKILL)  # the process keeps its key until it is waited for
             met = self.forks.end(pid) == -signal.SIGKILL
             self.met += met
             self.span_s = min(max(self.span_s * (1.2 if met else 0.5), SHORTEST_S), LONGEST_S)
-            refuse_half_frames(self.workspace / "curate.db")
+            require_whole_frames(self.workspace / "curate.db")
         self._end_of(self._start())
         return self._results()
 
     def _prepared(self, name: str) -> list[object]:
-        """Makes a workspace in which all before the command is up to date; its arguments."""
+        """Create a workspace in which all stages before the command are up to date.
+
+        Return its arguments.
+        """
         place, until = self.folder / "prepared", COMMANDS[name]
         if until is None:
             place.mkdir(parents=True)
             return ["init", *init_options(self.home)]
         workspace = made(self.home, place)
-        bring_up_to(workspace, until)
+        run_stages_before(workspace, until)
         if name.startswith("status"):
             downgrade(workspace)
         workspace.database.close()
@@ -135,7 +138,7 @@ class Case:
         return [*name.split(), "-w"]
 
     def _fresh(self, name: str) -> Path:
-        """A copy of the prepared workspace."""
+        """Copy the prepared workspace."""
         place = self.folder / name
         shutil.rmtree(place, ignore_errors=True)
         shutil.copytree(self.folder / "prepared", place)
@@ -148,7 +151,7 @@ class Case:
         assert self.forks.end(pid) == 0, self.arguments
 
     def _results(self) -> list[tuple]:
-        """All that a run to the end stores: rows, the exported file, students, backups."""
+        """Return all that a finished run stores: rows, the exported file, students, backups."""
         workspace = Workspace.open(self.workspace)
         run_workspace(workspace)
         rows = dump(workspace)
@@ -161,7 +164,7 @@ class Case:
 
 
 def settings(home: Path) -> dict:
-    """Of a workspace of one round that ends with a student."""
+    """Return the settings of a workspace with one round that ends with a student."""
     (home / "trainer.py").write_text(TRAINER)
     command = f"{shlex.join([sys.executable, str(home / 'trainer.py')])} {{output}}"
     document = toy_document(home / "kitti", home / "detector.txt")
@@ -169,12 +172,12 @@ def settings(home: Path) -> dict:
 
 
 def made(home: Path, folder: Path) -> Workspace:
-    """A fresh workspace."""
+    """Create a workspace."""
     return initialise(folder, make_config(settings(home), "test"), "0.25", "")
 
 
 def init_options(home: Path) -> list[object]:
-    """The same by the command line."""
+    """Return the same settings as command-line options."""
     document = settings(home)
     options: list[object] = ["--root", home / "kitti", "--labeled", "0.25"]
     for section in ("detector", "segmenter"):
@@ -184,8 +187,8 @@ def init_options(home: Path) -> list[object]:
     return [*options, "--set", "run.rounds=1", "--set", f"train.command={command}"]
 
 
-def bring_up_to(workspace: Workspace, until: str) -> None:
-    """Runs every stage before one."""
+def run_stages_before(workspace: Workspace, until: str) -> None:
+    """Run every stage before one."""
     for stage in graph_of(workspace).stages:
         if stage.name == until:
             break
@@ -193,14 +196,14 @@ def bring_up_to(workspace: Workspace, until: str) -> None:
 
 
 def downgrade(workspace: Workspace) -> None:
-    """Gives the database the schema of an older curate."""
+    """Downgrade the database to the schema of an older curate."""
     with workspace.database.writing() as connection:
         drop_views(connection)
         older_schema.downgrade(connection, OLDER_SCHEMA)
 
 
-def refuse_half_frames(path: Path) -> None:
-    """The file is sound, and no frame has rows without the task that they were stored with."""
+def require_whole_frames(path: Path) -> None:
+    """Check that the file is intact, and that no frame has rows without their task."""
     if not path.exists():
         return
     with closing(sqlite3.connect(path)) as database:
@@ -220,7 +223,7 @@ def refuse_half_frames(path: Path) -> None:
 def test_a_killed_command_loses_and_doubles_nothing(
     home: Path, tmp_path: Path, forks: CommandForks, name: str
 ) -> None:
-    """One kill at some moment, then everything to its end."""
+    """One kill at a random time, then everything to its end."""
     generator = np.random.default_rng(abs(hash(str(tmp_path))))
     case = Case(home, tmp_path / "case", name, forks, generator)
     assert case.kill_and_resume(kills=1) == case.expected
@@ -230,7 +233,7 @@ def test_a_killed_command_loses_and_doubles_nothing(
 def test_a_hundred_kills_lose_and_double_nothing(
     home: Path, tmp_path: Path, forks: CommandForks
 ) -> None:
-    """At random moments of every command, again and again before it may end."""
+    """At random times of every command, several times before it may finish."""
     generator = np.random.default_rng(0)
     cases: dict[str, Case] = {}
     for name in cycle(COMMANDS):

@@ -10,12 +10,12 @@ from support.process_tree import peaks, start
 pytestmark = pytest.mark.slow
 
 COMMANDS = ("predict", "repredict", "score")
-# CURATE_PROOF_FRAMES takes fewer where there is no time for all.
+# CURATE_PROOF_FRAMES sets a smaller number for shorter runs.
 FEW, MANY = 1_000, int(os.environ.get("CURATE_PROOF_FRAMES", "100000"))
 
 
 def peaks_of(home: Path, frames: int) -> dict[str, tuple[int, int]]:
-    """The peaks of every frame stage over recorded frames, two workers, in KiB."""
+    """Return the peak memory of every frame stage over recorded frames, two workers, in KiB."""
     csv = write_many_frames(home / "data", frames)
     init = start(
         "init", home / "work", "--root", home / "data", "--labeled", home / "data" / "labeled.txt",
@@ -34,7 +34,7 @@ def _peaks(command: str, workspace: Path) -> tuple[int, int]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peaks are read from /proc")
-def test_the_peak_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
+def test_peak_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
     """1,000 against 100,000 recorded frames: within 20 %, in the parent and in each worker."""
     few = peaks_of(tmp_path / "few", FEW)
     many = peaks_of(tmp_path / "many", MANY)

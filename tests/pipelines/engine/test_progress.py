@@ -1,4 +1,4 @@
-"""What a long sweep shows of itself where no terminal is, and how totals become steps."""
+"""Progress lines without a terminal, and the conversion from totals to steps."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from pipelines.engine.progress import as_total
 
 
 def test_totals_become_steps() -> None:
-    """Whoever tells how much is done in all moves a bar that takes how much more is done."""
+    """A bar needs increments; the caller reports totals."""
     moves: list[tuple[int, str]] = []
     reach = as_total(lambda step, note: moves.append((step, note)))
     reach(3, 10)
@@ -20,7 +20,7 @@ def test_totals_become_steps() -> None:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """A function that sets the time."""
+    """Return a function that sets the time."""
     now = 0.0
 
     def at(seconds: float) -> None:
@@ -34,7 +34,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
 def test_a_line_shows_throughput_time_left_and_failures(
     capsys: pytest.CaptureFixture, clock: Callable[[float], None]
 ) -> None:
-    """One frame after 0 s, 41 after 20 s: 2 a second, 29.5 s left for the other 59."""
+    """One frame after 0 s, 41 after 20 s: 2 per second, 29.5 s left for the other 59."""
     with progress.Bar().track("predict", 100) as advance:
         advance(1, "")
         clock(20.0)
@@ -44,7 +44,7 @@ def test_a_line_shows_throughput_time_left_and_failures(
 
 
 def test_the_warm_up_of_the_first_frame_does_not_count(clock: Callable[[float], None]) -> None:
-    """A first frame of 30 s and then 2 a second: the time left is right from the second frame."""
+    """The first frame takes 30 s, then 2 per second; the second one gives the right time left."""
     pace = progress.Pace(101)
     assert pace.rate is None
     clock(30.0)
@@ -57,8 +57,8 @@ def test_the_warm_up_of_the_first_frame_does_not_count(clock: Callable[[float], 
         assert pace.seconds_left == pytest.approx((101 - done) / 2)
 
 
-def test_what_an_earlier_run_had_done_does_not_count(clock: Callable[[float], None]) -> None:
-    """A training that resumes at step 500 of 1000 and then takes 10 s for 100 steps."""
+def test_steps_of_an_earlier_run_do_not_count(clock: Callable[[float], None]) -> None:
+    """A training resumes at step 500 of 1000 and takes 10 s for 100 steps."""
     pace = progress.Pace(1000)
     pace.advance(500)
     clock(10.0)
@@ -77,6 +77,5 @@ def test_what_an_earlier_run_had_done_does_not_count(clock: Callable[[float], No
         (7500, "2 h 5 min"),
     ],
 )
-def test_a_duration_in_words(seconds: float, words: str) -> None:
-    """Rounded to what matters."""
+def test_a_duration_is_rounded_to_what_matters(seconds: float, words: str) -> None:
     assert progress.duration(seconds) == words

@@ -1,4 +1,4 @@
-"""A Ray cluster of two nodes, one of which is killed while it works."""
+"""A Ray cluster of two nodes; one is killed while it works."""
 
 import os
 import signal
@@ -31,12 +31,12 @@ DELAY_S = "0.3"
 
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A head on this machine, with room for one actor."""
+    """Start a head on this machine, with room for one actor."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install '.[ray]'")
     from ray.cluster_utils import Cluster
 
     for name, value in {"TOY_DELAY_S": DELAY_S, "RAY_worker_niceness": "0"}.items():
-        monkeypatch.setenv(name, value)  # nodes hand it on to their actors
+        monkeypatch.setenv(name, value)  # nodes pass it on to their actors
     try:
         made = Cluster(
             initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": 100_000_000}
@@ -48,22 +48,20 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def add_node(cluster: Any) -> Any:
-    """A second node, with room for one actor."""
+    """Start a second node, with room for one actor."""
     return cluster.add_node(num_cpus=1, object_store_memory=100_000_000)
 
 
 def kill_node(node: Any) -> None:
-    """SIGKILL for every process of a node at once, its actors first of all."""
+    """Send SIGKILL to every process of a node at once, its actors first."""
     own = [info.process.pid for infos in node.all_processes.values() for info in infos]
     for pid in [below for each in own for below in descendants(each)] + own:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
 
 
-def test_a_killed_node_costs_its_frame_a_retry_and_nothing_else(
-    cluster: Any, tmp_path: Path
-) -> None:
-    """SIGKILL for all processes of the second node; every frame ends well, one was begun twice."""
+def test_the_frame_of_a_killed_node_is_retried(cluster: Any, tmp_path: Path) -> None:
+    """SIGKILL for all processes of the second node; every frame succeeds, one was started twice."""
     other = add_node(cluster)
     executor = RayExecutor(2, address=cluster.address)
     jobs = [FrameJob(key, f"{key:06d}") for key in range(60)]
@@ -89,20 +87,22 @@ def test_a_killed_node_costs_its_frame_a_retry_and_nothing_else(
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A toy data set and its detector."""
+    """Return a toy dataset and its detector."""
     write_toy_kitti(tmp_path / "kitti", frames=48, val=2)
     (tmp_path / "detector.txt").write_text("")
     return tmp_path
 
 
 def made(home: Path, name: str, **run: object) -> Workspace:
-    """A fresh workspace."""
+    """Create a workspace."""
     document = toy_document(home / "kitti", home / "detector.txt") | {"run": run}
     return initialise(home / name, make_config(document, "test"), "0.1", "")
 
 
-def test_a_run_that_loses_a_node_stores_what_serial_stores(cluster: Any, home: Path) -> None:
-    """`curate run` by the address of a cluster; a node dies as soon as frames are stored."""
+def test_a_run_that_loses_a_node_stores_the_same_rows_as_a_serial_run(
+    cluster: Any, home: Path
+) -> None:
+    """`curate run` with the address of a cluster; a node dies as soon as frames are stored."""
     other = add_node(cluster)
     options = {"ray": {"address": cluster.address}}
     workspace = made(home, "ray", executor="ray", workers=2, executor_options=options)
@@ -118,6 +118,6 @@ def test_a_run_that_loses_a_node_stores_what_serial_stores(cluster: Any, home: P
 
 
 def _stored(workspace: Workspace) -> int:
-    """How many frames are done."""
+    """Return the number of finished frames."""
     with closing(sqlite3.connect(workspace.root / "curate.db")) as database:
         return database.execute("SELECT count(*) FROM task").fetchone()[0]

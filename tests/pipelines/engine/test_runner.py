@@ -21,13 +21,13 @@ FRAME_STAGES = ("predict", "repredict", "points", "semantic")
 
 
 def count(workspace: Workspace, table: str) -> int:
-    """Rows of a table."""
+    """Return the number of rows of a table."""
     with workspace.database.reading() as connection:
         return connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar_one()
 
 
 def with_setting(workspace: Workspace, section: str, **changes: object) -> Workspace:
-    """The workspace after an edit of curate.toml."""
+    """Return the workspace after an edit of curate.toml."""
     return workspace.with_settings(section, **changes)
 
 
@@ -40,7 +40,6 @@ def test_a_run_fills_every_table(workspace: Workspace) -> None:
 
 
 def test_a_second_run_does_nothing(workspace: Workspace) -> None:
-    """What is up to date is not done again."""
     run(workspace)
     before = dump(workspace)
     assert set(run(workspace).values()) == {0}
@@ -58,17 +57,17 @@ def test_a_second_run_does_nothing(workspace: Workspace) -> None:
         ("run", {"workers": 2}, set()),
     ],
 )
-def test_a_changed_setting_redoes_its_stage_and_what_follows(
+def test_a_changed_setting_reruns_its_stage_and_the_later_ones(
     workspace: Workspace, section: str, changes: dict, redone: set
 ) -> None:
-    """And nothing else: a changed prior does not run the detector."""
+    """Nothing else: a changed prior does not run the detector."""
     run(workspace)
     done = run(with_setting(workspace, section, **changes))
     assert {name for name, frames in done.items() if frames} == redone
 
 
-def test_what_left_with_its_prediction_is_made_again(workspace: Workspace) -> None:
-    """Predictions made anew take evidence and weights with them, and their tasks as well."""
+def test_new_predictions_make_the_later_stages_stale(workspace: Workspace) -> None:
+    """Predicting again deletes evidence and weights, and their tasks too."""
     run(workspace)
     before = dump(workspace)
     tried = with_setting(workspace, "detector", minimum_score=0.5)
@@ -87,11 +86,11 @@ def test_what_left_with_its_prediction_is_made_again(workspace: Workspace) -> No
         ("segmenter", {"classes": "coco"}, "semantic", False),
     ],
 )
-def test_another_formula_is_applied_to_what_was_measured(
+def test_a_changed_formula_reuses_the_measurements(
     workspace: Workspace, another: NewWorkspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     section: str, changes: dict, prior: str, rates: bool,
 ) -> None:  # fmt: skip
-    """No point or pixel is counted again, and the rows are those of a run from the start."""
+    """No point or pixel is counted again, and the rows are those of a new run."""
     run(workspace)
     whole = another(tmp_path / "whole")
     run(with_setting(whole, section, **changes))
@@ -105,7 +104,7 @@ def test_another_formula_is_applied_to_what_was_measured(
 
 
 def counted(method, calls: list[str]):
-    """The method, which also leaves its name in a list."""
+    """Return the method, which also appends its name to a list."""
 
     def call(*arguments):
         calls.append(method.__qualname__)
@@ -114,10 +113,10 @@ def counted(method, calls: list[str]):
     return call
 
 
-def test_a_frame_that_failed_is_measured_however_the_formula_changes(
+def test_a_failed_frame_is_measured_even_if_only_the_formula_changed(
     workspace: Workspace, toy_kitti: Path
 ) -> None:
-    """What was never measured cannot be recalled."""
+    """It has no stored measurements to reuse."""
     name = next(iter(workspace.frames("unlabeled")))
     path = toy_kitti / "training" / "image_2" / f"{name}.png"
     whole = path.read_bytes()
@@ -138,10 +137,10 @@ def test_another_detector_makes_everything_stale(workspace: Workspace, weights_f
     assert all(run(workspace).values())
 
 
-def test_a_frame_whose_model_raises_is_recorded_and_costs_no_other_frame(
+def test_a_frame_on_which_the_model_raises_does_not_stop_the_others(
     workspace: Workspace, weights_file: Path
 ) -> None:
-    """One line in its task; the others go on to the end, and it is tried again next time."""
+    """Its task has a one-line error; the next run tries it again."""
     poisoned = next(iter(workspace.frames("unlabeled")))
     weights_file.write_text(poisoned)
     reports = {report.stage: report for report in run_workspace(workspace)}
@@ -157,8 +156,8 @@ def test_a_frame_whose_model_raises_is_recorded_and_costs_no_other_frame(
     assert (again.failed, again.kept) == (1, 5)
 
 
-def test_a_mended_frame_joins_the_others(workspace: Workspace, toy_kitti: Path) -> None:
-    """A damaged file fails its frame; after it is mended only that frame is worked on."""
+def test_a_fixed_frame_is_processed_in_the_next_run(workspace: Workspace, toy_kitti: Path) -> None:
+    """A damaged file fails its frame; after the fix only that frame is processed."""
     name = next(iter(workspace.frames("unlabeled")))
     path = toy_kitti / "training" / "velodyne" / f"{name}.bin"
     whole = path.read_bytes()
@@ -187,7 +186,7 @@ def test_a_mended_frame_joins_the_others(workspace: Workspace, toy_kitti: Path) 
 def test_a_damaged_file_fails_its_frame_with_one_line(
     workspace: Workspace, toy_kitti: Path, damage, message: str
 ) -> None:
-    """The line names the file; no other frame is lost."""
+    """The line contains the file; the other frames are done."""
     name = next(iter(workspace.frames("unlabeled")))
     damage(toy_kitti / "training", name)
     reports = run_workspace(workspace)
@@ -207,15 +206,15 @@ def test_an_empty_sweep_is_empty_in_every_stage(workspace: Workspace, toy_kitti:
     assert count(workspace, "weight") == 15
 
 
-def test_solve_refuses_to_weigh_half_a_round(workspace: Workspace) -> None:
-    """It says which command is missing."""
+def test_solve_requires_all_earlier_stages(workspace: Workspace) -> None:
+    """The error contains the missing command."""
     run_stage(workspace, "predict")
     with pytest.raises(WorkspaceError, match=r"repredict: 6 frames.*curate repredict"):
         run_stage(workspace, "solve", policy="pspsl")
 
 
-def test_policies_stand_side_by_side(workspace: Workspace) -> None:
-    """Solving for another policy leaves the first one's weights as they are."""
+def test_weights_of_two_policies_are_stored_together(workspace: Workspace) -> None:
+    """Solving for another policy does not change those of the first."""
     run(workspace)
     before = [row for row in dump(workspace) if row[0] == "weight"]
     run_stage(workspace, "solve", policy="uniform")
@@ -224,16 +223,16 @@ def test_policies_stand_side_by_side(workspace: Workspace) -> None:
     assert len(after) == 36
 
 
-def test_every_stage_reads_what_exists_before_it(workspace: Workspace) -> None:
-    """The DAG's edges go one way: inputs are sources or written by an earlier stage."""
-    known = {"frame", "ground_truth"}
+def test_every_stage_reads_only_earlier_outputs(workspace: Workspace) -> None:
+    """Inputs are sources or the outputs of earlier stages."""
+    available = {"frame", "ground_truth"}
     for each in round_graph().stages:
-        assert set(each.reads) <= known
-        known |= set(each.writes)
+        assert set(each.reads) <= available
+        available |= set(each.writes)
 
 
-def test_fingerprints_do_not_depend_on_where_the_data_lies(workspace: Workspace) -> None:
-    """A data set that moved is not worked on again."""
+def test_fingerprints_do_not_depend_on_the_location_of_the_data(workspace: Workspace) -> None:
+    """A moved dataset is not processed again."""
     plan = open_plan(workspace, 1)
     moved = replace(plan, workspace=with_setting(workspace, "dataset", root=Path("/elsewhere")))
     assert moved.fingerprints("pspsl") == plan.fingerprints("pspsl")

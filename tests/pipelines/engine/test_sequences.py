@@ -1,4 +1,4 @@
-"""Stages that look at whole sequences: planned, run and resumed per sequence."""
+"""Stages that process whole sequences: planned, run and resumed per sequence."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -31,10 +31,10 @@ class Lengths:
     poisoned: Path
 
     def open(self) -> None:
-        """Nothing to load."""
+        """Do nothing."""
 
     def __call__(self, job: SequenceJob) -> Sequence[FrameRows]:
-        """One row per label; a sequence that the file names fails."""
+        """Return one row per label; a sequence listed in the file fails."""
         if job.name in self.poisoned.read_text().split():
             raise ModelError(f"sequence {job.name}: poisoned")
         assert [frame.frame for frame in job.frames] == sorted(f.frame for f in job.frames)
@@ -54,7 +54,7 @@ class Lengths:
 
 @pytest.fixture
 def poisoned(tmp_path: Path) -> Path:
-    """A file with the names of sequences that fail."""
+    """Return a file with the names of sequences that fail."""
     path = tmp_path / "poisoned.txt"
     path.write_text("")
     return path
@@ -62,14 +62,14 @@ def poisoned(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def sequenced(workspace: Workspace) -> Workspace:
-    """The toy workspace over a data set that knows sequences of three frames."""
+    """Return the toy workspace over a dataset with sequences of three frames."""
     own = workspace.with_settings("dataset", kind="support.toys:ToySequences")
     assert isinstance(own.dataset, ToySequences)
     return own
 
 
 def plan_with_lengths(workspace: Workspace, poisoned: Path) -> Plan:
-    """A plan with `predict` and a stage of sequences behind it."""
+    """Return a plan with `predict` and a sequence stage after it."""
     plan = open_plan(workspace, 1)
     stage = SequenceStage(
         "lengths",
@@ -90,7 +90,7 @@ def run_lengths(workspace: Workspace, poisoned: Path, executor: Executor | None 
 
 
 def points(workspace: Workspace) -> dict[str, set[int]]:
-    """What is stored of each frame."""
+    """Return what is stored for each frame."""
     query = text(
         "SELECT f.frame, p.points FROM point_prior AS p JOIN frame AS f ON f.id = p.frame_id"
     )
@@ -102,7 +102,7 @@ def points(workspace: Workspace) -> dict[str, set[int]]:
 
 
 def expected(workspace: Workspace) -> dict[str, set[int]]:
-    """Three labels per frame, and as many frames as the sequence has in the split."""
+    """Return the expected rows: 3 labels per frame, times the frames of the sequence."""
     frames = list(workspace.frames("unlabeled"))
     of = {frame: ToySequences.sequence_name(frame) for frame in frames}
     names = list(of.values())
@@ -111,7 +111,7 @@ def expected(workspace: Workspace) -> dict[str, set[int]]:
 
 @pytest.fixture(params=["serial", "process"])
 def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
-    """Every executor that is always there."""
+    """Return every executor that is always available."""
     made = SerialExecutor() if request.param == "serial" else ProcessExecutor(2)
     yield made
     made.close()
@@ -120,7 +120,7 @@ def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
 def test_a_stage_sees_whole_sequences(
     sequenced: Workspace, poisoned: Path, executor: Executor
 ) -> None:
-    """Each label gets what only the whole sequence can tell; a second run does nothing."""
+    """Each label gets a value that depends on the whole sequence; a second run does nothing."""
     run_stage(sequenced, "predict")
     first = run_lengths(sequenced, poisoned, executor)
     assert (first.done, first.failed, first.labels) == (6, 0, 18)
@@ -129,7 +129,7 @@ def test_a_stage_sees_whole_sequences(
     assert (again.done, again.kept) == (0, 6)
 
 
-def test_a_sequence_that_fails_is_tried_again_alone(sequenced: Workspace, poisoned: Path) -> None:
+def test_only_the_failed_sequence_is_tried_again(sequenced: Workspace, poisoned: Path) -> None:
     """All its frames are recorded as failed; the other sequences are done."""
     run_stage(sequenced, "predict")
     frames = list(sequenced.frames("unlabeled"))
@@ -145,10 +145,10 @@ def test_a_sequence_that_fails_is_tried_again_alone(sequenced: Workspace, poison
     assert points(sequenced) == expected(sequenced)
 
 
-def test_a_sequence_waits_for_all_its_frames_and_is_redone_with_each(
+def test_a_sequence_is_processed_again_when_a_missing_frame_arrives(
     sequenced: Workspace, poisoned: Path, weights_file: Path
 ) -> None:
-    """A frame that failed before is left out; once it is there, its sequence is made anew."""
+    """A frame that failed before is left out; once it succeeds, its sequence is stale."""
     late = next(iter(sequenced.frames("unlabeled")))
     weights_file.write_text(late)
     run_stage(sequenced, "predict")
@@ -163,7 +163,7 @@ def test_a_sequence_waits_for_all_its_frames_and_is_redone_with_each(
 def test_new_predictions_of_one_frame_make_its_whole_sequence_stale(
     sequenced: Workspace, poisoned: Path
 ) -> None:
-    """Its neighbours' rows were made with the former predictions."""
+    """The rows of its neighbours depend on the old predictions."""
     run_stage(sequenced, "predict")
     run_lengths(sequenced, poisoned)
     frames = sequenced.frames("unlabeled")

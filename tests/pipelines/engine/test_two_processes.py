@@ -1,4 +1,4 @@
-"""Two `curate` processes on one database, on either engine."""
+"""Two `curate` processes on one database, with either engine."""
 
 import os
 import subprocess
@@ -23,14 +23,14 @@ LONGEST_WAIT_S = 120
 
 @pytest.fixture
 def gate(tmp_path: Path) -> Path:
-    """While this file is there, detectors wait."""
+    """Return a file; while it exists, detectors wait."""
     path = tmp_path / "gate"
     path.touch()
     return path
 
 
 def started(workspace: Workspace, gate: Path, *command: str) -> subprocess.Popen:
-    """A process of its own, whose detector waits at the gate."""
+    """Start a process with a detector that waits at the gate."""
     path = f"{TESTS}:{TESTS.parent}"
     return subprocess.Popen(
         [sys.executable, "-m", "pipelines", *command, "-w", str(workspace.root)],
@@ -42,25 +42,25 @@ def started(workspace: Workspace, gate: Path, *command: str) -> subprocess.Popen
 
 
 def owner(workspace: Workspace, number: int) -> str | None:
-    """What somebody is told who wants to work on a round; None where it is free."""
+    """Return the message for a second process that wants to work on a round; None if it is free."""
     try:
         with workspace.database.claiming_round(number, None, "a question"):
             return None
-    except DatabaseError as refusal:
-        return str(refusal)
+    except DatabaseError as error:
+        return str(error)
 
 
 def wait_until(condition: Callable[[], bool], process: subprocess.Popen | None = None) -> None:
-    """Returns once it holds; fails where the process ends before."""
+    """Return once a condition holds; fail if the process ends before."""
     end = time.monotonic() + LONGEST_WAIT_S
     while not condition():
         assert process is None or process.poll() is None, process.communicate()[1]
         assert time.monotonic() < end
-        time.sleep(0.1)  # who asks for an owner holds the claim for a moment
+        time.sleep(0.1)  # the check itself holds the claim for a moment
 
 
 def labels(workspace: Workspace, number: int) -> list[tuple]:
-    """The predictions of a round, without its number."""
+    """Return the predictions of a round, without its number."""
     table = bulk.table("prediction")
     with workspace.database.reading() as connection:
         return sorted(
@@ -68,10 +68,10 @@ def labels(workspace: Workspace, number: int) -> list[tuple]:
         )
 
 
-def test_stages_of_one_round_do_not_collide(
+def test_two_processes_cannot_work_on_one_round(
     workspace: Workspace, curate: Curate, gate: Path
 ) -> None:
-    """The second is refused in one line that names the first; a killed owner is none any more."""
+    """The second gets a one-line error with the first; a killed owner does not block."""
     first = started(workspace, gate, "predict")
     wait_until(arrival(gate, first.pid).exists, first)
     assert f"process {first.pid} " in (owner(workspace, 1) or "")
@@ -88,8 +88,8 @@ def test_stages_of_one_round_do_not_collide(
     assert len(labels(workspace, 1)) == 18
 
 
-def test_different_rounds_run_side_by_side(workspace: Workspace, gate: Path) -> None:
-    """Both at work at the same moment, and both with the rows of a run alone."""
+def test_different_rounds_run_in_parallel(workspace: Workspace, gate: Path) -> None:
+    """Both work at the same moment, and both have the rows of a single run."""
     both = {
         number: started(workspace, gate, "predict", "--round", str(number)) for number in (1, 2)
     }
@@ -104,8 +104,8 @@ def test_different_rounds_run_side_by_side(workspace: Workspace, gate: Path) -> 
     assert labels(workspace, 1) == labels(workspace, 2)
 
 
-def test_settings_of_a_round_at_work_are_not_changed(workspace: Workspace) -> None:
-    """What is recorded of a round is what its owner works with."""
+def test_settings_of_a_round_in_progress_do_not_change(workspace: Workspace) -> None:
+    """The recorded settings are those that its owner works with."""
     open_round(workspace, 1)
     changed = workspace.with_settings("detector", minimum_score=0.5)
     with workspace.database.claiming_round(1, None, "predict"):

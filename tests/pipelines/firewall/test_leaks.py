@@ -1,4 +1,4 @@
-"""Every kind of leak, done for real, is caught before it reaches a training."""
+"""Every kind of data leak is produced and must be detected before any training."""
 
 import csv
 import json
@@ -17,13 +17,13 @@ from curate.errors import DataError, LeakageError
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
 
-# So that a training takes no time: it is a program that writes a file.
+# A fast training: a program that writes a file.
 TRAINER = 'python3 -c \'import os; open(os.environ["CURATE_OUTPUT"], "w").write("student")\''
 
 
 @pytest.fixture(scope="session")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with toy frames and a workspace over them that can be copied to another place."""
+    """Return a folder with toy frames and a workspace over them that can be copied."""
     home = tmp_path_factory.mktemp("leaks")
     write_toy_kitti(home / "kitti", frames=12, val=4)
     (home / "detector.txt").touch()
@@ -39,20 +39,20 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def work(exported: Path, tmp_path: Path) -> Path:
-    """A workspace of 2 labeled, 6 unlabeled and 4 val frames, exported once."""
+    """Return a workspace of 2 labeled, 6 unlabeled and 4 val frames, exported once."""
     shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
     return tmp_path / "work"
 
 
 @pytest.fixture
 def toy_kitti(exported: Path, tmp_path: Path) -> Path:
-    """The frames of the workspace."""
+    """Return the frames of the workspace."""
     shutil.copytree(exported / "kitti", tmp_path / "kitti", dirs_exist_ok=True)
     return tmp_path / "kitti"
 
 
 def change(path: Path, *statements: str) -> None:
-    """Changes a database as someone with the sqlite3 shell would."""
+    """Change a database as someone with the sqlite3 shell would."""
     with closing(sqlite3.connect(path)) as connection:
         for statement in statements:
             connection.execute(statement)
@@ -60,14 +60,14 @@ def change(path: Path, *statements: str) -> None:
 
 
 def frames(work: Path, split: str) -> list[str]:
-    """The frames of a split."""
+    """Return the frames of a split."""
     with closing(sqlite3.connect(work / "curate.db")) as connection:
         query = "SELECT frame FROM frame WHERE split = ? ORDER BY frame"
         return [row[0] for row in connection.execute(query, (split,))]
 
 
 def assert_caught(curate: Curate, work: Path, *words: str, started: bool = True) -> None:
-    """`check` says so, and unless only it looks, neither export nor training starts."""
+    """Check that `check` reports the leak, and that neither export nor training starts."""
     code, out, err = curate("check", "-w", work)
     assert code == LeakageError.exit_code, out
     assert "FAIL" in out
@@ -87,7 +87,7 @@ def assert_caught(curate: Curate, work: Path, *words: str, started: bool = True)
 
 
 def test_a_clean_workspace_passes(curate: Curate, work: Path) -> None:
-    """Every rule with its numbers; then it trains."""
+    """Every rule is listed with its numbers; then the training runs."""
     code, out, err = curate("check", "-w", work)
     assert (code, err) == (0, "")
     assert "FAIL" not in out
@@ -101,8 +101,8 @@ def test_a_clean_workspace_passes(curate: Curate, work: Path) -> None:
     assert code == 0, err
 
 
-def test_a_changed_list_of_the_data_set(curate: Curate, work: Path, toy_kitti: Path) -> None:
-    """A val frame that moves into train.txt is named."""
+def test_a_changed_list_of_the_dataset(curate: Curate, work: Path, toy_kitti: Path) -> None:
+    """A val frame that moved into train.txt is reported."""
     val = toy_kitti / "ImageSets" / "val.txt"
     names = val.read_text().split()
     val.write_text("\n".join(names[1:]) + "\n")
@@ -111,10 +111,7 @@ def test_a_changed_list_of_the_data_set(curate: Curate, work: Path, toy_kitti: P
     assert_caught(curate, work, "1 added (000008)", "1 removed (000008)", "curate init")
 
 
-def test_a_changed_list_that_init_was_given(
-    curate: Curate, tmp_path: Path, toy_kitti: Path
-) -> None:
-    """The file of labeled frames grows; one that is gone is no matter, its frames are recorded."""
+def test_a_changed_list_passed_to_init(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
     (tmp_path / "detector.txt").touch()
     listed = tmp_path / "ids.txt"
     listed.write_text("000001\n000003\n")
@@ -142,8 +139,8 @@ def test_a_changed_split_in_the_database(curate: Curate, work: Path) -> None:
     assert_caught(curate, work, f"val: 1 removed ({moved})", f"unlabeled: 1 added ({moved})")
 
 
-def test_a_tampered_record_of_the_splits(curate: Curate, work: Path) -> None:
-    """Nor can the record be made to fit."""
+def test_a_changed_record_of_the_splits(curate: Curate, work: Path) -> None:
+    """The record is protected too."""
     change(
         work / "curate.db", "UPDATE split_list SET names = names || '999999\n' WHERE name = 'val'"
     )
@@ -153,7 +150,7 @@ def test_a_tampered_record_of_the_splits(curate: Curate, work: Path) -> None:
 
 
 def test_ground_truth_of_an_unlabeled_frame_in_the_database(curate: Curate, work: Path) -> None:
-    """With trigger and foreign keys out of the way."""
+    """With trigger and foreign keys switched off."""
     leaked = frames(work, "unlabeled")[2]
     change(
         work / "curate.db",
@@ -167,8 +164,8 @@ def test_ground_truth_of_an_unlabeled_frame_in_the_database(curate: Curate, work
 
 
 @pytest.mark.parametrize("split", ["val", "unlabeled"])
-def test_a_frame_smuggled_into_the_label_file(curate: Curate, work: Path, split: str) -> None:
-    """As a labeled frame, with its ground truth: object bank and trainer would take both."""
+def test_a_frame_inserted_into_the_label_file(curate: Curate, work: Path, split: str) -> None:
+    """As a labeled frame with its ground truth: object bank and trainer would use both."""
     leaked = frames(work, split)[0]
     change(
         work / "exports" / "round-01-pspsl.sqlite",
@@ -192,7 +189,7 @@ def test_a_frame_smuggled_into_the_label_file(curate: Curate, work: Path, split:
 
 
 def test_labels_changed_after_the_export(curate: Curate, work: Path) -> None:
-    """A box and a weight overwritten: only the hash can tell."""
+    """A changed box and weight: only the hash shows it."""
     change(work / "exports" / "round-01-pspsl.sqlite", "UPDATE label SET weight = 1, x = x + 0.25")
     code, _, err = curate("train-round", "--command", TRAINER, "-w", work)
     assert code == LeakageError.exit_code
@@ -201,12 +198,12 @@ def test_labels_changed_after_the_export(curate: Curate, work: Path) -> None:
 
 
 def test_a_damaged_label_file(curate: Curate, work: Path) -> None:
-    """Half a file is no leak, but nothing to train on."""
+    """Half a file is not a leak, but cannot be used for training."""
     path = work / "exports" / "round-01-pspsl.sqlite"
     path.write_bytes(path.read_bytes()[:5000])
     code, _, err = curate("train-round", "--command", TRAINER, "-w", work)
     assert code == DataError.exit_code, err
-    # An export finds it up to date, but damaged, too.
+    # The export is up to date, but damaged.
     assert "delete it and export it again" in err
     assert curate("check", "-w", work)[0] == LeakageError.exit_code
     path.unlink()
@@ -215,10 +212,10 @@ def test_a_damaged_label_file(curate: Curate, work: Path) -> None:
 
 
 @pytest.mark.parametrize("score", [1.0, 0.7])
-def test_label_files_that_pass_for_detections(
+def test_label_files_used_as_detections(
     curate: Curate, tmp_path: Path, toy_kitti: Path, score: float
 ) -> None:
-    """A record that was written from label files of X_u."""
+    """A record created from the label files of X_u."""
     dataset = KittiDataset(toy_kitti)
     record = tmp_path / "detections.csv"
     columns = "frame view flip_y rotation_rad scale category score x y z length width height yaw"
@@ -241,7 +238,7 @@ def test_label_files_that_pass_for_detections(
 
 
 def test_an_object_bank_of_unlabeled_frames(curate: Curate, work: Path) -> None:
-    """Exported for another trainer, and filled up with objects of X_u."""
+    """Exported for another trainer, with objects of X_u added."""
     code, _, err = curate("export", "--format", "openpcdet", "-w", work)
     assert code == 0, err
     assert curate("check", "-w", work)[0] == 0
@@ -254,7 +251,7 @@ def test_an_object_bank_of_unlabeled_frames(curate: Curate, work: Path) -> None:
 def test_the_same_recording_under_two_names(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """A labeled frame's points are those of a val frame, and an image is used twice."""
+    """A labeled frame has the points of a val frame, and one image is used twice."""
     home = toy_kitti / "training"
     shutil.copy(home / "velodyne" / "000002.bin", home / "velodyne" / "000009.bin")
     shutil.copy(home / "image_2" / "000003.png", home / "image_2" / "000010.png")
@@ -264,7 +261,7 @@ def test_the_same_recording_under_two_names(
         "init", work, "--root", toy_kitti, "--labeled", "0.25",
         "--detector", "support.toys:ToyDetector", "--detector-path", tmp_path / "detector.txt",
     )  # fmt: skip
-    for _ in range(2):  # the second time from remembered hashes
+    for _ in range(2):  # the second time from stored hashes
         code, _, err = curate("check", "-w", work)
         assert code == LeakageError.exit_code
         assert "2 pairs are identical" in err
@@ -274,8 +271,8 @@ def test_the_same_recording_under_two_names(
     assert curate("check", "-w", work)[0] == 0
 
 
-def test_pretraining_looks_too(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
-    """The first teacher learns from X_l as init chose it, or not at all."""
+def test_pretraining_is_checked_too(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
+    """The first teacher is trained on X_l as init chose it, or not at all."""
     work = tmp_path / "work"
     assert curate("init", work, "--root", toy_kitti, "--labeled", "0.25")[0] == 0
     (toy_kitti / "ImageSets" / "val.txt").write_text("000011\n")

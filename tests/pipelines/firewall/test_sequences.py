@@ -1,4 +1,4 @@
-"""Splitting data sets that know sequences: KITTI raw, KITTI with its mapping, folders."""
+"""Splits of datasets with sequences: KITTI raw, KITTI with its mapping, folders."""
 
 import shutil
 from pathlib import Path
@@ -16,7 +16,7 @@ from pipelines.workspace.setup import choose_split
 
 @pytest.fixture
 def drives(tmp_path: Path) -> Path:
-    """Five drives of four frames."""
+    """Return five drives of four frames."""
     write_toy_raw(tmp_path / "raw")
     day = tmp_path / "raw" / "2011_09_26"
     for number in range(2, 6):
@@ -29,7 +29,7 @@ def drives(tmp_path: Path) -> Path:
     return tmp_path / "raw"
 
 
-def test_a_share_of_a_raw_data_set_is_whole_drives(
+def test_a_share_of_a_raw_dataset_consists_of_whole_drives(
     curate: Curate, drives: Path, tmp_path: Path
 ) -> None:
     """A labeled drive, a val drive, three unlabeled ones; `check` counts them."""
@@ -52,10 +52,10 @@ def test_a_share_of_a_raw_data_set_is_whole_drives(
         assert len(set.union(*of)) == 5
 
 
-def test_splitting_by_frame_is_wished_and_warned_of(
+def test_splitting_by_frame_gives_a_warning(
     curate: Curate, drives: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Then the rule is waived, and `check` says with what numbers."""
+    """The rule is then waived, and `check` shows the numbers."""
     work = tmp_path / "work"
     code, _, err = curate(
         "init", work, "--dataset", "kitti-raw", "--root", drives, "--labeled", "0.5",
@@ -74,8 +74,8 @@ def test_splitting_by_frame_is_wished_and_warned_of(
     assert "each sequence is in one split" in err
 
 
-def test_a_list_that_cuts_a_drive_is_refused(curate: Curate, drives: Path, tmp_path: Path) -> None:
-    """With its name and the option."""
+def test_a_list_that_cuts_a_drive_is_rejected(curate: Curate, drives: Path, tmp_path: Path) -> None:
+    """The error contains the drive and the option."""
     (tmp_path / "ids.txt").write_text(f"{DRIVE}_0000000000\n")
     arguments = ("init", tmp_path / "w", "--dataset", "kitti-raw", "--root", drives, "--labeled")
     code, _, err = curate(*arguments, tmp_path / "ids.txt")
@@ -84,7 +84,7 @@ def test_a_list_that_cuts_a_drive_is_refused(curate: Curate, drives: Path, tmp_p
     assert "--split-by frame" in err
 
 
-def test_one_drive_cannot_be_shared(curate: Curate, tmp_path: Path) -> None:
+def test_a_single_drive_cannot_be_split(curate: Curate, tmp_path: Path) -> None:
     """A share of it would be all or nothing."""
     write_toy_raw(tmp_path / "raw")
     code, _, err = curate(
@@ -95,8 +95,8 @@ def test_one_drive_cannot_be_shared(curate: Curate, tmp_path: Path) -> None:
     assert "all 4 frames belong to sequence" in err
 
 
-def test_kitti_object_knows_its_drives_by_the_mapping(tmp_path: Path) -> None:
-    """Of the development kit, where that lies in the root."""
+def test_kitti_object_reads_its_drives_from_the_mapping(tmp_path: Path) -> None:
+    """Of the development kit, if it is in the root."""
     write_toy_kitti(tmp_path, frames=6, val=2)
     home = tmp_path / "devkit_object" / "mapping"
     home.mkdir(parents=True)

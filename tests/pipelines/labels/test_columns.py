@@ -1,4 +1,4 @@
-"""The columns of a round do not depend on the order in which a database gives its rows."""
+"""The columns of a round do not depend on the row order of the database."""
 
 import numpy as np
 from hypothesis import HealthCheck, given, settings
@@ -8,14 +8,14 @@ from db.models import BOX_COLUMNS
 from pipelines.labels.columns import ordered
 
 NUMBERS = ("score", "loss", "weight")
-# How long an example takes says nothing on a busy machine.
+# No deadline: on a busy machine the run time of an example says nothing.
 _PATIENT = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @_PATIENT
 @given(st.permutations(range(12)))
 def test_any_order_of_rows_gives_the_same_columns(order: list[int]) -> None:
-    """By name of the frame, then by k; each row stays whole."""
+    """Sorted by frame name, then by k; each row stays together."""
     names, kinds = ["b", "c", "a"], ["Car", "Cyclist"]
     numbers = dict.fromkeys((*BOX_COLUMNS, *NUMBERS), np.array(order, dtype=float))
     columns = {

@@ -11,8 +11,8 @@ from pipelines.workspace.workspace import Workspace
 ENGINES = ("sqlite", "postgresql")
 
 
-def test_every_label_gets_the_evidence_of_its_own_key(workspace: Workspace) -> None:
-    """Of the wanted frames alone; NaN where a table has no row of a label."""
+def test_every_label_gets_its_own_evidence(workspace: Workspace) -> None:
+    """Only requested frames are read; the value is NaN if a table has no row of a label."""
     for name in ("predict", "repredict", "points", "semantic"):
         run_stage(workspace, name)
     frames = list(workspace.frames("unlabeled").values())

@@ -1,4 +1,4 @@
-"""SQL functions: their values against numpy and the geometry, their nulls, and their faults."""
+"""SQL functions: values against numpy and the geometry, nulls, and errors."""
 
 import json
 import sqlite3
@@ -25,7 +25,7 @@ Y += (X - 1e6) / 2
 
 @pytest.fixture
 def connection() -> Iterator[sqlite3.Connection]:
-    """Values x and y, a null in each, and in group 1 one row alone."""
+    """Return a connection with values x and y, a null in each, and group 1 of a single row."""
     with closing(sqlite3.connect(":memory:")) as opened:
         register_functions(opened)
         opened.execute("CREATE TABLE t (g INTEGER, x REAL, y REAL)")
@@ -50,7 +50,7 @@ def connection() -> Iterator[sqlite3.Connection]:
         ("corr(x, -x)", -1.0),
     ],
 )
-def test_a_value_is_that_of_numpy(
+def test_the_values_equal_those_of_numpy(
     connection: sqlite3.Connection, sql: str, expected: float
 ) -> None:
     """Nulls do not count."""
@@ -59,26 +59,25 @@ def test_a_value_is_that_of_numpy(
 
 
 @pytest.mark.parametrize("sql", ["median(x)", "quantile(x, 0.5)", "stddev(x)", "corr(x, y)"])
-def test_without_values_there_is_no_result(connection: sqlite3.Connection, sql: str) -> None:
-    """A group without rows, one with nulls alone; a single value has no deviation."""
+def test_without_values_the_result_is_null(connection: sqlite3.Connection, sql: str) -> None:
+    """A group without rows, or with nulls only; a single value has no deviation."""
     assert connection.execute(f"SELECT {sql} FROM t WHERE g = 2").fetchone() == (None,)
     assert connection.execute(f"SELECT {sql} FROM t WHERE x IS NULL").fetchone() == (None,)
     alone = connection.execute(f"SELECT {sql} FROM t WHERE g = 1").fetchone()[0]
     assert alone == (3.0 if sql[0] in "mq" else None)
 
 
-def test_groups_are_kept_apart(connection: sqlite3.Connection) -> None:
-    """Each has its own values."""
+def test_groups_are_kept_separate(connection: sqlite3.Connection) -> None:
     rows = connection.execute("SELECT g, median(x) FROM t GROUP BY g ORDER BY g").fetchall()
     assert rows == [(0, pytest.approx(np.median(X))), (1, 3.0)]
 
 
-def test_what_does_not_vary_has_no_correlation(connection: sqlite3.Connection) -> None:
+def test_constant_values_have_no_correlation(connection: sqlite3.Connection) -> None:
     """As on PostgreSQL."""
     assert connection.execute("SELECT corr(x, 1) FROM t").fetchone() == (None,)
 
 
-def test_overlaps_are_those_of_the_geometry(connection: sqlite3.Connection) -> None:
+def test_overlaps_equal_those_of_the_geometry(connection: sqlite3.Connection) -> None:
     """Of boxes that overlap partly, wholly and not at all; a null box has none."""
     for _ in range(50):
         a, b = RNG.uniform([-2, -2, 1, 1, -4], [2, 2, 5, 3, 4], (2, 5))
@@ -105,10 +104,10 @@ def test_overlaps_are_those_of_the_geometry(connection: sqlite3.Connection) -> N
         ("SELECT median(1, 2)", "wrong number of arguments"),
     ],
 )
-def test_a_wrong_argument_is_explained(
+def test_a_wrong_argument_gives_a_one_line_error(
     curate: Curate, workspace: Workspace, sql: str, word: str
 ) -> None:
-    """In one line, whether the function or SQLite finds it."""
+    """Whether the function or SQLite finds it."""
     assert curate("run", "-w", workspace.root)[0] == 0
     code, _, err = curate("query", sql, "-w", workspace.root)
     assert code == ConfigError.exit_code
@@ -119,7 +118,7 @@ def test_a_wrong_argument_is_explained(
 def test_a_median_holds_a_bounded_number_of_values(
     connection: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Or an endless query would fill the memory."""
+    """Otherwise an endless query would fill the memory."""
     monkeypatch.setattr(functions, "MOST_VALUES", 500)
     assert connection.execute("SELECT median(x) FROM t").fetchone() == (None,)
     assert connection.execute("SELECT median(x) FROM t WHERE g = 1").fetchone() == (3.0,)
@@ -128,7 +127,7 @@ def test_a_median_holds_a_bounded_number_of_values(
 def test_a_workspace_and_a_served_file_have_all_functions(
     curate: Curate, workspace: Workspace
 ) -> None:
-    """With as many arguments as the documentation says."""
+    """With the documented number of arguments."""
     boxes = "0, 0, 4, 2, 0, 1, 0, 4, 2, 0"
     columns = ["median(k)", "quantile(k, 0.5)", "corr(k, k)", "stddev(k)", f"iou_bev({boxes})"]
     assert [each.split("(")[0] for each in columns] == [each.name for each in FUNCTIONS]
@@ -140,7 +139,7 @@ def test_a_workspace_and_a_served_file_have_all_functions(
         assert served.execute(sql).fetchone() == pytest.approx(expected)
 
 
-def test_a_connection_loads_nothing_heavy() -> None:
+def test_a_connection_imports_nothing_heavy() -> None:
     """Neither numba nor torch nor numpy, until a function needs it."""
     code = (
         "import sqlite3, sys\n"

@@ -1,10 +1,10 @@
-"""The common questions about labels find their rows by an index, whatever the number of labels."""
+"""The common queries about labels use an index, whatever the number of labels."""
 
 from pathlib import Path
 
 import pytest
 from sqlalchemy import text
-from support.label_questions import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRUSTED, solved
+from support.label_queries import COUNTS, FRAME, FRAME_OF_ROUND, HEAVIEST, TRUSTED, solved
 from support.labels_at_scale import filled_workspace
 
 from db import weight_index
@@ -14,23 +14,23 @@ from pipelines.workspace.workspace import Workspace
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """Two thousand weighed labels."""
+    """Return a workspace with two thousand weighted labels."""
     return solved(filled_workspace(tmp_path_factory.mktemp("filled"), frames=40))
 
 
 def _plan(workspace: Workspace, question: str) -> list[tuple[int, str]]:
-    """The steps of SQLite's plan, each with the number of the step that it belongs to."""
+    """Return the steps of SQLite's plan, each with its parent step."""
     with workspace.database.reading() as connection:
         rows = connection.execute(text(f"EXPLAIN QUERY PLAN {question}"))
         return [(row[1], row[3]) for row in rows]
 
 
 @pytest.mark.parametrize("question", [TRUSTED, HEAVIEST, FRAME, FRAME_OF_ROUND, COUNTS])
-def test_no_table_is_read_from_end_to_end(workspace: Workspace, question: str) -> None:
+def test_no_table_is_scanned_completely(workspace: Workspace, question: str) -> None:
     """SQLite seeks in every table of frames, predictions, evidence and weights.
 
-    Only what people decided and the rounds, which are never many, are read as a whole; no index
-    and no filter is made for the question alone.
+    Only human labels and rounds, which are never many, are scanned; no temporary index
+    and no Bloom filter is built for the query.
     """
     steps = [step for _, step in _plan(workspace, question)]
     assert {step.split()[1] for step in steps if step.startswith("SCAN")} <= {"h", "m", "r"}, steps
@@ -38,22 +38,25 @@ def test_no_table_is_read_from_end_to_end(workspace: Workspace, question: str) -
 
 
 @pytest.mark.parametrize("columns", ["*", "frame, k, weight"])
-def test_the_heaviest_labels_come_by_their_index(workspace: Workspace, columns: str) -> None:
-    """The weights of the policy come in its order; only what people decided is sorted."""
+def test_the_heaviest_labels_are_read_by_their_index(workspace: Workspace, columns: str) -> None:
+    """The weights of the policy are sorted by the index.
+
+    Only human labels are sorted at run time.
+    """
     plan = _plan(workspace, HEAVIEST.replace("*", columns) + " LIMIT 5")
     index = "ix_weight_v_pspsl (round=? AND v>?)"
     (part,) = [part for part, step in plan if step.startswith("SEARCH w") and index in step]
     assert [step for of, step in plan if of == part and "TEMP B-TREE" in step] == [], plan
 
 
-def test_a_named_query_of_one_policy_seeks_its_labels(workspace: Workspace) -> None:
-    """The selection of the policy and round reaches the index of the policy's weights."""
+def test_a_named_query_of_one_policy_uses_the_index(workspace: Workspace) -> None:
+    """The filter on policy and round reaches the index of the weights."""
     sql = find_query("trusted-frames").filtered("pspsl", 1)
     steps = [step for _, step in _plan(workspace, sql)]
     assert any("ix_weight_v_pspsl (round=? AND v>?)" in step for step in steps), steps
 
 
-def test_counts_are_those_of_the_labels(workspace: Workspace) -> None:
+def test_the_counts_equal_those_of_the_labels(workspace: Workspace) -> None:
     """Per policy and category."""
     counted = (
         "SELECT policy, category, count(*), sum(weight > 0), sum(weight > 0.5), sum(weight) "
@@ -67,10 +70,10 @@ def test_counts_are_those_of_the_labels(workspace: Workspace) -> None:
     assert [row[-1] for row in found] == pytest.approx([row[-1] for row in expected])
 
 
-def test_indices_that_were_left_out_of_a_large_load_are_back(
+def test_indices_dropped_for_a_large_load_are_restored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And the rows are those of a small one."""
+    """And the rows are those of a small load."""
     workspace = solved(filled_workspace(tmp_path / "work", frames=10), rounds=4)
     query = text("SELECT * FROM weight ORDER BY frame_id, k")
     schema = text("SELECT name, sql FROM sqlite_master WHERE type = 'index' ORDER BY name")

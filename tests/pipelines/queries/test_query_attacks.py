@@ -1,4 +1,4 @@
-"""Questions that would write, read elsewhere, or take all time and memory, on SQLite."""
+"""Queries that would write, read other files, or use up time and memory, on SQLite."""
 
 from pathlib import Path
 
@@ -36,7 +36,7 @@ from pipelines.workspace.workspace import Workspace
         "",
     ],
 )
-def test_a_question_reads_the_database_and_nothing_else(
+def test_a_query_reads_only_the_database(
     curate: Curate, workspace: Workspace, tmp_path: Path, sql: str
 ) -> None:
     """No other file is read or written, and no row is changed."""
@@ -65,18 +65,20 @@ ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
         ("SELECT " + ", ".join(["1"] * 600), "too many columns"),
     ],
 )
-def test_a_question_is_given_up_before_it_takes_all(
+def test_a_query_is_stopped_at_its_limits(
     curate: Curate, workspace: Workspace, sql: str, word: str
 ) -> None:
-    """Of time and memory, in one line."""
+    """Of time and memory, with a one-line error."""
     code, out, err = curate("query", sql, "--seconds", "0.5", "-w", workspace.root)
     assert (code, out) == (ConfigError.exit_code, "")
     assert word in err
     assert err.count("\n") == 1
 
 
-def test_rows_without_end_are_given_up_as_they_come(curate: Curate, workspace: Workspace) -> None:
-    """They are printed as they are found, and kept nowhere."""
+def test_an_endless_result_is_stopped_while_it_is_printed(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """Rows are printed as they are found, and not kept."""
     for form in ("csv", "json"):
         sql = ENDLESS + "SELECT i FROM n"
         code, out, err = curate(

@@ -1,4 +1,4 @@
-"""curate query: the queries that ship with curate, the forms of a result, other files."""
+"""`curate query`: the queries that ship with curate, output formats, other files."""
 
 import csv
 import io
@@ -20,56 +20,59 @@ QUERIES = named_queries()
 
 @pytest.fixture
 def weighted(curate: Curate, workspace: Workspace) -> Path:
-    """A toy workspace with weights and an exported file."""
+    """Return a toy workspace with weights and an exported file."""
     code, _, err = curate("run", "-w", workspace.root)
     assert code == 0, err
     return workspace.root
 
 
-def test_every_named_query_is_described_and_answered(curate: Curate, weighted: Path) -> None:
-    """On the working database; on the exported file too where it says so, with the same rows."""
+def test_every_named_query_is_described_and_runs(curate: Curate, weighted: Path) -> None:
+    """On the working database.
+
+    Also on the exported file if the query supports it, with the same rows.
+    """
     exported = weighted / "exports" / "labels.sqlite"
     for name, query in QUERIES.items():
         assert query.description, name
         assert not query.sql.startswith("--"), name
         code, out, err = curate("query", "--named", name, "--json", "-w", weighted)
         assert (code, err) == (0, ""), name
-        answer = json.loads(out)
+        result = json.loads(out)
         code, out, err = curate("query", "--named", name, "--json", "--file", exported)
         if query.exported:
             assert (code, err) == (0, ""), name
             if name != "splits":  # an exported file has no val frames
-                assert _rounded(json.loads(out)) == _rounded(answer), name
+                assert _rounded(json.loads(out)) == _rounded(result), name
         else:
             assert code == ConfigError.exit_code, f"{name} works on the exported file: say so"
 
 
 def _rounded(rows: list[dict]) -> list[dict]:
-    """Sums in another order differ in their last digits."""
+    """Round values: sums in another order differ in their last digits."""
     return [
         {key: round(value, 9) if isinstance(value, float) else value for key, value in row.items()}
         for row in rows
     ]
 
 
-def test_the_answers_are_those_of_the_labels(curate: Curate, weighted: Path) -> None:
-    """Kept labels add up to those of the view; frames fall into their splits."""
+def test_the_results_agree_with_the_labels(curate: Curate, weighted: Path) -> None:
+    """Kept labels add up to those of the view; frames belong to their splits."""
     kept = "sum(CASE WHEN weight > 0 THEN 1 ELSE 0 END) AS kept"
     sql = f"SELECT count(*) AS n, {kept}, max(lambda_u) AS age FROM weighted_labels"
     [whole] = json.loads(curate("query", sql, "--json", "-w", weighted)[1])
 
-    def ask(name: str) -> list[dict]:
+    def query_rows(name: str) -> list[dict]:
         return json.loads(curate("query", "--named", name, "--format", "json", "-w", weighted)[1])
 
     assert whole["n"] == 18
-    assert sum(row["labels"] for row in ask("kept")) == whole["n"]
-    assert sum(row["kept"] for row in ask("kept")) == whole["kept"] > 0
-    assert {row["distance"] for row in ask("kept")} <= {"00-20 m", "20-40 m"}
-    assert [row["greatest_lambda"] for row in ask("age")] == [whole["age"]]
-    assert {row["split"]: row["frames"] for row in ask("splits")} == {
+    assert sum(row["labels"] for row in query_rows("kept")) == whole["n"]
+    assert sum(row["kept"] for row in query_rows("kept")) == whole["kept"] > 0
+    assert {row["distance"] for row in query_rows("kept")} <= {"00-20 m", "20-40 m"}
+    assert [row["greatest_lambda"] for row in query_rows("age")] == [whole["age"]]
+    assert {row["split"]: row["frames"] for row in query_rows("splits")} == {
         "labeled": 2, "unlabeled": 6, "val": 4,
     }  # fmt: skip
-    assert all(row["score"] >= 0.5 and row["weight"] < 0.2 for row in ask("doubted"))
+    assert all(row["score"] >= 0.5 and row["weight"] < 0.2 for row in query_rows("doubted"))
 
 
 def test_missed_objects_are_listed_after_an_evaluation(curate: Curate, weighted: Path) -> None:
@@ -83,10 +86,10 @@ def test_missed_objects_are_listed_after_an_evaluation(curate: Curate, weighted:
     assert json.loads(curate("query", "--named", "precision", "--json", "-w", weighted)[1])
 
 
-def test_named_queries_take_a_policy_and_a_round(
+def test_named_queries_accept_a_policy_and_a_round(
     curate: Curate, weighted: Path, engine: str
 ) -> None:
-    """The rows are those of the whole result; each query says what it takes."""
+    """The rows are a part of the whole result; each query lists its options."""
     assert curate("solve", "--policy", "spsl", "--round", "1", "-w", weighted)[0] == 0
     assert curate("audit", "--replicates", "10", "-w", weighted)[0] == 0
 
@@ -113,15 +116,15 @@ def test_named_queries_take_a_policy_and_a_round(
     assert {(row["policy"], row["round"]) for row in both} == {("spsl", 1)}
 
 
-def test_what_the_audit_stores_can_be_selected() -> None:
-    """Evidence stands there beside the policies."""
+def test_stored_audits_can_be_queried() -> None:
+    """Evidence is listed beside the policies."""
     assert tuple(EVIDENCE) == AUDITED
     sql = QUERIES["kept"].filtered("it's", None)
     assert "policy = 'it''s'" in sql
 
 
-def test_the_list_names_every_query(curate: Curate) -> None:
-    """Without a workspace, in every form."""
+def test_the_list_contains_every_query(curate: Curate) -> None:
+    """Without a workspace, in every format."""
     code, out, _ = curate("query", "--list")
     assert code == 0
     assert all(name in out for name in QUERIES)
@@ -146,7 +149,7 @@ def test_the_list_names_every_query(curate: Curate) -> None:
         (["SELECT 1", "--file", "gone.sqlite"], "curate export"),
     ],
 )
-def test_a_wrong_call_names_the_remedy(
+def test_a_wrong_call_says_what_to_do(
     curate: Curate, workspace: Workspace, arguments: list[str], word: str
 ) -> None:
     """One line, and the exit code of a wrong argument."""
@@ -156,16 +159,16 @@ def test_a_wrong_call_names_the_remedy(
     assert err.count("\n") == 1
 
 
-def test_the_exported_file_can_only_be_read(curate: Curate, weighted: Path) -> None:
-    """As the working database."""
+def test_the_exported_file_is_read_only(curate: Curate, weighted: Path) -> None:
+    """Like the working database."""
     exported = weighted / "exports" / "labels.sqlite"
     code, _, err = curate("query", "DELETE FROM label", "--file", exported)
     assert code == ConfigError.exit_code
     assert "read-only" in err
 
 
-def test_a_huge_value_is_refused(curate: Curate, workspace: Workspace, engine: str) -> None:
-    """A server, too, would make a gigabyte where it is asked to."""
+def test_a_huge_value_is_rejected(curate: Curate, workspace: Workspace, engine: str) -> None:
+    """A server, too, would otherwise create a gigabyte."""
     huge = {
         "sqlite": "replace(hex(zeroblob(999999)), '0', 'long')",
         "postgresql": "repeat('x', 5000000)",

@@ -1,4 +1,4 @@
-"""The described schema is that of the databases, and every column has a meaning."""
+"""The described schema matches the databases, and every column has a meaning."""
 
 import csv
 import io
@@ -18,11 +18,11 @@ ENGINES = ("sqlite", "postgresql")
 
 
 def columns_of(schema) -> dict[tuple[str, str], list[str]]:
-    """Return the names of columns by name and kind of what they belong to."""
+    """Return the names of columns by kind and name of their table or view."""
     return {(each.name, each.kind): [one.name for one in each.columns] for each in schema}
 
 
-def test_the_schema_is_that_of_the_database(workspace: Workspace) -> None:
+def test_the_schema_matches_the_database(workspace: Workspace) -> None:
     """Each table and view with its columns in their order."""
     with workspace.database.reading() as connection:
         inspector = inspect(connection)
@@ -85,8 +85,8 @@ def test_the_schema_of_an_exported_file(curate: Curate, workspace: Workspace) ->
     assert rows["x"]["unit"] == "m"
 
 
-def test_evidence_of_a_user_is_in_the_schema(curate: Curate, workspace: Workspace) -> None:
-    """Its table, and its columns in the view, with what the source declares."""
+def test_user_supplied_evidence_is_in_the_schema(curate: Curate, workspace: Workspace) -> None:
+    """Its table, and its columns in the view, as the source declares them."""
     path = workspace.root / "curate.toml"
     priors = '["points", "support.toys:ToyPrior"]'
     path.write_text(re.sub(r"(?m)^priors = .*$", f"priors = {priors}", path.read_text()))
@@ -105,8 +105,8 @@ def test_evidence_of_a_user_is_in_the_schema(curate: Curate, workspace: Workspac
     assert {column.name for column in further} <= {column.name for column in table.columns}
 
 
-def test_the_schema_is_printed_in_every_form(curate: Curate, workspace: Workspace) -> None:
-    """One table of text per table, one list in JSON and CSV."""
+def test_the_schema_is_printed_in_every_format(curate: Curate, workspace: Workspace) -> None:
+    """One text table per table, one list in JSON and CSV."""
     _, out, _ = curate("query", "--schema", "-w", workspace.root)
     assert "weighted_labels (view): Every label" in out
     assert "ground_truth (table): What annotators wrote" in out
@@ -117,7 +117,7 @@ def test_the_schema_is_printed_in_every_form(curate: Curate, workspace: Workspac
 
 
 def test_one_table_is_described(curate: Curate, workspace: Workspace) -> None:
-    """By its name; a misspelled one is suggested."""
+    """By its name; a misspelled name gets a suggestion."""
     _, out, _ = curate("query", "--schema", "weight", "-w", workspace.root)
     assert out.startswith("weight (table)")
     assert "weighted_labels" not in out.splitlines()[0]
@@ -129,7 +129,6 @@ def test_one_table_is_described(curate: Curate, workspace: Workspace) -> None:
 def test_the_schema_needs_no_workspace(
     curate: Curate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Unless one is given."""
     monkeypatch.chdir(tmp_path)
     code, out, err = curate("query", "--schema")
     assert (code, err) == (0, "")
@@ -146,27 +145,27 @@ def test_the_schema_needs_no_workspace(
         ("SELECT p.frame FROM predictions AS p", "prediction"),
     ],
 )
-def test_a_misspelled_name_is_suggested(
+def test_a_misspelled_name_gets_a_suggestion(
     curate: Curate, workspace: Workspace, engine: str, sql: str, meant: str
 ) -> None:
-    """With the command that lists the known ones; on a server, too."""
+    """With the command that lists the known names; on a server, too."""
     code, out, err = curate("query", sql, "-w", workspace.root)
     assert (code, out) == (ConfigError.exit_code, "")
     assert f"did you mean '{meant}'? `curate query --schema`" in err
     assert err.count("\n") == 1
 
 
-def test_an_unknown_name_leads_to_the_schema(curate: Curate, workspace: Workspace) -> None:
-    """Where nothing resembles it."""
+def test_an_unknown_name_refers_to_the_schema(curate: Curate, workspace: Workspace) -> None:
+    """If no name is similar."""
     _, _, err = curate("query", "SELECT qqqqqqqq FROM frame", "-w", workspace.root)
     assert "did you mean" not in err
     assert "`curate query --schema` lists tables and columns" in err
 
 
-def test_an_unknown_function_is_suggested(
+def test_an_unknown_function_gets_a_suggestion(
     curate: Curate, workspace: Workspace, engine: str
 ) -> None:
-    """On a server with what to write instead of the functions that curate adds to SQLite."""
+    """On a server, with a replacement for the functions that curate adds to SQLite."""
     sql = {"sqlite": "SELECT medain(1)", "postgresql": "SELECT median(1)"}[engine]
     word = {"sqlite": "did you mean 'median'?", "postgresql": "percentile_cont(0.5) WITHIN GROUP"}
     _, _, err = curate("query", sql, "-w", workspace.root)

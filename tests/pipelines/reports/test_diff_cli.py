@@ -1,4 +1,4 @@
-"""curate diff: two rounds of the same labels, one of them disturbed by hand."""
+"""`curate diff`: two rounds of the same labels, one of them changed by hand."""
 
 import json
 import sqlite3
@@ -13,7 +13,7 @@ from pipelines.workspace.workspace import Workspace
 
 @pytest.fixture
 def two_rounds(curate: Curate, workspace: Workspace) -> Workspace:
-    """Two rounds; the toy detector answers alike in both."""
+    """Return two rounds; the toy detector predicts the same in both."""
     for number in (1, 2):
         for command in ("predict", "repredict", "score", "solve"):
             code, _, err = curate(command, "--round", number, "-w", workspace.root)
@@ -22,7 +22,7 @@ def two_rounds(curate: Curate, workspace: Workspace) -> Workspace:
 
 
 def disturb(workspace: Workspace, *statements: str) -> None:
-    """Changes the stored labels."""
+    """Change the stored labels."""
     with closing(sqlite3.connect(workspace.root / "curate.db")) as connection:
         connection.execute("PRAGMA foreign_keys = ON")
         for statement in statements:
@@ -31,7 +31,7 @@ def disturb(workspace: Workspace, *statements: str) -> None:
 
 
 def test_every_kind_of_change_is_counted_and_listed(curate: Curate, two_rounds: Workspace) -> None:
-    """A car that goes, one that moves a metre, a pedestrian that loses its weight."""
+    """A car that disappears, one that moves a metre, a pedestrian that loses its weight."""
     first, second, third = list(two_rounds.frames("unlabeled").values())[:3]
     k = "(SELECT k FROM prediction WHERE round = 2 AND frame_id = {} AND category = '{}')"
     car, one, walker = (
@@ -67,7 +67,7 @@ def test_every_kind_of_change_is_counted_and_listed(curate: Curate, two_rounds: 
 
 
 def test_the_tables_are_printed(curate: Curate, two_rounds: Workspace) -> None:
-    """With the limit obeyed; rounds that agree list nothing."""
+    """Within the row limit; equal rounds list nothing."""
     disturb(two_rounds, "UPDATE weight SET v = v / 2 WHERE round = 2")
     code, out, _ = curate("diff", 1, 2, "--limit", 1, "-w", two_rounds.root)
     assert code == 0
@@ -76,8 +76,8 @@ def test_the_tables_are_printed(curate: Curate, two_rounds: Workspace) -> None:
     assert "most changed" not in curate("diff", 1, 1, "-w", two_rounds.root)[1]
 
 
-def test_a_round_without_weights_names_the_remedy(curate: Curate, two_rounds: Workspace) -> None:
-    """And the policy."""
+def test_a_round_without_weights_is_reported(curate: Curate, two_rounds: Workspace) -> None:
+    """The error contains the policy and what to do."""
     code, _, err = curate("diff", 1, 2, "--policy", "spsl", "-w", two_rounds.root)
     assert code == WorkspaceError.exit_code
     assert "curate solve --round 1 --policy spsl" in err

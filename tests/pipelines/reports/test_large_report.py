@@ -1,4 +1,4 @@
-"""A report of two million labels: a small page, made in bounded memory."""
+"""A report of two million labels: a small page, in bounded memory."""
 
 import json
 import os
@@ -11,7 +11,7 @@ import pytest
 from support.large_workspace import large_workspace
 from support.paths import ROOT
 
-# Runs the command as a person would, and tells its greatest memory in KiB.
+# Runs the command and prints its peak memory in KiB.
 MEASURED = (
     "import time\n"
     "from pipelines.cli import main\n"
@@ -21,12 +21,12 @@ MEASURED = (
 )
 
 
-# The libraries take 200 of it; held whole, 200,000 labels took 300 already.
+# The libraries take 200 of it; without streaming, 200,000 labels already took 300.
 MOST_MIB = 700
 
 
 def measured(*arguments: str) -> tuple[str, int]:
-    """What a command prints, and the memory that it took in MiB."""
+    """Return what a command prints, and its peak memory in MiB."""
     ended = subprocess.run(
         [sys.executable, "-c", MEASURED, *arguments],
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])},
@@ -36,19 +36,19 @@ def measured(*arguments: str) -> tuple[str, int]:
     )
     assert ended.returncode == 0, ended.stderr
     print(ended.stdout)  # noqa: T201 - `pytest -s` shows the figures
-    told, peak = re.fullmatch(r"(.*)\npeak (\d+) .*\n", ended.stdout, re.DOTALL).groups()
-    return told, int(peak) // 1024
+    printed, peak = re.fullmatch(r"(.*)\npeak (\d+) .*\n", ended.stdout, re.DOTALL).groups()
+    return printed, int(peak) // 1024
 
 
 def report(root: Path, *arguments: str) -> tuple[Path, int]:
-    """The page of `curate report`, and the memory that it took in MiB."""
-    told, peak = measured("report", "-w", str(root), *arguments)
-    return Path(told.removeprefix("report: ")), peak
+    """Return the page of `curate report`, and the peak memory in MiB."""
+    printed, peak = measured("report", "-w", str(root), *arguments)
+    return Path(printed.removeprefix("report: ")), peak
 
 
 @pytest.mark.slow
 def test_two_million_labels_make_a_small_page(tmp_path: Path) -> None:
-    """The first of two rounds has 2 million labels, the second a quarter; both make a page."""
+    """The first of two rounds has 2 million labels, the second a quarter."""
     n = int(os.environ.get("CURATE_PROOF_LABELS", "2_000_000"))
     workspace = large_workspace(tmp_path, (n, n // 4))
     page, first = report(workspace.root, "--round", "1")
@@ -62,8 +62,8 @@ def test_two_million_labels_make_a_small_page(tmp_path: Path) -> None:
     assert "Since round 1" in text
     assert len(text) < 1_500_000
     assert second < MOST_MIB
-    told, compared = measured("diff", "1", "2", "--json", "-w", str(workspace.root))
-    rows = {row["category"]: row for row in json.loads(told)["categories"]}
+    printed, compared = measured("diff", "1", "2", "--json", "-w", str(workspace.root))
+    rows = {row["category"]: row for row in json.loads(printed)["categories"]}
     assert (rows["all"]["before"], rows["all"]["after"]) == (n, n // 4)
     assert rows["all"]["lost"] == n - rows["all"]["matched"]
     assert compared < MOST_MIB

@@ -1,4 +1,4 @@
-"""curate report: one file that stands alone."""
+"""`curate report`: one self-contained file."""
 
 import json
 import re
@@ -12,26 +12,26 @@ from pipelines.workspace.workspace import Workspace
 
 
 class Headings(HTMLParser):
-    """The h2 of a page, and its links."""
+    """The h2 headings of a page, and its links."""
 
     def __init__(self) -> None:
         super().__init__()
         self.found, self.links, self.inside = [], [], False
 
     def handle_starttag(self, tag, attrs) -> None:
-        """Collects links."""
+        """Collect links."""
         self.inside = tag == "h2"
         self.links += [value for key, value in attrs if key in {"src", "href"}]
 
     def handle_data(self, data) -> None:
-        """Collects headings."""
+        """Collect headings."""
         if self.inside:
             self.found.append(data)
         self.inside = False
 
 
 def read(path: Path) -> tuple[list[str], str]:
-    """Headings and text of a report that loads nothing."""
+    """Return headings and text of a report, and check that it loads nothing."""
     text = path.read_text(encoding="utf-8")
     reader = Headings()
     reader.feed(text)
@@ -42,10 +42,10 @@ def read(path: Path) -> tuple[list[str], str]:
     return reader.found, text
 
 
-def test_a_report_tells_a_round_its_changes_and_its_audit(
+def test_a_report_shows_a_round_its_changes_and_its_audit(
     curate: Curate, workspace: Workspace
 ) -> None:
-    """The first round has no changes; an audit brings the curve."""
+    """The first round has no changes; an audit adds the reliability curve."""
     root = workspace.root
     for number in (1, 2):
         for command in ("predict", "repredict", "score", "solve"):
@@ -77,8 +77,10 @@ def test_a_report_tells_a_round_its_changes_and_its_audit(
     assert second.read_text(encoding="utf-8") == text
 
 
-def test_an_unknown_chart_format_is_found_first(curate: Curate, workspace: Workspace) -> None:
-    """By all commands that draw charts, before they work."""
+def test_an_unknown_chart_format_is_found_before_any_work(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """By all commands that draw charts."""
     for command in ("report", "audit"):
         code, out, err = curate(command, "--format", "gif", "-w", workspace.root)
         assert code == ConfigError.exit_code
@@ -86,8 +88,7 @@ def test_an_unknown_chart_format_is_found_first(curate: Curate, workspace: Works
         assert out == ""
 
 
-def test_without_weights_the_remedy_is_named(curate: Curate, workspace: Workspace) -> None:
-    """One line."""
+def test_without_weights_the_error_says_what_to_do(curate: Curate, workspace: Workspace) -> None:
     assert curate("predict", "-w", workspace.root)[0] == 0
     code, _, err = curate("report", "-w", workspace.root)
     assert code == WorkspaceError.exit_code

@@ -41,7 +41,7 @@ _SECONDS = re.compile(r"\(\d+\.\d s\)")
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two weighted rounds, predicted val frames, an audit and a review."""
+    """Return a workspace with two weighted rounds, predicted val frames, an audit and a review."""
     root = tmp_path_factory.mktemp("tables")
     write_toy_kitti(root / "kitti", frames=12, val=4)
     weights = root / "detector.txt"
@@ -77,10 +77,10 @@ def run(
 
 @pytest.mark.parametrize("width", [60, 80, 120])
 @pytest.mark.parametrize("arguments", COMMANDS, ids=" ".join)
-def test_nothing_is_cut(
+def test_nothing_is_truncated(
     monkeypatch: pytest.MonkeyPatch, workspace: Path, arguments: tuple[str, ...], width: int
 ) -> None:
-    """Every number and every frame id of the widest terminal stands whole in a narrow one."""
+    """Every number and frame id of the widest terminal is complete in a narrow one."""
     whole = _SECONDS.sub("", run(monkeypatch, WIDE, arguments, workspace).text)
     screen = run(monkeypatch, width, arguments, workspace)
     assert [line for line in screen.lines if len(line) > width] == []
@@ -92,7 +92,7 @@ def test_nothing_is_cut(
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
-def test_a_real_process_in_a_terminal(workspace: Path, width: int) -> None:
+def test_a_process_in_a_terminal(workspace: Path, width: int) -> None:
     """With NO_COLOR and a terminal that reports its size, not COLUMNS."""
     sql = "SELECT * FROM weighted_labels WHERE frame = '000003' AND round = 1"
     environment = {
@@ -111,7 +111,7 @@ def test_a_real_process_in_a_terminal(workspace: Path, width: int) -> None:
 def test_a_pipe_gets_the_same_text_at_any_width(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, workspace: Path
 ) -> None:
-    """A row is one line there, however wide the terminal is said to be."""
+    """Each row is one line there."""
     curate = in_process(monkeypatch, capsys)
     texts = set()
     for columns in ("40", "80", "300"):

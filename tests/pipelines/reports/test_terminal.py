@@ -1,4 +1,4 @@
-"""Tables in a terminal, where nothing may be cut, and in a pipe, where nothing may wrap."""
+"""Tables in a terminal, where nothing may be truncated, and in a pipe, where nothing may wrap."""
 
 from pathlib import Path
 
@@ -19,15 +19,15 @@ WHOLE = ["0.1235", "98765", "0.61 - 0.83", *(row[0] for row in ROWS), *(row[7] f
 
 
 @pytest.mark.parametrize("width", [30, 60, 80, 100, 120, 200])
-def test_no_number_and_no_identifier_is_cut(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
-    """Each stands in one line, in its own line or cell, and the lines fit."""
+def test_no_number_or_identifier_is_truncated(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    """Each is complete in its own line or cell, and the lines fit."""
     with terminal(monkeypatch, width) as screen:
         print_table(COLUMNS, ROWS, title="Labels of three frames with a title that has to wrap too")
     assert max(map(len, screen.lines)) <= width
     assert "…" not in screen.text
     assert [value for value in WHOLE if value not in screen.text.split("\r\n", 1)[1]] in (
         [],
-        # 29 columns and a name beside them do not fit into 30.
+        # 29 columns plus a name do not fit into 30.
         [row[7] for row in ROWS] if width == 30 else [],
     )
     words = " ".join(screen.text.split())
@@ -35,7 +35,7 @@ def test_no_number_and_no_identifier_is_cut(monkeypatch: pytest.MonkeyPatch, wid
 
 
 def test_a_table_that_fits_has_a_line_per_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A name, a rule, three rows, and an empty line behind them."""
+    """A name, a rule, three rows, and an empty line at the end."""
     with terminal(monkeypatch, 200) as screen:
         print_table(COLUMNS, ROWS)
     assert len(screen.lines) == 6
@@ -43,7 +43,7 @@ def test_a_table_that_fits_has_a_line_per_row(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_text_wraps_before_a_table_becomes_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The message and the name of two words; the numbers stay in the first line of the row."""
+    """The message and the name of two words wrap; the numbers stay in the first line of the row."""
     with terminal(monkeypatch, 110) as screen:
         print_table(COLUMNS, ROWS)
     assert "row 1" not in screen.text
@@ -53,7 +53,7 @@ def test_text_wraps_before_a_table_becomes_blocks(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_table_that_is_too_wide_becomes_a_block_per_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Names stand beside their values; short pairs share lines."""
+    """Values follow their names; short pairs share lines."""
     columns = [f"column_{i}" for i in range(8)]
     with terminal(monkeypatch, 60) as screen:
         print_table(columns, [[i / 7] * 8 for i in range(2)])
@@ -63,7 +63,7 @@ def test_a_table_that_is_too_wide_becomes_a_block_per_row(monkeypatch: pytest.Mo
 
 
 def test_a_table_without_rows_shows_its_columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where they do not fit beside each other."""
+    """Also if they do not fit side by side."""
     for width in (40, 200):
         with terminal(monkeypatch, width) as screen:
             print_table(COLUMNS, [])
@@ -72,15 +72,15 @@ def test_a_table_without_rows_shows_its_columns(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_wide_characters_count_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As they do on the screen."""
+    """As on the screen."""
     with terminal(monkeypatch, 30) as screen:
         print_table(("name", "frame"), [("行人" * 5, "000001"), ("自転車", "000002")])
     assert "行人" * 5 in screen.text
     assert "000002" in screen.text
 
 
-def test_brackets_and_control_characters_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A value is text: neither markup, nor an order to the terminal."""
+def test_brackets_and_control_characters_are_escaped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A value is text: neither markup nor a control sequence for the terminal."""
     with terminal(monkeypatch, 80) as screen:
         print_table(("value",), [("[red]x[/red] :car: \x1b[2J",)])
     assert "[red]x[/red] :car: \\x1b[2J" in screen.text
@@ -98,7 +98,7 @@ def test_nothing_is_coloured(monkeypatch: pytest.MonkeyPatch, no_color: str) -> 
 def test_a_pipe_gets_whole_rows_of_any_width(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    """Whatever COLUMNS and FORCE_COLOR say."""
+    """Whatever COLUMNS and FORCE_COLOR are."""
     texts = set()
     for columns in ("20", "80", "500"):
         monkeypatch.setenv("COLUMNS", columns)
@@ -114,7 +114,7 @@ def test_a_pipe_gets_whole_rows_of_any_width(
 
 
 def test_lines_wrap_with_a_hanging_indent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And a number is not broken."""
+    """Numbers are not broken."""
     with terminal(monkeypatch, 60) as screen:
         print_line("  consistency    " + "loss 0.123456 and " * 6, indent=17)
     assert max(map(len, screen.lines)) <= 60
@@ -123,10 +123,10 @@ def test_lines_wrap_with_a_hanging_indent(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize(("lines", "paged"), [(10, True), (100, False)])
-def test_only_a_long_table_goes_through_a_pager(
+def test_only_a_long_table_uses_a_pager(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, lines: int, *, paged: bool
 ) -> None:
-    """PAGER is asked where the table is longer than the terminal."""
+    """PAGER is used if the table is longer than the terminal."""
     monkeypatch.setenv("PAGER", f"cat > {tmp_path / 'paged'}")
     monkeypatch.delenv("MANPAGER", raising=False)
     monkeypatch.setenv("TERM", "xterm")
@@ -137,10 +137,9 @@ def test_only_a_long_table_goes_through_a_pager(
     assert text.count("000001.bin") == 5
 
 
-def test_a_pipe_has_no_pager(
+def test_a_pipe_uses_no_pager(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    """However long the table."""
     monkeypatch.setenv("PAGER", f"cat > {tmp_path / 'paged'}")
     print_table(COLUMNS, ROWS * 500, page=True)
     assert not (tmp_path / "paged").exists()

@@ -1,4 +1,4 @@
-"""curate view: what it draws, where it leaves it, what it refuses."""
+"""`curate view`: its plots, their paths, and invalid input."""
 
 import json
 from dataclasses import replace
@@ -15,18 +15,18 @@ from pipelines.reports.recording import evidence_of_labels
 from pipelines.workspace.workspace import Workspace
 
 
-def drawn(path: Path) -> np.ndarray:
-    """The picture of a file."""
+def drawn_image(path: Path) -> np.ndarray:
+    """Return the image in a file."""
     import cv2
 
-    picture = cv2.imread(str(path))
-    assert picture is not None
-    return picture
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image
 
 
 @pytest.fixture
 def weighted(curate: Curate, workspace: Workspace) -> Workspace:
-    """Weights for X_u, predictions for val."""
+    """Create weights for X_u and predictions for val."""
     for command in ("predict", "repredict", "score", "solve"):
         code, _, err = curate(command, "-w", workspace.root)
         assert code == 0, err
@@ -35,32 +35,34 @@ def weighted(curate: Curate, workspace: Workspace) -> Workspace:
 
 
 def test_a_frame_of_every_split_is_drawn(curate: Curate, weighted: Workspace) -> None:
-    """The command says where the picture is; ground truth comes with labeled and val frames."""
+    """The command prints the path; labeled and val frames show ground truth."""
     for split in ("labeled", "unlabeled", "val"):
         name = next(iter(weighted.frames(split)))
         code, out, err = curate("view", name, "-w", weighted.root)
         assert (code, err) == (0, "")
         path = Path(out.removeprefix("picture: ").strip())
         assert path.parent == weighted.root / "pictures"
-        assert drawn(path).shape[1] >= 1200
+        assert drawn_image(path).shape[1] >= 1200
         found = read_frame(weighted, name, 1, "pspsl")
         assert (found.truth_boxes is None) == (split == "unlabeled")
         assert len(found.labels) == {"labeled": 0, "unlabeled": 3, "val": 3}[split]
         assert np.isnan(found.weights).all() == (split != "unlabeled")
 
 
-def test_repredictions_carry_the_weight_of_their_label(weighted: Workspace) -> None:
+def test_repredictions_have_the_weight_of_their_label(weighted: Workspace) -> None:
     """In the toy world every label is matched once."""
     found = read_frame(weighted, next(iter(weighted.frames("unlabeled"))), 1, "pspsl")
     assert sorted(found.repredictions.weights) == pytest.approx(sorted(found.weights))
     assert found.repredictions.boxes.shape == (3, 7)
 
 
-def test_output_and_policy_are_obeyed(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
-    """Another policy colours the boxes otherwise."""
+def test_the_options_for_output_and_policy_are_used(
+    curate: Curate, weighted: Workspace, tmp_path: Path
+) -> None:
+    """Another policy colours the boxes differently."""
     assert curate("solve", "--policy", "uniform", "-w", weighted.root)[0] == 0
     name = next(iter(weighted.frames("unlabeled")))
-    pictures = []
+    images = []
     for policy in ("pspsl", "uniform"):
         path = tmp_path / f"{policy} <1>.png"
         code, out, _ = curate(
@@ -68,8 +70,8 @@ def test_output_and_policy_are_obeyed(curate: Curate, weighted: Workspace, tmp_p
         )
         assert code == 0
         assert str(path) in out
-        pictures.append(drawn(path))
-    assert (pictures[0] != pictures[1]).any()
+        images.append(drawn_image(path))
+    assert (images[0] != images[1]).any()
 
 
 @pytest.mark.parametrize(
@@ -89,7 +91,7 @@ def test_the_format_is_that_of_the_option_or_of_the_suffix(
     suffix: str,
     start: bytes,
 ) -> None:
-    """PNG where neither says otherwise."""
+    """The default is PNG."""
     name = next(iter(weighted.frames("unlabeled")))
     words = [str(tmp_path / each) if each.startswith("OUT") else each for each in options]
     code, out, err = curate("view", name, *words, "-w", weighted.root)
@@ -98,11 +100,11 @@ def test_the_format_is_that_of_the_option_or_of_the_suffix(
     assert path.suffix == f".{suffix}"
     assert path.read_bytes().startswith(start)
     if "paper" in options:
-        assert (drawn(path) == 255).all(axis=2).mean() > 0.5
+        assert (drawn_image(path) == 255).all(axis=2).mean() > 0.5
 
 
-def test_a_picture_shows_the_k_that_explain_takes(weighted: Workspace) -> None:
-    """Also where a label before it gave way to a human one."""
+def test_a_plot_shows_the_k_that_explain_takes(weighted: Workspace) -> None:
+    """Also if an earlier label was replaced by a human one."""
     from pipelines.reports.pictures import shown_labels
 
     name = next(iter(weighted.frames("unlabeled")))
@@ -131,10 +133,9 @@ def test_a_picture_shows_the_k_that_explain_takes(weighted: Workspace) -> None:
         (["FRAME", "--style", "light"], "--style light: use dark or paper"),
     ],
 )
-def test_a_wrong_call_is_one_line(
+def test_a_wrong_call_gives_a_one_line_error(
     curate: Curate, weighted: Workspace, arguments: list[str], word: str
 ) -> None:
-    """It names what is wrong."""
     name = next(iter(weighted.frames("val")))
     words = [name if each == "FRAME" else each for each in arguments]
     code, _, err = curate("view", *words, "-w", weighted.root)
@@ -143,22 +144,22 @@ def test_a_wrong_call_is_one_line(
     assert err.count("\n") == 1
 
 
-def test_several_frames_are_several_pictures(curate: Curate, weighted: Workspace) -> None:
-    """Named, or all with labels up to a limit."""
+def test_several_frames_give_several_plots(curate: Curate, weighted: Workspace) -> None:
+    """The listed frames, or all with labels up to a limit."""
     names = list(weighted.frames("unlabeled"))
     code, out, _ = curate("view", *names[:2], "-w", weighted.root)
     assert (code, out.count("picture: ")) == (0, 2)
     code, out, _ = curate("view", "--all", "--limit", 3, "--json", "-w", weighted.root)
     assert code == 0
-    pictures = json.loads(out)["pictures"]
-    assert len(pictures) == 3
-    assert all(name in path for name, path in zip(names[:3], pictures, strict=True))
+    images = json.loads(out)["pictures"]
+    assert len(images) == 3
+    assert all(name in path for name, path in zip(names[:3], images, strict=True))
 
 
 def test_a_recording_has_a_time_line_over_the_frames(
     curate: Curate, weighted: Workspace, tmp_path: Path
 ) -> None:
-    """Every label with its stored evidence; ground truth of the val frame alone."""
+    """Every label has its stored evidence; only the val frame has ground truth."""
     rerun = pytest.importorskip("rerun.chunk", reason="the extra [rerun] is not installed")
     val = next(iter(weighted.frames("val")))
     names = [*weighted.frames("unlabeled"), val]
@@ -191,10 +192,10 @@ def test_a_recording_has_a_time_line_over_the_frames(
         (["--all", "--output", "a.png"], "--output"),
     ],
 )
-def test_options_that_exclude_each_other_are_refused(
+def test_options_that_exclude_each_other_are_rejected(
     curate: Curate, weighted: Workspace, arguments: list[str], word: str
 ) -> None:
-    """One line that names them."""
+    """The one-line error contains both."""
     name = next(iter(weighted.frames("unlabeled")))
     words = [name if each == "FRAME" else each for each in arguments]
     code, _, err = curate("view", *words, "-w", weighted.root)
@@ -203,8 +204,8 @@ def test_options_that_exclude_each_other_are_refused(
     assert err.count("\n") == 1
 
 
-def test_a_round_that_is_not_there_is_named(curate: Curate, weighted: Workspace) -> None:
-    """Not an empty picture."""
+def test_a_missing_round_is_reported(curate: Curate, weighted: Workspace) -> None:
+    """There is no empty plot."""
     code, _, err = curate("view", "--all", "--round", 7, "-w", weighted.root)
     assert code == WorkspaceError.exit_code
     assert "round 7 has no predictions" in err
@@ -213,7 +214,9 @@ def test_a_round_that_is_not_there_is_named(curate: Curate, weighted: Workspace)
     assert "curate solve --round 1 --policy uniform" in err
 
 
-def test_without_predictions_the_remedy_is_named(curate: Curate, workspace: Workspace) -> None:
+def test_without_predictions_the_error_says_what_to_do(
+    curate: Curate, workspace: Workspace
+) -> None:
     """There is no round yet."""
     code, _, err = curate("view", "000000", "-w", workspace.root)
     assert code == WorkspaceError.exit_code
@@ -221,16 +224,16 @@ def test_without_predictions_the_remedy_is_named(curate: Curate, workspace: Work
 
 
 def test_example_frame_is_drawn_from_above_and_over_its_image(weighted: Workspace) -> None:
-    """From above and over its image, with the labels and weights of that frame alone."""
+    """Both show the labels and weights of that frame only."""
     paths = draw_example_frame(weighted, 1)
     names = {path.name for path in paths}
     frame = next(name for name in weighted.frames("unlabeled") if any(name in n for n in names))
     assert names == {f"round-01-{frame}-bird-eye.png", f"round-01-{frame}-image.png"}
-    assert all(drawn(path).size for path in paths)
+    assert all(drawn_image(path).size for path in paths)
 
 
 def test_evidence_stays_with_its_label(weighted: Workspace) -> None:
-    """Also where a label before it gave way to a human one."""
+    """Also if an earlier label was replaced by a human one."""
     name = next(iter(weighted.frames("unlabeled")))
     every = evidence_of_labels(weighted, name, 1, "pspsl", np.arange(3))
     some = evidence_of_labels(weighted, name, 1, "pspsl", np.array([1, 2]))

@@ -1,4 +1,4 @@
-"""curate review: to an editor and back, and what a person's decision is worth from then on."""
+"""`curate review`: export to an editor, import, and the effect of human decisions."""
 
 import json
 import os
@@ -30,38 +30,38 @@ LABELS = "SELECT frame, k, category, x, weight, provenance FROM weighted_labels 
 
 @pytest.fixture
 def weighted(curate: Curate, workspace: Workspace) -> Workspace:
-    """Weights for X_u in round 1."""
+    """Create weights for X_u in round 1."""
     advance(curate, workspace, 1)
     return workspace
 
 
 def advance(curate: Curate, workspace: Workspace, number: int) -> None:
-    """Brings a round up to its weights."""
+    """Bring a round up to its weights."""
     for command in ("predict", "repredict", "score", "solve"):
         code, _, err = curate(command, "-w", workspace.root, "--round", number)
         assert code == 0, err
 
 
 def change(workspace: Workspace, sql: str) -> None:
-    """Changes the database behind the pipeline's back."""
+    """Change the database without the pipeline."""
     with workspace.database.writing() as connection:
         connection.exec_driver_sql(sql)
 
 
-def handed_out(curate: Curate, workspace: Workspace, folder: Path, *options: object) -> str:
-    """Exports a review; gives the first of its frames."""
+def export_review(curate: Curate, workspace: Workspace, folder: Path, *options: object) -> str:
+    """Export a review; return the first of its frames."""
     code, out, err = curate("review", "export", folder, "-w", workspace.root, "--json", *options)
     assert code == 0, err
     return json.loads(out)["frames"][0]
 
 
 def only_first(workspace: Workspace) -> tuple[str, str]:
-    """The option that asks about all labels of one frame and no others."""
+    """Return the option that selects all labels of one frame and no others."""
     return "--frames", next(iter(workspace.frames("unlabeled")))
 
 
 def decide(folder: Path, frame: str, box: int, word: str) -> None:
-    """Writes a word into the table."""
+    """Write a decision into the table."""
     path = folder / "review.csv"
     start = f"{frame},{box},"
     lines = [row + word * row.startswith(start) for row in path.read_text().splitlines()]
@@ -69,7 +69,7 @@ def decide(folder: Path, frame: str, box: int, word: str) -> None:
 
 
 def corrected(folder: Path, frame: str) -> None:
-    """Box 1 accepted, box 2 deleted, box 3 moved half a metre ahead, a cyclist added."""
+    """Accept box 1, delete box 2, move box 3 half a metre ahead, add a cyclist."""
     decide(folder, frame, 1, "accept")
     path = folder / "label_2" / f"{frame}.txt"
     lines = [line.split() for line in path.read_text().splitlines()]
@@ -77,8 +77,8 @@ def corrected(folder: Path, frame: str) -> None:
     path.write_text("\n".join([" ".join(lines[0]), " ".join(lines[2]), ADDED]) + "\n")
 
 
-def take(curate: Curate, workspace: Workspace, folder: Path, *options: object) -> dict:
-    """Imports a review."""
+def import_review(curate: Curate, workspace: Workspace, folder: Path, *options: object) -> dict:
+    """Import a review."""
     code, out, err = curate(
         "review", "import", folder, "-w", workspace.root, "--json", "--reviewer", "ada", *options
     )
@@ -88,21 +88,21 @@ def take(curate: Curate, workspace: Workspace, folder: Path, *options: object) -
 
 @pytest.fixture
 def reviewed(curate: Curate, weighted: Workspace, tmp_path: Path) -> tuple[Workspace, Path, str]:
-    """A review of which one frame was corrected and imported: workspace, folder, frame."""
+    """Return workspace, folder and frame of a review with one frame corrected and imported."""
     folder = tmp_path / "review"
-    frame = handed_out(curate, weighted, folder, *only_first(weighted))
+    frame = export_review(curate, weighted, folder, *only_first(weighted))
     corrected(folder, frame)
-    take(curate, weighted, folder)
+    import_review(curate, weighted, folder)
     return weighted, folder, frame
 
 
-def test_a_review_shows_whole_frames(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
-    """The least certain first; with pictures, a table and a guide."""
+def test_a_review_exports_whole_frames(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
+    """The least certain first; with images, a table and a guide."""
     change(weighted, "UPDATE weight SET v = 0.9")
     change(weighted, "UPDATE weight SET v = 0.45 WHERE frame_id = 5 AND k = 1")
     name = rows(weighted, "SELECT frame FROM frame WHERE id = 5")[0][0]
     folder = tmp_path / "review"
-    assert handed_out(curate, weighted, folder, "--count", 1) == name
+    assert export_review(curate, weighted, folder, "--count", 1) == name
     table = (folder / "review.csv").read_text().splitlines()
     assert [line.split(",")[:3] for line in table[1:]] == [
         [name, "all", ""], [name, "1", ""], [name, "2", "yes"], [name, "3", ""],
@@ -112,7 +112,7 @@ def test_a_review_shows_whole_frames(curate: Curate, weighted: Workspace, tmp_pa
     assert "accept" in (folder / "README.txt").read_text()
 
 
-def test_lowest_and_changed_ask_for_other_labels(
+def test_lowest_and_changed_select_other_labels(
     curate: Curate, weighted: Workspace, tmp_path: Path
 ) -> None:
     """Lowest by weight; changed against the round before, by category."""
@@ -123,8 +123,8 @@ def test_lowest_and_changed_ask_for_other_labels(
     change(weighted, "UPDATE weight SET v = 1.0 WHERE round = 2 AND frame_id = 6 AND k = 0")
     names = dict(rows(weighted, "SELECT id, frame FROM frame"))
     one = ("--count", 1, "--by")
-    assert handed_out(curate, weighted, tmp_path / "a", *one, "lowest") == names[4]
-    assert handed_out(curate, weighted, tmp_path / "b", *one, "changed") == names[6]
+    assert export_review(curate, weighted, tmp_path / "a", *one, "lowest") == names[4]
+    assert export_review(curate, weighted, tmp_path / "b", *one, "changed") == names[6]
     code, _, err = curate(
         "review", "export", tmp_path / "c", "-w", weighted.root, "--round", 1, "--by", "changed"
     )
@@ -132,20 +132,22 @@ def test_lowest_and_changed_ask_for_other_labels(
 
 
 def test_a_dry_run_stores_nothing(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
-    """And says what would be stored."""
+    """It prints what would be stored."""
     folder = tmp_path / "review"
-    corrected(folder, handed_out(curate, weighted, folder, "--count", 18))
-    told = take(curate, weighted, folder, "--dry-run")
-    found = {name: told[name] for name in ("accepted", "rejected", "moved", "added", "untouched")}
+    corrected(folder, export_review(curate, weighted, folder, "--count", 18))
+    printed = import_review(curate, weighted, folder, "--dry-run")
+    found = {
+        name: printed[name] for name in ("accepted", "rejected", "moved", "added", "untouched")
+    }
     assert found == {"accepted": 1, "rejected": 1, "moved": 1, "added": 1, "untouched": 15}
-    assert (told["dry_run"], told["frames"]) == (True, 6)
+    assert (printed["dry_run"], printed["frames"]) == (True, 6)
     assert rows(weighted, "SELECT count(*) FROM human_label") == [(0,)]
 
 
-def test_decisions_win_over_every_policy(
+def test_human_decisions_override_every_policy(
     curate: Curate, reviewed: tuple[Workspace, Path, str]
 ) -> None:
-    """Whatever a registered policy says: accepted, moved and added weigh 1, rejected 0."""
+    """Accepted, moved and added labels have weight 1, rejected ones 0."""
     workspace, _, frame = reviewed
     # The recorded detections of the toy estimate no IoU, which 3dioumatch needs.
     for policy in set(POLICIES.classes) - {"3dioumatch"}:
@@ -162,21 +164,23 @@ def test_decisions_win_over_every_policy(
         )
 
 
-def test_policies_do_not_see_decisions(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
+def test_policies_do_not_see_human_decisions(
+    curate: Curate, weighted: Workspace, tmp_path: Path
+) -> None:
     """The weights that they store are the same before and after."""
     before = rows(weighted, "SELECT * FROM weight ORDER BY frame_id, k")
     folder = tmp_path / "review"
-    corrected(folder, handed_out(curate, weighted, folder, *only_first(weighted)))
-    take(curate, weighted, folder)
+    corrected(folder, export_review(curate, weighted, folder, *only_first(weighted)))
+    import_review(curate, weighted, folder)
     change(weighted, "DELETE FROM task WHERE stage = 'solve'")
     assert curate("solve", "-w", weighted.root)[0] == 0
     assert rows(weighted, "SELECT * FROM weight ORDER BY frame_id, k") == before
 
 
-def test_decisions_survive_later_rounds(
+def test_human_decisions_survive_later_rounds(
     curate: Curate, reviewed: tuple[Workspace, Path, str]
 ) -> None:
-    """The next teacher's boxes lie elsewhere; no object is labeled twice, the refused one stays."""
+    """After the teacher changes, no object is labeled twice, and the rejected one stays."""
     workspace, _, frame = reviewed
     for command in ("predict", "repredict", "score"):
         assert curate(command, "-w", workspace.root, "--round", 2)[0] == 0
@@ -197,18 +201,18 @@ def _exported(curate: Curate, workspace: Workspace, number: int) -> WeightedLabe
     return WeightedLabels(workspace.root / "exports" / "labels.sqlite")
 
 
-def test_an_import_makes_files_stale(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
-    """What trainers read is written again; a file without human labels stays as it was."""
+def test_an_import_makes_exports_stale(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
+    """Files for trainers are written again; a file without human labels does not change."""
     assert curate("export", "-w", weighted.root)[0] == 0
     folder = tmp_path / "review"
-    frame = handed_out(curate, weighted, folder, *only_first(weighted))
+    frame = export_review(curate, weighted, folder, *only_first(weighted))
 
     def state() -> str:
         return state_of(weighted, "export")
 
     assert state() == "done"
     corrected(folder, frame)
-    take(curate, weighted, folder)
+    import_review(curate, weighted, folder)
     assert state() == "stale"
     assert _exported(curate, weighted, 1).meta["round"] == "1"
     assert state() == "done"
@@ -221,30 +225,30 @@ def test_an_import_makes_files_stale(curate: Curate, weighted: Workspace, tmp_pa
 def test_a_decision_counts_from_the_reviewed_round_on(
     curate: Curate, weighted: Workspace, tmp_path: Path
 ) -> None:
-    """Earlier rounds stay as they were trained, unless told otherwise."""
+    """Earlier rounds keep their training labels, unless an option includes them."""
     advance(curate, weighted, 2)
     folder = tmp_path / "review"
-    corrected(folder, handed_out(curate, weighted, folder, *only_first(weighted)))
+    corrected(folder, export_review(curate, weighted, folder, *only_first(weighted)))
     rounds = "SELECT DISTINCT round FROM weighted_labels WHERE provenance = 'human' ORDER BY 1"
-    assert take(curate, weighted, folder)["from_round"] == 2
+    assert import_review(curate, weighted, folder)["from_round"] == 2
     assert rows(weighted, rounds) == [(2,)]
-    assert take(curate, weighted, folder, "--from-round", 1)["changed"]
+    assert import_review(curate, weighted, folder, "--from-round", 1)["changed"]
     assert rows(weighted, rounds) == [(1,), (2,)]
 
 
-def test_the_same_import_again_changes_nothing(
+def test_a_repeated_import_changes_nothing(
     curate: Curate, reviewed: tuple[Workspace, Path, str]
 ) -> None:
-    """Corrected files take the place of the former; clear takes all of it away."""
+    """Corrected files replace the earlier ones; clear removes all of it."""
     workspace, folder, frame = reviewed
     stored = "SELECT * FROM human_label ORDER BY n"
     before = rows(workspace, stored)
-    assert not take(curate, workspace, folder)["changed"]
+    assert not import_review(curate, workspace, folder)["changed"]
     assert rows(workspace, stored) == before
     decide(folder, frame, 3, "accept")
     path = folder / "label_2" / f"{frame}.txt"
     path.write_text("\n".join(path.read_text().splitlines()[:2]) + "\n")
-    assert take(curate, workspace, folder)["added"] == 0
+    assert import_review(curate, workspace, folder)["added"] == 0
     assert len(rows(workspace, stored)) == 3
     listed = json.loads(curate("review", "list", "-w", workspace.root, "--json")[1])
     assert [(each["accepted"], each["rejected"], each["moved"]) for each in listed] == [(1, 1, 1)]
@@ -255,45 +259,47 @@ def test_the_same_import_again_changes_nothing(
     assert {row[5] for row in rows(workspace, LABELS)} == {"detector"}
 
 
-def test_a_later_review_overrules_an_earlier_one(
+def test_a_later_review_overrides_an_earlier_one(
     curate: Curate, reviewed: tuple[Workspace, Path, str], tmp_path: Path
 ) -> None:
-    """It shows human labels as such; one that is deleted there is rejected from then on."""
+    """It shows human labels as such; one that is deleted there is then rejected."""
     workspace, _, frame = reviewed
     later = tmp_path / "later"
-    handed_out(curate, workspace, later, "--frames", frame)
+    export_review(curate, workspace, later, "--frames", frame)
     table = [line.split(",") for line in (later / "review.csv").read_text().splitlines()]
     assert [row[2] for row in table[2:]] == ["human"] * 3
     path = later / "label_2" / f"{frame}.txt"
     path.write_text("\n".join(path.read_text().splitlines()[1:]) + "\n")
-    told = take(curate, workspace, later)
-    assert (told["rejected"], told["replaced"], told["untouched"]) == (1, 1, 2)
+    printed = import_review(curate, workspace, later)
+    assert (printed["rejected"], printed["replaced"], printed["untouched"]) == (1, 1, 2)
     decisions = "SELECT decision FROM human_label ORDER BY n"
     assert rows(workspace, decisions) == [("rejected",), ("rejected",), ("moved",), ("added",)]
 
 
-def test_every_format_goes_round(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
-    """Sent back as it is, nothing is decided; accepted, all of it, as it was shown."""
+def test_every_format_works_in_both_directions(
+    curate: Curate, weighted: Workspace, tmp_path: Path
+) -> None:
+    """Imported unchanged, nothing is decided; accepted, all of it, as it was exported."""
     name = next(iter(weighted.frames("unlabeled")))
     names = ", ".join(f"h.{name}" for name in ("x", "y", "z", "length", "width", "height", "yaw"))
     same = "JOIN prediction AS p ON p.frame_id = h.frame_id AND p.x = h.x AND p.yaw = h.yaw"
     for editor in EDITORS.classes:
         folder = tmp_path / f"in-{editor}"
-        handed_out(curate, weighted, folder, "--format", editor, "--frames", name)
-        assert take(curate, weighted, folder)["untouched"] == 3, editor
-        assert take(curate, weighted, folder, "--accept", name)["accepted"] == 3, editor
+        export_review(curate, weighted, folder, "--format", editor, "--frames", name)
+        assert import_review(curate, weighted, folder)["untouched"] == 3, editor
+        assert import_review(curate, weighted, folder, "--accept", name)["accepted"] == 3, editor
         assert len(rows(weighted, f"SELECT {names} FROM human_label AS h {same}")) == 3, editor
         assert curate("review", "clear", "--all", "-w", weighted.root)[0] == 0
 
 
-def test_people_are_seen_where_labels_are_shown(
+def test_human_labels_are_marked_in_every_output(
     curate: Curate, reviewed: tuple[Workspace, Path, str]
 ) -> None:
     """explain, view, report and the named query."""
     workspace, _, frame = reviewed
-    told = [curate("explain", frame, k, "-w", workspace.root) for k in (0, 1, 1_000_003)]
-    assert [code for code, _, _ in told] == [0, 0, 0]
-    accepted, rejected, added = (out for _, out, _ in told)
+    printed = [curate("explain", frame, k, "-w", workspace.root) for k in (0, 1, 1_000_003)]
+    assert [code for code, _, _ in printed] == [0, 0, 0]
+    accepted, rejected, added = (out for _, out, _ in printed)
     assert "accepted by ada" in accepted
     assert "pspsl alone gives" in accepted
     assert "rejected by ada" in rejected
@@ -310,15 +316,15 @@ def test_people_are_seen_where_labels_are_shown(
     assert curate("report", "-w", workspace.root)[0] == 0
     page = next((workspace.root / "reports").glob("*.html")).read_text()
     assert "1 accepted, 1 added, 1 moved, 1 rejected" in page
-    asked = json.loads(curate("query", "--named", "human", "-w", workspace.root, "--json")[1])
-    assert sum(row["objects"] for row in asked) == 3
+    queried = json.loads(curate("query", "--named", "human", "-w", workspace.root, "--json")[1])
+    assert sum(row["objects"] for row in queried) == 3
     for arguments in (("solve", "--policy", "uniform"), ("report", "--policy", "uniform")):
         assert curate(*arguments, "-w", workspace.root)[0] == 0
     page = (workspace.root / "reports" / "round-01-uniform.html").read_text()
     assert "a person rejected it" in page
 
 
-WISHES = (
+INVALID_SELECTIONS = (
     (("--frames", "{labeled}"), 5, "is not unlabeled"),
     (("--frames", "{val}"), 5, "is not unlabeled"),
     (("--frames", "999999"), 2, "no frame is named '999999'"),
@@ -330,32 +336,32 @@ WISHES = (
 )
 
 
-def test_a_wish_that_cannot_be_granted_is_one_line(
+def test_an_impossible_selection_gives_a_one_line_error(
     curate: Curate, weighted: Workspace, tmp_path: Path
 ) -> None:
-    """And leaves no folder."""
+    """No folder is left."""
     names = {split: next(iter(weighted.frames(split))) for split in ("labeled", "val")}
-    for options, code, fault in WISHES:
+    for options, code, message in INVALID_SELECTIONS:
         words = [str(option).format(**names) for option in options]
         ended, _, err = curate("review", "export", tmp_path / "r", "-w", weighted.root, *words)
-        assert (ended, fault in err, err.count("\n")) == (code, True, 1), err
+        assert (ended, message in err, err.count("\n")) == (code, True, 1), err
         assert not (tmp_path / "r").exists()
 
 
 def spoil_text(folder: Path, frame: str) -> None:
-    """A line is cut off."""
+    """Cut off a line."""
     path = folder / "label_2" / f"{frame}.txt"
     path.write_text(path.read_text()[:60])
 
 
 def spoil_both(folder: Path, frame: str) -> None:
-    """The same object twice."""
+    """Write the same object twice."""
     path = folder / "label_2" / f"{frame}.txt"
     decide(folder, frame, 1, "accept")
     path.write_text(path.read_text() + path.read_text().splitlines()[0] + "\n")
 
 
-FAULTS = (
+INVALID_EDITS = (
     (lambda folder, frame: (folder / "review.json").unlink(), (), "review.json: no such file"),
     (spoil_text, (), "fields, but a label line"),
     (spoil_both, (), "cannot overlap: reject one of box 1 ("),
@@ -365,19 +371,19 @@ FAULTS = (
 )
 
 
-def test_a_bad_answer_is_one_line_and_stores_nothing(
+def test_an_invalid_import_gives_one_line_and_stores_nothing(
     curate: Curate, weighted: Workspace, tmp_path: Path
 ) -> None:
-    """Not even the good half; and a folder that is there is left alone."""
+    """Not even the valid half; an existing folder is not changed."""
     whole = tmp_path / "review"
-    frame = handed_out(curate, weighted, whole, *only_first(weighted))
+    frame = export_review(curate, weighted, whole, *only_first(weighted))
     decide(whole, frame, 2, "accept")
-    for number, (spoil, options, fault) in enumerate(FAULTS):
+    for number, (spoil, options, message) in enumerate(INVALID_EDITS):
         folder = tmp_path / str(number)
         shutil.copytree(whole, folder)
         spoil(folder, frame)
         code, _, err = curate("review", "import", folder, "-w", weighted.root, *options)
-        assert (code in {2, 3}, fault in err, err.count("\n")) == (True, True, 1), err
+        assert (code in {2, 3}, message in err, err.count("\n")) == (True, True, 1), err
     assert rows(weighted, "SELECT count(*) FROM human_label") == [(0,)]
     code, _, err = curate("review", "export", whole, "-w", weighted.root)
     assert (code, "may contain edits" in err) == (2, True)
@@ -386,8 +392,8 @@ def test_a_bad_answer_is_one_line_and_stores_nothing(
     assert (code, "was not exported from the workspace" in err) == (3, True)
 
 
-def test_frames_that_are_not_unlabeled_cannot_have_human_labels(weighted: Workspace) -> None:
-    """The table itself refuses."""
+def test_only_unlabeled_frames_can_have_human_labels(weighted: Workspace) -> None:
+    """The table itself rejects others."""
     change(weighted, "INSERT INTO review VALUES ('r', 1, 'pspsl', 'kitti', 1, 1, 1, 'now', NULL)")
     for split in ("labeled", "val"):
         key = next(iter(weighted.frames(split).values()))
@@ -397,12 +403,12 @@ def test_frames_that_are_not_unlabeled_cannot_have_human_labels(weighted: Worksp
                 store(connection, "human_label", [row])
 
 
-def test_a_killed_import_leaves_nothing_behind(
+def test_a_killed_import_stores_nothing(
     curate: Curate, weighted: Workspace, tmp_path: Path
 ) -> None:
-    """Killed between the labels and what they speak for; the same import then does all of it."""
+    """Killed between the labels and their task; the same import then does all of it."""
     folder = tmp_path / "review"
-    corrected(folder, handed_out(curate, weighted, folder, *only_first(weighted)))
+    corrected(folder, export_review(curate, weighted, folder, *only_first(weighted)))
     code = (
         "import os, signal, sys\n"
         "from pipelines.review import importing\n"
@@ -419,5 +425,5 @@ def test_a_killed_import_leaves_nothing_behind(
     )
     assert ended.returncode == -signal.SIGKILL
     assert rows(weighted, "SELECT count(*) FROM human_label") == [(0,)]
-    assert take(curate, weighted, folder)["moved"] == 1
+    assert import_review(curate, weighted, folder)["moved"] == 1
     assert rows(weighted, "SELECT count(*) FROM human_label") == [(4,)]

@@ -10,13 +10,16 @@ from pipelines.workspace.workspace import Workspace
 
 @pytest.fixture(scope="session")
 def weighted(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """A workspace with weights; its folder's name means something in a URI."""
+    """Return a workspace with weights; its folder name has characters that are special in a URI."""
     return weighted_workspace(tmp_path_factory.mktemp("a%3Fmode=rwc&b?c #d"))
 
 
 @pytest.fixture(scope="module")
 def pages(weighted: Workspace) -> Iterator[Pages]:
-    """Its pages, with a short time limit; Datasette has one set of hooks for all its servers."""
+    """Return its pages, with a short time limit.
+
+    Datasette has one set of hooks for all its servers.
+    """
     pytest.importorskip("datasette", reason="the extra [serve] is not installed")
     from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""curate serve under attack: nothing is written, nothing else is read, nobody else may ask."""
+"""`curate serve` under attack: nothing is written, no other file is read."""
 
 import hashlib
 import sqlite3
@@ -115,7 +115,7 @@ NO_PATHS = (
 
 @pytest.fixture
 def connection(pages: Pages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What a question is asked on, in an empty folder."""
+    """Return the connection on which queries run, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     opened = connect_read_only(pages.workspace.root / "curate.db")
     yield opened
@@ -123,7 +123,7 @@ def connection(pages: Pages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def content(pages: Pages) -> str:
-    """A hash of every file of the workspace but SQLite's shared memory and an empty journal."""
+    """Return a hash of the workspace, without SQLite's shared memory and empty journal."""
     digest = hashlib.sha256()
     for path in sorted(pages.workspace.root.rglob("*")):
         if path.is_file() and path.stat().st_size and not path.name.endswith("-shm"):
@@ -132,21 +132,23 @@ def content(pages: Pages) -> str:
 
 
 @pytest.mark.parametrize("sql", [*WRITES, *READS_ELSEWHERE, *TOO_MUCH])
-def test_a_connection_only_reads(connection: sqlite3.Connection, tmp_path: Path, sql: str) -> None:
-    """Also where nothing stands before it; no file appears."""
+def test_a_connection_is_read_only(
+    connection: sqlite3.Connection, tmp_path: Path, sql: str
+) -> None:
+    """Also if there is no file yet; none is created."""
     with pytest.raises((sqlite3.Error, sqlite3.Warning, MemoryError)):
         connection.execute(sql).fetchall()
     assert list(tmp_path.iterdir()) == []
     assert connection.execute("SELECT count(*) FROM weight").fetchone()[0] > 0
 
 
-def test_sql_that_writes_is_refused_in_one_line(pages: Pages) -> None:
+def test_sql_that_writes_is_rejected_in_one_line(pages: Pages) -> None:
     """Some of each kind, as page and as JSON; no file of the workspace changes."""
     before = content(pages)
     for sql in (*WRITES[::6], *READS_ELSEWHERE[::4], *TOO_MUCH[::4]):
-        answer = pages.get("/workspace.json", sql=sql)
-        assert answer.status == 400, sql
-        assert b"Traceback" not in answer.body
+        response = pages.get("/workspace.json", sql=sql)
+        assert response.status == 400, sql
+        assert b"Traceback" not in response.body
     assert pages.get("/labels", sql=WRITES[0]).status == 400
     where = "1 = 1; DELETE FROM weight"
     assert pages.get("/workspace/weight.json", _where=where).status == 400
@@ -154,44 +156,44 @@ def test_sql_that_writes_is_refused_in_one_line(pages: Pages) -> None:
 
 
 @pytest.mark.parametrize("sql", ENDLESS)
-def test_an_endless_question_ends(pages: Pages, sql: str) -> None:
-    """With the remedy; the server goes on."""
-    answer = pages.get("/workspace", sql=sql)
-    assert answer.status == 400
-    assert "--time-limit" in answer.text
+def test_an_endless_query_is_stopped(pages: Pages, sql: str) -> None:
+    """The error says what to do; the server keeps running."""
+    response = pages.get("/workspace", sql=sql)
+    assert response.status == 400
+    assert "--time-limit" in response.text
     assert pages.get("/").status == 200
 
 
 @pytest.mark.parametrize("name", NO_FRAMES)
-def test_a_frame_is_looked_up_and_is_no_path(pages: Pages, name: str) -> None:
-    """Wherever the name is written."""
+def test_a_frame_name_is_not_used_as_a_path(pages: Pages, name: str) -> None:
+    """In any position of the URL."""
     for parameters in (
         {"frame": name},
         {"frame": "000003", "policy": name or "x"},
         {"frame": "000003", "round": name or "-1"},
         {"id": name},
     ):
-        answer = pages.get("/-/picture", **parameters)
-        assert answer.status == 404, parameters
-        assert b"root:" not in answer.body
+        response = pages.get("/-/picture", **parameters)
+        assert response.status == 404, parameters
+        assert b"root:" not in response.body
     assert b"<script>alert" not in pages.get("/-/frame", frame=name, k=name).body
 
 
 @pytest.mark.parametrize("path", NO_PATHS)
-def test_no_other_file_and_no_inner_page_is_reached(pages: Pages, path: str) -> None:
-    """The path goes out as it stands here; what a browser would do to it is left undone."""
-    answer = pages.get(path)
-    assert answer.status in {302, 400, 403, 404}, path
-    if answer.status == 302:
-        answer = pages.get(answer.headers["location"])
-        assert answer.status in {400, 403, 404}, path
+def test_no_other_file_or_internal_page_can_be_reached(pages: Pages, path: str) -> None:
+    """The path is sent as written here; a browser would normalise it."""
+    response = pages.get(path)
+    assert response.status in {302, 400, 403, 404}, path
+    if response.status == 302:
+        response = pages.get(response.headers["location"])
+        assert response.status in {400, 403, 404}, path
     for secret in (b"root:", b"SQLite format 3", b"hookimpl", b"[dataset]", b'"path"'):
-        assert secret not in answer.body
+        assert secret not in response.body
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE"])
-def test_only_reading_methods_are_answered(pages: Pages, method: str) -> None:
-    """Everywhere."""
+def test_only_reading_methods_are_allowed(pages: Pages, method: str) -> None:
+    """For every page."""
     for path in ("/", "/workspace", "/workspace/age", "/-/frame?frame=000003"):
         assert pages.get(path, method=method, body="a=1").status == 405
 
@@ -199,14 +201,14 @@ def test_only_reading_methods_are_answered(pages: Pages, method: str) -> None:
 @pytest.mark.parametrize(
     "host", ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8001", "", "[::2]"]
 )
-def test_a_foreign_name_is_refused(pages: Pages, host: str) -> None:
-    """A name that its owner points to this machine reads nothing (DNS rebinding)."""
+def test_an_unknown_host_name_is_rejected(pages: Pages, host: str) -> None:
+    """A host name that points to this machine cannot read anything (DNS rebinding)."""
     assert pages.get("/labels/weighted_labels.json", headers={"Host": host}).status == 403
     assert pages.get("/", headers={"Host": f"localhost:{pages.port}"}).status == 200
 
 
-def test_a_page_of_another_site_can_only_link(pages: Pages) -> None:
-    """Its pictures, frames and scripts are not answered, a followed link is."""
+def test_another_site_can_only_link_to_a_page(pages: Pages) -> None:
+    """Its requests for images, frames and scripts are rejected; a followed link works."""
     for kind in ("image", "iframe", "script", "empty"):
         headers = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": kind}
         assert pages.get("/-/picture?frame=000003", headers=headers).status == 403
@@ -214,8 +216,8 @@ def test_a_page_of_another_site_can_only_link(pages: Pages) -> None:
     assert pages.get("/", headers=headers).status == 200
 
 
-def test_every_answer_says_what_a_browser_may_load(pages: Pages) -> None:
-    """Refusals too; no other site is named."""
+def test_every_response_restricts_what_a_browser_loads(pages: Pages) -> None:
+    """Rejections too; no other site is allowed."""
     for path in ("/", "/nowhere", "/-/databases", "/-/picture?frame=000003", "/-/static/app.css"):
         headers = pages.get(path).headers
         assert headers["content-security-policy"].startswith("default-src 'none'")
@@ -224,8 +226,8 @@ def test_every_answer_says_what_a_browser_may_load(pages: Pages) -> None:
         assert "access-control-allow-origin" not in headers
 
 
-def test_many_at_once_are_all_answered(pages: Pages) -> None:
-    """Pictures are drawn one at a time; nobody gets another's."""
+def test_many_parallel_requests_are_all_answered(pages: Pages) -> None:
+    """Images are drawn one at a time, and each request gets its own."""
     from concurrent.futures import ThreadPoolExecutor
 
     names = list(pages.workspace.frames("unlabeled"))[:3] * 4
@@ -234,7 +236,7 @@ def test_many_at_once_are_all_answered(pages: Pages) -> None:
     assert len({(name, body) for name, body in zip(names, found, strict=True)}) == 3
 
 
-def test_plugins_of_others_are_not_loaded(pages: Pages) -> None:
+def test_installed_plugins_are_not_loaded(pages: Pages) -> None:
     """Some of them write."""
     from datasette.plugins import pm
 
@@ -246,6 +248,6 @@ def test_plugins_of_others_are_not_loaded(pages: Pages) -> None:
     [("localhost", True), ("127.0.0.1", True), ("127.8.8.8", True), ("::1", True),
      ("0.0.0.0", False), ("::", False), ("192.168.1.2", False), ("lab.example", False)],  # noqa: S104
 )  # fmt: skip
-def test_loopback_is_known(host: str, loopback: bool) -> None:
+def test_loopback_is_recognised(host: str, loopback: bool) -> None:
     """By name and by address."""
     assert is_loopback(host) == loopback

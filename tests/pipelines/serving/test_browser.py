@@ -14,20 +14,20 @@ from pipelines.workspace.workspace import Workspace
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """One for all tests."""
+    """Return one browser for all tests."""
     with chromium() as found:
         yield found
 
 
 @pytest.fixture(scope="module")
 def report(weighted: Workspace) -> Path:
-    """The report of the only round."""
+    """Return the report of the only round."""
     return write_report(weighted, None, None)[0]
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_the_report_is_seen_as_it_is_meant(browser: Any, report: Path, width: int) -> None:
-    """Charts with bars, tables with rows, pictures that are pictures, nothing beside the window."""
+def test_the_report_is_displayed_correctly(browser: Any, report: Path, width: int) -> None:
+    """Charts have bars, tables have rows, images are decoded, nothing overflows the window."""
     viewer = Viewer(browser, width)
     page = viewer.open(report.as_uri())
     assert viewer.faults == []
@@ -45,8 +45,8 @@ def test_the_report_is_seen_as_it_is_meant(browser: Any, report: Path, width: in
     assert viewer.overflow() <= 0
 
 
-def test_the_report_has_a_dark_face(browser: Any, report: Path) -> None:
-    """Where the system wants it."""
+def test_the_report_has_a_dark_mode(browser: Any, report: Path) -> None:
+    """If the system requests it."""
     viewer = Viewer(browser, 1280)
     grounds = []
     for scheme in ("light", "dark"):
@@ -71,10 +71,10 @@ def test_the_report_has_a_dark_face(browser: Any, report: Path) -> None:
         "/-/frame?frame=000003&k=1",
     ],
 )
-def test_a_served_page_loads_all_of_itself_from_here(
+def test_a_served_page_loads_only_from_its_server(
     browser: Any, pages: Pages, path: str, width: int
 ) -> None:
-    """No fault, no foreign request, nothing beside the window."""
+    """No error, no external request, nothing overflows the window."""
     viewer = Viewer(browser, width)
     viewer.open(pages.url + path)
     assert viewer.faults == []
@@ -82,8 +82,8 @@ def test_a_served_page_loads_all_of_itself_from_here(
     assert viewer.overflow() <= 0
 
 
-def test_a_reader_walks_from_a_question_to_a_picture(browser: Any, pages: Pages) -> None:
-    """Question, row, frame, label, neighbour."""
+def test_links_lead_from_a_query_to_an_image(browser: Any, pages: Pages) -> None:
+    """Query, row, frame, label, neighbour."""
     viewer = Viewer(browser, 1280)
     page = viewer.open(pages.url)
     page.get_by_role("link", name="kept").first.click()
@@ -102,8 +102,8 @@ def test_a_reader_walks_from_a_question_to_a_picture(browser: Any, pages: Pages)
     assert viewer.faults == []
 
 
-def test_a_question_is_typed_and_answered(browser: Any, pages: Pages) -> None:
-    """In the editor that the page brings along; a wrong one gets a line."""
+def test_a_query_can_be_typed_and_run(browser: Any, pages: Pages) -> None:
+    """In the editor of the page; a wrong one gets a one-line error."""
     viewer = Viewer(browser, 1280)
     page = viewer.open(pages.url + "/workspace")
     page.get_by_role("button", name="Run SQL").or_(page.locator("input[type=submit]")).first.click()

@@ -1,4 +1,4 @@
-"""curate serve for one file alone, and for a network."""
+"""`curate serve` for a single file, and for a network."""
 
 import sqlite3
 from pathlib import Path
@@ -12,10 +12,10 @@ from pipelines.workspace.workspace import Workspace
 pytest.importorskip("datasette", reason="the extra [serve] is not installed")
 
 
-def test_a_file_alone_is_served_without_pictures(
+def test_a_single_file_is_served_without_images(
     weighted: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where no workspace is near; hostile words in it stay words."""
+    """If no workspace is near; hostile text in it is escaped."""
     path = tmp_path / "foreign.sqlite"
     path.write_bytes((weighted.root / "exports" / "labels.sqlite").read_bytes())
     evil = "<script>alert(1)</script>"
@@ -34,8 +34,8 @@ def test_a_file_alone_is_served_without_pictures(
         assert alone.get("/workspace").status == 404
 
 
-def test_on_an_open_host_any_name_is_answered(weighted: Workspace) -> None:
-    """There the name is not known; the rest of the guard stands."""
+def test_an_open_host_accepts_any_host_name(weighted: Workspace) -> None:
+    """The name cannot be known there; all other checks stay."""
     served = choose(weighted.root, None, None)
     with running(served, weighted, host="0.0.0.0") as open_pages:  # noqa: S104
         assert open_pages.get("/", headers={"Host": "lab.example"}).status == 200

@@ -1,4 +1,4 @@
-"""curate serve: every table, question and frame has its page."""
+"""`curate serve`: every table, query and frame has its page."""
 
 import json
 import sqlite3
@@ -17,38 +17,38 @@ from pipelines.reports.pictures import frame_picture
 pytest.importorskip("datasette", reason="the extra [serve] is not installed")
 
 
-def test_the_first_page_leads_to_both_databases(pages: Pages) -> None:
-    """And lists the questions with their sense."""
-    answer = pages.get("/")
-    assert answer.status == 200
-    assert 'href="/workspace"' in answer.text
-    assert 'href="/labels"' in answer.text
-    assert all(query.description.split("`")[0][:30] in answer.text.replace("&#39;", "'")
+def test_the_first_page_links_to_both_databases(pages: Pages) -> None:
+    """It lists the queries with their descriptions."""
+    response = pages.get("/")
+    assert response.status == 200
+    assert 'href="/workspace"' in response.text
+    assert 'href="/labels"' in response.text
+    assert all(query.description.split("`")[0][:30] in response.text.replace("&#39;", "'")
                for query in named_queries().values())  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(Base.metadata.tables))
-def test_a_table_says_what_it_is(pages: Pages, name: str) -> None:
-    """In the words of its model."""
-    answer = pages.get(f"/workspace/{name}")
-    assert answer.status == 200
-    assert "metadata-description" in answer.text
+def test_a_table_shows_its_description(pages: Pages, name: str) -> None:
+    """The text comes from its model."""
+    response = pages.get(f"/workspace/{name}")
+    assert response.status == 200
+    assert "metadata-description" in response.text
 
 
 @pytest.mark.parametrize("name", named_queries())
-def test_a_named_query_answers_as_curate_query_does(pages: Pages, name: str) -> None:
-    """As many rows, the same columns; those of the working database only there."""
+def test_a_named_query_gives_the_same_rows_as_curate_query(pages: Pages, name: str) -> None:
+    """The same columns, too; those of the working database only there."""
     query = named_queries()[name]
     columns, rows = run_query(pages.workspace.database.url, query.sql)
-    answer = json.loads(pages.get(f"/workspace/{name}.json", _shape="array").text)
-    assert len(answer) == len(list(rows))
-    assert all(list(row) == list(columns) for row in answer)
+    response = json.loads(pages.get(f"/workspace/{name}.json", _shape="array").text)
+    assert len(response) == len(list(rows))
+    assert all(list(row) == list(columns) for row in response)
     assert pages.get(f"/workspace/{name}").status == 200
     assert pages.get(f"/labels/{name}").status == (200 if query.exported else 404)
 
 
-def test_a_label_leads_to_its_frame(pages: Pages) -> None:
-    """From its row, with round and policy; the number of the label to its explanation."""
+def test_a_label_links_to_its_frame(pages: Pages) -> None:
+    """From its row, with round and policy; the number of the label links to its explanation."""
     text = pages.get("/labels/weighted_labels").text
     name = next(iter(pages.workspace.frames("unlabeled")))
     link = f"/-/frame?frame={name}&amp;round=1&amp;policy=pspsl"
@@ -60,11 +60,11 @@ def test_a_label_leads_to_its_frame(pages: Pages) -> None:
     assert "recomputed" in page.text
 
 
-def test_a_picture_is_the_one_of_curate_view(pages: Pages) -> None:
-    """Nearly: it travels as JPEG."""
-    answer = pages.get("/-/picture", frame="000003")
-    assert (answer.status, answer.headers["content-type"]) == (200, "image/jpeg")
-    shown = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+def test_an_image_is_the_one_of_curate_view(pages: Pages) -> None:
+    """Nearly equal, because it is sent as JPEG."""
+    response = pages.get("/-/picture", frame="000003")
+    assert (response.status, response.headers["content-type"]) == (200, "image/jpeg")
+    shown = cv2.imdecode(np.frombuffer(response.body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     drawn = frame_picture(pages.workspace, "000003", chosen_round(pages.workspace, None), "pspsl")
     assert shown.shape == drawn.shape
     assert np.abs(shown.astype(int) - drawn).mean() < 6
@@ -73,16 +73,16 @@ def test_a_picture_is_the_one_of_curate_view(pages: Pages) -> None:
 
 @pytest.mark.parametrize("split", ["labeled", "unlabeled", "val"])
 def test_every_split_has_pages(pages: Pages, split: str) -> None:
-    """Neighbours are of the same split; by name and by key it is the same frame."""
+    """Neighbours are of the same split; name and key lead to the same frame."""
     names = pages.workspace.frames(split)
     first, second = list(names)[:2]
-    answer = pages.get("/-/frame", frame=first)
-    assert answer.status == 200
-    assert f"frame={second}&amp;" in answer.text
-    assert answer.body == pages.get("/-/frame", id=names[first]).body
+    response = pages.get("/-/frame", frame=first)
+    assert response.status == 200
+    assert f"frame={second}&amp;" in response.text
+    assert response.body == pages.get("/-/frame", id=names[first]).body
 
 
-def test_a_new_export_is_seen_without_a_new_start(pages: Pages) -> None:
+def test_a_new_export_is_served_without_a_restart(pages: Pages) -> None:
     """The file has been replaced, not changed."""
     path = pages.workspace.root / "exports" / "labels.sqlite"
     before = pages.get("/labels.json", sql="SELECT count(*) FROM label", _shape="arrayfirst").text

@@ -1,4 +1,4 @@
-"""curate serve as a command: it starts, says where, and ends; what is wrong takes one line."""
+"""`curate serve` as a command: start, address, end, and one-line errors."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ from pipelines.workspace.workspace import Workspace
 
 
 def has_datasette() -> bool:
-    """Whether the extra is installed."""
+    """Return whether the extra is installed."""
     from importlib.util import find_spec
 
     return find_spec("datasette") is not None
@@ -33,8 +33,8 @@ needs_datasette = pytest.mark.skipif(
 
 @needs_datasette
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_it_serves_until_it_is_told_to_end(weighted: Workspace, end: signal.Signals) -> None:
-    """Without a word more, and with the port free again."""
+def test_it_serves_until_it_is_stopped(weighted: Workspace, end: signal.Signals) -> None:
+    """Without further output, and the port is free again."""
     command = [sys.executable, "-m", "pipelines", "serve", str(weighted.root), "--port", "0"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(
@@ -43,8 +43,8 @@ def test_it_serves_until_it_is_told_to_end(weighted: Workspace, end: signal.Sign
         lines = [server.stdout.readline() for _ in range(3)]
         url = lines[-1].split()[2]
         assert "until Ctrl-C" in lines[-1]
-        with urllib.request.urlopen(url, timeout=60) as answer:  # noqa: S310
-            assert answer.status == 200
+        with urllib.request.urlopen(url, timeout=60) as response:  # noqa: S310
+            assert response.status == 200
         server.send_signal(end)
         _, err = server.communicate(timeout=60)
     assert err == ""
@@ -53,8 +53,8 @@ def test_it_serves_until_it_is_told_to_end(weighted: Workspace, end: signal.Sign
 
 
 @needs_datasette
-def test_a_port_in_use_is_told_in_one_line(curate: Curate, weighted: Workspace) -> None:
-    """With the remedy."""
+def test_a_port_in_use_gives_a_one_line_error(curate: Curate, weighted: Workspace) -> None:
+    """It says what to do."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         code, out, err = curate("serve", weighted.root, "--port", port)
@@ -65,7 +65,9 @@ def test_a_port_in_use_is_told_in_one_line(curate: Curate, weighted: Workspace) 
 
 
 @needs_datasette
-def test_a_host_that_is_not_here_is_told_in_one_line(curate: Curate, weighted: Workspace) -> None:
+def test_a_host_of_another_machine_gives_a_one_line_error(
+    curate: Curate, weighted: Workspace
+) -> None:
     """As a name and as an address."""
     for host in ("192.0.2.1", "nowhere.invalid"):
         code, _, err = curate("serve", weighted.root, "--host", host)
@@ -75,10 +77,10 @@ def test_a_host_that_is_not_here_is_told_in_one_line(curate: Curate, weighted: W
 
 
 @needs_datasette
-def test_a_file_that_is_no_database_is_told_in_one_line(
+def test_a_file_that_is_not_a_database_gives_a_one_line_error(
     curate: Curate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Missing, empty of sense, or a folder."""
+    """Missing, invalid, or a folder."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "notes.sqlite").write_text("not a database at all, but long enough" * 9)
     for name, error in (
@@ -89,10 +91,10 @@ def test_a_file_that_is_no_database_is_told_in_one_line(
         assert err.count("\n") == 1
 
 
-def test_the_missing_extra_is_named(
+def test_the_missing_extra_is_reported(
     curate: Curate, weighted: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the line that installs it."""
+    """With the command that installs it."""
     monkeypatch.setitem(sys.modules, "datasette.app", None)
     code, _, err = curate("serve", weighted.root)
     assert code == ConfigError.exit_code
@@ -100,8 +102,8 @@ def test_the_missing_extra_is_named(
     assert err.count("\n") == 1
 
 
-def test_a_workspace_is_named_once(curate: Curate, weighted: Workspace) -> None:
-    """As argument or as option."""
+def test_a_workspace_cannot_be_specified_twice(curate: Curate, weighted: Workspace) -> None:
+    """As argument and as option."""
     code, _, err = curate("serve", weighted.root, "-w", weighted.root)
     assert code == ConfigError.exit_code
     assert "once" in err
@@ -110,7 +112,7 @@ def test_a_workspace_is_named_once(curate: Curate, weighted: Workspace) -> None:
 def test_a_postgresql_workspace_serves_its_export(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And where there is none, the command that writes it is named."""
+    """Without one, the error contains the command that writes it."""
     url = URL.create("postgresql+psycopg", host="db", database="labels")
     stub = SimpleNamespace(root=tmp_path, database=SimpleNamespace(url=url))
     monkeypatch.setattr(sources.Workspace, "open", lambda _folder: stub)

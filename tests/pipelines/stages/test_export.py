@@ -1,4 +1,4 @@
-"""export: which frames are handed to trainers, and in which formats."""
+"""export: which frames are exported, and in which formats."""
 
 import sqlite3
 from contextlib import closing
@@ -15,18 +15,18 @@ from pipelines.workspace.workspace import Workspace
 
 
 def run(workspace: Workspace) -> Path:
-    """Runs everything; gives the exported file."""
+    """Run everything; return the exported file."""
     run_workspace(workspace)
     return workspace.root / "exports" / "labels.sqlite"
 
 
 def first(workspace: Workspace, split: str) -> str:
-    """The first frame of a split."""
+    """Return the first frame of a split."""
     return next(iter(workspace.frames(split)))
 
 
 def test_a_labeled_frame_without_objects_is_exported(workspace: Workspace) -> None:
-    """It is known to be empty, so its background is worth learning."""
+    """It is certainly empty, so its background can be learned."""
     name = first(workspace, "labeled")
     key = workspace.frames("labeled")[name]
     with workspace.database.writing() as connection:
@@ -40,7 +40,7 @@ def test_a_labeled_frame_without_objects_is_exported(workspace: Workspace) -> No
 def test_an_unlabeled_frame_without_predictions_is_left_out(
     workspace: Workspace, toy_kitti: Path
 ) -> None:
-    """No weight says how sure it is that the frame is empty."""
+    """There is no weight for how likely the frame is empty."""
     name = first(workspace, "unlabeled")
     (toy_kitti / "training" / "velodyne" / f"{name}.bin").write_bytes(b"")
     labels = WeightedLabels(run(workspace))
@@ -48,10 +48,10 @@ def test_an_unlabeled_frame_without_predictions_is_left_out(
     assert name not in labels.frame_ids
 
 
-def test_an_unlabeled_frame_whose_labels_all_weigh_nothing_is_exported(
+def test_an_unlabeled_frame_with_only_zero_weights_is_exported(
     workspace: Workspace,
 ) -> None:
-    """Its labels are background, as all around them, or regions to leave out: as it is set."""
+    """Its labels are background or ignored, depending on the setting."""
     strict = workspace.with_settings("run", method="threshold")
     strict = strict.with_settings("solve", options={"threshold": {"threshold": 1.0}})
     samples = [sample for sample in WeightedLabels(run(strict)) if not sample.labeled]
@@ -66,7 +66,7 @@ def test_an_unlabeled_frame_whose_labels_all_weigh_nothing_is_exported(
 
 
 def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_path: Path) -> None:
-    """To the workspace or to a place of the user's; unknown formats name the known."""
+    """Into the workspace or another folder; the error for unknown formats lists the known ones."""
     run(workspace)
     folder = ("-w", workspace.root)
     code, out, _ = curate("export", "--format", "kitti", *folder)
@@ -88,10 +88,10 @@ def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_pa
     assert "unknown exporter 'yolo': use one of coco, csv, kitti," in err
 
 
-def test_what_is_no_export_is_not_overwritten(
+def test_a_file_that_is_not_an_export_is_not_overwritten(
     curate: Curate, workspace: Workspace, tmp_path: Path
 ) -> None:
-    """A file of the user's in the place, or a policy that has weighted nothing."""
+    """A user's file at that path, or a policy that has no weights."""
     run(workspace)
     precious = tmp_path / "thesis.tex"
     precious.write_text("precious")
@@ -105,10 +105,10 @@ def test_what_is_no_export_is_not_overwritten(
 
 
 @pytest.mark.parametrize("leads", ["link", "nowhere", "thesis"])
-def test_what_stands_where_the_trainer_looks_is_not_overwritten(
+def test_an_unknown_file_at_the_trainers_path_is_not_overwritten(
     workspace: Workspace, tmp_path: Path, leads: str
 ) -> None:
-    """Neither a link, which an export would take the place of, nor a file of another kind."""
+    """Neither a link, which an export would replace, nor a file of another kind."""
     former = run(workspace)
     target = tmp_path / "elsewhere.sqlite"
     if leads == "link":
@@ -126,7 +126,7 @@ def test_what_stands_where_the_trainer_looks_is_not_overwritten(
     assert target.exists() == (leads == "link")
 
 
-def test_a_student_of_labeled_frames_alone_gets_no_others(
+def test_a_student_of_labeled_frames_gets_no_unlabeled_frames(
     workspace: Workspace,
 ) -> None:
     """Not even as background."""
@@ -135,10 +135,10 @@ def test_a_student_of_labeled_frames_alone_gets_no_others(
 
 
 @pytest.mark.parametrize("weight", ["1.5", "-0.1", "'NaN'", "9e999"])
-def test_a_weight_written_by_hand_is_told_and_goes_nowhere(
+def test_a_manually_changed_weight_is_reported_and_not_exported(
     curate: Curate, workspace: Workspace, tmp_path: Path, weight: str
 ) -> None:
-    """By every command that hands weights out, even where the export is up to date."""
+    """By every command that exports weights, even if the export is up to date."""
     exported = run(workspace).read_bytes()
     with workspace.database.writing() as connection:
         chosen = "round = 1 AND policy = 'pspsl' AND k = 0"

@@ -1,4 +1,4 @@
-"""Trainers of the user's: what they are told, what is checked, who teaches the next round."""
+"""External trainers: their arguments, the checks, and the teacher of the next round."""
 
 import hashlib
 import json
@@ -28,7 +28,7 @@ open(output, "w").write(f"student-{number}")
 
 @pytest.fixture
 def command(tmp_path: Path) -> str:
-    """A trainer in a few lines of Python, in a folder with a space."""
+    """Return a trainer in a few lines of Python, in a folder with a space."""
     script = tmp_path / "my trainer" / "train.py"
     script.parent.mkdir()
     script.write_text(TRAINER)
@@ -37,24 +37,24 @@ def command(tmp_path: Path) -> str:
 
 @pytest.fixture
 def exported(workspace: Workspace) -> Workspace:
-    """A workspace with a brought detector, whose first round has ended with its export."""
+    """Return a workspace with an external detector after its first round and export."""
     run_workspace(workspace)
     return workspace
 
 
 def python(code: str) -> str:
-    """A command that runs some Python."""
+    """Return a command that runs Python code."""
     return shlex.join([sys.executable, "-c", code])
 
 
 def checkpoints(workspace: Workspace) -> list[tuple]:
-    """Rounds, policies, paths and hashes."""
+    """Return rounds, policies, paths and hashes."""
     with workspace.database.reading() as connection:
         query = "SELECT round, policy, path, sha256 FROM checkpoint ORDER BY round"
         return [tuple(row) for row in connection.exec_driver_sql(query)]
 
 
-def test_the_student_of_a_command_teaches_the_next_round(
+def test_the_student_of_a_command_is_the_next_teacher(
     curate: Curate, exported: Workspace, command: str
 ) -> None:
     """It gets the labels, and its file is stored with its hash."""
@@ -73,10 +73,10 @@ def test_the_student_of_a_command_teaches_the_next_round(
         assert connection.exec_driver_sql(query).scalar_one() == 18
 
 
-def test_what_a_round_weighted_is_handed_out_after_its_student_as_before(
+def test_the_labels_of_a_round_can_be_exported_after_its_training(
     curate: Curate, exported: Workspace, command: str, tmp_path: Path
 ) -> None:
-    """Not the next round's labels, which do not exist yet; asking for them starts no round."""
+    """The export does not start the next round."""
     code, _, err = curate("train-round", "--command", command, "-w", exported.root)
     assert code == 0, err
     code, out, _ = curate("export", "-w", exported.root)
@@ -92,10 +92,10 @@ def test_what_a_round_weighted_is_handed_out_after_its_student_as_before(
     assert (code, Path(out.split()[-1]).name) == (0, "round-01-pspsl.html")
 
 
-def test_a_command_given_by_hand_trains_later_rounds_too(
+def test_a_command_given_as_an_option_trains_later_rounds_too(
     curate: Curate, exported: Workspace, command: str
 ) -> None:
-    """It stands in curate.toml once it has trained, so that no other trainer takes its place."""
+    """After its first training it is stored in curate.toml, so no other trainer replaces it."""
     path = exported.root / "curate.toml"
     path.write_text("# mine\n" + path.read_text())
     before = path.read_text()
@@ -105,18 +105,18 @@ def test_a_command_given_by_hand_trains_later_rounds_too(
     assert code == 0
     assert err.splitlines()[-1] == ("curate.toml: stored command in [train] for later rounds")
     assert path.read_text().startswith("# mine\n")
-    told = Workspace.open(exported.root)
-    assert told.config == exported.with_settings("train", command=command).config
-    done = [(each.round, each.stage) for each in run_workspace(told, 2) if each.done]
+    configured = Workspace.open(exported.root)
+    assert configured.config == exported.with_settings("train", command=command).config
+    done = [(each.round, each.stage) for each in run_workspace(configured, 2) if each.done]
     assert (1, "train-round") not in done
     assert (2, "train-round") in done
-    assert find_teacher(told, 3)[1].path.read_text() == "student-2"
+    assert find_teacher(configured, 3)[1].path.read_text() == "student-2"
 
 
-def test_a_student_that_teaches_nobody_is_trained_by_any_command(
+def test_a_student_that_is_not_the_next_teacher_can_use_any_command(
     curate: Curate, exported: Workspace, command: str
 ) -> None:
-    """The student of another policy leaves curate.toml as it is."""
+    """The student of another policy does not change curate.toml."""
     before = (exported.root / "curate.toml").read_text()
     for name in ("solve", "export"):
         assert curate(name, "--policy", "uniform", "-w", exported.root)[0] == 0
@@ -127,42 +127,42 @@ def test_a_student_that_teaches_nobody_is_trained_by_any_command(
     assert (exported.root / "curate.toml").read_text() == before
 
 
-def test_what_the_trainer_prints_is_streamed(
+def test_the_output_of_the_trainer_is_streamed(
     capfd: pytest.CaptureFixture, exported: Workspace, command: str
 ) -> None:
-    """To standard error, so that JSON stays JSON."""
-    told = exported.with_settings("train", command=command)
-    run_stage(told, "train-round", 1, "pspsl")
+    """To standard error, so standard output stays JSON."""
+    configured = exported.with_settings("train", command=command)
+    run_stage(configured, "train-round", 1, "pspsl")
     output = capfd.readouterr()
     assert output.out == ""
     assert f"round 1: 18 labels from {exported.config.detector.path}" in output.err
 
 
 def test_a_configured_command_trains_in_every_round(workspace: Workspace, command: str) -> None:
-    """`curate run` then has several rounds with a brought detector, and a second run does none."""
-    told = workspace.with_settings("train", command=command)
-    reports = run_workspace(told, 2)
+    """`curate run` then has several rounds with an external detector, and a second run has none."""
+    configured = workspace.with_settings("train", command=command)
+    reports = run_workspace(configured, 2)
     assert [report.round for report in reports if report.stage == "train-round"] == [1, 2]
-    assert find_teacher(told, 2)[1].path.read_text() == "student-1"
-    assert find_teacher(told, 3)[1].path.read_text() == "student-2"
-    assert {report.done for report in run_workspace(told, 2)} == {0}
-    other = told.with_settings("train", command=command + " again")
+    assert find_teacher(configured, 2)[1].path.read_text() == "student-1"
+    assert find_teacher(configured, 3)[1].path.read_text() == "student-2"
+    assert {report.done for report in run_workspace(configured, 2)} == {0}
+    other = configured.with_settings("train", command=command + " again")
     again = [report.stage for report in run_workspace(other, 1) if report.done]
     assert again == ["train-round"]
 
 
-def test_without_a_student_a_configured_command_has_no_next_teacher(
+def test_without_a_student_the_next_round_has_no_teacher(
     workspace: Workspace, command: str
 ) -> None:
-    """The brought detector does not answer in a round that a student should teach."""
-    told = workspace.with_settings("train", command=command)
+    """The external detector is not used in a round that needs a student."""
+    configured = workspace.with_settings("train", command=command)
     with pytest.raises(WorkspaceError, match="round 2 has no teacher yet; run `curate train-r"):
-        find_teacher(told, 2)
+        find_teacher(configured, 2)
     assert find_teacher(workspace, 2)[1].path == workspace.config.detector.path
 
 
-def test_labels_come_in_the_format_that_is_asked_for(curate: Curate, exported: Workspace) -> None:
-    """Exported beside the SQLite file."""
+def test_labels_are_exported_in_the_requested_format(curate: Curate, exported: Workspace) -> None:
+    """Beside the SQLite file."""
     code = (
         "import os, shutil; path = os.environ['CURATE_LABELS'];"
         "shutil.copy(path + '/ps_label_e0.pkl', os.environ['CURATE_OUTPUT'])"
@@ -175,7 +175,7 @@ def test_labels_come_in_the_format_that_is_asked_for(curate: Curate, exported: W
 
 
 @pytest.mark.parametrize(
-    ("code", "fault"),
+    ("code", "message"),
     [
         ("import sys; sys.exit(3)", "ended with exit code 3"),
         ("import os; os.kill(os.getpid(), 9)", "ended with signal 9"),
@@ -184,24 +184,24 @@ def test_labels_come_in_the_format_that_is_asked_for(curate: Curate, exported: W
         ("import os; os.mkdir(os.environ['CURATE_OUTPUT'])", "is empty, though"),
     ],
 )
-def test_a_trainer_that_fails_is_one_line_and_an_exit_code(
-    curate: Curate, exported: Workspace, command: str, code: str, fault: str
+def test_a_failing_trainer_gives_one_line_and_an_exit_code(
+    curate: Curate, exported: Workspace, command: str, code: str, message: str
 ) -> None:
-    """Nothing is registered, and a former student stays as it was."""
+    """Nothing is registered, and an earlier student does not change."""
     curate("train-round", "--command", command, "--round", 1, "-w", exported.root)
     before = checkpoints(exported)
     ended, _, err = curate(
         "train-round", "--command", python(code), "--round", 1, "-w", exported.root
     )
     assert ended == TrainerFailed.exit_code
-    assert fault in err
+    assert message in err
     assert err.count("\n") == 1
     assert checkpoints(exported) == before
     assert (exported.root / "checkpoints" / "round-01-pspsl.txt").read_text() == "student-1"
 
 
-def test_a_killed_training_goes_on_from_what_it_left(curate: Curate, exported: Workspace) -> None:
-    """The trainer finds its own file again; one that does not touch it has not trained."""
+def test_a_killed_training_resumes_from_its_file(curate: Curate, exported: Workspace) -> None:
+    """The trainer finds its own file again; without a new file the training has failed."""
     code = (
         "import os, sys; path = os.environ['CURATE_OUTPUT']; done = os.path.exists(path);"
         "open(path, 'a').write('half '); sys.exit(0 if done else 1)"
@@ -216,10 +216,10 @@ def test_a_killed_training_goes_on_from_what_it_left(curate: Curate, exported: W
     assert (exported.root / "checkpoints" / "round-01-pspsl.txt").read_text() == "half half "
 
 
-def test_labels_that_are_not_exported_are_refused(
+def test_labels_that_are_not_exported_are_rejected(
     curate: Curate, workspace: Workspace, command: str
 ) -> None:
-    """Before the trainer starts; so are those that are older than their weights."""
+    """Before the trainer starts; so are exports older than their weights."""
     run_workspace(workspace)
     (workspace.root / "exports" / "round-01-pspsl.sqlite").unlink()
     ended, _, err = curate("train-round", "--command", command, "-w", workspace.root)
@@ -228,25 +228,24 @@ def test_labels_that_are_not_exported_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("command", "fault"),
+    ("command", "message"),
     [
         ("", "is empty; name a program"),
         ("python 'train.py", "mend its quotes"),
         ("no-such-program {labels}", "no-such-program cannot be started"),
     ],
 )
-def test_a_command_that_is_none_is_refused(
-    curate: Curate, exported: Workspace, command: str, fault: str
+def test_an_invalid_command_is_rejected(
+    curate: Curate, exported: Workspace, command: str, message: str
 ) -> None:
-    """In one line."""
     ended, _, err = curate("train-round", "--command", command, "-w", exported.root)
     assert ended == ConfigError.exit_code
-    assert fault in err
+    assert message in err
     assert err.count("\n") == 1
 
 
-def test_no_shell_reads_the_command() -> None:
-    """What a shell would act on stays text, values stay within their argument, once."""
+def test_the_command_is_not_run_by_a_shell() -> None:
+    """Special characters stay text, and values stay within their argument."""
     values = {"labels": "/my data/{round}; rm -rf", "round": "1"}
     assert split_command("t --in={labels} '{other}' $HOME && {round", values) == [
         "t", "--in=/my data/{round}; rm -rf", "{other}", "$HOME", "&&", "{round",

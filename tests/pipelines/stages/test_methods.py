@@ -1,4 +1,4 @@
-"""Methods by one word, and what that word does to a run."""
+"""Methods selected by one word, and their effect on a run."""
 
 import json
 from collections.abc import Sequence
@@ -30,19 +30,19 @@ NAMES = [
 
 
 def run(workspace: Workspace) -> Workspace:
-    """Brings everything up to date."""
+    """Bring everything up to date."""
     run_workspace(workspace)
     return workspace
 
 
 def solved(workspace: Workspace, number: int, policy: str) -> None:
-    """Brings a round up to a policy's weights."""
+    """Bring a round up to a policy's weights."""
     for name in ("predict", "repredict", "points", "semantic", "solve"):
         run_stage(workspace, name, number, policy)
 
 
-def test_the_methods_are_the_ones_that_are_compared() -> None:
-    """Each is a registered policy of the same name, with a note of one line."""
+def test_the_methods_are_registered_policies() -> None:
+    """Each has the name of a registered policy, and a one-line note."""
     assert list(METHODS) == NAMES
     for name, method in METHODS.items():
         assert method.policy == name
@@ -55,7 +55,7 @@ def test_the_methods_are_the_ones_that_are_compared() -> None:
 
 
 def test_the_page_of_methods_is_complete() -> None:
-    """Each has its row, with its teacher."""
+    """Each method has its row, with its teacher."""
     page = (ROOT / "docs" / "methods.md").read_text()
     found = {row[1].strip(" `"): row[3].strip() for row in map(_cells, page.splitlines()) if row}
     words = {"student": "student", "ema": "average"}
@@ -69,7 +69,7 @@ def _cells(line: str) -> list[str]:
 
 
 def test_a_method_is_one_word_in_the_configuration(tmp_path: Path) -> None:
-    """Teacher and meaning of a weight of 0 follow from it, unless they are set."""
+    """It sets the teacher and the meaning of weight 0, unless they are set explicitly."""
     config = make_config({"dataset": {"root": tmp_path}}, "test")
     assert config.run.method == "pspsl"
     assert method_of(config, "pspsl") == METHODS["pspsl"]
@@ -85,14 +85,16 @@ def test_a_method_is_one_word_in_the_configuration(tmp_path: Path) -> None:
     assert method_named("mylab.rules:Mine").teacher == method_named("uniform").teacher == "student"
 
 
-def test_only_bands_of_doubt_are_ignored(tmp_path: Path) -> None:
-    """ST3D and HSSDA drop what they hold to be nothing; elsewhere a weight of 0 says so."""
+def test_only_uncertain_labels_are_ignored(tmp_path: Path) -> None:
+    """ST3D and HSSDA drop background; for other methods weight 0 marks it."""
     config = make_config({"dataset": {"root": tmp_path}}, "test")
     ignoring = [name for name in NAMES if zero_weight_of(config, name) == "ignore"]
     assert ignoring == ["st3d", "hssda"]
 
 
-def test_an_unknown_method_names_the_known_ones(curate: Curate, workspace: Workspace) -> None:
+def test_the_error_for_an_unknown_method_lists_the_known_ones(
+    curate: Curate, workspace: Workspace
+) -> None:
     """In one line, before anything runs."""
     with pytest.raises(ConfigError, match="'sass': use one of baseline, uda, uda-cl, sess"):
         with_method(workspace.config, "sass")
@@ -102,15 +104,17 @@ def test_an_unknown_method_names_the_known_ones(curate: Curate, workspace: Works
     assert rows(workspace, "SELECT * FROM prediction") == []
 
 
-def test_the_old_place_of_the_word_is_answered_with_the_new_one(tmp_path: Path) -> None:
-    """A curate.toml of an earlier version says what to write."""
+def test_the_old_key_gives_an_error_with_the_new_one(tmp_path: Path) -> None:
+    """For a curate.toml of an earlier version."""
     with pytest.raises(ConfigError, match=r'write method = "spsl" in \[run\]'):
         make_config({"dataset": {"root": tmp_path}, "solve": {"policy": "spsl"}}, "curate.toml")
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "3dioumatch"])
-def test_every_method_runs_by_its_word(curate: Curate, workspace: Workspace, name: str) -> None:
-    """`curate run --method` weighs and exports under that name; curate.toml stays as it is."""
+def test_every_method_can_be_run_by_its_name(
+    curate: Curate, workspace: Workspace, name: str
+) -> None:
+    """`curate run --method` weights and exports under that name; curate.toml does not change."""
     code, _, err = curate("run", "--method", name, "--workspace", workspace.root)
     assert code == 0, err
     policies = rows(workspace, "SELECT DISTINCT policy FROM weight")
@@ -119,17 +123,14 @@ def test_every_method_runs_by_its_word(curate: Curate, workspace: Workspace, nam
     assert 'method = "pspsl"' in (workspace.root / "curate.toml").read_text()
 
 
-def test_a_detector_without_iou_cannot_be_filtered_by_it(
-    curate: Curate, workspace: Workspace
-) -> None:
-    """3DIoUMatch says so in one line."""
+def test_a_detector_without_iou_cannot_use_3dioumatch(curate: Curate, workspace: Workspace) -> None:
     code, _, err = curate("run", "--method", "3dioumatch", "--workspace", workspace.root)
     assert code == ConfigError.exit_code
     assert "18 of 18 labels have no estimate of their IoU" in err
 
 
 def test_a_dropped_label_is_not_exported(curate: Curate, workspace: Workspace) -> None:
-    """It has no row of that policy; one of another policy beside it stays."""
+    """It has no row of that policy; rows of other policies stay."""
     options = {"st3d": {"keep": 0.9, "ignore": 0.5}}
     dropping = workspace.with_settings("solve", options=options)
     solved(dropping, 1, "st3d")
@@ -152,8 +153,8 @@ def test_a_dropped_label_is_not_exported(curate: Curate, workspace: Workspace) -
     assert "the policy dropped it" in err
 
 
-def test_a_policy_remembers_the_round_before(workspace: Workspace) -> None:
-    """What it did not drop there; a round that it has not weighed is asked for by name."""
+def test_a_policy_uses_its_previous_round(workspace: Workspace) -> None:
+    """What it did not drop there; the error for a round without weights contains the round."""
     with pytest.raises(WorkspaceError, match="curate solve --policy st3d --round 1"):
         solved(workspace, 2, "st3d")
     solved(workspace, 1, "st3d")
@@ -165,8 +166,8 @@ def test_a_policy_remembers_the_round_before(workspace: Workspace) -> None:
     assert np.isnan(memory.iou).all()
 
 
-def test_what_is_remembered_makes_stale_what_it_decided(workspace: Workspace) -> None:
-    """Weighing the first round otherwise redoes the second for the policy that looked back."""
+def test_changed_weights_make_the_next_round_stale(workspace: Workspace) -> None:
+    """Only for the policy that uses the previous round."""
     for policy in ("st3d", "uda"):
         solved(workspace, 1, policy)
         solved(workspace, 2, policy)
@@ -177,8 +178,8 @@ def test_what_is_remembered_makes_stale_what_it_decided(workspace: Workspace) ->
 
 
 @pytest.mark.parametrize("priors", [("points",), ("semantic",), ()])
-def test_each_prior_can_be_asked_alone(workspace: Workspace, priors: Sequence[str]) -> None:
-    """rho_det is then the one that was asked, or 1."""
+def test_each_prior_can_be_used_alone(workspace: Workspace, priors: Sequence[str]) -> None:
+    """rho_det is then the value of that prior, or 1."""
     alone = run(workspace.with_settings("run", priors=priors))
     found = rows(alone, "SELECT rho_diff, rho_anno, rho_det, weight FROM weighted_labels")
     assert len(found) == 18
@@ -195,17 +196,17 @@ ABLATIONS = [
 
 
 @pytest.mark.parametrize(("section", "flag"), ABLATIONS, ids=str)
-def test_every_ablation_of_the_weights_is_a_flag(
+def test_every_ablation_of_the_weights_is_a_setting(
     curate: Curate, workspace: Workspace, section: str, flag: dict
 ) -> None:
     """It changes weights, and `explain` still recomputes them."""
-    question = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
-    before = rows(run(workspace), question)
+    query = "SELECT frame, k, weight FROM weighted_labels ORDER BY frame, k"
+    before = rows(run(workspace), query)
     document = workspace.config.model_dump(mode="json")
     document[section] |= flag
     changed = Config.model_validate(document)
     write_config(workspace.root / "curate.toml", changed)
-    after = rows(run(replace(workspace, config=changed)), question)
+    after = rows(run(replace(workspace, config=changed)), query)
     assert before != after
     frame, k, weight = max(after, key=lambda row: row[2])
     _, out, _ = curate("explain", frame, k, "--json", "-w", workspace.root)
@@ -215,19 +216,19 @@ def test_every_ablation_of_the_weights_is_a_flag(
 def trained(
     workspace: Workspace, tmp_path: Path, tiny: str, name: str, **train: object
 ) -> Workspace:
-    """A workspace of its own where a tiny detector was trained for two rounds of a method."""
+    """Return a workspace in which a tiny detector was trained for two rounds of a method."""
     document = workspace.config.model_dump(mode="json") | {"detector": {}}
     config = make_config(document | {"run": {"rounds": 2, "method": name}}, "test")
     own = initialise(tmp_path / f"{name}-{len(train)}", config, "0.25", "")
     settings = {"preset": tiny, "pretrain_steps": 5, "round_steps": 3} | train
-    section = own.config.train.model_copy(update=settings)  # the tiny preset is no user's
+    section = own.config.train.model_copy(update=settings)  # users cannot select the tiny preset
     return run(replace(own, config=own.config.model_copy(update={"train": section})))
 
 
-def test_an_averaged_teacher_teaches_the_next_round(
+def test_an_averaged_teacher_is_used_in_the_next_round(
     workspace: Workspace, tmp_path: Path, tiny: str
 ) -> None:
-    """The same first teacher and labels; what is registered is the average, not the student."""
+    """The same first teacher and labels; the average is registered, not the student."""
     averaged = trained(workspace, tmp_path, tiny, "sess")
     plain = trained(workspace, tmp_path, tiny, "sess", teacher="student")
     first, second = ([find_teacher(of, n)[1] for of in (averaged, plain)] for n in (1, 2))
@@ -240,10 +241,10 @@ def test_an_averaged_teacher_teaches_the_next_round(
     assert second[0].sha256 == sha256(path)
 
 
-def test_students_of_two_methods_do_not_meet(
+def test_the_students_of_two_methods_are_separate(
     workspace: Workspace, tmp_path: Path, tiny: str
 ) -> None:
-    """Each has a checkpoint of its own name; they share the first teacher, which is kept."""
+    """Each has its own checkpoint name; they share the first teacher, which is kept."""
     own = trained(workspace, tmp_path, tiny, "spsl")
     kept = [own.root / "checkpoints" / f"round-{n}.safetensors" for n in ("00", "01-spsl")]
     before = [sha256(path) for path in kept]
@@ -255,10 +256,10 @@ def test_students_of_two_methods_do_not_meet(
     ]
 
 
-def test_a_wrong_option_of_the_trainer_is_an_error_of_one_line(
+def test_a_wrong_option_of_the_trainer_gives_a_one_line_error(
     workspace: Workspace, tmp_path: Path, tiny: str
 ) -> None:
-    """It names the option and where it stands."""
+    """It contains the option and its position."""
     with pytest.raises(ConfigError, match=r"train\.options.*'setps'") as info:
         trained(workspace, tmp_path, tiny, "baseline", options={"setps": 4})
     assert "\n" not in str(info.value)

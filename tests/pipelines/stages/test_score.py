@@ -1,4 +1,4 @@
-"""Evidence sources as stages: the shipped ones, and those from outside."""
+"""Evidence sources as stages: the built-in ones, and external ones."""
 
 import csv
 import json
@@ -28,13 +28,13 @@ ENGINES = ("sqlite", "postgresql")
 
 
 def rows(workspace: Workspace, columns: str = "*") -> list[dict[str, Any]]:
-    """What the view shows, by column name."""
+    """Return the rows of the view, by column name."""
     with workspace.database.reading() as connection:
         query = text(f"SELECT {columns} FROM weighted_labels ORDER BY frame, k")
         return [dict(row) for row in connection.execute(query).mappings()]
 
 
-def test_a_prior_from_outside_has_its_columns_everywhere(
+def test_an_external_prior_has_its_columns_everywhere(
     curate: Curate, workspace: Workspace, tmp_path: Path
 ) -> None:
     """In the view, the weights, the exports, the explanation, the report and queries."""
@@ -79,8 +79,8 @@ def test_a_prior_from_outside_has_its_columns_everywhere(
     assert [row["rho_toy"] for row in json.loads(out)] == [row["rho_toy"] for row in found]
 
 
-def test_a_source_of_sequences_sees_whole_sequences(workspace: Workspace) -> None:
-    """Its columns are in the view; it is no prior, so the weights are those without it."""
+def test_a_sequence_source_sees_whole_sequences(workspace: Workspace) -> None:
+    """Its columns are in the view; it is not a prior, so the weights do not change."""
     sequenced = workspace.with_settings(
         "dataset", kind="support.toys:ToySequences", split_by="frame"
     )
@@ -99,8 +99,8 @@ def test_a_source_of_sequences_sees_whole_sequences(workspace: Workspace) -> Non
     assert run(own)[TRACKS] == 0
 
 
-def test_a_prior_that_is_replaced_gets_its_evidence_again(workspace: Workspace) -> None:
-    """Each source has a table of its own; back at the first, nothing is gathered again."""
+def test_a_replaced_prior_gets_new_evidence(workspace: Workspace) -> None:
+    """Each source has its own table; after switching back, nothing is computed again."""
     run(workspace)
     before = rows(workspace)
     own = workspace.with_settings("run", priors=(OWN, "semantic"))
@@ -113,10 +113,10 @@ def test_a_prior_that_is_replaced_gets_its_evidence_again(workspace: Workspace) 
     assert run(own)[OWN] == 0
 
 
-def test_a_changed_declaration_makes_its_table_anew(
+def test_a_changed_declaration_recreates_its_table(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """What it stored is computed again; one line says so."""
+    """The values are computed again; one line reports it."""
     own = workspace.with_settings("run", priors=("points", OWN))
     run(own)
     changed = tuple(replace(column, meaning="changed") for column in ToyPrior.columns)
@@ -129,7 +129,7 @@ def test_a_changed_declaration_makes_its_table_anew(
     source_of.cache_clear()
 
 
-def test_a_source_that_left_the_configuration_is_named(
+def test_a_source_removed_from_the_configuration_is_reported(
     workspace: Workspace, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Its table stays, its columns are shown, and no weight uses it."""
@@ -163,10 +163,10 @@ COLUMN = ToyPrior.columns[0]
         ({"name": "points"}, "the name 'points' is taken"),
     ],
 )
-def test_a_wrong_declaration_is_refused_before_any_work(
+def test_a_wrong_declaration_is_rejected_before_any_work(
     monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], message: str
 ) -> None:
-    """In one line that names the source and the column."""
+    """The one-line error contains the source and the column."""
     for name, value in changes.items():
         monkeypatch.setattr(ToyPrior, name, value)
     source_of.cache_clear()
@@ -191,7 +191,7 @@ def test_a_wrong_declaration_is_refused_before_any_work(
 def test_wrong_evidence_fails_its_frame_in_one_line(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch, wrong: dict[str, list], message: str
 ) -> None:
-    """The line names the source and the column."""
+    """The line contains the source and the column."""
     right = ToyPrior.rate
     monkeypatch.setattr(
         ToyPrior,
@@ -210,10 +210,10 @@ def test_wrong_evidence_fails_its_frame_in_one_line(
         assert "\n" not in error
 
 
-def test_other_maps_in_the_same_folder_are_looked_at_anew(
+def test_changed_maps_in_the_same_folder_make_the_evidence_stale(
     workspace: Workspace, tmp_path: Path
 ) -> None:
-    """A segmenter may be a folder: what is exchanged or renamed in it counts, a look at it not."""
+    """If the segmenter is a folder, replaced or renamed files count; reading them does not."""
     maps = tmp_path / "maps"
     maps.mkdir()
     (maps / "a.png").write_bytes(b"one map")
@@ -227,20 +227,20 @@ def test_other_maps_in_the_same_folder_are_looked_at_anew(
     assert run(own)["semantic"] == 0
 
 
-def test_two_sources_of_one_name_are_refused() -> None:
-    """The error names both."""
+def test_two_sources_of_one_name_are_rejected() -> None:
+    """The error contains both."""
     with pytest.raises(ConfigError, match=r"ToyPrior and .*ToyPriorAgain have the same name 'toy'"):
         round_graph((OWN, "support.toys:ToyPriorAgain"))
 
 
-def test_an_unknown_prior_is_refused() -> None:
-    """A misspelt name is not passed over."""
+def test_an_unknown_prior_is_rejected() -> None:
+    """A misspelt name is not ignored."""
     known = ", ".join(sorted(PRIORS.classes))
     with pytest.raises(ConfigError, match=f"unknown prior 'pionts': use one of {known}"):
         round_graph(("pionts",))
 
 
-def test_the_shipped_round_has_a_stage_per_registered_prior() -> None:
+def test_the_default_round_has_a_stage_per_registered_prior() -> None:
     """In the order of the registry, between repredict and solve."""
     graph = round_graph(tuple(PRIORS.classes))
     names = [each.name for each in graph.stages]

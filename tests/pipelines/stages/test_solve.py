@@ -1,10 +1,10 @@
-"""solve: a policy's weights take the place of its former ones, and of nothing else."""
+"""solve: the weights of a policy replace its earlier ones, and nothing else."""
 
 from pathlib import Path
 
 import pytest
 from sqlalchemy import text
-from support.label_questions import solved
+from support.label_queries import solved
 from support.labels_at_scale import EACH, filled_workspace
 
 from db import bulk
@@ -17,7 +17,7 @@ FRAMES = 10
 def workspace(
     tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Workspace:
-    """Ten frames of fifty labels, weighed by two policies, written so many rows at a time."""
+    """Return ten frames of 50 labels, weighted by two policies, written in batches."""
     monkeypatch.setattr(bulk, "BLOCK_ROWS", request.param)
     workspace = solved(filled_workspace(tmp_path / "work", FRAMES))
     return solved(workspace, "uda")
@@ -32,7 +32,7 @@ def _rows(workspace: Workspace, policy: str) -> list[tuple]:
 @pytest.mark.parametrize(
     "left", [[], [1], [FRAMES], [2, 3, 7], list(range(1, FRAMES)), list(range(1, FRAMES + 1))]
 )
-def test_frames_that_are_gone_leave_no_weight(workspace: Workspace, left: list[int]) -> None:
+def test_removed_frames_leave_no_weight(workspace: Workspace, left: list[int]) -> None:
     """At the start, in the middle or at the end; another policy keeps its weights."""
     first, others = _rows(workspace, "pspsl"), _rows(workspace, "uda")
     assert len(first) == len(others) == FRAMES * EACH
@@ -44,15 +44,15 @@ def test_frames_that_are_gone_leave_no_weight(workspace: Workspace, left: list[i
     assert _rows(workspace, "uda") == others
 
 
-def test_another_age_in_place_gives_the_rows_of_a_first_solve(
+def test_solving_again_at_another_age_gives_the_rows_of_a_first_solve(
     workspace: Workspace, tmp_path: Path
 ) -> None:
-    """To the last bit, although they are changed where they stand."""
+    """To the last bit, although rows are updated in place."""
     others = _rows(workspace, "uda")
     younger = _rows(workspace, "pspsl")
     solved(workspace, rounds=7)
-    anew = solved(filled_workspace(tmp_path / "anew", FRAMES), rounds=7)
-    assert _rows(workspace, "pspsl") == _rows(anew, "pspsl") != younger
+    fresh = solved(filled_workspace(tmp_path / "anew", FRAMES), rounds=7)
+    assert _rows(workspace, "pspsl") == _rows(fresh, "pspsl") != younger
     assert _rows(workspace, "uda") == others
 
 
@@ -61,10 +61,8 @@ def test_another_age_in_place_gives_the_rows_of_a_first_solve(
     "UPDATE weight SET k = 1000 WHERE policy = 'pspsl' AND frame_id = 4 AND k = 17",
     "INSERT INTO weight SELECT round, frame_id, 1000 + k, policy, lambda_u, rho_det, v FROM weight",
 ])  # fmt: skip
-def test_weights_that_somebody_changed_by_hand_are_replaced(
-    workspace: Workspace, statement: str
-) -> None:
-    """Rows that are not those of the labels get no values of others."""
+def test_manually_changed_weights_are_replaced(workspace: Workspace, statement: str) -> None:
+    """Missing or extra rows do not shift the values of others."""
     before = _rows(workspace, "pspsl")
     with workspace.database.writing(keys_known=True) as connection:
         connection.execute(text(statement))

@@ -1,4 +1,4 @@
-"""The settings of a workspace: each described, checked, and explained where it is wrong."""
+"""The settings of a workspace: each described, checked, and reported if it is wrong."""
 
 import json
 import tomllib
@@ -28,15 +28,15 @@ REGISTRIES = {
 }
 
 
-def test_every_section_of_the_configuration_is_walked() -> None:
-    """So that the walks below miss none."""
+def test_every_section_of_the_configuration_is_tested() -> None:
+    """So that the tests below miss none."""
     assert [name for name, _ in sections_of(Config)] == list(Config.model_fields)
     assert len(SETTINGS) > 50
 
 
 @pytest.mark.parametrize("setting", SETTINGS.values(), ids=SETTINGS.keys())
-def test_every_setting_says_what_it_is(setting: Setting) -> None:
-    """A sentence, a unit for a number and for nothing else, and an example if it is unset."""
+def test_every_setting_has_a_description(setting: Setting) -> None:
+    """A sentence, a unit if and only if it is a number, and an example if it is unset."""
     assert setting.meaning[0].isupper()
     assert setting.meaning.endswith(".")
     assert setting.accepted.type != "value"
@@ -46,7 +46,7 @@ def test_every_setting_says_what_it_is(setting: Setting) -> None:
 
 @pytest.mark.parametrize("name", [name for name, each in SETTINGS.items() if is_number(each)])
 def test_every_number_has_a_range_that_is_checked(name: str) -> None:
-    """Infinity and a number below every range are rejected in words that name the range."""
+    """For infinity and a number below every range, the error contains the range."""
     assert SETTINGS[name].accepted.range
     listed = SETTINGS[name].accepted.type.startswith("list")
     for value in ("-1e300", "inf", "nan"):
@@ -67,19 +67,19 @@ def test_every_default_is_accepted(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_every_misspelled_key_is_recognised(name: str) -> None:
-    """By its own name, with the keys of the section."""
+def test_every_misspelled_key_is_reported(name: str) -> None:
+    """With its name and the keys of the section."""
     section, key = name.split(".")
     with pytest.raises(ConfigError) as caught:
         change_setting({}, f"{section}.{key}x=1")
     words = str(caught.value)
     assert words.startswith(f"--set {name}x: unknown key; did you mean '{key}'?; [{section}] has ")
-    assert_in_our_words(words)
+    assert_no_pydantic_text(words)
 
 
 @pytest.mark.parametrize("name", [name for name, each in SETTINGS.items() if each.accepted.choices])
-def test_every_misspelled_choice_is_recognised(name: str) -> None:
-    """Names of the registries and fixed choices; all of them are listed."""
+def test_every_misspelled_choice_is_reported(name: str) -> None:
+    """Registered names and fixed choices; the error lists all of them."""
     choices = SETTINGS[name].accepted.choices
     wrong = choices[0] + "x"
     with pytest.raises(ConfigError) as caught:
@@ -89,11 +89,11 @@ def test_every_misspelled_choice_is_recognised(name: str) -> None:
     assert words.startswith(f"--set {name}")
     assert f"did you mean '{choices[0]}'?" in words
     assert all(choice in words for choice in choices)
-    assert_in_our_words(words)
+    assert_no_pydantic_text(words)
 
 
 @pytest.mark.parametrize(("name", "found"), REGISTRIES.items())
-def test_registered_names_and_classes_of_the_user_are_accepted(
+def test_registered_names_and_user_supplied_classes_are_accepted(
     name: str, found: registry.Registry
 ) -> None:
     """Without importing them."""
@@ -131,15 +131,15 @@ def test_registered_names_and_classes_of_the_user_are_accepted(
         ("solve.policy=spsl", 'solve: policy has moved: write method = "spsl" in [run]'),
     ],
 )
-def test_a_wrong_setting_is_explained(setting: str, words: str) -> None:
-    """With its key and what is accepted there."""
+def test_a_wrong_setting_is_reported(setting: str, words: str) -> None:
+    """With its key and the accepted values."""
     with pytest.raises(ConfigError) as caught:
         change_setting({}, setting)
     assert str(caught.value).startswith(f"--set {words}")
-    assert_in_our_words(str(caught.value))
+    assert_no_pydantic_text(str(caught.value))
 
 
-def test_all_faults_of_a_file_are_one_line(tmp_path: Path) -> None:
+def test_all_errors_of_a_file_are_one_line(tmp_path: Path) -> None:
     """With the file, and each key once."""
     path = tmp_path / "curate.toml"
     path.write_text(
@@ -154,18 +154,18 @@ def test_all_faults_of_a_file_are_one_line(tmp_path: Path) -> None:
     assert "train.round_stpes: unknown key; did you mean 'round_steps'?" in words
     assert "dataset.kind: unknown dataset 'kiti'" in words
     assert "solve = 3: use a table" in words
-    assert_in_our_words(words)
+    assert_no_pydantic_text(words)
 
 
-def assert_in_our_words(message: str) -> None:
-    """One line without a phrase of pydantic."""
+def assert_no_pydantic_text(message: str) -> None:
+    """Check that a message is one line without a phrase of pydantic."""
     assert "\n" not in message
     for phrase in ("Input should", "Extra inputs", "not permitted", "valid ", "type=", "pydantic"):
         assert phrase not in message
 
 
-def test_a_written_file_explains_and_holds_every_setting(tmp_path: Path) -> None:
-    """What is unset is a comment with an example; what was written is read again."""
+def test_a_written_file_contains_and_explains_every_setting(tmp_path: Path) -> None:
+    """Unset settings are comments with an example; the file can be read back."""
     config = make_config(
         {"dataset": {"root": "data"}, "solve": {"options": {"my.lab:Policy": {"a": 1}}}}, "test"
     )
@@ -185,14 +185,14 @@ def test_a_written_file_explains_and_holds_every_setting(tmp_path: Path) -> None
 
 
 def test_a_commented_setting_can_be_uncommented(tmp_path: Path) -> None:
-    """Its example is valid as it stands."""
+    """Its example is valid as it is."""
     path = tmp_path / "curate.toml"
     write_config(path, make_config({"dataset": {"root": "data"}}, "test"))
     path.write_text(path.read_text().replace("# quantile = 0.95", "quantile = 0.95"))
     assert read_config(path).solve.quantile == 0.95
 
 
-def test_a_changed_setting_takes_the_place_of_its_comment(tmp_path: Path) -> None:
+def test_a_changed_setting_replaces_its_comment(tmp_path: Path) -> None:
     """Every other line of the file stays."""
     path = tmp_path / "curate.toml"
     write_config(path, make_config({"dataset": {"root": "data"}}, "test"))
@@ -205,7 +205,7 @@ def test_a_changed_setting_takes_the_place_of_its_comment(tmp_path: Path) -> Non
     ]
 
 
-def test_the_schema_that_a_file_names_lies_beside_it(tmp_path: Path) -> None:
+def test_the_schema_that_a_file_refers_to_is_beside_it(tmp_path: Path) -> None:
     """It accepts what curate writes and rejects what curate rejects."""
     path = tmp_path / "curate.toml"
     write_config(path, make_config({"dataset": {"root": "data"}}, "test"))

@@ -25,7 +25,7 @@ CHANGES = {"command": 'python "my train.py" {labels}\n', "labels_format": "st3d"
         ),
     ],
 )
-def test_only_what_is_said_changes(tmp_path: Path, before: str, after: str) -> None:
+def test_only_the_given_settings_change(tmp_path: Path, before: str, after: str) -> None:
     """Comments, order and the other sections stay."""
     path = tmp_path / "curate.toml"
     path.write_text(before)
@@ -38,8 +38,8 @@ def test_only_what_is_said_changes(tmp_path: Path, before: str, after: str) -> N
     assert tomllib.loads(path.read_text())["train"].items() >= CHANGES.items()
 
 
-def test_a_mark_in_front_of_the_file_does_not_hide_its_first_line(tmp_path: Path) -> None:
-    """Some editors write one; such a file is read, so it can be changed."""
+def test_a_byte_order_mark_does_not_hide_the_first_line(tmp_path: Path) -> None:
+    """Some editors write one; such a file can be read, so it can be changed."""
     path = tmp_path / "curate.toml"
     path.write_bytes(b"\xef\xbb\xbf[train]\nsteps = 1\n")
     change_settings(path, "train", {"labels_format": "st3d"})

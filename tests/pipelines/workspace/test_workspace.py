@@ -18,22 +18,22 @@ from pipelines.workspace.config import read_config
 from pipelines.workspace.workspace import Workspace, sha256
 
 
-def test_settings_of_a_command_change_their_section_alone(workspace: Workspace) -> None:
-    """The other sections are the very same objects."""
+def test_settings_of_a_command_change_only_their_section(workspace: Workspace) -> None:
+    """The other sections are the same objects."""
     changed = workspace.with_settings("run", workers=3)
     assert changed.config.run == workspace.config.run.model_copy(update={"workers": 3})
     assert changed.config.dataset is workspace.config.dataset
 
 
-def test_a_wrong_setting_of_a_command_is_named(workspace: Workspace) -> None:
-    """In one line, with where it was said."""
+def test_a_wrong_setting_of_a_command_is_reported(workspace: Workspace) -> None:
+    """In one line, with its origin."""
     message = r"^command line: run\.workers = 0: use a whole number, at least 1$"
     with pytest.raises(ConfigError, match=message):
         workspace.with_settings("run", workers=0)
 
 
-def test_a_pipe_in_the_place_of_a_file_is_refused(tmp_path: Path) -> None:
-    """Reading it would never end; nor would a device's."""
+def test_a_pipe_in_place_of_a_file_is_rejected(tmp_path: Path) -> None:
+    """Reading it would never end; nor would a device."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for place in (pipe, Path("/dev/zero")):
@@ -43,8 +43,8 @@ def test_a_pipe_in_the_place_of_a_file_is_refused(tmp_path: Path) -> None:
             read_config(place)
 
 
-def test_a_checkpoint_that_became_a_pipe_counts_as_gone(workspace: Workspace) -> None:
-    """The message says how to make it anew."""
+def test_a_checkpoint_replaced_by_a_pipe_counts_as_missing(workspace: Workspace) -> None:
+    """The error says how to create it again."""
     path = workspace.root / "checkpoints" / "teacher"
     path.write_bytes(b"")
     with workspace.database.writing() as connection:
@@ -55,23 +55,23 @@ def test_a_checkpoint_that_became_a_pipe_counts_as_gone(workspace: Workspace) ->
         find_teacher(workspace, 2)
 
 
-def test_a_checkpoint_that_was_exchanged_does_not_answer(workspace: Workspace) -> None:
-    """Its answers would stand as those of the one that was made; once that is back, all is well."""
+def test_a_replaced_checkpoint_is_not_used(workspace: Workspace) -> None:
+    """Its predictions would be stored as those of the old one; with the old one back, all works."""
     path = workspace.root / "checkpoints" / "teacher"
     path.write_bytes(b"made")
     with workspace.database.writing() as connection:
         register_checkpoint(connection, workspace, 1, workspace.config.run.method, path)
     assert open_round(workspace, 2).teacher.path == path
     path.write_bytes(b"another")
-    for ask in (lambda: open_round(workspace, 2), lambda: newest_checkpoint(workspace)):
+    for call in (lambda: open_round(workspace, 2), lambda: newest_checkpoint(workspace)):
         with pytest.raises(WorkspaceError, match=r"has changed since .* run `curate train-round"):
-            ask()
+            call()
     assert peek_round(workspace, 2) is not None
     path.write_bytes(b"made")
     assert newest_checkpoint(workspace) == path
 
 
-def test_a_zero_byte_in_the_address_of_a_database() -> None:
-    """Drivers raise errors of their own for it."""
+def test_a_null_character_in_a_database_url_is_rejected() -> None:
+    """Drivers raise their own errors for it."""
     with pytest.raises(ConfigError, match=r"run\.database: no URL"):
         parse_url("sqlite:////tmp/a\0b")

@@ -1,4 +1,4 @@
-"""Point clouds in PCD and PLY: all forms of both, and headers that lie."""
+"""Point clouds in PCD and PLY: every variant of both, and invalid headers."""
 
 import struct
 import warnings
@@ -30,7 +30,7 @@ TYPE = np.dtype(
 
 
 def rows() -> np.ndarray:
-    """The points with fields among them that nobody reads."""
+    """Return the points with extra fields between the coordinates."""
     table = np.zeros(len(POINTS), TYPE)
     for name, column in zip("xyzi", POINTS.T, strict=True):
         table[name] = column
@@ -39,7 +39,7 @@ def rows() -> np.ndarray:
 
 
 def packed(content: bytes) -> bytes:
-    """LZF of literals, and of one repetition where the content ends in a run of zeros."""
+    """Return LZF with literals, and one repetition if the content ends in a run of zeros."""
     run = len(content) - len(content.rstrip(b"\0"))
     run = min(run - 1, 264) if run > 4 else 0
     literal = content[: len(content) - run]
@@ -50,14 +50,13 @@ def packed(content: bytes) -> bytes:
     return out + (bytes([7 << 5, run - 9, 0]) if run >= 9 else b"")
 
 
-def test_pcd_of_text(tmp_path: Path) -> None:
-    """Numbers by line."""
+def test_pcd_as_text(tmp_path: Path) -> None:
     lines = [f"{x!r} {y!r} 7 7 7 {z!r} {i!r} 9" for x, y, z, i in POINTS.tolist()]
     (tmp_path / "a.pcd").write_text(PCD.format(form="ascii") + "\n".join(lines) + "\n")
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
 
 
-def test_pcd_of_bytes(tmp_path: Path) -> None:
+def test_pcd_as_binary(tmp_path: Path) -> None:
     """Row after row."""
     content = PCD.format(form="binary").encode() + rows().tobytes()
     (tmp_path / "a.pcd").write_bytes(content)
@@ -67,7 +66,7 @@ def test_pcd_of_bytes(tmp_path: Path) -> None:
         read_cloud(tmp_path / "a.pcd")
 
 
-def test_pcd_compressed(tmp_path: Path) -> None:
+def test_pcd_as_compressed_binary(tmp_path: Path) -> None:
     """Field after field, literals and repetitions."""
     table = rows()
     table["r"] = 0
@@ -90,7 +89,7 @@ def test_pcd_compressed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_ply_of_bytes(tmp_path: Path, order: str) -> None:
+def test_ply_as_binary(tmp_path: Path, order: str) -> None:
     """In both byte orders, with an element before the vertices and properties of other types."""
     kind = [("x", "f8"), ("r", "u1"), ("y", "f8"), ("z", "f8"), ("intensity", "f4")]
     table = np.zeros(40, [(name, order + of) for name, of in kind])
@@ -109,8 +108,10 @@ def test_ply_of_bytes(tmp_path: Path, order: str) -> None:
     "claim",
     ["element vertex 999999999999", "element vertex 41", "element vertex -1", "element x 1"],
 )
-def test_a_header_that_lies_costs_nothing(tmp_path: Path, claim: str) -> None:
-    """It is refused by the bytes that are there."""
+def test_a_header_that_claims_too_much_is_rejected_without_allocating(
+    tmp_path: Path, claim: str
+) -> None:
+    """It is compared with the size of the file."""
     names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
     for form in ("ascii", "binary_little_endian"):
         head = f"ply\nformat {form} 1.0\n{claim}\n{names}end_header\n".encode()
@@ -120,8 +121,8 @@ def test_a_header_that_lies_costs_nothing(tmp_path: Path, claim: str) -> None:
             read_cloud(tmp_path / "a.ply")
 
 
-def test_a_point_farther_than_any_lidar_sees(tmp_path: Path) -> None:
-    """Maps over the points would fill the memory; coordinates on a map are no LiDAR's."""
+def test_a_point_beyond_any_lidar_range_is_rejected(tmp_path: Path) -> None:
+    """Grids over the points would fill the memory; map coordinates are not LiDAR coordinates."""
     points = POINTS.copy()
     points[3, 0] = 4.5e6
     np.save(tmp_path / "a.npy", points)
@@ -130,7 +131,7 @@ def test_a_point_farther_than_any_lidar_sees(tmp_path: Path) -> None:
 
 
 def write_npy(path: Path, shape: str) -> Path:
-    """The points behind a header that says so of their shape."""
+    """Write the points with a header that claims this shape."""
     header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     path.write_bytes(
         b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header.encode() + POINTS.tobytes()
@@ -138,16 +139,16 @@ def write_npy(path: Path, shape: str) -> Path:
     return path
 
 
-def test_python_2_wrote_long_integers(tmp_path: Path) -> None:
-    """They are read, and the user need not be told."""
+def test_long_integers_of_python_2_are_read(tmp_path: Path) -> None:
+    """Without a message."""
     np.testing.assert_array_equal(read_cloud(write_npy(tmp_path / "a.npy", "(40L, 4L)")), POINTS)
 
 
-def test_a_damaged_header_is_one_error_and_no_warning(tmp_path: Path) -> None:
-    """Python warns of a number that runs into a word."""
+def test_a_damaged_header_gives_one_error_and_no_warning(tmp_path: Path) -> None:
+    """Python warns of a number directly followed by a word."""
     path = write_npy(tmp_path / "a.npy", "(1and 40, 4)")
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as recorded:
         warnings.simplefilter("always")
         with pytest.raises(DataError, match=r"a\.npy: not a readable"):
             read_cloud(path)
-    assert not told
+    assert not recorded

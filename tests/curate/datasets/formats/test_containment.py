@@ -1,4 +1,4 @@
-"""Paths of a data set stay inside it."""
+"""Paths of a dataset stay inside it."""
 
 import os
 from pathlib import Path
@@ -26,7 +26,7 @@ LAYOUTS = {
 
 @given(st.text(max_size=20))
 def test_a_frame_id_is_a_plain_name(name: str) -> None:
-    """What is accepted names a file in a folder, and prints on one line."""
+    """An accepted id is a file name in a folder, and prints on one line."""
     try:
         check_frame_id(name)
     except DataError as error:
@@ -39,8 +39,8 @@ def test_a_frame_id_is_a_plain_name(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["../000001", "/etc/passwd", "..", "a/b", "a\\b", "a\0b", "a\nb"])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_no_name_leads_out(tmp_path: Path, layout: str, name: str) -> None:
-    """Neither asked for nor in a list."""
+def test_no_frame_id_leads_outside(tmp_path: Path, layout: str, name: str) -> None:
+    """Neither as an argument nor in a list."""
     write, kind = LAYOUTS[layout]
     write(tmp_path)
     with pytest.raises(DataError, match="not a frame id"):
@@ -48,8 +48,8 @@ def test_no_name_leads_out(tmp_path: Path, layout: str, name: str) -> None:
 
 
 @pytest.mark.parametrize("line", ["../../secret", "/etc/passwd", "a\\b", "\0"])
-def test_a_list_of_frames_names_frames(tmp_path: Path, line: str) -> None:
-    """A split list with a path in it is refused by its line."""
+def test_a_list_with_a_path_in_it_is_rejected(tmp_path: Path, line: str) -> None:
+    """The error contains the line."""
     write_toy_kitti(tmp_path, 4)
     (tmp_path / "ImageSets" / "train.txt").write_text(f"000000\n{line}\n")
     with pytest.raises(DataError, match=r"train\.txt:2: .* not a frame id"):
@@ -58,8 +58,11 @@ def test_a_list_of_frames_names_frames(tmp_path: Path, line: str) -> None:
 
 @pytest.mark.parametrize("part", ["points", "image", "label"])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_link_that_leads_out_is_not_followed(tmp_path: Path, layout: str, part: str) -> None:
-    """Of a file or of its folder, unless that was wished; links within the data set are."""
+def test_a_link_to_the_outside_is_not_followed(tmp_path: Path, layout: str, part: str) -> None:
+    """Of a file or of its folder, unless an option allows it.
+
+    Links within the dataset are followed.
+    """
     write, kind = LAYOUTS[layout]
     write(tmp_path / "data")
     name = kind(tmp_path / "data").frame_ids()[0]
@@ -86,11 +89,16 @@ def test_a_link_that_leads_out_is_not_followed(tmp_path: Path, layout: str, part
 
 
 @pytest.mark.parametrize("key", ["points", "images", "labels", "splits", "calibration"])
-def test_a_description_that_leads_out_is_refused(tmp_path: Path, key: str) -> None:
-    """By dots or from the root of the disk."""
+def test_a_description_that_leads_outside_is_rejected(tmp_path: Path, key: str) -> None:
+    """By `..` or by an absolute path."""
     for where in ("../outside", "/etc"):
-        told = {"points": "lidar", "images": "camera", "calibration": "calib.txt", key: where}
-        lines = [f'{name} = "{value}"' for name, value in told.items()]
+        description = {
+            "points": "lidar",
+            "images": "camera",
+            "calibration": "calib.txt",
+            key: where,
+        }
+        lines = [f'{name} = "{value}"' for name, value in description.items()]
         (tmp_path / "dataset.toml").write_text("\n".join(lines))
         with pytest.raises(DataError, match="leads out of the data set"):
             FolderDataset(tmp_path)
@@ -98,13 +106,18 @@ def test_a_description_that_leads_out_is_refused(tmp_path: Path, key: str) -> No
 
 @pytest.mark.parametrize("follow_links", [False, True])
 @pytest.mark.parametrize("key", ["points", "images", "labels", "splits", "calibration"])
-def test_a_name_that_no_file_could_have_is_refused(
+def test_an_impossible_file_name_is_rejected(
     tmp_path: Path, key: str, *, follow_links: bool
 ) -> None:
-    """In one short line, also where links may lead out."""
+    """In one short line, also if links may lead outside."""
     for where in ("9" * 5000, "nul\\u0000"):
-        told = {"points": "lidar", "images": "camera", "calibration": "calib.txt", key: where}
-        lines = [f'{name} = "{value}"' for name, value in told.items()]
+        description = {
+            "points": "lidar",
+            "images": "camera",
+            "calibration": "calib.txt",
+            key: where,
+        }
+        lines = [f'{name} = "{value}"' for name, value in description.items()]
         (tmp_path / "dataset.toml").write_text("\n".join(lines))
         with pytest.raises(DataError, match="is not a valid path") as raised:
             FolderDataset(tmp_path, follow_links=follow_links)
@@ -112,7 +125,7 @@ def test_a_name_that_no_file_could_have_is_refused(
 
 
 def test_a_link_in_place_of_a_description_is_not_followed(tmp_path: Path) -> None:
-    """What a message would repeat of another file stays there."""
+    """The message does not quote the other file."""
     (tmp_path / "secret").write_text("password = 1\n")
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "dataset.toml").symlink_to(tmp_path / "secret")
@@ -123,8 +136,8 @@ def test_a_link_in_place_of_a_description_is_not_followed(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "linked", ["mapping", "mapping/train_mapping.txt", "mapping/train_rand.txt"]
 )
-def test_a_mapping_that_leads_out_is_not_read(tmp_path: Path, linked: str) -> None:
-    """No word of the file that it leads to stands in the message."""
+def test_a_mapping_outside_the_dataset_is_not_read(tmp_path: Path, linked: str) -> None:
+    """The message does not quote the file that it links to."""
     write_toy_kitti(tmp_path / "data", 4)
     (tmp_path / "data" / "mapping").mkdir()
     (tmp_path / "data" / "mapping" / "train_mapping.txt").write_text("2011_09_26 drive_1 0\n" * 4)
@@ -137,7 +150,7 @@ def test_a_mapping_that_leads_out_is_not_read(tmp_path: Path, linked: str) -> No
     assert "secret" not in str(caught.value)
 
 
-def test_tables_that_lead_out_are_not_read(tmp_path: Path) -> None:
+def test_tables_outside_the_dataset_are_not_read(tmp_path: Path) -> None:
     """Of nuScenes, each file and the folder of a version."""
     write_nuscenes(tmp_path / "data", ("scene-0061",), 1)
     version = NuScenesDataset(tmp_path / "data").version
@@ -152,8 +165,8 @@ def test_tables_that_lead_out_are_not_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("part", ["points", "image", "calibration", "label"])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_pipe_is_not_waited_for(tmp_path: Path, layout: str, part: str) -> None:
-    """Nobody would ever write into it; nor where a link within the data set leads to one."""
+def test_a_pipe_is_not_read(tmp_path: Path, layout: str, part: str) -> None:
+    """Reading would wait forever; a link to a pipe within the dataset is rejected too."""
     write, kind = LAYOUTS[layout]
     write(tmp_path)
     name = kind(tmp_path).frame_ids()[0]

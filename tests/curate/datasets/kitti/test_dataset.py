@@ -1,4 +1,4 @@
-"""Tests of the KITTI reader: layouts, points, calibration, images, and every kind of bad file."""
+"""The KITTI reader: layouts, points, calibration, images, and every kind of invalid file."""
 
 import struct
 
@@ -27,7 +27,7 @@ Tr_velo_to_cam: 0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3
 
 @pytest.fixture
 def flat_kitti(toy_kitti):
-    """The toy frames in the flat layout, without labels and lists."""
+    """Return the toy frames in the flat layout, without labels and lists."""
     root = toy_kitti.parent / "flat"
     root.mkdir()
     for folder in ("velodyne", "image_2", "calib"):
@@ -36,22 +36,22 @@ def flat_kitti(toy_kitti):
 
 
 def one_line(caught):
-    """The message of a caught error, which has to be one line."""
+    """Return the message of an error, after checking that it is one line."""
     message = str(caught.value)
     assert "\n" not in message
     return message
 
 
-def test_lists_the_frames_that_have_points(toy_kitti):
-    """Frames are sorted; files of other kinds are none."""
+def test_it_lists_the_frames_that_have_points(toy_kitti):
+    """Frames are sorted; files with other suffixes are ignored."""
     (toy_kitti / "training" / "velodyne" / "notes.txt").write_text("")
     (toy_kitti / "training" / "velodyne" / "000003.bin").unlink()
     expected = [f"{i:06d}" for i in range(12) if i != 3]
     assert list(KittiDataset(toy_kitti).frame_ids()) == expected
 
 
-def test_hidden_files_are_no_frames_and_no_lists(toy_kitti):
-    """Those beginning with ._ that macOS leaves beside the files that it copies."""
+def test_hidden_files_are_neither_frames_nor_lists(toy_kitti):
+    """MacOS leaves files beginning with ._ beside the files that it copies."""
     (toy_kitti / "training" / "velodyne" / "._000003.bin").write_bytes(b"\x00\x05\x16\x07")
     (toy_kitti / "ImageSets" / "._train.txt").write_bytes(b"\x00\x05/\x07")
     dataset = KittiDataset(toy_kitti)
@@ -59,8 +59,8 @@ def test_hidden_files_are_no_frames_and_no_lists(toy_kitti):
     assert set(dataset.splits()) == {"train", "val"}
 
 
-def test_reads_a_frame_with_and_without_its_image(toy_kitti):
-    """Size and points are the same either way; pixels only where asked for."""
+def test_a_frame_is_read_with_and_without_its_image(toy_kitti):
+    """Size and points are the same; pixels are read only if requested."""
     dataset = KittiDataset(toy_kitti)
     bare, full = dataset.read("000001"), dataset.read("000001", image=True)
     assert bare.image is None
@@ -93,13 +93,13 @@ def test_a_flat_folder_without_labels(flat_kitti):
     assert one_line(caught) == f"{flat_kitti}/label_2/000001.txt: no such label file"
 
 
-def test_a_root_without_points_is_refused(tmp_path):
-    """The error names the root and what should be in it."""
+def test_a_root_without_points_is_rejected(tmp_path):
+    """The error contains the root and what should be in it."""
     with pytest.raises(DataError, match="contains neither training/velodyne nor velodyne"):
         KittiDataset(tmp_path)
 
 
-def test_reads_the_lists_of_frames(toy_kitti):
+def test_it_reads_the_lists_of_frames(toy_kitti):
     """Empty lines are skipped; frames need not exist."""
     (toy_kitti / "ImageSets" / "train.txt").write_text("000001\n\n000777\n")
     splits = KittiDataset(toy_kitti).splits()
@@ -108,34 +108,34 @@ def test_reads_the_lists_of_frames(toy_kitti):
 
 
 def test_the_list_of_testing_frames_is_left_out(toy_kitti):
-    """KITTI's test.txt numbers the frames of testing/, which are others than those of training/."""
+    """KITTI's test.txt lists the frames of testing/, not those of training/."""
     (toy_kitti / "ImageSets" / "test.txt").write_text("000001\n")
     assert "test" not in KittiDataset(toy_kitti).splits()
 
 
-def test_a_listed_frame_that_is_not_there_fails_when_read(toy_kitti):
-    """The error names the missing file."""
+def test_a_missing_frame_in_a_list_fails_when_read(toy_kitti):
+    """The error contains the missing file."""
     with pytest.raises(DataError) as caught:
         KittiDataset(toy_kitti).read("000777")
     assert one_line(caught).endswith("velodyne/000777.bin: no such velodyne file")
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../000001", "a/b", "/etc/passwd", "a\\b", "a\0b"])
-def test_a_frame_id_cannot_leave_the_data_set(toy_kitti, name):
+def test_a_frame_id_cannot_leave_the_dataset(toy_kitti, name):
     """Only plain file names are frame ids."""
     with pytest.raises(DataError, match="is not a frame id"):
         KittiDataset(toy_kitti).read(name)
 
 
-def test_a_list_with_a_path_in_it_is_refused_with_its_place(toy_kitti):
-    """The error names the list and the line."""
+def test_a_list_with_a_path_in_it_is_rejected(toy_kitti):
+    """The error contains the list and the line."""
     (toy_kitti / "ImageSets" / "train.txt").write_text("000001\n../../secret\n")
     with pytest.raises(DataError, match=r"train\.txt:2: '\.\./\.\./secret' is not a frame id"):
         KittiDataset(toy_kitti).splits()
 
 
-def test_a_list_is_text(toy_kitti):
-    """With or without a mark in front; no name is made up of bytes that are no letters."""
+def test_a_list_must_be_text(toy_kitti):
+    """With or without a byte order mark; undecodable bytes are rejected."""
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"\xef\xbb\xbf000001\n")
     assert KittiDataset(toy_kitti).splits()["train"] == ("000001",)
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"000001\n\xff\xfe\n")
@@ -144,7 +144,7 @@ def test_a_list_is_text(toy_kitti):
 
 
 def test_annotations_are_in_the_lidar_frame(toy_kitti):
-    """The labelled boxes hold the bright points of the toy frames."""
+    """The labelled boxes contain the bright points of the toy frames."""
     dataset = KittiDataset(toy_kitti)
     truth, frame = dataset.annotations("000002"), dataset.read("000002")
     assert truth.categories.tolist() == ["Car", "Pedestrian", "Cyclist"]
@@ -152,8 +152,8 @@ def test_annotations_are_in_the_lidar_frame(toy_kitti):
     assert np.linalg.norm(cloud.mean(axis=0) - truth.boxes[0, :3]) < 0.8
 
 
-def test_a_bad_label_line_is_named(toy_kitti):
-    """File and line reach the caller of `annotations`."""
+def test_an_invalid_label_line_is_reported(toy_kitti):
+    """`annotations` raises with file and line."""
     path = toy_kitti / "training" / "label_2" / "000002.txt"
     path.write_text("Unicorn" + path.read_text()[3:])
     with pytest.raises(DataError, match=r"000002\.txt:1: unknown category 'Unicorn'"):
@@ -161,7 +161,6 @@ def test_a_bad_label_line_is_named(toy_kitti):
 
 
 def test_an_empty_sweep_is_valid(tmp_path):
-    """No points is what a LiDAR may see."""
     path = tmp_path / "a.bin"
     path.write_bytes(b"")
     points = read_points(path)
@@ -170,8 +169,8 @@ def test_an_empty_sweep_is_valid(tmp_path):
 
 
 @pytest.mark.parametrize("size", [1, 15, 17, 16 * 5 + 4])
-def test_truncated_points_are_refused(tmp_path, size):
-    """The error names the file and its size."""
+def test_truncated_points_are_rejected(tmp_path, size):
+    """The error contains the file and its size."""
     path = tmp_path / "a.bin"
     path.write_bytes(bytes(size))
     with pytest.raises(DataError) as caught:
@@ -182,7 +181,7 @@ def test_truncated_points_are_refused(tmp_path, size):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("column", [0, 3])
 def test_points_that_are_not_finite_are_counted(tmp_path, value, column):
-    """The error says how many there are and which is the first."""
+    """The error contains their number and the index of the first."""
     points = np.ones((10, 4), np.float32)
     points[[4, 7], column] = value
     path = tmp_path / "a.bin"
@@ -216,8 +215,8 @@ def test_calibration_is_read_by_name(tmp_path):
         ("R0_rect: 1 0 0", "R0_rect: 0 0 0", "cannot be inverted"),
     ],
 )
-def test_bad_calibration_is_named_with_its_place(tmp_path, former, later, message):
-    """File, line where there is one, and what is wrong."""
+def test_invalid_calibration_is_reported_with_its_position(tmp_path, former, later, message):
+    """File, line if there is one, and reason."""
     path = tmp_path / "a.txt"
     assert former in CALIBRATION
     path.write_text(CALIBRATION.replace(former, later))
@@ -226,8 +225,8 @@ def test_bad_calibration_is_named_with_its_place(tmp_path, former, later, messag
     assert one_line(caught).startswith(str(path))
 
 
-def test_missing_calibration_is_named(toy_kitti):
-    """The error names the path."""
+def test_missing_calibration_is_reported(toy_kitti):
+    """The error contains the path."""
     path = toy_kitti / "training" / "calib" / "000000.txt"
     path.unlink()
     with pytest.raises(DataError) as caught:
@@ -235,8 +234,8 @@ def test_missing_calibration_is_named(toy_kitti):
     assert one_line(caught) == f"{path}: no such calibration file"
 
 
-def test_calibration_survives_its_file_exactly(tmp_path):
-    """Not a bit of the matrices is lost."""
+def test_calibration_is_written_and_read_exactly(tmp_path):
+    """Every bit of the matrices is the same."""
     generator = np.random.default_rng(0)
     calibration = Calibration(generator.normal(size=(3, 4)), toy_calibration().lidar_to_camera)
     calibration.lidar_to_camera[:3] += generator.normal(scale=0.01, size=(3, 4))
@@ -248,8 +247,8 @@ def test_calibration_survives_its_file_exactly(tmp_path):
 
 @pytest.mark.parametrize("image", [False, True])
 @pytest.mark.parametrize("content", [b"", b"no image", b"\x89PNG\r\n\x1a\n"])
-def test_an_unreadable_image_is_named(toy_kitti, image, content):
-    """Bytes that are no image fail whether the pixels or only the size are asked for."""
+def test_an_unreadable_image_is_rejected(toy_kitti, image, content):
+    """Whether the pixels or only the size are requested."""
     path = toy_kitti / "training" / "image_2" / "000000.png"
     path.write_bytes(content)
     with pytest.raises(DataError) as caught:
@@ -257,16 +256,16 @@ def test_an_unreadable_image_is_named(toy_kitti, image, content):
     assert one_line(caught).startswith(f"{path}: ")
 
 
-def test_a_truncated_png_is_refused(toy_kitti):
-    """Its header is whole, but not its pixels."""
+def test_a_truncated_png_is_rejected(toy_kitti):
+    """Its header is complete, but not its pixels."""
     path = toy_kitti / "training" / "image_2" / "000000.png"
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(DataError, match="the PNG is truncated"):
         KittiDataset(toy_kitti).read("000000", image=True)
 
 
-def test_a_missing_image_is_named(toy_kitti):
-    """The error names the PNG that should be there."""
+def test_a_missing_image_is_reported(toy_kitti):
+    """The error contains the expected PNG."""
     path = toy_kitti / "training" / "image_2" / "000000.png"
     path.unlink()
     with pytest.raises(DataError) as caught:
@@ -274,7 +273,7 @@ def test_a_missing_image_is_named(toy_kitti):
     assert one_line(caught) == f"{path}: no such image file"
 
 
-def test_jpeg_images_are_read_where_there_is_no_png(toy_kitti):
+def test_jpeg_images_are_read_if_there_is_no_png(toy_kitti):
     """The size comes from the decoded image."""
     folder = toy_kitti / "training" / "image_2"
     pixels = np.full((30, 50, 3), 128, np.uint8)
@@ -284,22 +283,21 @@ def test_jpeg_images_are_read_where_there_is_no_png(toy_kitti):
     assert frame.image_size == (50, 30)
 
 
-def test_the_size_is_read_from_the_header_alone(toy_kitti):
-    """No pixel is decoded where only the size is asked for."""
+def test_only_the_header_is_read_for_the_size(toy_kitti):
     path = toy_kitti / "training" / "image_2" / "000000.png"
     header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", 1242, 375)
     path.write_bytes(header)
     assert KittiDataset(toy_kitti).read("000000").image_size == (1242, 375)
 
 
-def test_frames_without_labels_have_the_same_files(tmp_path):
-    """The label path is None, not a path to nothing."""
+def test_frames_without_labels_have_no_label_path(tmp_path):
+    """The label path is None, not a path to a missing file."""
     write_toy_kitti(tmp_path, frames=1, labels=False)
     assert KittiDataset(tmp_path).files("000000").label is None
 
 
 def test_real_frames(kitti_root):
-    """The 24 labelled frames and the 13 of the raw drive are what their description says."""
+    """The 24 labelled frames and the 13 of the raw drive match their description."""
     labelled, raw = KittiDataset(kitti_root), KittiDataset(kitti_root / "raw")
     assert len(labelled.frame_ids()) == 24
     assert len(raw.frame_ids()) == 13
@@ -311,7 +309,7 @@ def test_real_frames(kitti_root):
     assert raw.files("000072").label is None
 
 
-def test_real_calibration_puts_points_of_a_car_into_its_rectangle(kitti_root):
+def test_real_calibration_projects_points_of_a_car_into_its_rectangle(kitti_root):
     """The points inside a labelled 3D box appear inside its labelled 2D box."""
     from curate.geometry.points_in_boxes import points_in_box_mask
 
@@ -325,8 +323,8 @@ def test_real_calibration_puts_points_of_a_car_into_its_rectangle(kitti_root):
     assert ((pixels > (left - 3, top - 3)) & (pixels < (right + 3, bottom + 3))).all()
 
 
-def test_points_may_be_left_out(toy_kitti):
-    """Calibration and image are read although the points could not be."""
+def test_points_can_be_left_out(toy_kitti):
+    """Calibration and image are read although the point file is damaged."""
     (toy_kitti / "training" / "velodyne" / "000001.bin").write_bytes(b"truncated")
     frame = KittiDataset(toy_kitti).read("000001", points=False)
     assert frame.points.shape == (0, 4)

@@ -1,4 +1,4 @@
-"""Tests of KITTI's label format and its conversion to the LiDAR frame."""
+"""KITTI's label format and its conversion to the LiDAR frame."""
 
 import numpy as np
 import pytest
@@ -27,18 +27,18 @@ IMAGE_SIZE = (1242, 375)
 
 
 def numbers(low, high):
-    """Finite floats of a range."""
+    """Draw finite floats of a range."""
     return st.floats(low, high, allow_nan=False)
 
 
 def angles():
-    """Yaws in (-pi, pi], the ends included."""
+    """Draw yaws in (-pi, pi], the ends included."""
     return numbers(-np.pi, np.pi).map(lambda angle: np.pi if angle == -np.pi else angle)
 
 
 @st.composite
 def calibrations(draw):
-    """A camera that looks roughly along the LiDAR's x, slightly tilted and displaced."""
+    """Draw a camera that looks roughly along the LiDAR's x, slightly tilted and displaced."""
     looks_ahead = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     tilt = np.array([draw(numbers(-0.05, 0.05)) for _ in range(3)])
     skew = np.array([[0, -tilt[2], tilt[1]], [tilt[2], 0, -tilt[0]], [-tilt[1], tilt[0], 0]])
@@ -51,20 +51,20 @@ def calibrations(draw):
 
 @st.composite
 def box_arrays(draw):
-    """(n, 7) boxes within 80 m of the LiDAR."""
+    """Draw (n, 7) boxes within 80 m of the LiDAR."""
     place, side = numbers(-80, 80), numbers(0.2, 15)
     box = st.tuples(place, place, numbers(-4, 4), side, side, side, angles())
     return np.array(draw(st.lists(box, max_size=5)), dtype=np.float64).reshape(-1, 7)
 
 
 def write(path, *lines):
-    """A text file of lines."""
+    """Write a text file of lines."""
     path.write_text("".join(f"{line}\n" for line in lines))
     return path
 
 
 def annotations_of(boxes):
-    """Annotations with plausible 2D facts."""
+    """Return annotations with plausible 2D values."""
     count = len(boxes)
     return Annotations(
         boxes,
@@ -76,7 +76,7 @@ def annotations_of(boxes):
     )
 
 
-def test_reads_each_field_in_its_place(tmp_path):
+def test_each_field_is_read(tmp_path):
     """A label line is split into KITTI's fields."""
     found = read_objects(write(tmp_path / "a.txt", CAR, REGION))
     assert found.categories.tolist() == ["Car", "DontCare"]
@@ -90,25 +90,25 @@ def test_reads_each_field_in_its_place(tmp_path):
     assert np.isnan(found.scores).all()
 
 
-def test_reads_scores_of_results(tmp_path):
+def test_scores_of_results_are_read(tmp_path):
     """The 16th field is the score."""
     path = write(tmp_path / "a.txt", f"{CAR} 0.5", "", f"{CAR} -3.25")
     assert read_objects(path, scored=True).scores.tolist() == [0.5, -3.25]
 
 
-def test_files_of_other_systems_read_alike(tmp_path):
-    """A byte order mark, carriage returns, tabs and spare spaces mean nothing."""
+def test_files_of_other_systems_are_read_equally(tmp_path):
+    """A byte order mark, carriage returns, tabs and extra spaces are ignored."""
     (tmp_path / "a.txt").write_text(f"{CAR}\n{CAR}\n")
     foreign = CAR.replace(" ", " \t ") + " \r\n"
     (tmp_path / "b.txt").write_bytes(b"\xef\xbb\xbf" + foreign.encode() * 2 + b"\r\n")
-    ours, theirs = read_objects(tmp_path / "a.txt"), read_objects(tmp_path / "b.txt")
-    assert theirs.categories.tolist() == ours.categories.tolist()
-    assert theirs.locations.tolist() == ours.locations.tolist()
+    ours, other = read_objects(tmp_path / "a.txt"), read_objects(tmp_path / "b.txt")
+    assert other.categories.tolist() == ours.categories.tolist()
+    assert other.locations.tolist() == ours.locations.tolist()
 
 
 @pytest.mark.parametrize("text", ["", "\n", "  \n\n"])
-def test_an_empty_file_holds_no_objects(tmp_path, text):
-    """No lines, or only empty ones, are no objects, with the shapes of any other file."""
+def test_an_empty_file_has_no_objects(tmp_path, text):
+    """The arrays have the usual shapes."""
     path = tmp_path / "a.txt"
     path.write_text(text)
     for found in (read_objects(path), read_objects(path, scored=True), KittiObjects.empty()):
@@ -134,8 +134,8 @@ def test_an_empty_file_holds_no_objects(tmp_path, text):
         (CAR.replace("1.60 3.66", "-1.60 3.66"), False, "negative height, width or length"),
     ],
 )
-def test_a_bad_line_is_one_line_of_error_with_its_place(tmp_path, line, scored, message):
-    """The error names file and line, and says what is wrong there, in one line."""
+def test_an_invalid_line_gives_one_line_with_its_position(tmp_path, line, scored, message):
+    """The error contains file, line and reason."""
     good = f"{CAR} 0.5" if scored else CAR
     path = write(tmp_path / "a.txt", good, "", line, good)
     with pytest.raises(DataError) as caught:
@@ -145,15 +145,15 @@ def test_a_bad_line_is_one_line_of_error_with_its_place(tmp_path, line, scored, 
     assert "\n" not in str(caught.value)
 
 
-def test_the_first_of_several_bad_lines_is_named(tmp_path):
-    """Whatever the kind of fault, the first line counts."""
+def test_the_first_of_several_invalid_lines_is_reported(tmp_path):
+    """Whatever the kind of error."""
     path = write(tmp_path / "a.txt", CAR, CAR.replace("Car", "Dog"), "Car 1", "x y z")
     with pytest.raises(DataError, match=r"a\.txt:2: unknown category 'Dog'"):
         read_objects(path)
 
 
-def test_categories_may_be_narrowed_and_opened(tmp_path):
-    """`categories` replaces KITTI's own categories; None accepts any."""
+def test_the_known_categories_can_be_changed(tmp_path):
+    """`known` replaces KITTI's own categories; None accepts any."""
     path = write(tmp_path / "a.txt", CAR.replace("Car", "Dog"))
     assert read_objects(path, categories=None).categories.tolist() == ["Dog"]
     assert read_objects(path, categories={"Dog"}).categories.tolist() == ["Dog"]
@@ -162,8 +162,8 @@ def test_categories_may_be_narrowed_and_opened(tmp_path):
 
 
 @pytest.mark.parametrize("scored", [False, True])
-def test_a_missing_or_binary_file_is_named(tmp_path, scored):
-    """No file, a folder, or bytes that are no text."""
+def test_a_missing_or_binary_file_is_rejected(tmp_path, scored):
+    """A missing file, a folder, or bytes that are not text."""
     with pytest.raises(DataError, match=r"missing\.txt: no such label file"):
         read_objects(tmp_path / "missing.txt", scored=scored)
     with pytest.raises(DataError, match="cannot be read"):
@@ -173,7 +173,7 @@ def test_a_missing_or_binary_file_is_named(tmp_path, scored):
         read_objects(tmp_path / "binary.txt", scored=scored)
 
 
-def test_a_box_by_hand():
+def test_a_box_computed_by_hand():
     """A car ahead: the camera at the LiDAR's origin looks along x, rotation_y -pi/2 is yaw 0."""
     objects = KittiObjects(
         np.array(["Car"]), np.zeros(1), np.zeros(1, np.int64), np.zeros(1), np.zeros((1, 4)),
@@ -221,8 +221,8 @@ def test_a_file_keeps_boxes_to_a_millimetre(tmp_path_factory, boxes, calibration
     assert back.boxes_2d == pytest.approx(annotations.boxes_2d)
 
 
-def test_regions_have_no_box_and_are_written_as_kitti_does(tmp_path):
-    """DontCare: NaN in the LiDAR frame, no detection, and KITTI's own line in a file."""
+def test_dontcare_regions_have_no_box(tmp_path):
+    """NaN in the LiDAR frame, no detection, and KITTI's own line in a file."""
     objects = read_objects(write(tmp_path / "a.txt", REGION, CAR))
     annotations = to_annotations(objects, toy_calibration())
     assert np.isnan(annotations.boxes[0]).all()
@@ -233,7 +233,7 @@ def test_regions_have_no_box_and_are_written_as_kitti_does(tmp_path):
 
 
 def test_results_keep_their_scores(tmp_path):
-    """Scores make it a result file with 16 fields."""
+    """A file with scores has 16 fields."""
     boxes = np.array([[20.0, 0, 0, 4, 2, 1.5, 0.1], [-20, 0, 0, 4, 2, 1.5, 0.1]])
     detections = Detections(boxes, np.array([0.123456, 1.0]), np.array(["Car", "Cyclist"]))
     path = tmp_path / "a.txt"
@@ -245,7 +245,7 @@ def test_results_keep_their_scores(tmp_path):
 
 
 def test_detections_get_a_rectangle_and_an_observation_angle():
-    """Straight ahead alpha is rotation_y; behind the camera there is a box without height."""
+    """Straight ahead alpha is rotation_y; behind the camera the rectangle has no height."""
     boxes = np.array([[20.0, 0, 0, 4, 2, 1.5, 0.1], [-20, 0, 0, 4, 2, 1.5, 0.1]])
     detections = Detections(boxes, np.ones(2), np.array(["Car", "Car"]))
     objects = from_detections(detections, toy_calibration(), (120, 40))
@@ -266,7 +266,7 @@ def test_detections_get_a_rectangle_and_an_observation_angle():
     ],
 )
 def test_numbers_that_are_not_finite_are_not_written(tmp_path, field, value, message):
-    """Nothing is left behind where the objects cannot be written."""
+    """No file is left."""
     path = tmp_path / "a.txt"
     fields = dict(vars(read_objects(write(tmp_path / "b.txt", CAR)))) | {field: value}
     with pytest.raises(DataError, match=message):
@@ -274,8 +274,8 @@ def test_numbers_that_are_not_finite_are_not_written(tmp_path, field, value, mes
     assert not path.exists()
 
 
-def test_scores_for_some_objects_only_are_refused(tmp_path):
-    """A file has scores or has none."""
+def test_scores_for_some_objects_only_are_rejected(tmp_path):
+    """A file has scores for all objects or for none."""
     objects = read_objects(write(tmp_path / "a.txt", CAR, CAR))
     objects.scores[0] = 0.5
     with pytest.raises(DataError, match="1 of 2 objects have no score"):
@@ -283,7 +283,6 @@ def test_scores_for_some_objects_only_are_refused(tmp_path):
 
 
 def test_selection_keeps_all_fields_together(tmp_path):
-    """Every field follows the index."""
     objects = read_objects(write(tmp_path / "a.txt", CAR, REGION, CAR.replace("Car", "Van")))
     chosen = objects.select(np.array([2, 0]))
     assert chosen.categories.tolist() == ["Van", "Car"]
@@ -292,7 +291,7 @@ def test_selection_keeps_all_fields_together(tmp_path):
 
 
 def test_real_labels_survive_the_conversion(kitti_root):
-    """Every object of the 24 KITTI frames comes back to the digits of its file."""
+    """Every object of the 24 KITTI frames keeps the digits of its file."""
     dataset = KittiDataset(kitti_root)
     for frame_id in dataset.frame_ids():
         files = dataset.files(frame_id)
@@ -304,8 +303,8 @@ def test_real_labels_survive_the_conversion(kitti_root):
                 np.testing.assert_allclose(getattr(back, name), values, atol=1e-9)
 
 
-def test_projected_labels_lie_on_the_labelled_rectangles(kitti_root):
-    """For cars that are fully seen, the projected 3D box and KITTI's 2D box agree."""
+def test_projected_labels_match_the_labelled_rectangles(kitti_root):
+    """For fully visible cars, the projected 3D box and KITTI's 2D box agree."""
     dataset = KittiDataset(kitti_root)
     overlaps = []
     for frame_id in dataset.frame_ids():
@@ -324,8 +323,8 @@ def test_projected_labels_lie_on_the_labelled_rectangles(kitti_root):
     assert np.min(overlaps) > 0.6
 
 
-def test_recorded_detections_lie_on_labelled_cars(kitti_root):
-    """What a real detector is sure of is where the labels have a car, in 3D and in the image."""
+def test_recorded_detections_match_labelled_cars(kitti_root):
+    """Confident detections of a real detector overlap labelled cars, in 3D and in the image."""
     from curate.detectors.recorded import RecordedDetector
 
     dataset = KittiDataset(kitti_root)
@@ -345,7 +344,7 @@ def test_recorded_detections_lie_on_labelled_cars(kitti_root):
 
 
 def rectangle_iou(a, b):
-    """IoU of two rectangles left, top, right, bottom."""
+    """Return the IoU of two rectangles (left, top, right, bottom)."""
     sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     common = np.prod(np.maximum(sides, 0))
     return common / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - common)

@@ -1,4 +1,4 @@
-"""Checkpoints: what is written can be read back, and nothing else is taken for one."""
+"""Checkpoints: writing, reading, and rejecting all other files."""
 
 import pickle
 
@@ -18,12 +18,12 @@ META = {"format": "curate-pillars", "format_version": "3", "preset": "small"}
 
 @pytest.fixture(scope="module")
 def checkpoint():
-    """An untrained network of two categories."""
+    """Return the checkpoint of an untrained network of two categories."""
     return checkpoint_of(PillarNetwork(PRESETS["small"], 2), ("Car", "Tram"))
 
 
-def test_a_checkpoint_comes_back_as_it_was(tmp_path, checkpoint):
-    """Preset, categories and every tensor survive, and the graph lies beside the file."""
+def test_a_checkpoint_is_read_back_unchanged(tmp_path, checkpoint):
+    """Preset, categories and every tensor are the same, and the graph is beside the file."""
     path = tmp_path / "new" / "teacher.safetensors"
     save_checkpoint(path, checkpoint)
     loaded = load_checkpoint(path)
@@ -39,7 +39,7 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path, checkpoint):
 
 
 def test_equal_weights_have_equal_bytes(tmp_path, checkpoint, monkeypatch):
-    """A training done again with the same seed is the same teacher: nothing becomes stale."""
+    """Repeating a training with the same seed makes nothing stale."""
     monkeypatch.setattr(module, "write_graph", lambda *_: None)
     path = tmp_path / "teacher.safetensors"
     contents = set()
@@ -56,8 +56,8 @@ class Bomb:
         return (pytest.fail, ("a pickle was executed",))
 
 
-def test_a_pickle_is_refused_and_never_executed(tmp_path):
-    """A pickle named like a checkpoint is an error of one line."""
+def test_a_pickle_is_rejected_and_never_executed(tmp_path):
+    """A pickle with the name of a checkpoint gives a one-line error."""
     path = tmp_path / "foreign.safetensors"
     path.write_bytes(pickle.dumps(Bomb()))
     with pytest.raises(
@@ -71,16 +71,14 @@ def test_a_pickle_is_refused_and_never_executed(tmp_path):
     ("content", "message"),
     [(b"", "not a readable safetensors"), (b"\x00" * 100, "not a readable safetensors")],
 )
-def test_garbage_is_refused(tmp_path, content, message):
-    """Files that are no safetensors are named."""
+def test_a_random_file_is_rejected(tmp_path, content, message):
     path = tmp_path / "bad.safetensors"
     path.write_bytes(content)
     with pytest.raises(ModelError, match=message):
         load_checkpoint(path)
 
 
-def test_a_truncated_checkpoint_is_refused(tmp_path, checkpoint):
-    """Half a download is not taken for a model."""
+def test_a_truncated_checkpoint_is_rejected(tmp_path, checkpoint):
     path = tmp_path / "half.safetensors"
     save_checkpoint(path, checkpoint)
     path.write_bytes(path.read_bytes()[:-1000])
@@ -88,8 +86,8 @@ def test_a_truncated_checkpoint_is_refused(tmp_path, checkpoint):
         load_checkpoint(path)
 
 
-def test_a_missing_checkpoint_says_what_to_do(tmp_path):
-    """The error for a file that is not there names it and the remedy."""
+def test_a_missing_checkpoint_is_reported(tmp_path):
+    """The error contains the path and what to do."""
     with pytest.raises(ModelError, match=r"nowhere\.safetensors: no such checkpoint; train"):
         PillarDetector(tmp_path / "nowhere.safetensors")
 
@@ -109,8 +107,8 @@ def test_a_missing_checkpoint_says_what_to_do(tmp_path):
         ({**META, "categories": '["Car"]'}, "damaged checkpoint"),
     ],
 )
-def test_foreign_tensors_are_refused(tmp_path, metadata, message):
-    """Safetensors of something else, or of another version, are told apart in one line."""
+def test_unexpected_tensors_are_rejected(tmp_path, metadata, message):
+    """Safetensors of another model or another version have different one-line errors."""
     path = tmp_path / "foreign.safetensors"
     save_file({"weight": np.zeros(3, dtype=np.float32)}, path, metadata)
     with pytest.raises(ModelError, match=f"foreign.safetensors: {message}") as info:
@@ -118,7 +116,7 @@ def test_foreign_tensors_are_refused(tmp_path, metadata, message):
     assert "\n" not in str(info.value)
 
 
-def test_tensors_of_another_size_are_refused(checkpoint):
+def test_tensors_of_another_size_are_rejected(checkpoint):
     """A network is not built from tensors that do not fit it."""
     weights = {**checkpoint.weights, "answer.bias": np.zeros(99, dtype=np.float32)}
     with pytest.raises(ModelError, match=r"answer\.bias"):
@@ -126,8 +124,8 @@ def test_tensors_of_another_size_are_refused(checkpoint):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_weights_that_are_no_numbers_are_refused(tmp_path, checkpoint, value):
-    """They would find nothing in any frame, which looks like empty frames."""
+def test_weights_that_are_not_finite_are_rejected(tmp_path, checkpoint, value):
+    """They would detect nothing, which looks like empty frames."""
     path = tmp_path / "teacher.safetensors"
     weights = {name: array.copy() for name, array in checkpoint.weights.items()}
     broken = next(name for name, array in weights.items() if array.dtype.kind == "f")

@@ -1,4 +1,4 @@
-"""The detector: ONNX Runtime and torch answer alike, and odd frames do no harm."""
+"""The detector: ONNX Runtime and torch agree, and unusual frames work."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ NAMES = ("Car", "Pedestrian", "Cyclist")
 
 
 def lively(name):
-    """A checkpoint whose batch norms and answers are far from their first values."""
+    """Return a checkpoint with batch norms and outputs far from their initial values."""
     generator = torch.Generator().manual_seed(0)
     network = PillarNetwork(PRESETS[name], len(NAMES))
     with torch.no_grad():
@@ -36,12 +36,12 @@ def lively(name):
 
 
 def frame_of(points):
-    """A frame with these points and a camera that nobody looks through."""
+    """Return a frame with these points and an arbitrary camera."""
     return Frame("000000", points, Calibration(np.eye(3, 4), np.eye(4)), (100, 100))
 
 
 def cloud(count, seed=0):
-    """(count, 4) points all over the small grid."""
+    """Return (count, 4) points all over the small grid."""
     rng = np.random.default_rng(seed)
     low, high = [0, -32, -2, 0], [64, 32, 1, 1]
     return rng.uniform(low, high, (count, 4)).astype(np.float32)
@@ -49,7 +49,7 @@ def cloud(count, seed=0):
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """The file of a lively small checkpoint."""
+    """Return the file of a small checkpoint with random statistics."""
     path = tmp_path_factory.mktemp("checkpoints") / "small.safetensors"
     save_checkpoint(path, lively("small"))
     return path
@@ -73,7 +73,7 @@ def test_onnx_runtime_and_torch_agree(tmp_path, preset, count):
 
 
 def test_an_empty_frame_has_no_detections(small):
-    """No points, or none on the grid, is an empty answer."""
+    """No points, or none on the grid."""
     detector = PillarDetector(small)
     assert len(detector.predict(frame_of(np.zeros((0, 4), dtype=np.float32)))) == 0
     behind = np.array([[-5, 0, 0, 0]], dtype=np.float32)
@@ -81,7 +81,7 @@ def test_an_empty_frame_has_no_detections(small):
 
 
 def test_detections_are_sorted_and_do_not_overlap_within_a_category(small):
-    """After suppression, boxes of a category overlap at most by the threshold."""
+    """After NMS, boxes of a category overlap at most by the threshold."""
     detector = PillarDetector(small, minimum_score=0.0, nms_iou=0.3)
     found = detector.predict(frame_of(cloud(3000)))
     assert len(found) > 10
@@ -93,7 +93,7 @@ def test_detections_are_sorted_and_do_not_overlap_within_a_category(small):
         assert overlap.max(initial=0) <= 0.3
 
 
-def test_the_minimum_score_cuts(small):
+def test_the_minimum_score_selects_detections(small):
     """A higher threshold keeps the better part of the same detections."""
     frame = frame_of(cloud(3000))
     everything = PillarDetector(small, minimum_score=0.0).predict(frame)
@@ -103,8 +103,8 @@ def test_the_minimum_score_cuts(small):
     assert better.scores.min() >= middle
 
 
-def test_a_missing_or_outdated_graph_is_made_again(small):
-    """The checkpoint is what counts: its graph is replaced where it is not there or another's."""
+def test_a_missing_or_outdated_graph_is_exported_again(small):
+    """The checkpoint defines the model: a missing or different graph is replaced."""
     frame = frame_of(cloud(500))
     expected = PillarDetector(small, minimum_score=0.0).predict(frame)
     graph = graph_path(small)
@@ -119,14 +119,13 @@ def test_a_missing_or_outdated_graph_is_made_again(small):
 
 
 def test_an_unknown_device_is_a_configuration_error(small):
-    """A device that torch does not know, or does not have, is named."""
     for device in ("toaster", "cuda:99"):
         with pytest.raises(ConfigError, match=device):
             PillarDetector(small, device=device)
 
 
 def test_the_slot_maximum_has_the_gradient_of_scatter_reduce():
-    """Without ties the gradient is autograd's own, for slots with no, one and several points."""
+    """Without ties the gradient is that of autograd, for slots with no, one and several points."""
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(20, 3, generator=generator, requires_grad=True)
     slots = torch.randint(0, 6, (20,), generator=generator)
@@ -139,7 +138,7 @@ def test_the_slot_maximum_has_the_gradient_of_scatter_reduce():
     torch.testing.assert_close(ours, values.grad)
 
 
-def test_a_sensor_mounted_higher_sees_the_same_objects_lower(small):
+def test_the_height_of_the_sensor_does_not_matter(small):
     """Heights are measured from the ground: the scores stay, the boxes move with the points."""
     rng = np.random.default_rng(3)
     ground = np.column_stack([rng.uniform([0, -32], [51, 32], (4000, 2)), np.full(4000, -1.75)])

@@ -1,4 +1,4 @@
-"""Points to pillars, boxes to targets, and answers back to boxes."""
+"""Points to pillars, boxes to targets, and outputs back to boxes."""
 
 import numpy as np
 import pytest
@@ -20,19 +20,19 @@ NAMES = ("Car", "Pedestrian", "Cyclist")
 
 
 def car(x, y, yaw=0.0, length=4.0, width=1.6):
-    """One box as (1, 7)."""
+    """Return one box as (1, 7)."""
     return np.array([[x, y, -0.8, length, width, 1.5, yaw]])
 
 
 def targets_of(boxes, weights=None, ids=None):
-    """Targets in the small grid, by default of cars with weight 1."""
+    """Return targets in the small grid, by default of cars with weight 1."""
     weights = np.ones(len(boxes)) if weights is None else np.asarray(weights)
     ids = np.zeros(len(boxes), dtype=int) if ids is None else np.asarray(ids)
     return encode_boxes(boxes, ids, weights, len(NAMES), SMALL)
 
 
 def cell_of(x, y):
-    """The small grid's cell at a place."""
+    """Return the small grid's cell at a position."""
     return int(x / SMALL.cell_m), int((y + 32) / SMALL.cell_m)
 
 
@@ -44,8 +44,7 @@ def test_grids_can_be_halved_twice(preset):
         assert cells * preset.cell_m == pytest.approx(bounds[1] - bounds[0])
 
 
-def test_an_unknown_preset_names_the_known_ones():
-    """The error for a misspelt preset lists what there is."""
+def test_the_error_for_an_unknown_preset_lists_the_known_ones():
     with pytest.raises(ConfigError, match=r"tiny.*small, kitti"):
         preset_named("tiny")
 
@@ -63,14 +62,14 @@ def test_points_off_the_grid_are_left_out():
 
 
 def test_the_last_point_below_the_edge_stays_on_the_grid():
-    """Rounding does not push a point below the upper edge into a cell that is not there."""
+    """Rounding does not move a point below the upper edge into a cell that does not exist."""
     edge = np.nextafter(np.float32(SMALL.x_range[1]), np.float32(0))
     side = np.nextafter(np.float32(32), np.float32(0))
     pillars = encode_points(np.array([[edge, side, 0, 0]], dtype=np.float32), SMALL)
     assert pillars.slots.tolist() == [4 * 80 * 100 - 1]
 
 
-def test_the_pillars_of_a_cell_are_neighbours_in_the_canvas():
+def test_the_pillars_of_a_cell_are_adjacent_in_the_canvas():
     """The four pillars of output cell (1, 50) have the slots 4 * (1 * 100 + 50) and following."""
     corner = np.array([0.64, 0.0])
     offsets = np.array([[0.1, 0.1], [0.1, 0.4], [0.4, 0.1], [0.4, 0.4]])
@@ -78,7 +77,7 @@ def test_the_pillars_of_a_cell_are_neighbours_in_the_canvas():
     assert encode_points(points, SMALL).slots.tolist() == [600, 601, 602, 603]
 
 
-def test_features_tell_a_point_from_its_pillar():
+def test_features_are_relative_to_the_pillar():
     """Offsets from the pillar's centre and mean, count and distance, for a pillar of two points."""
     points = np.array([[3.2 + 0.1, 0.1, -1.0, 0.3], [3.2 + 0.3, 0.2, -0.5, 0.7]], dtype=np.float32)
     features = encode_points(points, SMALL).features
@@ -98,8 +97,8 @@ def test_features_tell_a_point_from_its_pillar():
     )
 
 
-def test_an_object_is_one_at_its_centre_and_ends_in_its_region():
-    """The heatmap of an object's category is 1 in its cell and 0 far away, others' are empty."""
+def test_the_heatmap_is_one_at_the_centre_and_zero_far_away():
+    """Only in the heatmap of the object's category."""
     targets = targets_of(car(20, 3))
     x, y = cell_of(20, 3)
     assert targets.heatmap[x, y, 0] == 1
@@ -118,7 +117,7 @@ def test_the_gaussian_lies_along_the_object():
     assert along[x, y + 2, 0] == pytest.approx(across[x + 2, y, 0])
 
 
-def test_weight_zero_draws_nothing_and_blanks_its_region():
+def test_weight_zero_draws_nothing_and_ignores_its_region():
     """An ignored box has no gaussian; its whole footprint is not background."""
     targets = targets_of(car(20, 3), weights=[0.0])
     x, y = cell_of(20, 3)
@@ -128,8 +127,8 @@ def test_weight_zero_draws_nothing_and_blanks_its_region():
     assert targets.code_weights.sum() == 0
 
 
-def test_background_is_as_sure_as_the_least_sure_object():
-    """Where the regions of two objects overlap the lower weight counts."""
+def test_background_has_the_lowest_weight_of_overlapping_objects():
+    """Where the regions of two objects overlap, the lower weight counts."""
     targets = targets_of(np.concatenate([car(20, 3), car(20, 3.7)]), weights=[0.75, 0.25])
     x, y = cell_of(20, 3)
     assert targets.background[x, y] == 0.25
@@ -137,7 +136,7 @@ def test_background_is_as_sure_as_the_least_sure_object():
 
 
 def test_the_cells_of_an_object_share_its_weight():
-    """However many cells learn a box, their weights sum to v."""
+    """The weights of all cells that learn a box sum to v."""
     targets = targets_of(np.concatenate([car(20, 3), car(40, -9.1)]), weights=[1.0, 0.5])
     half = targets.codes[:, 2:3].shape[0] // 2
     assert targets.code_weights[:half].sum() == pytest.approx(1.0)
@@ -145,7 +144,7 @@ def test_the_cells_of_an_object_share_its_weight():
 
 
 def test_objects_off_the_grid_are_left_out():
-    """A box whose centre lies beside the grid is no target."""
+    """A box with its centre outside the grid is not a target."""
     targets = targets_of(np.concatenate([car(-3, 0), car(70, 0), car(10, 40)]))
     assert len(targets.centres) == len(targets.codes) == 0
     assert not targets.heatmap.any()
@@ -165,7 +164,7 @@ boxes_on_grid = st.tuples(
 
 @settings(max_examples=60)
 @given(boxes_on_grid)
-def test_every_cell_that_learns_a_box_would_answer_that_box(box):
+def test_decoding_inverts_encoding(box):
     """Decoding the codes of an object gives the object back, from each of its cells."""
     expected = np.array([box])
     targets = targets_of(expected)
@@ -176,8 +175,8 @@ def test_every_cell_that_learns_a_box_would_answer_that_box(box):
     assert (turned < 1e-3).all()
 
 
-def test_without_a_known_front_the_axis_is_kept():
-    """Where front and back are alike the direction code vanishes, the yaw holds modulo pi."""
+def test_without_a_known_front_only_the_axis_is_kept():
+    """If front and back are equally likely, the direction code is 0; the yaw holds modulo pi."""
     targets = targets_of(car(20, 3, yaw=2.0))
     codes = targets.codes[:1].astype(np.float64)
     codes[:, 8:] = 0
@@ -185,7 +184,7 @@ def test_without_a_known_front_the_axis_is_kept():
     assert np.sin(decoded[0, 6] - 2.0) == pytest.approx(0, abs=1e-6)
 
 
-def test_decode_takes_what_reaches_the_threshold_best_first():
+def test_decode_returns_peaks_above_the_threshold_best_first():
     """Scores, names and boxes of the peaks, in falling order."""
     scores = np.zeros((*SMALL.cells, 3), dtype=np.float32)
     codes = np.zeros((*SMALL.cells, BOX_CODE), dtype=np.float32)
@@ -200,8 +199,8 @@ def test_decode_takes_what_reaches_the_threshold_best_first():
     assert found.boxes[0] == pytest.approx([20.5 * 0.64, 0.5 * 0.64, 0, 1, 1, 1, 0])
 
 
-def test_decode_answers_neighbouring_cells_too():
-    """Two people can stand in adjacent cells: neither is dropped for being beside the other."""
+def test_decode_keeps_adjacent_cells():
+    """Two people can stand in adjacent cells: neither is dropped."""
     scores = np.zeros((*SMALL.cells, 3), dtype=np.float32)
     codes = np.zeros((*SMALL.cells, BOX_CODE), dtype=np.float32)
     scores[20, 50, 1], scores[20, 51, 1] = 0.9, 0.8
@@ -209,8 +208,8 @@ def test_decode_answers_neighbouring_cells_too():
     assert found.scores == pytest.approx([0.9, 0.8])
 
 
-def test_decode_of_silence_is_empty():
-    """No peak at all, even at threshold 0, is an empty answer of the right shapes."""
+def test_decode_without_peaks_is_empty():
+    """Even at threshold 0 the arrays are empty, with the right shapes."""
     zeros = np.zeros((*SMALL.cells, 3), dtype=np.float32)
     codes = np.zeros((*SMALL.cells, BOX_CODE), dtype=np.float32)
     found = decode(zeros, codes, zeros[..., 0], NAMES, SMALL, 0.0)

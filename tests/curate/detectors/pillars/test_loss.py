@@ -1,4 +1,4 @@
-"""The weighted loss, with numbers worked by hand."""
+"""The weighted loss, with numbers worked out by hand."""
 
 import math
 from dataclasses import replace
@@ -23,7 +23,7 @@ CAR = [10.0, 0.0, -0.8, 4.0, 1.6, 1.5, 0.3]
 
 
 def targets_of(*frames):
-    """Targets of frames, each a list of (box, weight), of one category."""
+    """Return targets of frames, each a list of (box, weight), of one category."""
     return BatchTargets.stack(
         [
             encode_boxes(
@@ -38,8 +38,8 @@ def targets_of(*frames):
     )
 
 
-def answers(frames=1, seed=0):
-    """Random answers that ask for gradients."""
+def random_outputs(frames=1, seed=0):
+    """Return random outputs that require gradients."""
     generator = torch.Generator().manual_seed(seed)
     parts = [
         torch.randn(frames, *PRESET.cells, *more, generator=generator, dtype=torch.float64)
@@ -49,13 +49,13 @@ def answers(frames=1, seed=0):
 
 
 def gradients(targets, seed=0, frames=1):
-    """Of the whole loss."""
-    given = answers(frames, seed)
+    """Return the gradients of the whole loss."""
+    given = random_outputs(frames, seed)
     weighted_loss(given, targets, PRESET, 1.0)["loss"].backward()
     return Answers(*(part.grad for part in given))
 
 
-def test_background_alone():
+def test_background_only():
     """Without objects each of the 32 x 32 cells at p = 1/2 adds 1/4 * ln 2."""
     logits = torch.zeros(1, *PRESET.cells, 1)
     expected = 32 * 32 * 0.25 * math.log(2)
@@ -80,7 +80,10 @@ def test_the_box_term_is_l1_times_v():
 
 
 def test_the_iou_term_is_least_at_the_true_overlap():
-    """A box moved half its length along itself overlaps by 1/3; saying 1/3 costs its entropy."""
+    """A box moved half its length along itself overlaps by 1/3.
+
+    Predicting 1/3 costs its entropy.
+    """
     straight = [*CAR[:6], 0.0]
     targets = targets_of([(straight, 0.5)])
     codes = torch.zeros(1, *PRESET.cells, BOX_CODE, dtype=torch.float64)
@@ -90,8 +93,10 @@ def test_the_iou_term_is_least_at_the_true_overlap():
 
     silent = torch.full((1, *PRESET.cells, 1), -9.0)
 
-    def loss(said):
-        logits = torch.full((1, *PRESET.cells), math.log(said / (1 - said)), dtype=torch.float64)
+    def loss(predicted):
+        logits = torch.full(
+            (1, *PRESET.cells), math.log(predicted / (1 - predicted)), dtype=torch.float64
+        )
         return float(iou_loss(Answers(silent, codes, logits), targets, PRESET))
 
     entropy = -(math.log(1 / 3) / 3 + 2 * math.log(2 / 3) / 3)
@@ -100,17 +105,17 @@ def test_the_iou_term_is_least_at_the_true_overlap():
 
 
 def test_the_iou_term_does_not_move_the_box():
-    """The overlap is a target: the gradient reaches the estimate alone, in every frame."""
+    """The overlap is a target: the gradient reaches only the estimate, in every frame."""
     targets = targets_of([(CAR, 1.0)], [(CAR, 1.0)])
-    given = answers(2)
+    given = random_outputs(2)
     iou_loss(given, targets, PRESET).backward()
     assert given.codes.grad is None
     assert given.logits.grad is None
     assert (given.iou_logits.grad.flatten(1).abs().sum(1) > 0).all()
 
 
-def test_what_is_found_beside_all_objects_overlaps_none():
-    """A cell that finds something there costs ln 2 / 9 at IoU 1/2; in an ignored region nothing."""
+def test_a_false_positive_has_target_iou_zero():
+    """A false detection costs ln 2 / 9 at IoU 1/2; in an ignored region nothing."""
     silent = torch.full((1, *PRESET.cells, 1), -9.0)
     codes, undecided = torch.zeros(1, *PRESET.cells, BOX_CODE), torch.zeros(1, *PRESET.cells)
     ignored = targets_of([(CAR, 0.0)])
@@ -123,7 +128,7 @@ def test_what_is_found_beside_all_objects_overlaps_none():
 
 
 @pytest.mark.parametrize("v", [0.1, 0.5])
-def test_the_gradient_of_an_object_is_v_times_that_of_a_sure_one(v):
+def test_the_gradient_of_an_object_is_scaled_by_v(v):
     """In the object's region every gradient is scaled by v, outside nothing changes."""
     sure, unsure = targets_of([(CAR, 1.0)]), targets_of([(CAR, v)])
     region = (unsure.background < 1)[0, ..., 0]
@@ -138,7 +143,7 @@ def test_the_gradient_of_an_object_is_v_times_that_of_a_sure_one(v):
 
 
 def test_an_ignored_region_has_no_gradient():
-    """A label of weight 0 says nothing: neither object nor background where it lies."""
+    """Neither as object nor as background."""
     targets = targets_of([(CAR, 0.0)])
     logits, codes, ious = gradients(targets)
     region = (targets.background == 0)[0, ..., 0]
@@ -150,7 +155,7 @@ def test_an_ignored_region_has_no_gradient():
 
 
 def test_the_weights_of_other_objects_do_not_matter():
-    """A sure object's gradient is the same beside unsure ones: no sum of weights divides it."""
+    """The gradient of an object is not divided by a sum of weights."""
     other = [10.0, 7.0, *CAR[2:]]
     alone = gradients(targets_of([(CAR, 1.0)], []), frames=2)[1]
     for weight in (0.0, 0.3, 1.0):
@@ -161,7 +166,7 @@ def test_the_weights_of_other_objects_do_not_matter():
 def test_frames_of_a_batch_do_not_mix():
     """The loss of a batch is the sum of the losses of its frames."""
     frames = ([(CAR, 1.0)], [], [([5.0, -3.0, *CAR[2:]], 0.4), (CAR, 0.9)])
-    given = answers(3)
+    given = random_outputs(3)
     together = weighted_loss(given, targets_of(*frames), PRESET, 2.0)["loss"]
     alone = [
         weighted_loss(
@@ -173,7 +178,7 @@ def test_frames_of_a_batch_do_not_mix():
 
 
 def test_large_logits_stay_finite():
-    """Saturated answers give finite losses and gradients."""
+    """Saturated outputs give finite losses and gradients."""
     logits = torch.full((1, *PRESET.cells, 1), 60.0, requires_grad=True)
     wrong = heatmap_loss(logits, targets_of([(CAR, 1.0)])) + heatmap_loss(
         -logits, targets_of([(CAR, 1.0)])

@@ -1,4 +1,4 @@
-"""Tests of records in the formats of other projects: the same boxes, whatever the file."""
+"""Recorded results in the formats of other projects: the same boxes in every format."""
 
 import json
 import logging
@@ -30,7 +30,7 @@ FRAMES = {"000001": FOUND, "000002": Detections.empty()}
 
 
 def tilted_calibration():
-    """A camera that stands apart from the LiDAR, so that a forgotten calibration is seen."""
+    """Return a camera apart from the LiDAR, so that a missing transform shows."""
     plain = toy_calibration()
     moved = plain.lidar_to_camera.copy()
     moved[:3, 3] = [0.3, -0.1, -0.27]
@@ -41,12 +41,12 @@ def tilted_calibration():
 
 
 def frame(frame_id):
-    """A frame of which only name and calibration matter."""
+    """Return a frame with a name and a calibration."""
     return Frame(frame_id, np.zeros((0, 4), np.float32), tilted_calibration(), (120, 40))
 
 
 def write_kitti(folder, frames=FRAMES):
-    """KITTI result files."""
+    """Write KITTI result files."""
     folder.mkdir()
     for frame_id, found in frames.items():
         objects = from_detections(found, tilted_calibration(), (120, 40))
@@ -55,7 +55,7 @@ def write_kitti(folder, frames=FRAMES):
 
 
 def write_openpcdet(path, frames=FRAMES):
-    """OpenPCDet's result.pkl."""
+    """Write OpenPCDet's result.pkl."""
     entries = [
         {
             "frame_id": frame_id,
@@ -71,7 +71,7 @@ def write_openpcdet(path, frames=FRAMES):
 
 
 def mmdetection3d(frames=FRAMES):
-    """mmdetection3d's entries: z at the bottom."""
+    """Return mmdetection3d's entries: z at the bottom."""
     down = np.array([0, 0, 0.5, 0, 0, 0, 0])
     return {
         frame_id: {
@@ -84,24 +84,24 @@ def mmdetection3d(frames=FRAMES):
 
 
 def write_mmdetection3d(path, frames=FRAMES):
-    """A pickle of arrays, in order only, with the order beside it."""
+    """Write a pickle of arrays without names, with the frame order beside it."""
     path.write_bytes(pickle.dumps(list(mmdetection3d(frames).values())))
     (path.parent / "order.txt").write_text("\n".join(frames) + "\n")
     return path
 
 
 def write_inferencer(folder, frames=FRAMES):
-    """The folder of the inferencer."""
+    """Write the folder of the inferencer."""
     folder.mkdir()
     for frame_id, entry in mmdetection3d(frames).items():
-        held = {key: value.tolist() for key, value in entry.items()}
-        held["bboxes_3d"] = held.pop("boxes_3d")
-        (folder / f"{frame_id}.json").write_text(json.dumps(held | {"box_type_3d": "LiDAR"}))
+        content = {key: value.tolist() for key, value in entry.items()}
+        content["bboxes_3d"] = content.pop("boxes_3d")
+        (folder / f"{frame_id}.json").write_text(json.dumps(content | {"box_type_3d": "LiDAR"}))
     return folder
 
 
 def nuscenes(frames=FRAMES):
-    """Content of nuScenes' results: the task's names, sizes width first, in the map."""
+    """Return nuScenes' results: the task's names, width before length, in the map."""
     names = {"Car": "car", "Pedestrian": "pedestrian"}
     return {
         frame_id: [
@@ -126,7 +126,7 @@ def nuscenes(frames=FRAMES):
 
 
 def write_nuscenes(path, frames=FRAMES):
-    """One JSON file."""
+    """Write one JSON file."""
     path.write_text(json.dumps({"meta": {"use_lidar": True}, "results": nuscenes(frames)}))
     return path
 
@@ -145,13 +145,13 @@ FORMATS = {
 
 @pytest.fixture(params=FORMATS)
 def written(request, tmp_path):
-    """Path, its writer, and the options that it needs."""
+    """Return path, writer and the required options of every format."""
     write, options = FORMATS[request.param]
     return write(tmp_path / request.param), write, options
 
 
-def test_every_format_says_the_same(written):
-    """Boxes at their centre in the LiDAR frame, to what the file's decimals hold."""
+def test_every_format_gives_the_same_boxes(written):
+    """The origin is the centre in the LiDAR frame; values agree to the decimals of the file."""
     path, _, options = written
     record = RecordedDetector(path, **options)
     found = record.predict(frame("000001"))
@@ -162,8 +162,8 @@ def test_every_format_says_the_same(written):
     assert record.frame_ids() == ("000001", "000002")
 
 
-def test_low_scores_are_left_out_and_names_translated(written):
-    """As the options say."""
+def test_low_scores_are_dropped_and_names_translated(written):
+    """As the options specify."""
     path, _, options = written
     record = RecordedDetector(path, 0.5, rename={"Car": "car"}, **options)
     assert record.predict(frame("000001")).categories.tolist() == ["car"]
@@ -184,8 +184,8 @@ def test_a_second_pass_gives_views(written):
     np.testing.assert_allclose(similarity.invert_boxes(found.boxes), BOXES, atol=2e-4)
 
 
-def test_without_a_second_pass_the_user_is_told_once(tmp_path, caplog):
-    """Weights of 0 everywhere would be a riddle."""
+def test_a_missing_second_pass_is_reported_once(tmp_path, caplog):
+    """All weights would be 0 without an explanation."""
     record = RecordedDetector(write_openpcdet(tmp_path / "a.pkl"))
     with caplog.at_level(logging.WARNING):
         assert list(record.views("000001")) == list(record.views("000002")) == []
@@ -203,8 +203,8 @@ def test_without_a_second_pass_the_user_is_told_once(tmp_path, caplog):
         ({"path": "a.pkl", "scale": -1}, "positive scale"),
     ],
 )
-def test_a_pass_says_what_was_done_to_the_points(tmp_path, one, message):
-    """Exactly, or it is refused."""
+def test_a_pass_must_specify_its_augmentation(tmp_path, one, message):
+    """Exactly, or it is rejected."""
     with pytest.raises(ConfigError, match=message):
         RecordedDetector(write_openpcdet(tmp_path / "a.pkl"), passes=[one])
 
@@ -216,8 +216,8 @@ def test_a_frame_without_result_is_an_error(written):
         RecordedDetector(path, **options).predict(frame("000007"))
 
 
-def test_a_result_for_a_frame_that_does_not_exist_is_reported(written, caplog):
-    """Some: a warning that names them. All: an error that shows how frames are named."""
+def test_results_for_unknown_frames_are_reported(written, caplog):
+    """Some: a warning that lists them. All: an error that shows example frame names."""
     path, _, options = written
     with caplog.at_level(logging.WARNING):
         RecordedDetector(path, frame_ids=("000001", "000007"), **options)
@@ -237,7 +237,7 @@ def test_a_result_for_a_frame_that_does_not_exist_is_reported(written, caplog):
         ({"boxes_lidar": "far"}, "must be numbers"),
     ],
 )
-def test_impossible_answers_are_named(tmp_path, change, message):
+def test_impossible_results_are_reported(tmp_path, change, message):
     """With the entry and the frame."""
     entry = {"frame_id": "7", "name": FOUND.categories, "score": FOUND.scores, "boxes_lidar": BOXES}
     path = tmp_path / "a.pkl"
@@ -248,8 +248,8 @@ def test_impossible_answers_are_named(tmp_path, change, message):
     assert "\n" not in str(caught.value)
 
 
-def test_numbered_labels_need_their_names(tmp_path):
-    """The order of classes is the model's, and a wrong one would go unseen."""
+def test_numbered_labels_need_class_names(tmp_path):
+    """The order of classes is the model's; a wrong order would not be noticed."""
     path = write_mmdetection3d(tmp_path / "a.pkl")
     with pytest.raises(ConfigError, match=r"give detector\.options\.classes"):
         RecordedDetector(path, frame_list="order.txt")
@@ -263,7 +263,7 @@ def test_numbered_labels_need_their_names(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "held", "message"),
+    ("name", "content", "message"),
     [
         ("a.json", {"a": 1}, "holds a dict, not a list of frames"),
         ("a.json", [], "holds no frames"),
@@ -273,23 +273,23 @@ def test_numbered_labels_need_their_names(tmp_path):
         ("a.feather", [], "no known record of detections; expected a .csv or .parquet file"),
     ],
 )
-def test_other_contents_are_refused_by_name(tmp_path, name, held, message):
-    """With what would be read."""
-    (tmp_path / name).write_text(json.dumps(held))
+def test_unsupported_contents_are_rejected(tmp_path, name, content, message):
+    """The error lists what can be read."""
+    (tmp_path / name).write_text(json.dumps(content))
     with pytest.raises(DataError, match=message):
         RecordedDetector(tmp_path / name)
 
 
-def test_boxes_of_the_camera_are_refused(tmp_path):
-    """mmdetection3d says so in its files."""
+def test_boxes_in_the_camera_frame_are_rejected(tmp_path):
+    """mmdetection3d marks them in its files."""
     entry = {"frame_id": "1", "bboxes_3d": [], "scores_3d": [], "labels_3d": []}
     (tmp_path / "a.json").write_text(json.dumps([entry | {"box_type_3d": "Camera"}]))
     with pytest.raises(DataError, match="of type Camera, not LiDAR"):
         RecordedDetector(tmp_path / "a.json", classes=CLASSES)
 
 
-def test_the_format_can_be_named(tmp_path):
-    """An unknown name is refused, and so is a folder without results."""
+def test_the_format_can_be_specified(tmp_path):
+    """An unknown name is rejected, and so is a folder without results."""
     path = write_openpcdet(tmp_path / "a.pkl")
     assert len(RecordedDetector(path, kind="openpcdet").frame_ids()) == 2
     with pytest.raises(
@@ -301,8 +301,7 @@ def test_the_format_can_be_named(tmp_path):
         RecordedDetector(tmp_path / "empty")
 
 
-def test_a_bad_result_file_fails_its_frame_alone(tmp_path):
-    """The others are read."""
+def test_an_invalid_result_file_fails_only_its_frame(tmp_path):
     folder = write_kitti(tmp_path / "results")
     (folder / "000003.txt").write_text("Car 0 0\n")
     record = RecordedDetector(folder)
@@ -312,7 +311,7 @@ def test_a_bad_result_file_fails_its_frame_alone(tmp_path):
 
 
 def written_results(tmp_path, boxes):
-    """A file with these results of frame 000001."""
+    """Return a file with these results of frame 000001."""
     (tmp_path / "a.json").write_text(json.dumps({"meta": {}, "results": {"000001": boxes}}))
     return tmp_path / "a.json"
 
@@ -336,7 +335,7 @@ BOX = nuscenes()["000001"][0]
         ({"a": 1}, "expected a list of boxes, not dict"),
     ],
 )
-def test_usual_mistakes_in_nuscenes_results_are_named(tmp_path, boxes, message):
+def test_common_mistakes_in_nuscenes_results_are_reported(tmp_path, boxes, message):
     """At once, with frame and box."""
     path = written_results(tmp_path, boxes)
     with pytest.raises(DataError, match=message) as caught:
@@ -345,8 +344,8 @@ def test_usual_mistakes_in_nuscenes_results_are_named(tmp_path, boxes, message):
     assert "\n" not in str(caught.value)
 
 
-def test_nuscenes_results_in_the_lidar_frame_are_refused(tmp_path):
-    """They would lie hundreds of metres from the vehicle."""
+def test_nuscenes_results_in_the_lidar_frame_are_rejected(tmp_path):
+    """They would be hundreds of metres from the vehicle."""
     path = written_results(tmp_path, [BOX | {"translation": [12.0, 4.0, -0.8]}])
     with pytest.raises(DataError, match="they are in the frame of the LiDAR or vehicle") as caught:
         RecordedDetector(path).predict(frame("000001"))
@@ -357,7 +356,7 @@ def test_nuscenes_results_in_the_lidar_frame_are_refused(tmp_path):
 
 
 def test_nuscenes_results_need_poses(tmp_path):
-    """Which KITTI, for one, does not have."""
+    """KITTI has none."""
     record = RecordedDetector(write_nuscenes(tmp_path / "a.json"))
     bare = Frame("000001", np.zeros((0, 4), np.float32), toy_calibration(), (120, 40))
     with pytest.raises(ConfigError, match="need the vehicle's poses"):
@@ -366,7 +365,7 @@ def test_nuscenes_results_need_poses(tmp_path):
 
 @pytest.fixture(params=["ijson", "json"])
 def json_reader(request, monkeypatch):
-    """With ijson, where it is installed, and without."""
+    """Run the test with ijson, if it is installed, and without."""
     if request.param == "ijson":
         pytest.importorskip("ijson")
     else:
@@ -374,11 +373,11 @@ def json_reader(request, monkeypatch):
 
 
 @pytest.mark.usefixtures("json_reader")
-def test_results_are_read_a_frame_at_a_time_or_whole(tmp_path):
-    """With the same answers; a key in the meta that is called results is not it."""
+def test_streaming_and_whole_reading_agree(tmp_path):
+    """A key in the meta that is called results is not mistaken for the results."""
     path = write_nuscenes(tmp_path / "a.json")
-    held = json.loads(path.read_text())
-    path.write_text(json.dumps({"meta": {"results": {"a": 1}}, **held, "more": [{}]}))
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({"meta": {"results": {"a": 1}}, **content, "more": [{}]}))
     record = RecordedDetector(path)
     assert record.frame_ids() == tuple(sorted(nuscenes()))
     path.write_text(json.dumps({"meta": {}, "results": {}}))
@@ -398,16 +397,16 @@ def test_results_are_read_a_frame_at_a_time_or_whole(tmp_path):
         ('{"meta": {}}', "holds a dict, not a list of frames, and no nuScenes results"),
     ],
 )
-def test_damaged_results_are_refused_in_one_line(tmp_path, text, message):
-    """By whichever reader."""
+def test_damaged_results_are_rejected_in_one_line(tmp_path, text, message):
+    """By both readers."""
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(DataError, match=message) as caught:
         RecordedDetector(tmp_path / "a.json")
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_what_is_no_nuscenes_result_is_said(tmp_path):
-    """Where the kind was named."""
+def test_a_file_that_is_not_a_nuscenes_result_is_rejected(tmp_path):
+    """If the format was specified."""
     (tmp_path / "a.json").write_text("[]")
     with pytest.raises(DataError, match="no nuScenes results: an object with meta and results"):
         RecordedDetector(tmp_path / "a.json", kind="nuscenes")
@@ -417,8 +416,8 @@ def test_what_is_no_nuscenes_result_is_said(tmp_path):
 
 
 @pytest.mark.kitti
-def test_real_results_in_kittis_form_are_the_record(kitti_root, tmp_path):
-    """A real detector's boxes, written as result files with the real calibration, come back."""
+def test_real_results_in_kitti_format_equal_the_record(kitti_root, tmp_path):
+    """A real detector's boxes, written as result files with the real calibration, are read back."""
     dataset = KittiDataset(kitti_root)
     record = RecordedDetector(kitti_root / "recorded" / "pointgnn_T0.csv")
     (tmp_path / "results").mkdir()

@@ -1,6 +1,6 @@
-"""Every recorded format by one property: the same boxes, written as the format has it, come back.
+"""One property for every recorded format: boxes written in it are read back unchanged.
 
-The writers here know nothing of curate's conversions: they turn and shift with scipy's rotations.
+The writers here do not use curate's conversions: they transform with scipy's rotations.
 """
 
 import csv
@@ -33,11 +33,11 @@ LOOKING_AHEAD = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 @dataclass(frozen=True)
 class Rig:
-    """Where the sensors are.
+    """The poses of the sensors.
 
     Attributes:
-        to_camera: LiDAR to camera, and where the LiDAR is seen from there.
-        to_map: LiDAR to map, and where it is.
+        to_camera: rotation from LiDAR to camera, and the LiDAR's position in the camera frame.
+        to_map: rotation from LiDAR to map, and the LiDAR's position.
     """
 
     to_camera: tuple[Rotation, np.ndarray]
@@ -45,7 +45,7 @@ class Rig:
 
     @property
     def calibration(self) -> Calibration:
-        """The same in matrices."""
+        """Return the same as matrices."""
         projection = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]])
         camera, place = np.eye(4), np.eye(4)
         for matrix, (turn, origin) in ((camera, self.to_camera), (place, self.to_map)):
@@ -54,7 +54,7 @@ class Rig:
 
 
 def write_csv(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
-    """As curate has it."""
+    """Write curate's own CSV."""
     header = "frame,category,score,x,y,z,length,width,height,yaw,view,flip_y,rotation_rad,scale"
     with path.with_suffix(".csv").open("w", newline="") as file:
         writer = csv.writer(file)
@@ -65,7 +65,7 @@ def write_csv(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
 
 
 def write_parquet(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
-    """As curate has it, with a yaw that may be any number of turns away."""
+    """Write curate's own Parquet, with yaws outside (-pi, pi]."""
     arrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     order = ("x", "y", "z", "length", "width", "height", "yaw")
@@ -78,7 +78,7 @@ def write_parquet(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]
 
 
 def write_kitti(path: Path, found: Detections, rig: Rig) -> tuple[Path, dict]:
-    """Camera frame, centre of the bottom, height width length, rotation_y about the y downwards."""
+    """Write camera frame, bottom centre, height width length, rotation_y about the downward y."""
     turn, origin = rig.to_camera
     lines = []
     for box, score, name in rows_of(found):
@@ -94,7 +94,7 @@ def write_kitti(path: Path, found: Detections, rig: Rig) -> tuple[Path, dict]:
 
 
 def write_openpcdet(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
-    """As here, with velocities."""
+    """Write LiDAR boxes with velocities."""
     boxes = np.column_stack([found.boxes, np.ones((len(found), 2))])
     entry = {"frame_id": FRAME, "name": found.categories, "score": found.scores}
     path.with_suffix(".pkl").write_bytes(pickle.dumps([entry | {"boxes_lidar": boxes}]))
@@ -102,7 +102,7 @@ def write_openpcdet(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dic
 
 
 def write_mmdetection3d(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
-    """The centre of the bottom, and numbered names."""
+    """Write bottom centres, and class numbers."""
     boxes = [[*box[:2], box[2] - box[5] / 2, *box[3:]] for box in found.boxes.tolist()]
     entry = {
         "frame_id": FRAME,
@@ -115,7 +115,7 @@ def write_mmdetection3d(path: Path, found: Detections, _rig: Rig) -> tuple[Path,
 
 
 def write_nuscenes(path: Path, found: Detections, rig: Rig) -> tuple[Path, dict]:
-    """In the map, width before length, a quaternion with w first."""
+    """Write map coordinates, width before length, a quaternion with w first."""
     turn, origin = rig.to_map
     results = []
     for box, score, name in rows_of(found):
@@ -143,7 +143,7 @@ WRITERS: dict[str, Callable[[Path, Detections, Rig], tuple[Path, dict]]] = {
 
 
 def rows_of(found: Detections):
-    """Box, score and name of each."""
+    """Return box, score and name of each detection."""
     return zip(found.boxes.tolist(), found.scores.tolist(), found.categories.tolist(), strict=True)
 
 
@@ -160,11 +160,11 @@ boxes = st.tuples(
     st.floats(2, 60), st.floats(-30, 30), st.floats(-3, 3),
     st.floats(2.1, 9), st.floats(0.3, 2.0), st.floats(0.3, 4), st.floats(-np.pi, np.pi),
 )  # fmt: skip
-answers = st.lists(
+detections = st.lists(
     st.tuples(boxes, st.floats(0.01, 1), st.sampled_from(NAMES)),
     min_size=1,
     max_size=5,
-    unique_by=lambda row: round(row[0][0], 6),  # a box that comes twice is refused
+    unique_by=lambda row: round(row[0][0], 6),  # duplicate boxes are rejected
 ).map(
     lambda rows: Detections(
         np.array([row[0] for row in rows]),
@@ -175,7 +175,7 @@ answers = st.lists(
 
 
 def assert_equal(one: Detections, other: Detections) -> None:
-    """To a micrometre; yaw as a direction."""
+    """Check equality to a micrometre; yaw is compared as a direction."""
     np.testing.assert_allclose(one.boxes[:, :6], other.boxes[:, :6], atol=1e-6)
     turn = one.boxes[:, 6] - other.boxes[:, 6]
     np.testing.assert_allclose(np.abs(np.sin(turn / 2)), 0, atol=1e-7)
@@ -184,15 +184,14 @@ def assert_equal(one: Detections, other: Detections) -> None:
     assert one.categories.tolist() == other.categories.tolist()
 
 
-def test_every_format_is_here() -> None:
-    """A new one needs a writer."""
+def test_every_format_has_a_writer() -> None:
     assert set(WRITERS) == set(KINDS)
 
 
 @pytest.mark.parametrize("kind", WRITERS)
 @settings(max_examples=15, deadline=None)
-@given(found=answers, rig=rigs)
-def test_the_same_boxes_come_back(kind: str, found: Detections, rig: Rig) -> None:
+@given(found=detections, rig=rigs)
+def test_boxes_are_read_back_unchanged(kind: str, found: Detections, rig: Rig) -> None:
     """Whatever frame of reference, origin, order of sizes and angle the format has."""
     with tempfile.TemporaryDirectory() as folder:
         path, options = WRITERS[kind](Path(folder) / "results", found, rig)
@@ -203,12 +202,12 @@ def test_the_same_boxes_come_back(kind: str, found: Detections, rig: Rig) -> Non
 
 @pytest.mark.parametrize("kind", [kind for kind in WRITERS if kind not in ("csv", "parquet")])
 @settings(max_examples=8, deadline=None)
-@given(found=answers, rig=rigs, similarity=similarities.filter(lambda a: a != Similarity()))
-def test_the_boxes_of_a_copy_come_back(
+@given(found=detections, rig=rigs, similarity=similarities.filter(lambda a: a != Similarity()))
+def test_boxes_of_an_augmented_copy_are_read_back(
     kind: str, found: Detections, rig: Rig, similarity: Similarity
 ) -> None:
     """A second pass is written with the same sensors, and inverted afterwards."""
-    # What a scale of 0.1 to 10 does to a street is beyond what results can be.
+    # Scales from 0.1 to 10 move boxes beyond the accepted range.
     similarity = Similarity(similarity.flip_y, similarity.rotation_rad, 1.0)
     if similarity == Similarity():
         similarity = Similarity(flip_y=True)
@@ -227,8 +226,8 @@ def test_the_boxes_of_a_copy_come_back(
 
 
 @pytest.mark.parametrize("kind", ["csv", "openpcdet", "mmdetection3d"])
-def test_boxes_in_the_axes_of_nuscenes_sensor_come_back(kind: str, tmp_path: Path) -> None:
-    """There x is to the right and y forward; what is in the camera's frame or a map's stays."""
+def test_boxes_in_the_axes_of_nuscenes_sensor_are_read_back(kind: str, tmp_path: Path) -> None:
+    """There x is to the right and y forward; camera and map coordinates do not change."""
     boxes = np.array([[12.0, 3.0, -0.8, 4.0, 1.8, 1.5, 0.3], [9.0, -4.0, 0.1, 1.0, 0.8, 1.7, 3.1]])
     found = Detections(boxes, np.array([0.9, 0.5]), as_categories(["Car", "Pedestrian"]))
     quarter = Rotation.from_euler("z", 90, degrees=True)

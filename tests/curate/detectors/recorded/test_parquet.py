@@ -1,4 +1,4 @@
-"""Tests of recorded detections in Parquet."""
+"""Recorded detections in Parquet."""
 
 import logging
 from pathlib import Path
@@ -18,7 +18,7 @@ parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installe
 
 
 def table(**changes):
-    """Two boxes of frame a and one of b, of which some columns are changed or left out (None)."""
+    """Return two boxes of frame a and one of b, with some columns changed or left out (None)."""
     columns = {
         "frame": ["a", "a", "b"],
         "category": ["Car", "Pedestrian", "Car"],
@@ -31,13 +31,13 @@ def table(**changes):
 
 
 def write(path: Path, *, group=2, **changes) -> Path:
-    """The table in row groups."""
+    """Write the table in row groups."""
     parquet.write_table(table(**changes), path, row_group_size=group)
     return path
 
 
-def test_our_own_export_is_a_record(tmp_path):
-    """Boxes, scores and categories to the last bit, whatever the row groups."""
+def test_our_own_export_can_be_read_as_a_record(tmp_path):
+    """Boxes, scores and categories to the last bit, for any size of row groups."""
     ParquetExporter(rows_per_group=2).write(tmp_path / "labels.parquet", toy_labels())
     record = RecordedDetector(tmp_path / "labels.parquet")
     assert record.frame_ids() == ("000001",)
@@ -47,7 +47,7 @@ def test_our_own_export_is_a_record(tmp_path):
     assert found.categories.tolist() == list(CATEGORIES)
 
 
-def test_rows_may_be_in_any_order_and_type(tmp_path):
+def test_rows_can_have_any_order_and_type(tmp_path):
     """Numbers as integers, names as dictionaries, frames as numbers, spread over row groups."""
     path = write(
         tmp_path / "a.parquet",
@@ -81,7 +81,7 @@ def test_views_are_in_the_same_file(tmp_path):
     assert len(record.views("b")) == 1
 
 
-def test_without_views_the_user_is_told_once(tmp_path, caplog):
+def test_missing_views_are_reported_once(tmp_path, caplog):
     """An export of labels has none."""
     record = RecordedDetector(write(tmp_path / "a.parquet"))
     with caplog.at_level(logging.WARNING):
@@ -98,7 +98,7 @@ def test_without_views_the_user_is_told_once(tmp_path, caplog):
         ({"frame": ["a", None, "b"]}, "row group 0: 1 rows have no frame"),
     ],
 )
-def test_a_file_that_cannot_be_a_record_is_refused(tmp_path, changes, message):
+def test_a_file_that_cannot_be_a_record_is_rejected(tmp_path, changes, message):
     """At once, in one line."""
     path = write(tmp_path / "a.parquet", **changes)
     with pytest.raises(DataError, match=message) as caught:
@@ -124,8 +124,8 @@ VIEWS = {"view": [0, 1, 1], "flip_y": [0, 1, 1], "rotation_rad": [0, 0, 0], "sca
         (VIEWS | {"view": [1, 1, 1]}, "box 1: flip_y, rotation_rad or scale differ within a view"),
     ],
 )
-def test_a_bad_row_fails_its_frame_alone(tmp_path, changes, message):
-    """Frame b lies in another row group."""
+def test_an_invalid_row_fails_only_its_frame(tmp_path, changes, message):
+    """Frame b is in another row group."""
     record = RecordedDetector(write(tmp_path / "a.parquet", **changes))
     with pytest.raises(DataError, match=message) as caught:
         record.predict(empty_frame("a"))
@@ -134,16 +134,15 @@ def test_a_bad_row_fails_its_frame_alone(tmp_path, changes, message):
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1", b"no parquet at all"])
-def test_a_damaged_file_is_named(tmp_path, content):
-    """In one line."""
+def test_a_damaged_file_is_rejected(tmp_path, content):
     (tmp_path / "a.parquet").write_bytes(content)
     with pytest.raises(DataError, match=r"a\.parquet: no readable Parquet") as caught:
         RecordedDetector(tmp_path / "a.parquet")
     assert "\n" not in str(caught.value)
 
 
-def test_damage_within_is_named(tmp_path):
-    """The footer may be whole where the rows are not."""
+def test_damaged_rows_are_reported(tmp_path):
+    """The footer may be intact if the rows are not."""
     path = write(tmp_path / "a.parquet", group=3)
     content = bytearray(path.read_bytes())
     content[4:60] = bytes(56)
@@ -153,14 +152,14 @@ def test_damage_within_is_named(tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_table_takes_no_passes(tmp_path):
+def test_a_table_accepts_no_second_pass_files(tmp_path):
     """Its copies are views."""
     with pytest.raises(ConfigError, match="a table holds its augmented copies itself"):
         RecordedDetector(write(tmp_path / "a.parquet"), passes=[{"path": "b", "flip_y": True}])
 
 
-def test_only_a_few_row_groups_are_held(tmp_path, monkeypatch):
-    """Whatever the size of the file."""
+def test_only_a_few_row_groups_are_in_memory(tmp_path, monkeypatch):
+    """For files of any size."""
     path = tmp_path / "a.parquet"
     one = table(frame=["a"] * 3)
     names = [f"{i:04d}" for i in range(300)]
@@ -183,7 +182,7 @@ def test_only_a_few_row_groups_are_held(tmp_path, monkeypatch):
     read.clear()
     for name in reversed(names):
         assert len(record.predict(empty_frame(name))) == 3
-    # Those that were still held need not be read again.
-    held = 30 - len(read)
-    assert held <= 2
-    assert read == list(reversed(range(30 - held)))
+    # Cached row groups are not read again.
+    cached = 30 - len(read)
+    assert cached <= 2
+    assert read == list(reversed(range(30 - cached)))

@@ -1,4 +1,4 @@
-"""Tests of the reader of pickles that runs nothing."""
+"""The reader of pickles that never executes code."""
 
 import collections
 import os
@@ -27,7 +27,7 @@ HELD = [
 
 
 class Runs:
-    """Whoever unpickles it in the usual way calls a function."""
+    """Calls a function when it is unpickled with pickle.load."""
 
     def __init__(self, function, *arguments):
         self.call = function, arguments
@@ -37,13 +37,13 @@ class Runs:
 
 
 def written(path, value, protocol=4):
-    """A pickle of a value."""
+    """Return a pickle of a value."""
     path.write_bytes(pickle.dumps(value, protocol))
     return path
 
 
 @pytest.mark.parametrize("protocol", range(2, 6))
-def test_arrays_and_containers_come_back(tmp_path, protocol):
+def test_arrays_and_containers_are_read(tmp_path, protocol):
     """In every protocol, with their shapes and types."""
     [found] = read_plain_pickle(written(tmp_path / "a.pkl", HELD, protocol))
     [expected] = HELD
@@ -56,8 +56,8 @@ def test_arrays_and_containers_come_back(tmp_path, protocol):
             assert found[key] == value
 
 
-def test_names_of_numpy_1_are_known(tmp_path):
-    """What numpy 1 wrote says numpy.core where numpy 2 says numpy._core."""
+def test_names_of_numpy_1_are_accepted(tmp_path):
+    """Numpy 1 writes numpy.core where numpy 2 writes numpy._core."""
     content = pickle.dumps(np.arange(3.0), 2).replace(b"numpy._core", b"numpy.core")
     assert b"numpy.core.multiarray" in content
     (tmp_path / "a.pkl").write_bytes(content)
@@ -65,20 +65,20 @@ def test_names_of_numpy_1_are_known(tmp_path):
 
 
 @pytest.mark.parametrize("protocol", range(5))
-def test_a_pickle_that_tries_to_run_code_is_refused_and_nothing_runs(tmp_path, protocol):
-    """The usual reader would make the folder; here the refused name is given, in one line."""
+def test_a_pickle_with_code_is_rejected_and_not_executed(tmp_path, protocol):
+    """pickle.load would create the folder; here the one-line error contains the rejected name."""
     path = written(tmp_path / "evil.pkl", [Runs(os.mkdir, str(tmp_path / "pwned"))], protocol)
     with pytest.raises(DataError) as caught:
         read_plain_pickle(path)
     assert not (tmp_path / "pwned").exists()
     assert f"evil.pkl: refused, the pickle names {os.mkdir.__module__}.mkdir;" in str(caught.value)
     assert "\n" not in str(caught.value)
-    pickle.loads(path.read_bytes())  # the proof that it was armed
+    pickle.loads(path.read_bytes())  # proves that the pickle was armed
     assert (tmp_path / "pwned").exists()
 
 
-def test_a_module_that_a_pickle_names_is_not_even_imported(tmp_path, monkeypatch):
-    """Import runs code too."""
+def test_a_module_in_a_pickle_is_not_imported(tmp_path, monkeypatch):
+    """Importing runs code too."""
     (tmp_path / "bad_module.py").write_text("import os\nos.mkdir('pwned')\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -100,8 +100,8 @@ def test_a_module_that_a_pickle_names_is_not_even_imported(tmp_path, monkeypatch
         b"\x80\x04\x8c\x05numpy\x8c\x11ndarray.__class__\x93.",
     ],
 )
-def test_other_names_are_refused(tmp_path, content):
-    """Those of numpy that do more than hold values too, and ways through an admitted one."""
+def test_other_names_are_rejected(tmp_path, content):
+    """Functions of numpy that do more than hold values, and attributes of accepted names."""
     (tmp_path / "a.pkl").write_bytes(content)
     with pytest.raises(DataError, match="refused, the pickle names"):
         read_plain_pickle(tmp_path / "a.pkl")
@@ -113,11 +113,11 @@ def test_other_names_are_refused(tmp_path, content):
         b"",
         b"no pickle",
         pickle.dumps(HELD)[:-40],
-        b"cnumpy\nndarray\n)R.",  # calls what may only be named
+        b"cnumpy\nndarray\n)R.",  # calls an object that may only be referenced
         b"\x80\x02U\x01aQ.",  # a persistent id
     ],
 )
-def test_a_damaged_pickle_is_one_line(tmp_path, content):
+def test_a_damaged_pickle_gives_a_one_line_error(tmp_path, content):
     """Never another exception."""
     (tmp_path / "a.pkl").write_bytes(content)
     with pytest.raises(DataError, match=r"a\.pkl: no pickle, or a damaged one") as caught:
@@ -125,7 +125,6 @@ def test_a_damaged_pickle_is_one_line(tmp_path, content):
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path):
-    """Before anything is read."""
+def test_a_missing_file_is_reported(tmp_path):
     with pytest.raises(DataError, match=r"b\.pkl: no such file"):
         read_plain_pickle(tmp_path / "b.pkl")

@@ -1,4 +1,4 @@
-"""Tests of the detector that answers from a file."""
+"""The detector that reads its predictions from a file."""
 
 import pickle
 
@@ -18,12 +18,12 @@ MOVED = f"000001,1,1,0.25,1.04,Car,0.8,3,{BOX}"
 
 
 def write(path, *rows, header=HEADER):
-    """A record with a header."""
+    """Write a record with a header."""
     path.write_text("".join(f"{row}\n" for row in (header, *rows)))
     return path
 
 
-def test_answers_what_was_recorded(tmp_path):
+def test_it_returns_what_was_recorded(tmp_path):
     """View 0 is the prediction, the others are augmented copies with their similarity."""
     detector = RecordedDetector(write(tmp_path / "a.csv", PLAIN, MOVED))
     found = detector.predict(empty_frame("000001"))
@@ -36,8 +36,8 @@ def test_answers_what_was_recorded(tmp_path):
     assert isinstance(detector, RecordedViews)
 
 
-def test_a_mark_in_front_of_a_spreadsheets_file_is_no_part_of_it(tmp_path):
-    """The first column keeps its name, and every row its place."""
+def test_a_byte_order_mark_is_ignored(tmp_path):
+    """The first column keeps its name."""
     path = write(tmp_path / "a.csv", PLAIN, MOVED)
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     detector = RecordedDetector(path)
@@ -45,8 +45,8 @@ def test_a_mark_in_front_of_a_spreadsheets_file_is_no_part_of_it(tmp_path):
     assert detector.views("000001")[0][1].scores.tolist() == [0.8]
 
 
-def test_low_scores_are_left_out_of_every_view(tmp_path):
-    """`minimum_score` includes its own value."""
+def test_low_scores_are_dropped_in_every_view(tmp_path):
+    """`minimum_score` itself is kept."""
     low = PLAIN.replace("0.9", "0.1")
     path = write(tmp_path / "a.csv", PLAIN, low, MOVED, MOVED.replace("0.8", "0.09"))
     detector = RecordedDetector(path, minimum_score=0.1)
@@ -55,8 +55,8 @@ def test_low_scores_are_left_out_of_every_view(tmp_path):
     assert len(RecordedDetector(path, minimum_score=0.95).predict(empty_frame("000001"))) == 0
 
 
-def test_a_box_that_comes_twice_fails_its_frame(tmp_path):
-    """A file that was appended to itself would double every label; boxes left out do not count."""
+def test_a_duplicate_box_fails_its_frame(tmp_path):
+    """A file appended to itself would double every label; dropped boxes do not count."""
     other = PLAIN.replace("000001", "000002")
     alike = [
         PLAIN.replace("Car", "Cyclist"),
@@ -74,8 +74,8 @@ def test_a_box_that_comes_twice_fails_its_frame(tmp_path):
         RecordedDetector(path).predict(empty_frame("000002"))
 
 
-def test_views_come_in_the_order_of_their_numbers(tmp_path):
-    """Rows of frames and views may be mixed; there may be several views."""
+def test_views_are_sorted_by_their_numbers(tmp_path):
+    """Rows of frames and views can be mixed; there can be several views."""
     second = MOVED.replace("000001,1", "000001,2").replace("0.25", "-0.5")
     other = PLAIN.replace("000001", "000002")
     beside = second.replace("12.0", "22.0")
@@ -87,7 +87,7 @@ def test_views_come_in_the_order_of_their_numbers(tmp_path):
     assert list(detector.views("000002")) == []
 
 
-def test_a_frame_with_other_views_only_has_no_detections(tmp_path):
+def test_a_frame_with_only_other_views_has_no_detections(tmp_path):
     """It was recorded, and the detector found nothing in it."""
     detector = RecordedDetector(write(tmp_path / "a.csv", MOVED))
     assert detector.predict(empty_frame("000001")).boxes.shape == (0, 7)
@@ -136,8 +136,8 @@ def test_other_columns_and_their_order_do_not_matter(tmp_path):
         (MOVED.replace("0.25", "0.26"), "differ from line 3, which is of the same frame and view"),
     ],
 )
-def test_a_bad_row_is_one_line_of_error_with_its_place(tmp_path, row, message):
-    """The error names file and line, and says what is wrong there."""
+def test_an_invalid_row_gives_one_line_with_its_position(tmp_path, row, message):
+    """The error contains file, line and reason."""
     path = write(tmp_path / "a.csv", PLAIN, MOVED, row)
     with pytest.raises(DataError) as caught:
         RecordedDetector(path)
@@ -146,7 +146,7 @@ def test_a_bad_row_is_one_line_of_error_with_its_place(tmp_path, row, message):
     assert "\n" not in str(caught.value)
 
 
-def test_missing_columns_and_files_are_named(tmp_path):
+def test_missing_columns_and_files_are_reported(tmp_path):
     """An empty file has no columns at all."""
     path = write(tmp_path / "a.csv", header=HEADER.replace("score,", "").replace(",yaw", ""))
     with pytest.raises(DataError, match=r"a\.csv:1: no column score, yaw in the header"):
@@ -161,8 +161,8 @@ def test_missing_columns_and_files_are_named(tmp_path):
         RecordedDetector(path)
 
 
-def test_workers_can_have_a_copy(tmp_path):
-    """It answers the same after a trip to another process."""
+def test_it_can_be_sent_to_workers(tmp_path):
+    """After pickling it returns the same."""
     detector = RecordedDetector(write(tmp_path / "a.csv", PLAIN, MOVED))
     copy = pickle.loads(pickle.dumps(detector))
     np.testing.assert_array_equal(
@@ -171,7 +171,7 @@ def test_workers_can_have_a_copy(tmp_path):
 
 
 def test_real_records(kitti_root):
-    """Both teachers answer for all 24 frames and one augmented copy of each."""
+    """Both teachers have detections for all 24 frames and one augmented copy of each."""
     for name in ("pointgnn_T0.csv", "pointgnn_T1.csv"):
         detector = RecordedDetector(kitti_root / "recorded" / name)
         assert len(detector.frame_ids()) == 24
@@ -179,8 +179,8 @@ def test_real_records(kitti_root):
         assert [len(view) for view in views] == [1] * 24
 
 
-def test_real_views_fit_the_frame_after_the_inverse(kitti_root):
-    """What a sure detector found in A(x) lies, mapped back by A^-1, on what it found in x."""
+def test_real_views_match_the_frame_after_the_inverse(kitti_root):
+    """Confident detections in A(x), transformed by A^-1, match those in x."""
     from curate.geometry.overlap import bev_iou
 
     detector = RecordedDetector(kitti_root / "recorded" / "pointgnn_T1.csv", minimum_score=0.9)

@@ -1,4 +1,4 @@
-"""The common questions about labels, and a workspace whose labels are weighed."""
+"""The common queries about labels, and a workspace with weighted labels."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ def solved(
     rounds: int = 3,
     frames: Sequence[int] | None = None,
 ) -> Workspace:
-    """The workspace with a policy's weights of some frames or all, as `curate solve` makes them."""
+    """Return the workspace with the weights of a policy for some or all frames."""
     if frames is None:
         frames = list(workspace.frames("unlabeled").values())
     context = RoundContext(1, rounds, 0, Teacher(workspace.root, ""))
