@@ -125,7 +125,7 @@ def test_a_detector_without_iou_cannot_be_filtered_by_it(
     """3DIoUMatch says so in one line."""
     code, _, err = curate("run", "--method", "3dioumatch", "--workspace", workspace.root)
     assert code == ConfigError.exit_code
-    assert "18 of 18 labels have no estimate of their IoU" in err
+    assert "18 of 18 labels have no IoU estimate" in err
 
 
 def test_a_dropped_label_is_not_exported(curate: Curate, workspace: Workspace) -> None:

@@ -413,7 +413,7 @@ def test_what_is_no_nuscenes_result_is_said(tmp_path):
         DataError, match="not nuScenes results; expected a JSON object with meta and results"
     ):
         RecordedDetector(tmp_path / "a.json", kind="nuscenes")
-    with pytest.raises(DataError, match="results is a .*, not an object of sample tokens"):
+    with pytest.raises(DataError, match=r"results is a \w+, not an object of sample tokens"):
         (tmp_path / "a.json").write_text('{"meta": {}, "results": []}')
         RecordedDetector(tmp_path / "a.json")
 
