@@ -127,7 +127,7 @@ class PointPrior(EvidenceSource):
     name: ClassVar[str] = "points"
     columns: ClassVar[tuple[Column, ...]] = (
         Column("points", "int32", "1", "m, LiDAR points in the box"),
-        Column("points_threshold", "float64", "1", "m_th, what labeled boxes of the category hold"),
+        Column("points_threshold", "float64", "1", "m_th, threshold learned from labeled boxes"),
         Column("rho_diff", "float64", "1", "point prior, Eq. 8: min(m, m_th) / m_th"),
     )
     rho_column: ClassVar[str | None] = "rho_diff"
