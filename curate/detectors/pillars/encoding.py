@@ -27,7 +27,7 @@ x = 20.0, y = -3.0, z = 0.75 above the ground, 3.9 x 1.6 x 1.5 m, yaw 0.5
 
 The eight cells around the centre cell learn the same box, with their own offset: cell (32, 45) has
 code 0 = -1.25. The weight v of the car is shared: 57 % for the centre cell, 17 % for its nearest
-neighbour (31, 44), less for the others.
+neighbour (30, 45), less for the others.
 """
 
 from dataclasses import dataclass
