@@ -1,4 +1,4 @@
-"""How far a detector agrees with itself on an augmented copy of a frame (Eqs. 2 and 5).
+"""Consistency of a detector's predictions with those on an augmented copy of a frame (Eqs. 2, 5).
 
 Source: An et al., Remote Sensing 15(3):627, 2023. The box residual is the encoding of SECOND and
 OpenPCDet, with the prediction as the anchor and the mapped-back reprediction as the target.
@@ -15,19 +15,20 @@ from curate.geometry.overlap import bev_iou
 from curate.shapes import Float, Int
 
 SCORE_FLOOR = 1e-6
-"""Scores are lifted to this before the logarithm, so that a score of 0 has a finite loss."""
+"""Lower scores are raised to this value before the logarithm: a score of 0 has a finite loss."""
 
 
 @dataclass(frozen=True)
 class ConsistencySettings:
-    """How a prediction is compared with its reprediction.
+    """Parameters of the comparison of a prediction with its reprediction.
 
     Attributes:
         score_weight: factor of -ln s'.
         box_weight: factor of the summed smooth L1 of the residual.
-        beta: where smooth L1 turns from a parabola into a line.
-        minimum_iou: pairs with a BEV IoU at or below this never match. Low on purpose: the loss
-            judges how well two boxes agree, the match only says that they mean the same object.
+        beta: absolute residual at which smooth L1 changes from a parabola to a line.
+        minimum_iou: pairs with a BEV IoU at or below this never match. The default is low on
+            purpose: a match only states that two boxes show the same object, the loss measures how
+            well they agree.
     """
 
     score_weight: float = 1.0
@@ -36,7 +37,7 @@ class ConsistencySettings:
     minimum_iou: float = 0.1
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for a setting without meaning."""
+        """Raise ConfigError if a setting is out of its range."""
         if self.score_weight < 0 or self.box_weight < 0:
             raise ConfigError("consistency: score_weight and box_weight must not be negative")
         if self.beta <= 0:
@@ -47,13 +48,13 @@ class ConsistencySettings:
 
 @dataclass(frozen=True)
 class Consistency:
-    """The agreement of n predictions with one view's repredictions; NaN where nothing matched.
+    """Consistency of n predictions with the repredictions of one view; NaN for unmatched ones.
 
     Attributes:
         matched: (n,) int64 index of the matched reprediction, -1 for none.
-        iou: (n,) BEV IoU with it.
-        score_loss: (n,) -ln s', with s' the reprediction's score; without its weight.
-        box_loss: (n,) sum of smooth L1 over the seven residuals; without its weight.
+        iou: (n,) BEV IoU with the matched reprediction.
+        score_loss: (n,) -ln s', where s' is the score of the reprediction; not yet weighted.
+        box_loss: (n,) sum of smooth L1 over the seven residuals; not yet weighted.
         loss: (n,) score_weight * score_loss + box_weight * box_loss.
     """
 
@@ -66,11 +67,11 @@ class Consistency:
 
 @dataclass(frozen=True)
 class MeanConsistency:
-    """The agreement of n predictions with several views.
+    """Consistency of n predictions with the repredictions of several views.
 
     Attributes:
-        loss: (n,) mean loss over the views that matched, NaN where none did.
-        views_matched: (n,) int64 number of those views.
+        loss: (n,) mean loss over the views that matched, NaN if none matched.
+        views_matched: (n,) int64 number of views that matched.
     """
 
     loss: Float[np.ndarray, " n"]
@@ -85,7 +86,7 @@ def consistency(
     repredictions: Detections,
     settings: ConsistencySettings = _DEFAULT,
 ) -> Consistency:
-    """Match one view's repredictions to the predictions and measure the disagreement.
+    """Match the repredictions of one view to the predictions and return the consistency losses.
 
     Args:
         predictions: n detections of the frame, in the LiDAR frame.
@@ -93,26 +94,30 @@ def consistency(
         settings: see `ConsistencySettings`.
 
     Raises:
-        ModelError: if a matched box is not finite or has no size, so that it has no residual.
+        ModelError: if a matched box is not finite or has a side that is not positive.
     """
     matched, iou = match(predictions, repredictions, settings.minimum_iou)
-    found = matched >= 0
-    targets = repredictions.select(matched[found])
-    residuals = residual(predictions.boxes[found], targets.boxes)
+    has_match = matched >= 0
+    targets = repredictions.select(matched[has_match])
+    residuals = residual(predictions.boxes[has_match], targets.boxes)
     if not np.isfinite(residuals).all():
         raise ModelError(
-            "the detector answered a box that is not finite or has no size; "
+            "the detector returned a box that is not finite or has no size; "
             "drop such boxes in the detector",
         )
     score_loss, box_loss = np.full((2, len(predictions)), np.nan)
-    score_loss[found] = -np.log(np.clip(targets.scores, SCORE_FLOOR, 1.0))
-    box_loss[found] = smooth_l1(residuals, settings.beta).sum(axis=1)
+    score_loss[has_match] = -np.log(np.clip(targets.scores, SCORE_FLOOR, 1.0))
+    box_loss[has_match] = smooth_l1(residuals, settings.beta).sum(axis=1)
     loss = settings.score_weight * score_loss + settings.box_weight * box_loss
     return Consistency(matched, iou, score_loss, box_loss, loss)
 
 
 def mean_over_views(views: Sequence[Consistency]) -> MeanConsistency:
-    """L of each prediction over one or more views of its frame."""
+    """Return the mean loss L of each prediction over the views of its frame.
+
+    Args:
+        views: one or more views, each with the same n predictions.
+    """
     losses = np.stack([view.loss for view in views])
     views_matched = np.isfinite(losses).sum(axis=0)
     total = np.nansum(losses, axis=0)
@@ -123,9 +128,25 @@ def mean_over_views(views: Sequence[Consistency]) -> MeanConsistency:
 def match(
     predictions: Detections, repredictions: Detections, minimum_iou: float
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """One-to-one pairs within each category that maximise the total BEV IoU.
+    """Return the one-to-one matches within each category that maximise the total BEV IoU.
 
-    Of several best assignments the choice depends on the detections alone, not on their order.
+    Example with two predicted cars A, B, two repredicted cars a, b and `minimum_iou` 0.1:
+
+        BEV IoU      a     b        gain         a     b
+              A   0.60  0.50           A      0.60  0.50
+              B   0.55  0.05           B      0.55  0.00   (0.05 is not above minimum_iou)
+
+    Greedy matching would pair A with a (0.60) and leave B unmatched. The optimal assignment pairs
+    A with b and B with a, total 1.05: the result is matched = [1, 0], iou = [0.50, 0.55]. A pair
+    that the assignment contains only to be complete has gain 0 and is discarded.
+
+    If several assignments have the same total, the choice depends on the detections, not on their
+    order.
+
+    Args:
+        predictions: n detections.
+        repredictions: detections in the same frame of reference.
+        minimum_iou: pairs with a BEV IoU at or below this never match.
 
     Returns:
         (n,) int64 index of the matched reprediction or -1, and (n,) its BEV IoU or NaN.
@@ -138,11 +159,11 @@ def match(
         rows = _canonical_order(predictions, category)
         columns = _canonical_order(repredictions, category)
         overlaps = bev_iou(predictions.boxes[rows], repredictions.boxes[columns])
-        # Pairs that may not match gain nothing, so the optimum of the rest is not disturbed.
+        # Pairs that must not match have gain 0, so they do not change the optimum of the others.
         gain = np.where(overlaps > minimum_iou, overlaps, 0.0)
         row, column = linear_sum_assignment(gain, maximize=True)
-        real = gain[row, column] > 0
-        row, column = row[real], column[real]
+        valid = gain[row, column] > 0
+        row, column = row[valid], column[valid]
         matched[rows[row]] = columns[column]
         iou[rows[row]] = overlaps[row, column]
     return matched, iou
@@ -151,35 +172,36 @@ def match(
 def residual(
     anchors: Float[np.ndarray, "n 7"], targets: Float[np.ndarray, "n 7"]
 ) -> Float[np.ndarray, "n 7"]:
-    """(n, 7) dx/d, dy/d, dz/h, ln l'/l, ln w'/w, ln h'/h, sin(yaw' - yaw); d, h of the anchor.
+    """Return the SECOND/OpenPCDet residual of each target box from its anchor box.
 
     Args:
-        anchors: (n, 7) boxes.
-        targets: (n, 7) boxes.
+        anchors: (n, 7) boxes x, y, z, l, w, h, yaw.
+        targets: (n, 7) boxes x', y', z', l', w', h', yaw' in the same frame of reference.
 
     Returns:
-        The residual; not finite where a length is not positive.
+        (n, 7) dx/d, dy/d, dz/h, ln l'/l, ln w'/w, ln h'/h, sin(yaw' - yaw), where
+        d = sqrt(l^2 + w^2) is the diagonal of the anchor; not finite if a side is not positive.
     """
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
-    reach = np.stack([diagonal, diagonal, anchors[:, 5]], axis=1)
+    scale = np.stack([diagonal, diagonal, anchors[:, 5]], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        offset = (targets[:, :3] - anchors[:, :3]) / reach
-        stretch = np.log(targets[:, 3:6] / anchors[:, 3:6])
-        turn = np.sin(targets[:, 6:] - anchors[:, 6:])
-    return np.concatenate([offset, stretch, turn], axis=1)
+        offset = (targets[:, :3] - anchors[:, :3]) / scale
+        size_ratio = np.log(targets[:, 3:6] / anchors[:, 3:6])
+        yaw_difference = np.sin(targets[:, 6:] - anchors[:, 6:])
+    return np.concatenate([offset, size_ratio, yaw_difference], axis=1)
 
 
 def smooth_l1(
     difference: Float[np.ndarray, " *shape"], beta: float
 ) -> Float[np.ndarray, " *shape"]:
-    """0.5 x^2 / beta where |x| < beta, |x| - 0.5 beta elsewhere."""
-    size = np.abs(difference)
-    loss: np.ndarray = np.where(size < beta, 0.5 * size**2 / beta, size - 0.5 * beta)
+    """Return 0.5 x^2 / beta for |x| < beta, otherwise |x| - 0.5 beta."""
+    absolute = np.abs(difference)
+    loss: np.ndarray = np.where(absolute < beta, 0.5 * absolute**2 / beta, absolute - 0.5 * beta)
     return loss
 
 
 def _canonical_order(detections: Detections, category: str) -> np.ndarray:
-    """Indices of a category's detections by falling score, then by box: ties get an order."""
+    """Return the indices of a category's detections by descending score; ties sorted by box."""
     index = np.flatnonzero(detections.categories == category)
     keys = np.column_stack([-detections.scores[index], detections.boxes[index]])
     return index[np.lexsort(keys.T[::-1])]

@@ -46,7 +46,7 @@ class Declaration:
         name: of the source.
         source: as the configuration names it.
         columns: beside the key of the label.
-        rho_column: see `curate.priors.base.Declared`.
+        rho_column: see `curate.priors.base.EvidenceDeclaration`.
     """
 
     name: str

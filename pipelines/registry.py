@@ -180,7 +180,7 @@ SEGMENTERS = Registry(
 )
 PRIORS = Registry(
     "prior",
-    "curate.priors.base:Declared",
+    "curate.priors.base:EvidenceDeclaration",
     {
         "points": "curate.priors.points:PointPrior",
         "semantic": "curate.priors.semantic:SemanticPrior",

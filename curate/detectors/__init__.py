@@ -1,1 +1,1 @@
-"""3D detectors, one file each."""
+"""3D detectors, one file or folder each."""

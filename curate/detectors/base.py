@@ -1,4 +1,4 @@
-"""What every detector offers, and what one offers that curate can train."""
+"""Interfaces of detectors, and of detectors that curate can train."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,39 +22,39 @@ if TYPE_CHECKING:
 
 
 class Detector(Protocol):
-    """Finds boxes in a frame; raises `ModelError` where the model cannot be used as it is."""
+    """Finds boxes in a frame; raises `ModelError` if the model cannot be used."""
 
     def predict(self, frame: Frame) -> Detections:
-        """Return all boxes of the frame, low scores too, after non-maximum suppression.
+        """Return all boxes of the frame, including low scores, after non-maximum suppression.
 
-        Boxes are in the frame of reference of `frame.points`, which the caller may have cropped
-        to the camera's view or transformed by a similarity.
+        Boxes are in the frame of reference of `frame.points`. The caller may have cropped these
+        points to the camera's view or transformed them by a similarity.
         """
         ...
 
 
 @runtime_checkable
 class RecordedViews(Protocol):
-    """A detector whose answers for augmented copies were recorded: it dictates the augmentation."""
+    """A detector with stored predictions for augmented copies; the record defines each A."""
 
     def views(self, frame_id: str) -> Sequence[tuple[Similarity, Detections]]:
-        """Each augmented copy A(x) of the frame with the detections in A's frame of reference."""
+        """Return A and the detections of each augmented copy A(x), in A's frame of reference."""
         ...
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One frame to learn from.
+    """One training frame with its weighted labels.
 
     Attributes:
-        frame_id: name of the frame.
-        labeled: whether the boxes are ground truth (X_l) or pseudo-labels (X_u).
+        frame_id: id of the frame.
+        labeled: true if the boxes are ground truth (X_l), false if they are pseudo-labels (X_u).
         points: (n, 4) float32 inside the camera's view, LiDAR frame.
         boxes: (m, 7) in the LiDAR frame.
         categories: (m,) str.
-        weights: (m,) in [0, 1]: 1 for ground truth.
-        zero_weight: what a pseudo-label of weight 0 is: "background", so no object, or a region to
-            "ignore". The label file says it, as the policy has it.
+        weights: (m,) v in [0, 1]; 1 for ground truth.
+        zero_weight: meaning of a pseudo-label of weight 0: "background" (not an object) or a region
+            to "ignore". It comes from the policy, through the label file.
     """
 
     frame_id: str
@@ -67,28 +67,28 @@ class Sample:
 
     @property
     def ignored(self) -> Bool[np.ndarray, " m"]:
-        """(m,) bool, which boxes are ignore regions: neither object nor background."""
-        nothing = self.weights == 0
-        return nothing if self.labeled or self.zero_weight == "ignore" else np.zeros_like(nothing)
+        """(m,) bool, true for boxes that are ignore regions: neither object nor background."""
+        zero = self.weights == 0
+        return zero if self.labeled or self.zero_weight == "ignore" else np.zeros_like(zero)
 
     @cached_property
     def ground(self) -> GroundMap:
-        """The height of the ground; a training asks for it in every pass."""
+        """Height map of the ground; cached because training reads it in every pass."""
         return GroundMap.of(self.points)
 
 
 class Student(Protocol):
     """A detector in training: its network, batch encoding, targets and loss.
 
-    All that training changes lies in the parameters and buffers of `network`: the trainer optimises
-    and averages them and stores them in snapshots. What is random in the network or the loss
-    (dropout, sampled proposals) draws from torch's global generators, which the trainer seeds in
+    Everything that training changes is in the parameters and buffers of `network`. The trainer
+    optimises and averages them and stores them in snapshots. Randomness in the network or the loss
+    (dropout, sampled proposals) comes from torch's global generators, which the trainer seeds in
     every step.
 
     Attributes:
         preset: name of the preset that the network was built from.
-        categories: what it finds, in the order of its outputs.
-        network: on CPU at first; the trainer moves it to the device of the training.
+        categories: categories that it detects, in the order of its outputs.
+        network: on CPU at first; the trainer moves it to the training device.
     """
 
     preset: str
@@ -96,11 +96,11 @@ class Student(Protocol):
     network: "nn.Module"
 
     def encode(self, samples: Sequence[Sample], device: str) -> Any:
-        """Return a batch of augmented samples with its targets, as `loss` takes it.
+        """Return a batch of augmented samples with its targets, as the input of `loss`.
 
-        A box of weight 0 is an ignore region, neither object nor background: what shall be
-        background has been removed from the sample. Every other weight v multiplies all loss terms
-        of its object: classification, box, direction, second stage.
+        A box of weight 0 is an ignore region here, neither object nor background: labels that
+        count as background have already been removed from the sample. Every other weight v
+        multiplies all loss terms of its object: classification, box, direction, second stage.
         """
         ...
 
@@ -109,17 +109,17 @@ class Student(Protocol):
 
         Args:
             batch: from `encode`.
-            expected_objects: objects that the labeled frames of a batch hold on average. The loss
-                is normalised by this or by counts (of objects, anchors, proposals), never by sums
-                of weights, which would cancel them.
+            expected_objects: average number of objects in the labeled frames of a batch. Normalise
+                the loss by this number or by counts (of objects, anchors, proposals), never by sums
+                of weights: these would cancel the weights.
         """
         ...
 
     def save(self, path: Path, weights: "Mapping[str, Tensor]") -> None:
-        """Write a checkpoint, and what inference needs beside it; each file whole or not at all.
+        """Write a checkpoint and the files that inference needs, each one atomically.
 
         Args:
-            path: with the detector's `checkpoint_suffix`; the detector's constructor takes it.
+            path: has the detector's `checkpoint_suffix`; the detector's constructor accepts it.
             weights: the state of `network`, or a moving average of it.
         """
         ...
@@ -128,12 +128,13 @@ class Student(Protocol):
 class TrainableDetector(Detector, Protocol):
     """A detector that curate can train; its constructor takes a checkpoint as first argument.
 
-    A class is trainable if it has all of these members; importing it need not import torch.
+    A class is trainable if it has all of these members. Importing it need not import torch.
 
     Attributes:
         presets: names of the networks that can be trained; the first is the default.
-        checkpoint_suffix: of its checkpoint files, such as ".safetensors".
-        checkpoint_version: of their format; checkpoints of another version are trained again.
+        checkpoint_suffix: suffix of its checkpoint files, such as ".safetensors".
+        checkpoint_version: version of their format; checkpoints of another version are trained
+            again.
     """
 
     presets: ClassVar[Collection[str]]
@@ -145,13 +146,13 @@ class TrainableDetector(Detector, Protocol):
         """Check that a file is a checkpoint of this detector and of this format version.
 
         Raises:
-            ModelError: if it is missing, damaged, of another detector or of another version.
+            ModelError: if the file is missing, damaged, or of another detector or version.
         """
         ...
 
     @classmethod
     def new_student(cls, preset: str, categories: tuple[str, ...]) -> Student:
-        """Return a student with first weights drawn from torch's global generator."""
+        """Return a student with initial weights drawn from torch's global generator."""
         ...
 
     @classmethod
@@ -159,20 +160,20 @@ class TrainableDetector(Detector, Protocol):
         """Return a student that continues from a checkpoint.
 
         Raises:
-            ModelError: as `check_checkpoint`.
+            ModelError: as in `check_checkpoint`.
         """
         ...
 
 
 def choose_preset(detector: type[TrainableDetector], name: str | None) -> str:
-    """Return the name of one of the detector's presets; None stands for the first.
+    """Return the name of one of the detector's presets; None selects the first.
 
     Raises:
-        ConfigError: if the detector has no such preset; the known ones are listed.
+        ConfigError: if the detector has no such preset; the message lists all of them.
     """
     chosen = next(iter(detector.presets), "") if name is None else name
     if chosen not in detector.presets:
-        known = ", ".join(detector.presets)
-        meant = did_you_mean(chosen, detector.presets)
-        raise ConfigError(f"unknown preset {chosen!r}; choose one of {known}{meant}")
+        choices = ", ".join(detector.presets)
+        hint = did_you_mean(chosen, detector.presets)
+        raise ConfigError(f"unknown preset {chosen!r}; choose one of {choices}{hint}")
     return chosen

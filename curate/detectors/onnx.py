@@ -1,9 +1,9 @@
-"""Any 3D detector that was exported to ONNX, by a small declared mapping of inputs and outputs.
+"""Detector that runs any 3D detector exported to ONNX, with configured inputs and outputs.
 
 The model takes the points of a sweep, [n, 3 or 4] or [1, n, 3 or 4] float32 (x, y, z,
-intensity), and answers boxes [n, >=7] or [1, n, >=7] with either scores and labels [n], or scores
-per class [n, classes]. Voxels before and anchors after it, where the export left them out, are the
-business of two functions that the user names as `package.module:function`.
+intensity). It returns boxes [n, >=7] or [1, n, >=7] with either scores and labels [n], or scores
+per class [n, classes]. If the export leaves out voxelisation or the decoding of anchors, the user
+provides them as two functions, each configured as `package.module:function`.
 """
 
 import importlib
@@ -30,23 +30,26 @@ class OnnxDetector:
     Args:
         model: the .onnx file.
         classes: the categories in the order of the model's labels or score columns.
+        categories: the categories of the project; used if `classes` is not given.
         minimum_score: boxes with a lower score are left out.
-        points: name of the input that takes the points; needless where there is one input.
-        outputs: names of the outputs `boxes`, `scores` and, where scores are not per class,
-            `labels`; needless where the model names them so.
-        convention: what the numbers of a box mean, see `BoxConvention`.
-        intensity_scale: factor from [0, 1] to the intensity that the model knows, e.g. 255.
+        points: name of the input that takes the points; not needed if there is one input.
+        outputs: names of the outputs for `boxes`, `scores` and, unless scores are per class,
+            `labels`; not needed for outputs with these names.
+        convention: meaning of the numbers of a box, see `BoxConvention`.
+        intensity_scale: factor from [0, 1] to the intensity range of the model, e.g. 255.
         first_label: the number of the first class.
         sigmoid: whether scores are logits.
-        nms_iou: BEV IoU above which the better box of a category suppresses the other; None where
-            the model does it.
+        nms_iou: BEV IoU above which the higher-scored box of a category suppresses the other; None
+            if the model suppresses boxes itself.
         preprocess: `package.module:function` from (n, 4) points to the model's inputs by name.
-        postprocess: likewise from the outputs by name to `boxes`, `scores` and `labels` by name.
-        threads: of ONNX Runtime.
+        postprocess: `package.module:function` from the outputs by name to `boxes`, `scores` and
+            `labels` by name.
+        threads: number of threads of ONNX Runtime.
 
     Raises:
-        ModelError: the file is missing or no ONNX model, or its inputs or outputs do not fit.
-        ConfigError: an option is wrong, or a function cannot be imported.
+        ModelError: if the file is missing or not an ONNX model, or its inputs or outputs do not
+            fit.
+        ConfigError: if an option is invalid, or a function cannot be imported.
     """
 
     def __init__(
@@ -75,8 +78,8 @@ class OnnxDetector:
         self.first_label = first_label
         self.sigmoid = sigmoid
         self.nms_iou = nms_iou
-        self._preprocess = _function(preprocess) if preprocess else None
-        self._postprocess = _function(postprocess) if postprocess else None
+        self._preprocess = _import_function(preprocess) if preprocess else None
+        self._postprocess = _import_function(postprocess) if postprocess else None
         self._session = open_session(self.model, threads, "detector")
         if not self._preprocess:
             self._input, self._shape = self._find_input(points)
@@ -86,41 +89,41 @@ class OnnxDetector:
         """See `curate.detectors.base.Detector`; a sweep without points has no boxes.
 
         Raises:
-            ModelError: if the model fails, or answers what was not declared.
+            ModelError: if the model fails, or its outputs do not have the configured form.
         """
         if len(frame.points) == 0:
             return Detections.empty()
-        answers = self._run(self._inputs(frame.points))
+        outputs = self._run(self._inputs(frame.points))
         if self._postprocess:
-            named = _called(self._postprocess, answers, self.model)
+            named = _call(self._postprocess, outputs, self.model)
         else:
-            named = {key: answers[name] for key, name in self._names.items()}
+            named = {key: outputs[name] for key, name in self._names.items()}
         found = self._detections(named)
         found = found.select(np.flatnonzero(found.scores >= self.minimum_score))
         if self.nms_iou is not None:
-            found = _suppressed(found, self.nms_iou)
+            found = _suppress(found, self.nms_iou)
         return found.select(np.argsort(-found.scores, kind="stable"))
 
     def _inputs(self, points: np.ndarray) -> Mapping[str, np.ndarray]:
-        """What the model is fed."""
+        """Return the model's inputs by name."""
         scaled = points.astype(np.float32)  # a copy
         scaled[:, 3] *= self.intensity_scale
         if self._preprocess:
-            return _called(self._preprocess, scaled, self.model)
+            return _call(self._preprocess, scaled, self.model)
         columns = self._shape[-1] if isinstance(self._shape[-1], int) else 4
         rows = np.ascontiguousarray(scaled[:, :columns])
         return {self._input: rows[None] if len(self._shape) == 3 else rows}
 
     def _run(self, inputs: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Return the model's outputs by name."""
-        names = [one.name for one in self._session.get_outputs()]
+        names = [output.name for output in self._session.get_outputs()]
         try:
             return dict(zip(names, self._session.run(None, dict(inputs)), strict=True))
         except runtime_errors() as error:
             raise ModelError(f"{self.model}: {first_line(error)}") from error
 
     def _detections(self, named: Mapping[str, np.ndarray]) -> Detections:
-        """Return the answer as detections; ModelError where its shapes do not fit."""
+        """Return the outputs as detections; raise ModelError if their shapes do not fit."""
         boxes, scores = (_without_batch(np.asarray(named[key]), key) for key in ("boxes", "scores"))
         labels = named.get("labels")
         if scores.ndim == 2 and scores.shape[1] == 1 and labels is not None:
@@ -129,19 +132,19 @@ class OnnxDetector:
             labels, scores = scores.argmax(axis=1) + self.first_label, scores.max(axis=1)
         labels = np.zeros(0, np.int64) if labels is None else np.asarray(labels).reshape(-1)
         shapes = {"boxes": boxes.shape, "scores": scores.shape, "labels": labels.shape}
-        strange = [each.dtype for each in (boxes, scores, labels) if not is_numeric_array(each)]
-        if strange:
-            raise ModelError(f"{self.model}: answers {strange[0]} where numbers were expected")
+        other_types = [each.dtype for each in (boxes, scores, labels) if not is_numeric_array(each)]
+        if other_types:
+            raise ModelError(f"{self.model}: an output is {other_types[0]}, expected numbers")
         if (
             boxes.ndim != 2
             or boxes.shape[1] < 7
             or scores.shape != boxes.shape[:1]
             or labels.shape != scores.shape
         ):
-            told = ", ".join(f"{key} {list(shape)}" for key, shape in shapes.items())
+            described = ", ".join(f"{key} {list(shape)}" for key, shape in shapes.items())
             raise ModelError(
-                f"{self.model}: answers {told}; expected boxes [n, 7 or more] with scores [n] and "
-                "labels [n], or scores [n, classes]"
+                f"{self.model}: the outputs are {described}; expected boxes [n, 7 or more] with "
+                "scores [n] and labels [n], or scores [n, classes]"
             )
         scores = scores.astype(np.float64)
         if self.sigmoid:
@@ -152,13 +155,13 @@ class OnnxDetector:
         return Detections(boxes, scores, as_categories([self.classes[i] for i in index.tolist()]))
 
     def _check_values(self, scores: np.ndarray, labels: np.ndarray) -> None:
-        """ModelError for scores and labels that no declared class can have."""
+        """Raise ModelError if a score is not in [0, 1] or a label is not a configured class."""
         if len(scores) == 0:
             return
         if not (scores.min() >= 0 and scores.max() <= 1):
             raise ModelError(
                 f"{self.model}: scores from {scores.min():.3g} to {scores.max():.3g} are not in "
-                "[0, 1]; set detector.options.sigmoid = true where they are logits"
+                "[0, 1]; set detector.options.sigmoid = true if they are logits"
             )
         last = self.first_label + len(self.classes) - 1
         within = labels.min() >= self.first_label and labels.max() <= last
@@ -169,44 +172,48 @@ class OnnxDetector:
                 "first_label in detector.options"
             )
 
-    def _find_input(self, wanted: str | None) -> tuple[str, Sequence[int | str | None]]:
-        """Name and shape of the input that takes the points."""
+    def _find_input(self, name: str | None) -> tuple[str, Sequence[int | str | None]]:
+        """Return name and shape of the input that takes the points."""
         inputs = self._session.get_inputs()
-        told = ", ".join(f"{one.name} {one.type}{one.shape}" for one in inputs)
-        one = next((one for one in inputs if wanted in {None, one.name}), None)
-        if one is None:
-            raise ModelError(f"{self.model}: takes {told}; no input is named {wanted}")
-        shape = one.shape
+        described = ", ".join(f"{each.name} {each.type}{each.shape}" for each in inputs)
+        chosen = next((each for each in inputs if name in {None, each.name}), None)
+        if chosen is None:
+            raise ModelError(
+                f"{self.model}: the inputs are {described}; there is no input {name}; "
+                "set detector.options.points"
+            )
+        shape = chosen.shape
         fits = len(shape) in {2, 3} and (
             len(shape) == 2 or shape[0] in {1, None} or _free(shape[0])
         )
         if (
             len(inputs) != 1
             or not fits
-            or one.type != "tensor(float)"
+            or chosen.type != "tensor(float)"
             or not _free(shape[-2])
             or not (_free(shape[-1]) or shape[-1] in {3, 4})
         ):
             raise ModelError(
-                f"{self.model}: takes {told}; expected one tensor(float)[n, 4] of points with a "
-                "free n: name what makes the inputs in detector.options.preprocess"
+                f"{self.model}: the inputs are {described}; expected one tensor(float)[n, 4] of "
+                "points with a free n; set detector.options.preprocess to a function that makes "
+                "the inputs"
             )
-        return one.name, shape
+        return chosen.name, shape
 
     def _find_outputs(self, mapping: Mapping[str, str]) -> Mapping[str, str]:
-        """Return the names of boxes, scores and, where there are any, labels."""
+        """Return the output names of boxes, scores and, if the model has them, labels."""
         unknown = sorted(set(mapping) - set(_KEYS))
         if unknown:
             raise ConfigError(f"detector.options.outputs: {unknown[0]}: use {', '.join(_KEYS)}")
-        offered = {one.name for one in self._session.get_outputs()}
+        available = {output.name for output in self._session.get_outputs()}
         names = {key: mapping.get(key, key) for key in _KEYS}
-        if "labels" not in mapping and "labels" not in offered:
+        if "labels" not in mapping and "labels" not in available:
             del names["labels"]
-        missing = [name for name in names.values() if name not in offered]
+        missing = [name for name in names.values() if name not in available]
         if missing:
             raise ModelError(
-                f"{self.model}: answers {', '.join(sorted(offered))}; no output is named "
-                f"{missing[0]}: name boxes, scores and labels in detector.options.outputs"
+                f"{self.model}: the outputs are {', '.join(sorted(available))}; there is no output "
+                f"{missing[0]}; map boxes, scores and labels in detector.options.outputs"
             )
         return names
 
@@ -216,10 +223,10 @@ def _free(size: int | str | None) -> bool:
     return not isinstance(size, int)
 
 
-def _without_batch(answer: np.ndarray, key: str) -> np.ndarray:
-    """Return an output without its leading batch of one."""
-    batched = answer.ndim == 3 or (key == "scores" and answer.ndim == 2 and answer.shape[0] == 1)
-    return answer[0] if batched and answer.shape[0] == 1 else answer
+def _without_batch(output: np.ndarray, key: str) -> np.ndarray:
+    """Return an output without its leading batch axis of size one."""
+    batched = output.ndim == 3 or (key == "scores" and output.ndim == 2 and output.shape[0] == 1)
+    return output[0] if batched and output.shape[0] == 1 else output
 
 
 def _convention(options: Mapping[str, Any]) -> BoxConvention:
@@ -229,28 +236,30 @@ def _convention(options: Mapping[str, Any]) -> BoxConvention:
         raise ConfigError(f"detector.options.convention: {error}") from None
 
 
-def _function(name: str) -> Callable[[Any], Any]:
-    """Return the function that `package.module:function` names."""
+def _import_function(name: str) -> Callable[[Any], Any]:
+    """Return the function at `package.module:function`."""
     module_name, _, function_name = name.partition(":")
     try:
         found = getattr(importlib.import_module(module_name), function_name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"detector.options: '{name}' cannot be imported: {error}") from error
     if not callable(found):
-        raise ConfigError(f"detector.options: '{name}' is no function")
+        raise ConfigError(f"detector.options: '{name}' is not a function")
     return found  # type: ignore[no-any-return]
 
 
-def _called(function: Callable[[Any], Any], given: Any, model: Path) -> Mapping[str, np.ndarray]:
-    """What the user's function makes; ModelError where it is no mapping."""
-    made = function(given)
-    if not isinstance(made, Mapping):
-        raise ModelError(f"{model}: {function.__name__} answers no dict but {type(made).__name__}")
-    return made
+def _call(function: Callable[[Any], Any], argument: Any, model: Path) -> Mapping[str, np.ndarray]:
+    """Return the result of the user's function; raise ModelError if it is not a mapping."""
+    result = function(argument)
+    if not isinstance(result, Mapping):
+        raise ModelError(
+            f"{model}: {function.__name__} returned {type(result).__name__}, expected a dict"
+        )
+    return result
 
 
-def _suppressed(found: Detections, nms_iou: float) -> Detections:
-    """Return the detections that no better one of their category suppresses."""
+def _suppress(found: Detections, nms_iou: float) -> Detections:
+    """Return the detections that remain after non-maximum suppression per category."""
     kept = [np.zeros(0, dtype=np.int64)]
     for category in np.unique(found.categories):
         index = np.flatnonzero(found.categories == category)

@@ -1,1 +1,1 @@
-"""Boxes, their overlap, projection into the image, and the similarity transform."""
+"""Geometry of boxes and points: overlap, projection into the image, similarity transforms."""

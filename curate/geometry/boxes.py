@@ -1,4 +1,4 @@
-"""Corners of boxes: the eight of the cuboid, and the four of its footprint in bird's eye view."""
+"""Corners of boxes: eight of the cuboid, and four of its footprint in bird's eye view (BEV)."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ _FOOTPRINT_SIGNS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
 
 
 def as_boxes(boxes: Num[np.ndarray, " ..."]) -> Float[np.ndarray, "n 7"]:
-    """(n, 7) boxes as C-contiguous float64, the one layout that the kernels are compiled for.
+    """Return (n, 7) boxes as C-contiguous float64, the only layout the kernels are compiled for.
 
     Raises:
         ValueError: if the array is not (n, 7).
@@ -39,7 +39,7 @@ def box_corners(boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 8 3"]:
     """Return the eight corners of each box, in the frame of the boxes.
 
     Returns:
-        (n, 8, 3) in metres: the footprint of `bev_corners` at the bottom, then the same at the top.
+        (n, 8, 3) in metres: the corners of `bev_corners` at the bottom, then those at the top.
     """
     boxes = as_boxes(boxes)
     footprint = np.tile(bev_corners(boxes), (1, 2, 1))

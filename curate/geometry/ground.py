@@ -1,4 +1,4 @@
-"""The height of the ground in a sweep, to a few centimetres: what objects stand on."""
+"""Height of the ground in a sweep, accurate to a few centimetres."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -7,19 +7,20 @@ import numpy as np
 
 from curate.shapes import Float
 
+# Side of a square of the map.
 _SQUARE_METRES = 3.0
-# Points farther from the sensor tell nothing of the ground, and would make the map large.
+# Points farther away along x or y are not used: they are not ground, and would enlarge the map.
 _REACH_METRES = 150.0
 
 
 @dataclass(frozen=True)
 class GroundMap:
-    """The ground around every square.
+    """Map of the ground height on a grid of squares.
 
     Attributes:
-        low: (2,) x and y in metres of the map's corner.
-        heights: (columns, rows) z in metres of the ground around a square, NaN where no point
-            tells.
+        low: (2,) lowest x and y of the map, in metres.
+        heights: (columns, rows) z of the ground in each square, in metres; NaN if there is no point
+            in the square or its neighbours.
     """
 
     low: Float[np.ndarray, " 2"]
@@ -27,11 +28,12 @@ class GroundMap:
 
     @classmethod
     def of(cls, points: Float[np.ndarray, "n _"]) -> Self:
-        """Return the map of (n, >=3) points.
+        """Return the ground map of (n, >=3) points.
 
-        A square has the second lowest of its own and its eight neighbours' lowest points, or the
-        lowest where there is but one: walls and cars that cover the others do not raise it, nor
-        does one stray point lower it.
+        The height of a square is the second lowest of nine numbers: the lowest z in the square and
+        in each of its eight neighbours. If only one of them has points, it is their lowest z. Walls
+        and cars that cover the other squares therefore do not raise the height, and a single
+        outlier does not lower it.
         """
         near = points[(np.abs(points[:, :2]) <= _REACH_METRES).all(axis=1), :3]
         if len(near) == 0:
@@ -48,29 +50,29 @@ class GroundMap:
         return cls(low, np.where(np.isinf(heights), np.nan, heights))
 
     def at(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """Return (n,) height of the ground at (n, 2) places, NaN where no point tells."""
+        """Return (n,) height of the ground at (n, 2) places x, y; NaN if it is not known there."""
         reach = 2 * _REACH_METRES
-        off = np.clip(places, -reach, reach) - self.low
-        square = np.floor(off / _SQUARE_METRES).astype(np.int64)
+        offset = np.clip(places, -reach, reach) - self.low
+        square = np.floor(offset / _SQUARE_METRES).astype(np.int64)
         on_map = ((square >= 0) & (square < self.heights.shape)).all(axis=1)
         column, row = np.where(on_map[:, None], square, 0).T
         return np.where(on_map, self.heights[column, row], np.nan)
 
     def lowered(self, rows: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-        """Return a copy of (n, >=3) points or boxes whose z is measured from the ground below them.
+        """Return a copy of (n, >=3) points or boxes with z measured from the ground below them.
 
-        Where no point tells how high it is, the ground has the median height of the rest.
+        If the height of the ground is not known at a place, the median height of the map is used.
         """
-        return self._shifted(rows, -1)
+        return self._shift(rows, -1)
 
     def raised(self, rows: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-        """Return the inverse of `lowered`: a copy whose z is again that of the sensor's frame."""
-        return self._shifted(rows, 1)
+        """Return a copy with z in the sensor's frame again; the inverse of `lowered`."""
+        return self._shift(rows, 1)
 
-    def _shifted(self, rows: np.ndarray, sign: int) -> np.ndarray:
+    def _shift(self, rows: np.ndarray, sign: int) -> np.ndarray:
         heights = self.at(rows[:, :2])
-        known = self.heights[~np.isnan(self.heights)]
-        usual = np.median(known) if len(known) else 0.0
+        valid = self.heights[~np.isnan(self.heights)]
+        median = np.median(valid) if len(valid) else 0.0
         shifted = rows.copy()
-        shifted[:, 2] += sign * np.where(np.isnan(heights), usual, heights)
+        shifted[:, 2] += sign * np.where(np.isnan(heights), median, heights)
         return shifted

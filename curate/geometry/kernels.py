@@ -1,23 +1,36 @@
-"""Compiled kernels on rotated rectangles: their overlap, and all that is decided by it.
+"""Compiled kernels on rotated rectangles: intersection area, IoU and non-maximum suppression.
 
-The common area is Green's theorem on the edges of the larger rectangle in the frame of the smaller:
-the integral of y dx along each edge, with y clamped to the smaller rectangle's width and x to its
-length. Nothing is divided by a difference that can vanish, so touching, nested and nearly parallel
-rectangles need no special care; exactly aligned ones are products of their common sides, so that a
-box has an overlap of exactly 1 with itself.
+The intersection area comes from Green's theorem. In the frame of the smaller rectangle, y dx is
+integrated along each edge of the larger one, with x clamped to half the length and y to half the
+width of the smaller rectangle:
 
-All kernels stay in this one file: numba's cache on disk watches the file of a kernel only, so that
-a kernel elsewhere would go on using an old copy of the functions here.
+    smaller a: 4 x 2 at the origin, so x is clamped to [-2, 2] and y to [-1, 1]
+    larger b:  a 6 x 6 square with corners (0, -3), (6, -3), (6, 3), (0, 3), counter-clockwise
+    bottom edge, x from 0 to 6:   x clamped to 0 .. 2, y to -1:   -1 * 2 = -2
+    right edge, x = 6:            clamped to one x:                0
+    top edge, x from 6 to 0:      x clamped to 2 .. 0, y to 1:     1 * -2 = -2
+    left edge, x = 0:                                              0
+    area = minus the sum = 4: the part of a with x > 0, 2 x 2
+
+(The example is aligned to keep it short; the code computes aligned rectangles as below.)
+
+There is no division by a difference that can vanish, so touching, nested and nearly parallel
+rectangles need no special case. For exactly aligned rectangles the area is the product of the
+common sides: a box has an IoU of exactly 1 with itself.
+
+All kernels are in this one file because numba's cache on disk tracks changes only of the file of a
+kernel: a kernel in another file would keep using an old version of the functions here.
 """
 
 import numpy as np
 from numba import njit
 
-# Angles closer than this to a multiple of 90 degrees are rounding (yaw + pi, wrapped, for
-# example); the area changes by less than 1e-12 of the product of the sides.
+# Rectangles with a smaller sine or cosine of the angle between them count as aligned: the rest is
+# rounding, for example of yaw + pi, wrapped. This changes the area by less than 1e-12 of the
+# product of the sides.
 _ALIGNED_SINE = 1e-12
 
-# Columns of the table that `rectangle_table` makes of boxes.
+# Columns of the table that `rectangle_table` returns.
 _X, _Y, _Z, _HALF_LENGTH, _HALF_WIDTH, _HALF_HEIGHT, _COS, _SIN, _RADIUS, _AREA = range(10)
 
 _Pair = tuple[float, float]
@@ -25,10 +38,10 @@ _Pair = tuple[float, float]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rectangle_table(boxes: np.ndarray) -> np.ndarray:
-    """Return (n, 10) what the other kernels need of (n, 7) boxes, computed once per box.
+    """Return the (n, 10) table of (n, 7) boxes with the values that the other kernels use.
 
-    A box with a side that is not positive gets an area of 0, and one with a number that is not
-    finite a row of zeros: they overlap nothing.
+    A box with a length or width that is not positive gets area 0, and a box with a number that is
+    not finite gets a row of zeros: such boxes overlap nothing.
     """
     table = np.zeros((len(boxes), 10))
     for i in range(len(boxes)):
@@ -46,13 +59,13 @@ def rectangle_table(boxes: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _common_length(offset: float, half_a: float, half_b: float) -> float:
-    """Length that two intervals share whose centres lie `offset` apart; the same both ways."""
+    """Return the common length of two intervals with this offset of their centres; symmetric."""
     return max(0.0, min(2 * half_a, 2 * half_b, half_a + half_b - abs(offset)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _edge_integral(from_: _Pair, to: _Pair, half_sides: _Pair) -> float:
-    """Integral of y dx along an edge, x and y clamped to plus and minus the half sides."""
+    """Return the integral of y dx along an edge, x and y clamped to +-half sides."""
     (x0, y0), (x1, y1), (half_x, half_y) = from_, to, half_sides
     start = min(max(x0, -half_x), half_x)
     end = min(max(x1, -half_x), half_x)
@@ -76,7 +89,11 @@ def _edge_integral(from_: _Pair, to: _Pair, half_sides: _Pair) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _precedes(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
-    """Return whether row i of `a` is the frame of reference; the same for (a, b) and (b, a)."""
+    """Return whether a[i] is the frame of reference: the smaller one, ties by the other columns.
+
+    The choice is the same for (a, b) and (b, a), so the order of the arguments does not change the
+    area.
+    """
     if a[i, _AREA] != b[j, _AREA]:
         return bool(a[i, _AREA] < b[j, _AREA])
     for column in range(_RADIUS):
@@ -87,7 +104,7 @@ def _precedes(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _area_in_frame_of(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
-    """Common area of rectangles a[i] and b[j], computed in the frame of a[i]."""
+    """Return the common area of rectangles a[i] and b[j], computed in the frame of a[i]."""
     half_x, half_y = a[i, _HALF_LENGTH], a[i, _HALF_WIDTH]
     away_x, away_y = b[j, _X] - a[i, _X], b[j, _Y] - a[i, _Y]
     x = a[i, _COS] * away_x + a[i, _SIN] * away_y
@@ -106,7 +123,7 @@ def _area_in_frame_of(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
     rear_right = (x - forward_x - left_x, y - forward_y - left_y)
     front_right = (x + forward_x - left_x, y + forward_y - left_y)
     half_sides = (half_x, half_y)
-    # Counter-clockwise, the area is minus the integral.
+    # The edges run counter-clockwise, so the area is minus the integral.
     return -(
         _edge_integral(front_left, rear_left, half_sides)
         + _edge_integral(rear_left, rear_right, half_sides)
@@ -117,7 +134,7 @@ def _area_in_frame_of(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _near(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
-    """Return whether the circles around a[i] and b[j] meet."""
+    """Return whether the circumscribed circles of a[i] and b[j] intersect."""
     reach = a[i, _RADIUS] + b[j, _RADIUS]
     away_x, away_y = b[j, _X] - a[i, _X], b[j, _Y] - a[i, _Y]
     return bool(away_x * away_x + away_y * away_y < reach * reach)
@@ -125,7 +142,7 @@ def _near(a: np.ndarray, i: int, b: np.ndarray, j: int) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _common_area(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
-    """Common area of rectangles a[i] and b[j]; 0 where one has no area."""
+    """Return the common area of rectangles a[i] and b[j]; 0 if one has no area."""
     smaller = min(a[i, _AREA], b[j, _AREA])
     if not smaller > 0:
         return 0.0
@@ -136,7 +153,7 @@ def _common_area(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bev_iou(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
-    """Intersection over union of the footprints a[i] and b[j]."""
+    """Return the intersection over union of the footprints a[i] and b[j]."""
     common = _common_area(a, i, b, j)
     if common == 0:
         return 0.0
@@ -145,7 +162,7 @@ def _bev_iou(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _iou_3d(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
-    """Intersection over union of the cuboids a[i] and b[j]."""
+    """Return the intersection over union of the cuboids a[i] and b[j]."""
     height_a, height_b = 2 * a[i, _HALF_HEIGHT], 2 * b[j, _HALF_HEIGHT]
     if not (height_a > 0 and height_b > 0):
         return 0.0
@@ -159,15 +176,15 @@ def _iou_3d(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def iou_matrix(a: np.ndarray, b: np.ndarray, order: np.ndarray, with_height: bool) -> np.ndarray:
-    """Return (n, m) IoU of the rectangle tables a and b, of cuboids or of footprints.
+    """Return the (n, m) IoU of the rectangle tables a and b, of cuboids or of footprints.
 
-    Only pairs whose x ranges can meet are looked at.
+    Only pairs with ranges of x that can overlap are tested.
 
     Args:
         a: (n, 10) rectangle table.
         b: (m, 10) rectangle table, sorted by x.
         order: (m,) int64 column of the result for each row of b.
-        with_height: volumes, not footprints.
+        with_height: true for the IoU of volumes, false for that of footprints.
     """
     matrix = np.zeros((len(a), len(b)))
     largest_radius = 0.0
@@ -198,18 +215,19 @@ def paired_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def grouped_iou(
     a: np.ndarray, starts_a: np.ndarray, b: np.ndarray, starts_b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs that overlap in bird's eye view, group by group.
+    """Return the pairs that overlap in bird's eye view, within each group.
 
     Args:
         a: (n, 10) rectangle table; group g is rows starts_a[g] to starts_a[g + 1].
         starts_a: (groups + 1,) int64.
-        b: (m, 10) rectangle table, grouped alike by `starts_b`.
+        b: (m, 10) rectangle table; group g is rows starts_b[g] to starts_b[g + 1].
         starts_b: (groups + 1,) int64.
 
     Returns:
         Row in a, row in b, BEV IoU and 3D IoU of each pair, ascending by (row in a, row in b).
     """
-    rows_a, rows_b = [0 for _ in range(0)], [0 for _ in range(0)]  # typed by their elements
+    # Empty lists; numba infers the type of a list from the element in the comprehension.
+    rows_a, rows_b = [0 for _ in range(0)], [0 for _ in range(0)]
     bev, volumes = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for group in range(len(starts_a) - 1):
         for i in range(starts_a[group], starts_a[group + 1]):
@@ -225,11 +243,14 @@ def grouped_iou(
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _may_exceed(a: np.ndarray, i: int, b: np.ndarray, j: int, threshold: float) -> bool:
-    """Whether the BEV IoU can be above the threshold, from b[j]'s extents in the frame of a[i]."""
+    """Return whether the BEV IoU can exceed the threshold; cheaper than the IoU itself.
+
+    The test bounds the common area by that of a[i] and b[j]'s bounding rectangle in a[i]'s frame.
+    """
     away_x, away_y = b[j, _X] - a[i, _X], b[j, _Y] - a[i, _Y]
     cos = abs(a[i, _COS] * b[j, _COS] + a[i, _SIN] * b[j, _SIN])
     sin = abs(a[i, _COS] * b[j, _SIN] - a[i, _SIN] * b[j, _COS])
-    most = _common_length(
+    upper_bound = _common_length(
         a[i, _COS] * away_x + a[i, _SIN] * away_y,
         a[i, _HALF_LENGTH],
         cos * b[j, _HALF_LENGTH] + sin * b[j, _HALF_WIDTH],
@@ -238,14 +259,16 @@ def _may_exceed(a: np.ndarray, i: int, b: np.ndarray, j: int, threshold: float) 
         a[i, _HALF_WIDTH],
         sin * b[j, _HALF_LENGTH] + cos * b[j, _HALF_WIDTH],
     )
-    most = min(most, a[i, _AREA], b[j, _AREA])
-    # The margin keeps rounding from deciding.
-    return bool(most * (1 + threshold) * (1 + 1e-9) > threshold * (a[i, _AREA] + b[j, _AREA]))
+    upper_bound = min(upper_bound, a[i, _AREA], b[j, _AREA])
+    # IoU > threshold is equivalent to common * (1 + threshold) > threshold * (area_a + area_b).
+    # The margin of 1e-9 covers rounding: a pair is never skipped because of it.
+    areas = a[i, _AREA] + b[j, _AREA]
+    return bool(upper_bound * (1 + threshold) * (1 + 1e-9) > threshold * areas)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cell(value: float, low: float, cell: float, count: int) -> int:
-    """Index of the grid cell of a coordinate; the last cells take what lies outside."""
+    """Return the index of the grid cell of a coordinate; the outer cells extend to infinity."""
     position = (value - low) / cell
     if not position > 0:  # NaN too
         return 0
@@ -254,15 +277,17 @@ def _cell(value: float, low: float, cell: float, count: int) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def greedy_nms(table: np.ndarray, order: np.ndarray, iou_threshold: float) -> np.ndarray:
-    """Greedy non-maximum suppression on BEV IoU.
+    """Return the boxes that greedy non-maximum suppression on BEV IoU keeps.
 
-    Each box is compared with the kept boxes of its own and the eight neighbouring cells of a grid
-    whose cells are as wide as the largest box.
+    The boxes are sorted into a grid with cells at least as wide as the diagonal of the largest box.
+    Each box is compared only with the kept boxes of its own cell and the eight neighbouring ones.
+    The kept boxes of a cell form a linked list: `newest` is the last kept box of a cell, `older`
+    the one kept before it in the same cell.
 
     Args:
         table: (n, 10) rectangle table.
-        order: (n,) int64, the rows from the best to the worst.
-        iou_threshold: a box goes when its IoU with a kept box is above this.
+        order: (n,) int64, the rows from the highest to the lowest score.
+        iou_threshold: a box is dropped if its IoU with a kept box is above this.
 
     Returns:
         (k,) int64 kept rows, in `order`.

@@ -9,15 +9,15 @@ from curate.shapes import Int, Num
 def nms_bev(
     boxes: Num[np.ndarray, "n 7"], scores: Num[np.ndarray, " n"], iou_threshold: float
 ) -> Int[np.ndarray, " k"]:
-    """Return the boxes that non-maximum suppression in bird's eye view keeps.
+    """Return the indices of the boxes that greedy non-maximum suppression keeps.
 
-    A box is dropped where a kept box with a higher score has a BEV IoU above the threshold with it.
+    A box is dropped if its BEV IoU with a kept box of higher score is above the threshold.
 
     Args:
-        boxes: (n, 7) in metres and radians; of one category, or of all where categories shall
-            suppress each other.
+        boxes: (n, 7) in metres and radians. All boxes can suppress each other: call once per
+            category to prevent this across categories.
         scores: (n,) higher is better; equal scores are ranked by index.
-        iou_threshold: in [0, 1].
+        iou_threshold: BEV IoU in [0, 1] above which a box is dropped.
 
     Returns:
         (k,) int64 indices of the kept boxes, by descending score.

@@ -1,8 +1,8 @@
-"""Intersection over union of rotated boxes: of their footprints, and of their volumes.
+"""Intersection over union of rotated boxes: of their footprints (BEV) and of their volumes (3D).
 
-Exact up to rounding; a box and its copy, also one turned by half a turn, give exactly 1, and
-the order of the two arguments never matters. A box with a side that is zero, negative or not finite
-overlaps nothing, itself included.
+The results are exact up to rounding. A box and its copy give exactly 1, even if the copy is turned
+by 180 degrees. The order of the two arguments does not matter. A box with a side that is zero,
+negative or not finite overlaps nothing, not even itself.
 """
 
 import numpy as np
@@ -44,7 +44,15 @@ def iou_3d(
 def paired_iou_3d(
     boxes_a: Num[np.ndarray, "n 7"], boxes_b: Num[np.ndarray, "n 7"]
 ) -> Float[np.ndarray, " n"]:
-    """(n,) volume IoU in [0, 1] of each of (n, 7) boxes with the other's box in the same row."""
+    """Return (n,) volume IoU in [0, 1] of the boxes in the same row.
+
+    Args:
+        boxes_a: (n, 7) in metres and radians; both in the same frame of reference.
+        boxes_b: (n, 7).
+
+    Raises:
+        ValueError: if boxes are not rows of seven numbers.
+    """
     from curate.geometry.kernels import paired_iou
 
     return paired_iou(_table(boxes_a), _table(boxes_b))
@@ -61,12 +69,12 @@ def overlapping_pairs(
     Float[np.ndarray, " pairs"],
     Float[np.ndarray, " pairs"],
 ]:
-    """All pairs with a BEV IoU above 0 within groups of boxes, such as the frames of a split.
+    """Return all pairs with a BEV IoU above 0 within groups of boxes, such as frames of a split.
 
     Args:
         boxes_a: (n, 7); group g is the rows starts_a[g] to starts_a[g + 1].
         starts_a: (groups + 1,) integers, from 0 to n.
-        boxes_b: (m, 7), grouped alike by `starts_b`.
+        boxes_b: (m, 7); group g is the rows starts_b[g] to starts_b[g + 1].
         starts_b: (groups + 1,) integers, from 0 to m.
 
     Returns:

@@ -1,8 +1,7 @@
-"""Compiled kernels on points and boxes: the grid that boxes are entered into, and who is in them.
+"""Compiled kernels on points and boxes: a grid of the boxes, and the points inside each box.
 
-Their caller is `curate.geometry.points_in_boxes`, which imports them where it uses them: numba is
-not loaded by a program that only reads a row. They stay in one file, see
-`curate.geometry.kernels`.
+`curate.geometry.points_in_boxes` calls them and imports them only when needed, so that programs
+which do not count points do not load numba. They are in one file, see `curate.geometry.kernels`.
 """
 
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from numba import njit
 
 
 class Axes(NamedTuple):
-    """Where the grid lies: bounds in metres, cells per metre, and the number of cells along y."""
+    """Position of the grid: bounds in metres, cells per metre, and the number of cells along y."""
 
     low_x: float
     low_y: float
@@ -23,25 +22,29 @@ class Axes(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _contains(placed: np.ndarray, i: int, x: float, y: float, z: float) -> bool:
-    """Return whether box i of `_placed` contains the point."""
-    if not abs(z - placed[i, 2]) <= placed[i, 5]:
+def _contains(table: np.ndarray, i: int, x: float, y: float, z: float) -> bool:
+    """Return whether row i of the box table contains the point.
+
+    The table is that of `curate.geometry.points_in_boxes`: centre, half sides, cosine and sine of
+    the yaw.
+    """
+    if not abs(z - table[i, 2]) <= table[i, 5]:
         return False
-    away_x, away_y = x - placed[i, 0], y - placed[i, 1]
-    along = placed[i, 6] * away_x + placed[i, 7] * away_y
-    across = placed[i, 6] * away_y - placed[i, 7] * away_x
-    return bool(abs(along) <= placed[i, 3] and abs(across) <= placed[i, 4])
+    away_x, away_y = x - table[i, 0], y - table[i, 1]
+    along = table[i, 6] * away_x + table[i, 7] * away_y
+    across = table[i, 6] * away_y - table[i, 7] * away_x
+    return bool(abs(along) <= table[i, 3] and abs(across) <= table[i, 4])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cell(value: float, low: float, cells_per_metre: float) -> int:
-    """Index along one axis of the grid cell of a coordinate that is not below `low`."""
+    """Return the index of a coordinate's cell along one axis; `value` must not be below `low`."""
     return int((value - low) * cells_per_metre)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cell_of_point(x: float, y: float, axes: Axes) -> int:
-    """Return the cell of a point, -1 outside the grid."""
+    """Return the flat index of a point's cell, -1 outside the grid."""
     if not (axes.low_x <= x <= axes.high_x and axes.low_y <= y <= axes.high_y):
         return -1
     column = _cell(x, axes.low_x, axes.cells_per_metre)
@@ -49,21 +52,22 @@ def _cell_of_point(x: float, y: float, axes: Axes) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def enter_boxes(
+def boxes_by_cell(
     lows: np.ndarray, highs: np.ndarray, indices: np.ndarray, axes: Axes
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the boxes of every grid cell.
 
     Args:
         lows: (k, 2) lowest x and y of each footprint.
-        highs: (k, 2) highest x and y.
-        indices: (k,) int64 the boxes' own numbers, ascending.
-        axes: of a grid that holds all of them.
+        highs: (k, 2) highest x and y of each footprint.
+        indices: (k,) int64 numbers of the boxes, ascending.
+        axes: the grid; it contains all footprints.
 
     Returns:
-        starts (cells + 1,) and boxes: cell c holds boxes[starts[c]:starts[c + 1]], ascending.
+        starts (cells + 1,) and boxes: cell c has boxes[starts[c]:starts[c + 1]], ascending.
     """
-    cells, boxes = [0 for _ in range(0)], [0 for _ in range(0)]  # typed by their elements
+    # Empty lists; numba infers the type of a list from the element in the comprehension.
+    cells, boxes = [0 for _ in range(0)], [0 for _ in range(0)]
     for i in range(len(indices)):
         first = _cell_of_point(lows[i, 0], lows[i, 1], axes)
         last_in_column = _cell_of_point(lows[i, 0], highs[i, 1], axes)
@@ -79,43 +83,43 @@ def enter_boxes(
     for cell in range(1, len(starts)):
         starts[cell] += starts[cell - 1]
     free = starts.copy()
-    entered = np.empty(len(cells), np.int64)
+    cell_boxes = np.empty(len(cells), np.int64)
     for position in range(len(cells)):
         cell = cells[position]
-        entered[free[cell]] = boxes[position]
+        cell_boxes[free[cell]] = boxes[position]
         free[cell] += 1
-    return starts, entered
+    return starts, cell_boxes
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_points(
-    points: np.ndarray, placed: np.ndarray, axes: Axes, starts: np.ndarray, entered: np.ndarray
+    points: np.ndarray, table: np.ndarray, axes: Axes, starts: np.ndarray, cell_boxes: np.ndarray
 ) -> np.ndarray:
-    """Return the kernel of `count_points_in_boxes`."""
-    counts = np.zeros(len(placed), np.int64)
+    """Return (n,) number of points in each box; kernel of `count_points_in_boxes`."""
+    counts = np.zeros(len(table), np.int64)
     for p in range(len(points)):
         x, y = np.float64(points[p, 0]), np.float64(points[p, 1])
         cell = _cell_of_point(x, y, axes)
         if cell >= 0:
             for position in range(starts[cell], starts[cell + 1]):
-                i = entered[position]
-                if _contains(placed, i, x, y, np.float64(points[p, 2])):
+                i = cell_boxes[position]
+                if _contains(table, i, x, y, np.float64(points[p, 2])):
                     counts[i] += 1
     return counts
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def first_box(
-    points: np.ndarray, placed: np.ndarray, axes: Axes, starts: np.ndarray, entered: np.ndarray
+    points: np.ndarray, table: np.ndarray, axes: Axes, starts: np.ndarray, cell_boxes: np.ndarray
 ) -> np.ndarray:
-    """Return the kernel of `box_of_points`."""
+    """Return (p,) first box that contains each point, or -1; kernel of `box_of_points`."""
     owners = np.full(len(points), -1)
     for p in range(len(points)):
         x, y = np.float64(points[p, 0]), np.float64(points[p, 1])
         cell = _cell_of_point(x, y, axes)
         if cell >= 0:
             for position in range(starts[cell], starts[cell + 1]):
-                if _contains(placed, entered[position], x, y, np.float64(points[p, 2])):
-                    owners[p] = entered[position]
+                if _contains(table, cell_boxes[position], x, y, np.float64(points[p, 2])):
+                    owners[p] = cell_boxes[position]
                     break
     return owners

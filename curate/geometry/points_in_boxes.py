@@ -1,7 +1,7 @@
-"""Which LiDAR points lie in which boxes; a box contains its boundary.
+"""Tests of which LiDAR points are inside which boxes; the boundary belongs to the box.
 
-The footprints are entered into a bird's eye view grid once, then each point tests only the boxes of
-its cell: one pass over the points, whatever the number of boxes.
+The footprints are sorted into a bird's eye view grid once. Each point then tests only the boxes of
+its cell: one pass over the points, independent of the number of boxes.
 """
 
 from typing import TYPE_CHECKING
@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from curate.geometry.point_kernels import Axes
 
 _CELL_METRES = 1.0
-_MOST_CELLS = 256
-# The grid must never lose a point that the exact test would accept: boxes are entered wider.
+_MAX_CELLS_PER_AXIS = 256
+# Footprints are enlarged by this margin in the grid, so that rounding does not lose a point that
+# the exact test would accept.
 _MARGIN_METRES = 1e-3
 
 
@@ -26,35 +27,35 @@ def count_points_in_boxes(
     """Return the number of points in each box.
 
     Args:
-        points: (p, >=3) x, y, z in metres in the frame of the boxes; NaN is in no box.
-        boxes: (n, 7) in metres and radians; a point in several boxes counts in each; NaN contains
-            nothing.
+        points: (p, >=3) x, y, z in metres in the frame of the boxes; a point with NaN is in no box.
+        boxes: (n, 7) in metres and radians. A point in several boxes counts in each of them. A box
+            with NaN contains nothing.
     """
     from curate.geometry.point_kernels import count_points
 
-    placed = _placed(as_boxes(boxes))
-    return count_points(_as_points(points), placed, *_grid(placed))
+    table = _table(as_boxes(boxes))
+    return count_points(_as_points(points), table, *_grid(table))
 
 
 def box_of_points(
     points: Num[np.ndarray, "p _"], boxes: Num[np.ndarray, "n 7"]
 ) -> Int[np.ndarray, " p"]:
-    """Return the index of the first box that contains each point, -1 where none does.
+    """Return the index of the first box that contains each point, -1 if no box does.
 
     Args:
-        points: (p, >=3) x, y, z in metres in the frame of the boxes; NaN is in no box.
+        points: (p, >=3) x, y, z in metres in the frame of the boxes; a point with NaN is in no box.
         boxes: (n, 7) in metres and radians.
     """
     from curate.geometry.point_kernels import first_box
 
-    placed = _placed(as_boxes(boxes))
-    return first_box(_as_points(points), placed, *_grid(placed))
+    table = _table(as_boxes(boxes))
+    return first_box(_as_points(points), table, *_grid(table))
 
 
 def points_in_box_mask(
     points: Num[np.ndarray, "p _"], box: Num[np.ndarray, " 7"]
 ) -> Bool[np.ndarray, " p"]:
-    """Return whether each point lies in one box.
+    """Return whether each point is inside one box.
 
     Args:
         points: (p, >=3) x, y, z in metres in the frame of the box.
@@ -72,31 +73,31 @@ def _as_points(points: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(points, dtype=dtype)
 
 
-def _placed(boxes: np.ndarray) -> np.ndarray:
-    """Return (n, 8) centre, half sides, cosine and sine of the yaw; NaN where one is not finite."""
-    placed = np.empty((len(boxes), 8))
-    placed[:, :3], placed[:, 3:6] = boxes[:, :3], boxes[:, 3:6] / 2
+def _table(boxes: np.ndarray) -> np.ndarray:
+    """Return (n, 8) centre, half sides, cosine and sine of the yaw; NaN for non-finite boxes."""
+    table = np.empty((len(boxes), 8))
+    table[:, :3], table[:, 3:6] = boxes[:, :3], boxes[:, 3:6] / 2
     finite = np.isfinite(boxes).all(axis=1)
     yaw = np.where(finite, boxes[:, 6], 0)
-    placed[:, 6], placed[:, 7] = np.cos(yaw), np.sin(yaw)
-    placed[~finite] = np.nan
-    return placed
+    table[:, 6], table[:, 7] = np.cos(yaw), np.sin(yaw)
+    table[~finite] = np.nan
+    return table
 
 
-def _grid(placed: np.ndarray) -> tuple["Axes", np.ndarray, np.ndarray]:
-    """Return the grid around all boxes, and what `enter_boxes` returns."""
-    from curate.geometry.point_kernels import Axes, enter_boxes
+def _grid(table: np.ndarray) -> tuple["Axes", np.ndarray, np.ndarray]:
+    """Return the axes of the grid around all boxes, and the two arrays of `boxes_by_cell`."""
+    from curate.geometry.point_kernels import Axes, boxes_by_cell
 
-    indices = np.flatnonzero(np.isfinite(placed[:, 0]))
+    indices = np.flatnonzero(np.isfinite(table[:, 0]))
     if len(indices) == 0:
         return Axes(0.0, 0.0, -1.0, -1.0, 1.0, 1), np.zeros(2, np.int32), indices
-    centres, halves = placed[indices, :2], np.abs(placed[indices, 3:5])
-    cos, sin = np.abs(placed[indices, 6:7]), np.abs(placed[indices, 7:8])
+    centres, halves = table[indices, :2], np.abs(table[indices, 3:5])
+    cos, sin = np.abs(table[indices, 6:7]), np.abs(table[indices, 7:8])
     reach = cos * halves + sin * halves[:, ::-1] + _MARGIN_METRES
     lows, highs = centres - reach, centres + reach
     (low_x, low_y), (high_x, high_y) = lows.min(axis=0).tolist(), highs.max(axis=0).tolist()
     widest = max(high_x - low_x, high_y - low_y)
-    cells_per_metre = 1 / max(_CELL_METRES, widest / _MOST_CELLS)
+    cells_per_metre = 1 / max(_CELL_METRES, widest / _MAX_CELLS_PER_AXIS)
     rows = int((high_y - low_y) * cells_per_metre) + 1
     axes = Axes(low_x, low_y, high_x, high_y, cells_per_metre, rows)
-    return axes, *enter_boxes(lows, highs, indices, axes)
+    return axes, *boxes_by_cell(lows, highs, indices, axes)

@@ -1,4 +1,4 @@
-"""Rigid poses from quaternions, and boxes in a frame of reference that is turned in all three axes.
+"""Rigid poses from quaternions, and transforms of boxes between frames with any 3D rotation.
 
 Quaternions are (w, x, y, z), scalar first, of unit length.
 """
@@ -10,7 +10,7 @@ from curate.shapes import Float, Num
 
 
 def rotation_matrices(quaternions: Num[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return (n, 3, 3) rotations of (n, 4) unit quaternions w, x, y, z."""
+    """Return (n, 3, 3) rotation matrices of (n, 4) unit quaternions w, x, y, z."""
     w, x, y, z = np.asarray(quaternions, dtype=np.float64).reshape(-1, 4).T
     return np.stack(
         [
@@ -25,7 +25,12 @@ def rotation_matrices(quaternions: Num[np.ndarray, "n 4"]) -> Float[np.ndarray, 
 def pose_matrix(
     translation: Num[np.ndarray, " 3"], quaternion: Num[np.ndarray, " 4"]
 ) -> Float[np.ndarray, "4 4"]:
-    """(4, 4) from the frame of reference that stands at `translation`, turned by `quaternion`."""
+    """Return the (4, 4) pose of an inner frame of reference: it maps inner to outer coordinates.
+
+    Args:
+        translation: (3,) origin of the inner frame in the outer frame, metres.
+        quaternion: (4,) rotation w, x, y, z of the inner frame in the outer frame.
+    """
     pose = np.eye(4)
     pose[:3, :3] = rotation_matrices(np.reshape(quaternion, (1, 4)))[0]
     pose[:3, 3] = translation
@@ -33,7 +38,7 @@ def pose_matrix(
 
 
 def invert_pose(pose: Num[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Inverse of a (4, 4) rigid pose."""
+    """Return the inverse of a (4, 4) rigid pose."""
     inverse = np.eye(4)
     inverse[:3, :3] = pose[:3, :3].T
     inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
@@ -46,10 +51,10 @@ def boxes_in_frame(
     quaternions: Num[np.ndarray, "n 4"],
     pose: Num[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "n 7"]:
-    """Boxes of an outer frame of reference (a map's) in the one that stands at `pose` (a LiDAR's).
+    """Return boxes of an outer frame of reference, such as a map, in an inner one, such as a LiDAR.
 
-    A box keeps its yaw about the inner z: the direction of its length, seen from above. What it is
-    tilted besides, a few degrees where the ground or the sensor is, has no place in seven numbers.
+    The yaw is the direction of the box's length about the inner z axis. A remaining tilt of a few
+    degrees, from sloped ground or a tilted sensor, is dropped: seven numbers cannot store it.
 
     Args:
         centres: (n, 3) in the outer frame, metres.
@@ -61,11 +66,11 @@ def boxes_in_frame(
         (n, 7) x, y, z, length, width, height, yaw in the inner frame.
     """
     inverse = invert_pose(pose)
-    ahead = rotation_matrices(quaternions)[:, :, 0] @ inverse[:3, :3].T
+    heading = rotation_matrices(quaternions)[:, :, 0] @ inverse[:3, :3].T
     return np.column_stack(
         [
             np.reshape(centres, (-1, 3)) @ inverse[:3, :3].T + inverse[:3, 3],
             np.reshape(sizes, (-1, 3)),
-            wrap_angle(np.arctan2(ahead[:, 1], ahead[:, 0])),
+            wrap_angle(np.arctan2(heading[:, 1], heading[:, 0])),
         ]
     )

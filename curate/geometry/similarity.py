@@ -10,10 +10,10 @@ from curate.shapes import Float, Num
 
 
 def wrap_angle(angle_rad: Num[np.ndarray, " *shape"] | np.floating) -> Float[np.ndarray, " *shape"]:
-    """Angles in radians, wrapped to (-pi, pi]; those in the range already stay as they are."""
+    """Return angles in radians, wrapped to (-pi, pi]; angles in this range stay unchanged."""
     angle_rad = np.asarray(angle_rad, dtype=np.float64)
     wrapped = np.pi - np.mod(np.pi - angle_rad, 2 * np.pi)
-    # Just above pi the remainder is rounded to the divisor, and the result to -pi.
+    # For an angle just above pi the remainder is rounded to 2 pi, and the result to -pi.
     wrapped = np.where(wrapped <= -np.pi, np.pi, wrapped)
     return np.where((angle_rad > -np.pi) & (angle_rad <= np.pi), angle_rad, wrapped)
 
@@ -24,11 +24,11 @@ class Similarity:
 
     Attributes:
         flip_y: mirror over the x axis.
-        rotation_rad: counter-clockwise about z, radians.
-        scale: uniform, > 0.
+        rotation_rad: rotation about z, counter-clockwise, radians.
+        scale: uniform scale, above 0.
 
     Raises:
-        ConfigError: the rotation is not finite, or the scale not finite and positive.
+        ConfigError: if the rotation is not finite, or the scale is not finite and positive.
     """
 
     flip_y: bool = False
@@ -59,13 +59,13 @@ class Similarity:
         )
 
     def apply_to_points(self, points: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-        """A of (n, >=3) points; columns after the third are kept. Same dtype."""
+        """Return A of (n, >=3) points, in the same dtype; further columns stay unchanged."""
         moved = points.copy()
         moved[:, :3] = points[:, :3] @ self._matrix().T.astype(points.dtype)
         return moved
 
     def apply_to_boxes(self, boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 7"]:
-        """A of (n, 7) boxes."""
+        """Return A of (n, 7) boxes."""
         moved = np.array(boxes, dtype=np.float64)
         moved[:, :3] = moved[:, :3] @ self._matrix().T
         moved[:, 3:6] *= self.scale
@@ -74,7 +74,7 @@ class Similarity:
         return moved
 
     def invert_boxes(self, boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 7"]:
-        """A^-1 of (n, 7) boxes."""
+        """Return A^-1 of (n, 7) boxes."""
         moved = np.array(boxes, dtype=np.float64)
         moved[:, :3] = moved[:, :3] @ self._matrix() / self.scale**2
         moved[:, 3:6] /= self.scale
@@ -83,7 +83,7 @@ class Similarity:
         return moved
 
     def _matrix(self) -> np.ndarray:
-        """Return (3, 3) with A(p) = matrix @ p; its inverse is its transpose over scale squared."""
+        """Return the (3, 3) matrix M with A(p) = M @ p; M^-1 is M^T divided by scale squared."""
         cos, sin = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
         mirror = -1.0 if self.flip_y else 1.0
         return self.scale * np.array([[cos, -sin * mirror, 0], [sin, cos * mirror, 0], [0, 0, 1]])

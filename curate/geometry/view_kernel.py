@@ -1,4 +1,4 @@
-"""Compiled kernel: which points appear in the image of a camera."""
+"""Compiled kernel that tests which points are inside the image of a camera."""
 
 import numpy as np
 from numba import njit
@@ -14,12 +14,25 @@ def points_in_view(
     height: float,
     margin: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the kernel of `in_view`: (n,) bool, and (n,) whether it leaves a point undecided.
+    """Return whether each point is in view, and whether rounding leaves it undecided.
 
-    It has no branches: which points are seen is too irregular to be foretold.
+    The kernel of `in_view`. It has no branches, because the result is too irregular for branch
+    prediction.
+
+    Args:
+        x: (n,) metres in the LiDAR frame.
+        y: (n,) metres in the LiDAR frame.
+        z: (n,) metres in the LiDAR frame.
+        matrix: (3, 4) projection from the LiDAR frame to homogeneous image points.
+        width: width of the image in pixels.
+        height: height of the image in pixels.
+        margin: points closer than this to the border of the view are undecided.
+
+    Returns:
+        (n,) bool in view, false if undecided, and (n,) bool undecided.
     """
-    seen = np.empty(len(x), np.bool_)
-    doubtful = np.empty(len(x), np.bool_)
+    visible = np.empty(len(x), np.bool_)
+    undecided = np.empty(len(x), np.bool_)
     m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
     m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
     m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
@@ -39,6 +52,6 @@ def points_in_view(
             | (right < -margin)
             | (below < -margin)
         )
-        seen[i] = inside
-        doubtful[i] = not (inside | outside)  # NaN too
-    return seen, doubtful
+        visible[i] = inside
+        undecided[i] = not (inside | outside)  # NaN too
+    return visible, undecided

@@ -1,4 +1,4 @@
-"""The point prior rho_diff (Eq. 8): a box with few LiDAR points in it is hard to be sure of.
+"""The point prior rho_diff (Eq. 8): boxes with few LiDAR points are trusted less.
 
 Source: An et al., Remote Sensing 15(3):627, 2023.
 """
@@ -24,13 +24,13 @@ Statistic = Literal["median", "mean", "quantile", "fixed"]
 
 @dataclass(frozen=True)
 class PointSettings:
-    """How m_th(c) follows from the ground truth of category c in X_l.
+    """Settings of the threshold m_th(c), from the ground truth of category c in X_l.
 
     Attributes:
-        statistic: of the point counts of c's ground-truth boxes; "fixed" uses `fixed` and looks at
-            none of them.
-        quantile: for "quantile", in [0, 1].
-        fixed: for "fixed", in points.
+        statistic: statistic of the point counts of c's ground-truth boxes; "fixed" uses the value
+            of `fixed` instead.
+        quantile: quantile in [0, 1], for the statistic "quantile".
+        fixed: number of points, for the statistic "fixed".
         fallback: m_th of a category without ground truth in X_l, in points.
     """
 
@@ -40,11 +40,11 @@ class PointSettings:
     fallback: float = 5.0
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for a setting without meaning."""
+        """Raise ConfigError if a setting is out of its range."""
         if self.statistic not in get_args(Statistic):
-            known = ", ".join(get_args(Statistic))
+            choices = ", ".join(get_args(Statistic))
             raise ConfigError(
-                f"point prior: unknown statistic {self.statistic!r}; choose one of {known}"
+                f"point prior: unknown statistic {self.statistic!r}; choose one of {choices}"
             )
         if not 0 <= self.quantile <= 1:
             raise ConfigError(f"point prior: quantile must be in [0, 1], not {self.quantile}")
@@ -58,11 +58,11 @@ _DEFAULT = PointSettings()
 def points_threshold(
     counts_per_ground_truth: Num[np.ndarray, " g"], settings: PointSettings = _DEFAULT
 ) -> float:
-    """m_th of one category, at least 1 so that a box without a point is never trusted.
+    """Return m_th of one category; it is at least 1, so a box without points has rho_diff 0.
 
     Args:
         counts_per_ground_truth: (g,) LiDAR points inside each ground-truth box of the category.
-        settings: which statistic; its fallback is the answer for g = 0.
+        settings: statistic and fallback; the fallback is returned if g = 0.
     """
     if settings.statistic == "fixed":
         return float(settings.fixed)
@@ -79,7 +79,7 @@ def points_threshold(
 def point_trust(
     points: Num[np.ndarray, " n"], thresholds: Num[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """rho_diff (Eq. 8) from (n,) point counts m and (n,) thresholds m_th."""
+    """Return (n,) rho_diff (Eq. 8) from (n,) point counts m and (n,) thresholds m_th."""
     rho: np.ndarray = np.minimum(points, thresholds) / thresholds
     return rho
 
@@ -89,21 +89,21 @@ def learn_thresholds(
     categories: Sequence[str],
     settings: PointSettings = _DEFAULT,
 ) -> dict[str, float]:
-    """m_th of each category from labeled frames; warns for a category without ground truth.
+    """Return m_th of each category from labeled frames; warns of categories without ground truth.
 
     Args:
-        samples: the frames of X_l, never of X_u, with their ground truth. Their points must be
-            cropped, or not, as those of the frames that will be scored.
-        categories: which categories need a threshold.
+        samples: frames of X_l, never of X_u, with their ground truth. Crop their points in the same
+            way as those of the frames to be scored.
+        categories: categories that need a threshold.
         settings: see `PointSettings`.
     """
     counts: dict[str, list[np.ndarray]] = {category: [] for category in categories}
     for frame, annotations in samples:
-        wanted = annotations.select(np.isin(annotations.categories, list(categories)))
-        inside = count_points_in_boxes(frame.points, wanted.boxes)
-        for category, found in counts.items():
-            found.append(inside[wanted.categories == category])
-    merged = {c: np.concatenate([np.zeros(0), *found]) for c, found in counts.items()}
+        selected = annotations.select(np.isin(annotations.categories, list(categories)))
+        inside = count_points_in_boxes(frame.points, selected.boxes)
+        for category, of_category in counts.items():
+            of_category.append(inside[selected.categories == category])
+    merged = {c: np.concatenate([np.zeros(0), *parts]) for c, parts in counts.items()}
     missing = [] if settings.statistic == "fixed" else [c for c, m in merged.items() if not len(m)]
     for category in missing:
         logger.warning(
@@ -127,14 +127,14 @@ class PointPrior(EvidenceSource):
     name: ClassVar[str] = "points"
     columns: ClassVar[tuple[Column, ...]] = (
         Column("points", "int32", "1", "m, LiDAR points in the box"),
-        Column("points_threshold", "float64", "1", "m_th, what labeled boxes of the category hold"),
+        Column("points_threshold", "float64", "1", "m_th, threshold learned from labeled boxes"),
         Column("rho_diff", "float64", "1", "point prior, Eq. 8: min(m, m_th) / m_th"),
     )
     rho_column: ClassVar[str | None] = "rho_diff"
     measured_columns: ClassVar[tuple[str, ...]] = ("points",)
 
     def __post_init__(self) -> None:
-        """Raise ConfigError where a threshold is not a positive number."""
+        """Raise ConfigError if a threshold is not a positive number."""
         for category, value in self.thresholds.items():
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(
@@ -147,7 +147,7 @@ class PointPrior(EvidenceSource):
         return {"points": np.asarray(counts, dtype=np.int64)}
 
     def rate(self, detections: Detections, measured: Measured) -> Evidence:
-        """Compare the counts with the threshold.
+        """Return the point counts, the thresholds and rho_diff.
 
         Raises:
             ConfigError: if a detection's category has no threshold.
@@ -157,13 +157,13 @@ class PointPrior(EvidenceSource):
         return {"points": points, "points_threshold": threshold, "rho_diff": rho}
 
     def describe(self, row: Mapping[str, Any]) -> str:
-        """Return Eq. 8 with the numbers of a label."""
+        """Return Eq. 8 with the numbers of one label."""
         return (
             "Eq. 8: rho_diff = min({points}, {points_threshold}) / {points_threshold} = {rho_diff}"
         ).format(**row)
 
     def _threshold_per_label(self, categories: np.ndarray) -> np.ndarray:
-        """Return (n,) float64."""
+        """Return the (n,) float64 threshold of each label."""
         names, inverse = np.unique(categories, return_inverse=True)
         unknown = [str(name) for name in names if name not in self.thresholds]
         if unknown:

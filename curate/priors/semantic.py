@@ -1,7 +1,7 @@
-"""The semantic prior rho_anno (Eq. 9): the image should show the label's class where the box lies.
+"""The semantic prior rho_anno (Eq. 9): share of the box's image area that shows the label's class.
 
-Source: An et al., Remote Sensing 15(3):627, 2023. Its prose says "arithmetic mean" of the score and
-the share of class pixels, its printed formula is a square root: geometric is the default here.
+Source: An et al., Remote Sensing 15(3):627, 2023. Its text says "arithmetic mean" of the score and
+the share of class pixels, but its formula is a square root. The default here is the geometric mean.
 """
 
 from collections.abc import Collection, Mapping
@@ -24,11 +24,11 @@ Outside = Literal["neutral", "drop"]
 
 @dataclass(frozen=True)
 class SemanticSettings:
-    """How score s and class share S/A become rho_anno.
+    """Settings that combine score s and class share S/A into rho_anno.
 
     Attributes:
-        mean: "geometric" sqrt(s S/A), "product" s S/A, "arithmetic" (s + S/A) / 2.
-        outside: for a box that the image does not show, "neutral" gives rho_anno = s, "drop" 0.
+        mean: "geometric" for sqrt(s S/A), "product" for s S/A, "arithmetic" for (s + S/A) / 2.
+        outside: rho_anno of a box outside the image: s for "neutral", 0 for "drop".
     """
 
     mean: Mean = "geometric"
@@ -38,9 +38,9 @@ class SemanticSettings:
         """Raise ConfigError for an unknown option."""
         for value, kind, noun in ((self.mean, Mean, "mean"), (self.outside, Outside, "outside")):
             if value not in get_args(kind):
-                known = ", ".join(get_args(kind))
+                choices = ", ".join(get_args(kind))
                 raise ConfigError(
-                    f"semantic prior: unknown {noun} {value!r}; choose one of {known}"
+                    f"semantic prior: unknown {noun} {value!r}; choose one of {choices}"
                 )
 
 
@@ -52,7 +52,7 @@ class SemanticPrior(EvidenceSource):
     """rho_anno = sqrt(s * S / A) with the semantic map of a segmenter.
 
     Attributes:
-        segmenter: names the class of every pixel; None for a prior that only rates.
+        segmenter: provides the semantic map; None for a prior that only rates.
         settings: see `SemanticSettings`.
     """
 
@@ -74,15 +74,17 @@ class SemanticPrior(EvidenceSource):
 
     @property
     def needs_points(self) -> bool:
-        """Whether the segmenter reads the points; one that does not say so may."""
+        """Whether the segmenter reads the points; assumed if it does not declare it."""
         return bool(getattr(self.segmenter, "needs_points", self.segmenter is not None))
 
     def measure(self, frame: Frame, detections: Detections) -> Measured:
-        """Segment the frame and look at each box's rectangle; no label, no segmentation.
+        """Segment the frame and count the pixels of each projected box.
+
+        A frame without detections is not segmented.
 
         Raises:
             ConfigError: if there is no segmenter, or it has no classes for a detection's category.
-            ModelError: if the semantic map is not in the size of the image.
+            ModelError: if the size of the semantic map differs from the image size.
         """
         if self.segmenter is None:
             raise ConfigError("semantic prior: pixels cannot be counted without a segmenter")
@@ -91,23 +93,23 @@ class SemanticPrior(EvidenceSource):
         semantic_map = self.segmenter.segment(frame)
         width, height = frame.image_size
         if semantic_map.class_ids.shape != (height, width):
-            shown = " x ".join(str(side) for side in semantic_map.class_ids.shape[::-1])
+            map_size = " x ".join(str(side) for side in semantic_map.class_ids.shape[::-1])
             raise ModelError(
-                f"frame {frame.frame_id}: the semantic map is {shown}, the image {width} x "
-                f"{height} pixels; make the segmenter answer in the size of the image",
+                f"frame {frame.frame_id}: the semantic map has {map_size} pixels, the image "
+                f"{width} x {height}; the segmenter must return a map of the image size",
             )
         rectangles = image_rectangles(detections.boxes, frame.calibration, frame.image_size)
         counts = count_pixels(rectangles, detections.categories, semantic_map)
         return dict(zip(self.measured_columns, counts, strict=True))
 
     def rate(self, detections: Detections, measured: Measured) -> Evidence:
-        """Return S, A and what follows from them by equation 9."""
+        """Return S, A and rho_anno (Eq. 9)."""
         mask_pixels, box_pixels = (measured[name] for name in self.measured_columns)
         rho = semantic_trust(detections.scores, mask_pixels, box_pixels, self.settings)
         return {"mask_pixels": mask_pixels, "box_pixels": box_pixels, "rho_anno": rho}
 
     def describe(self, row: Mapping[str, Any]) -> str:
-        """Return Eq. 9 with the numbers of a label."""
+        """Return Eq. 9 with the numbers of one label."""
         formula = {
             "geometric": "sqrt(s S/A)", "product": "s S/A", "arithmetic": "(s + S/A) / 2",
         }[self.settings.mean]  # fmt: skip
@@ -121,7 +123,7 @@ def semantic_trust(
     box_pixels: Num[np.ndarray, " n"],
     settings: SemanticSettings = _DEFAULT,
 ) -> Float[np.ndarray, " n"]:
-    """rho_anno (Eq. 9) from (n,) scores and (n,) pixel counts S and A."""
+    """Return (n,) rho_anno (Eq. 9) from (n,) scores and (n,) pixel counts S and A."""
     share = mask_pixels / np.maximum(box_pixels, 1)
     if settings.mean == "geometric":
         rho = np.sqrt(scores * share)
@@ -137,39 +139,40 @@ def count_pixels(
     categories: Shaped[np.ndarray, " n"],
     semantic_map: SemanticMap,
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """S and A of each rectangle: a pixel counts where the rectangle touches any part of it.
+    """Count the class pixels S and all pixels A of each rectangle.
 
-    As in KITTI, pixel (row r, column c) is centred on the coordinates (c, r) and the whole image is
-    the rectangle 0, 0, width - 1, height - 1. The columns of a rectangle are therefore left to
-    right, both rounded (halves up) and both included, as far as the image has them; rows likewise.
+    A pixel counts if the rectangle touches any part of it. As in KITTI, the centre of the pixel in
+    row r and column c has the coordinates (c, r), and the whole image is the rectangle 0, 0,
+    width - 1, height - 1. A rectangle therefore has the columns from round(left) to round(right),
+    both included, clipped to the image; halves are rounded up. The same holds for its rows.
 
     Args:
-        rectangles: (n, 4) left, top, right, bottom in pixels, NaN where the image shows nothing.
+        rectangles: (n, 4) left, top, right, bottom in pixels; NaN for boxes outside the image.
         categories: (n,) str.
         semantic_map: see `SemanticMap`.
 
     Returns:
-        (n,) int64 pixels of the category's classes, (n,) int64 pixels.
+        (n,) int64 S, pixels of the category's classes, and (n,) int64 A, all pixels.
 
     Raises:
         ConfigError: if the semantic map has no classes for a category.
     """
     height, width = semantic_map.class_ids.shape
-    seen = ~np.isnan(rectangles).any(axis=1)
-    nearest = np.floor(np.where(seen[:, None], rectangles, 0.0) + 0.5)
-    left, top = np.clip(nearest[:, :2], 0, (width, height)).astype(np.int64).T
-    right, bottom = np.clip(nearest[:, 2:] + 1, 0, (width, height)).astype(np.int64).T
-    box_pixels = np.where(seen, (right - left) * (bottom - top), 0)
+    visible = ~np.isnan(rectangles).any(axis=1)
+    rounded = np.floor(np.where(visible[:, None], rectangles, 0.0) + 0.5)
+    left, top = np.clip(rounded[:, :2], 0, (width, height)).astype(np.int64).T
+    right, bottom = np.clip(rounded[:, 2:] + 1, 0, (width, height)).astype(np.int64).T
+    box_pixels = np.where(visible, (right - left) * (bottom - top), 0)
     mask_pixels = np.zeros(len(rectangles), dtype=np.int64)
     for category in np.unique(categories):
-        k = np.flatnonzero(seen & (categories == category))
-        counted = _classes(semantic_map, str(category))
+        k = np.flatnonzero(visible & (categories == category))
+        class_ids = _classes(semantic_map, str(category))
         if len(k) == 0:
             continue
-        # Only what the category's rectangles cover together is looked at.
+        # The integral image covers only the bounding rectangle of the category's rectangles.
         row, column = top[k].min(), left[k].min()
         part = semantic_map.class_ids[row : bottom[k].max(), column : right[k].max()]
-        total = _integral(part, counted)
+        total = _integral(part, class_ids)
         above, below = top[k] - row, bottom[k] - row
         before, after = left[k] - column, right[k] - column
         mask_pixels[k] = (
@@ -178,21 +181,26 @@ def count_pixels(
     return mask_pixels, box_pixels
 
 
-def _integral(class_ids: np.ndarray, counted: Collection[int]) -> np.ndarray:
-    """(h + 1, w + 1) class pixels above and left of each pixel corner of a (h, w) part of a map."""
+def _integral(part: np.ndarray, class_ids: Collection[int]) -> np.ndarray:
+    """Return the (h + 1, w + 1) integral image of the pixels of some classes.
+
+    Args:
+        part: (h, w) uint8 part of a semantic map.
+        class_ids: the classes to count.
+    """
     import cv2
 
-    counts = np.zeros(256, dtype=np.uint8)
-    counts[list(counted)] = 1
-    if class_ids.size == 0:
-        return np.zeros([side + 1 for side in class_ids.shape], dtype=np.int32)
-    return np.asarray(cv2.integral(cv2.LUT(class_ids, counts)))
+    is_counted = np.zeros(256, dtype=np.uint8)
+    is_counted[list(class_ids)] = 1
+    if part.size == 0:
+        return np.zeros([side + 1 for side in part.shape], dtype=np.int32)
+    return np.asarray(cv2.integral(cv2.LUT(part, is_counted)))
 
 
 def _classes(semantic_map: SemanticMap, category: str) -> tuple[int, ...]:
     if category not in semantic_map.category_classes:
         raise ConfigError(
             f"semantic prior: the segmenter has no classes for category {category}; "
-            "name the class ids that count for it in the segmenter's class table",
+            "add the class ids of this category to the segmenter's class table",
         )
     return semantic_map.category_classes[category]

@@ -1,1 +1,1 @@
-"""Training a detector from weighted labels."""
+"""Training of a detector from weighted labels."""

@@ -1,4 +1,4 @@
-"""What a training does to a sample before the network sees it: paste, flip, rotate, scale."""
+"""Augmentation of training samples: pasted objects, flip, rotation and scale."""
 
 from dataclasses import dataclass, replace
 
@@ -12,15 +12,16 @@ from curate.training.object_bank import ObjectBank, paste_objects
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How much samples are changed.
+    """Parameters of the augmentation.
 
     Attributes:
-        flip_probability: of the mirror over the x axis.
-        rotation_limit_rad: rotation about z is uniform within plus and minus this.
-        scale_range: uniform scale.
-        pasted: objects of each category pasted into a frame, where there is room.
-        fewest_points: an object with fewer points than this is an ignore region: what the sensor
-            did not see, or what a pasted object hides, can neither be learned nor be background.
+        flip_probability: probability of the mirror over the x axis.
+        rotation_limit_rad: the rotation about z is uniform in plus or minus this angle.
+        scale_range: lowest and highest scale; the scale is uniform in between.
+        pasted: highest number of objects of each category that are pasted into a frame.
+        fewest_points: an object with fewer points becomes an ignore region. An object that the
+            sensor did not see, or that a pasted object hides, cannot be learned and is not
+            background either.
     """
 
     flip_probability: float
@@ -30,14 +31,14 @@ class Augmentation:
     fewest_points: int
 
     def apply(self, sample: Sample, bank: ObjectBank, generator: np.random.Generator) -> Sample:
-        """Return a new sample; the one given is left as it is.
+        """Return an augmented copy of a sample; the input is not changed.
 
-        Pseudo-labels of weight 0 that are background are not in it; to what is pasted their place
-        is taken. All that weighs 0 afterwards is an ignore region.
+        Pseudo-labels of weight 0 that count as background are removed after pasting, so no object
+        is pasted onto them. Boxes that have weight 0 in the result are ignore regions.
         """
         sample = _without_background(paste_objects(sample, bank, self.pasted, generator))
-        seen = count_points_in_boxes(sample.points, sample.boxes) >= self.fewest_points
-        change = Similarity.draw(
+        visible = count_points_in_boxes(sample.points, sample.boxes) >= self.fewest_points
+        similarity = Similarity.draw(
             generator,
             flip_probability=self.flip_probability,
             rotation_limit_rad=self.rotation_limit_rad,
@@ -45,15 +46,15 @@ class Augmentation:
         )
         return replace(
             sample,
-            points=change.apply_to_points(sample.points),
-            boxes=change.apply_to_boxes(sample.boxes),
-            weights=np.where(seen, sample.weights, 0.0),
+            points=similarity.apply_to_points(sample.points),
+            boxes=similarity.apply_to_boxes(sample.boxes),
+            weights=np.where(visible, sample.weights, 0.0),
             zero_weight="ignore",
         )
 
 
 def _without_background(sample: Sample) -> Sample:
-    """Return the sample without the boxes of weight 0 that are background."""
+    """Return the sample without the boxes of weight 0 that count as background."""
     kept = (sample.weights > 0) | sample.ignored
     return replace(
         sample,

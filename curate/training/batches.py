@@ -1,4 +1,4 @@
-"""The batches of a training: which frames meet in a step, augmented."""
+"""Batches of a training: the augmented frames of each step."""
 
 import numpy as np
 
@@ -10,17 +10,17 @@ from curate.training.settings import TrainingSettings
 
 
 class Batches:
-    """Makes the batch of any step.
+    """The batches of a training by step number.
 
-    A batch depends on the labels, the settings and the number of the step only, so that a training
-    that was killed goes on with the batches it would have seen.
+    A batch depends only on the labels, the settings and the step number. A killed training
+    therefore resumes with the same batches.
 
     Args:
-        labels: the frames to learn from.
-        settings: of the training.
+        labels: the training frames.
+        settings: settings of the training.
 
     Raises:
-        DataError: no frame is labeled.
+        DataError: if no frame is labeled.
     """
 
     def __init__(self, labels: WeightedLabels, settings: TrainingSettings) -> None:
@@ -28,44 +28,47 @@ class Batches:
         self._settings = settings
         self._augmentation = settings.augmentation()
         self._cache: dict[int, Sample] = {}
-        self._room = settings.cache_bytes
+        self._free_cache_bytes = settings.cache_bytes
         self.labeled = np.flatnonzero(labels.labeled)
         self.unlabeled = np.flatnonzero(~labels.labeled)
         if len(self.labeled) == 0:
-            raise DataError("the label file holds no labeled frame; a training needs at least one")
+            raise DataError("the label file has no labeled frame; training needs at least one")
         labeled = [self._sample(int(index)) for index in self.labeled]
         self.bank = ObjectBank.build(labeled, labels.categories, settings.fewest_points)
-        known = sum(np.count_nonzero(~sample.ignored) for sample in labeled)
-        self.objects_per_frame = max(known / len(labeled), 1.0)
+        objects = sum(np.count_nonzero(~sample.ignored) for sample in labeled)
+        self.objects_per_frame = max(objects / len(labeled), 1.0)
 
     def __getitem__(self, step: int) -> list[Sample]:
         """Return the augmented samples of a step."""
         augmented = []
-        for place, index in enumerate(self.chosen(step)):
-            generator = np.random.default_rng([self._settings.seed, step, place])
+        for position, index in enumerate(self.frame_indices(step)):
+            generator = np.random.default_rng([self._settings.seed, step, position])
             augmented.append(self._augmentation.apply(self._sample(index), self.bank, generator))
         return augmented
 
-    def chosen(self, step: int) -> list[int]:
-        """The frames of a step: X_l and X_u each run through in an order new for every pass."""
-        of_unlabeled = self._settings.unlabeled_batch_size if len(self.unlabeled) else 0
-        chosen = []
+    def frame_indices(self, step: int) -> list[int]:
+        """Return the indices of the frames of a step, in X_l and then in X_u.
+
+        Each pass over X_l or X_u visits every frame once, in a new random order.
+        """
+        unlabeled_count = self._settings.unlabeled_batch_size if len(self.unlabeled) else 0
+        indices = []
         for pool, count in (
             (self.labeled, self._settings.batch_size),
-            (self.unlabeled, of_unlabeled),
+            (self.unlabeled, unlabeled_count),
         ):
-            for turn in range(step * count, (step + 1) * count):
-                seed = [self._settings.seed, turn // len(pool), int(pool is self.labeled)]
+            for draw in range(step * count, (step + 1) * count):
+                seed = [self._settings.seed, draw // len(pool), int(pool is self.labeled)]
                 order = np.random.default_rng(seed).permutation(len(pool))
-                chosen.append(int(pool[order[turn % len(pool)]]))
-        return chosen
+                indices.append(int(pool[order[draw % len(pool)]]))
+        return indices
 
     def _sample(self, index: int) -> Sample:
-        """Return the sample as read, from memory where there was room for it."""
+        """Return the sample without augmentation, from the cache if it had room for it."""
         if index in self._cache:
             return self._cache[index]
         sample = self._labels[index]
-        if sample.points.nbytes <= self._room:
-            self._room -= sample.points.nbytes
+        if sample.points.nbytes <= self._free_cache_bytes:
+            self._free_cache_bytes -= sample.points.nbytes
             self._cache[index] = sample
         return sample

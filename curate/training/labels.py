@@ -1,6 +1,6 @@
-"""Exported labels as a torch dataset, for this project's trainer or anyone else's.
+"""Exported labels as a torch dataset, for this project's trainer or any other one.
 
-Needs the exported file and the frames it names, nothing else of this project's machinery:
+It needs only the exported file and the frames that the file lists, no workspace:
 
     labels = WeightedLabels("labels.sqlite")
     for batch in DataLoader(labels, batch_size=4, collate_fn=labels.collate):
@@ -32,7 +32,7 @@ from curate.frames import Frame
 from curate.geometry.projection import in_view
 from curate.shapes import Bool, Float, Int
 
-# Ground truth that looks like a category without being one: neither object nor background of it.
+# Ground-truth categories that look like another one: an ignore region for that category.
 NEIGHBOURS: Final = {"Van": "Car", "Person_sitting": "Pedestrian"}
 
 
@@ -40,18 +40,19 @@ NEIGHBOURS: Final = {"Van": "Car", "Person_sitting": "Pedestrian"}
 class LabelBatch:
     """Several frames with their boxes as tensors, from `WeightedLabels.collate`.
 
-    The p points and n boxes of all frames are concatenated; `point_frames` and `box_frames` say
-    which frame of the batch each belongs to. Boxes of weight 0 that are background are left out,
-    so a weight of 0 marks a region to ignore: loss times weight is right for every box.
+    The p points and n boxes of all frames are concatenated; `point_frames` and `box_frames` give
+    the frame of each within the batch. Boxes of weight 0 that count as background are left out, so
+    a weight of 0 marks a region to ignore: multiply the loss of every box by its weight.
 
     Attributes:
-        frame_ids: names of the b frames.
-        labeled: (b,) bool, whether a frame's boxes are ground truth (X_l) or pseudo-labels (X_u).
+        frame_ids: ids of the b frames.
+        labeled: (b,) bool, true if a frame's boxes are ground truth (X_l), false if they are
+            pseudo-labels (X_u).
         points: (p, 4) float32 x, y, z in metres in the LiDAR frame, and intensity in [0, 1].
-        point_frames: (p,) int64 in [0, b).
+        point_frames: (p,) int64 frame of each point, in [0, b).
         boxes: (n, 7) float32 x, y, z, length, width, height in metres and yaw in radians, at the
             box centre in the LiDAR frame.
-        box_frames: (n,) int64 in [0, b).
+        box_frames: (n,) int64 frame of each box, in [0, b).
         categories: (n,) int64 index into `WeightedLabels.categories`.
         weights: (n,) float32 v in [0, 1]; 1 for ground truth.
     """
@@ -72,20 +73,20 @@ class LabelBatch:
 
 
 class WeightedLabels(Dataset[Sample]):
-    """The frames of an exported label file with their boxes and weights, in the order of frames.
+    """The frames of an exported label file with their boxes and weights, sorted by frame id.
 
     A torch `Dataset` of `Sample`. Source of the weights: An et al., Remote Sensing 15(3):627, 2023,
     Eqs. 6 and 10: v multiplies an object's classification and box loss.
 
     Args:
-        path: the SQLite file, text or `Path`.
-        read: gives the frame of an id; by default the frames of the data set that the file names,
-            in KITTI's layout below its root.
-        root: where that data set lies now, if it has moved since the export.
+        path: path of the SQLite file.
+        read: returns the frame of a frame id; by default reads KITTI's layout below the root of the
+            data set that the file specifies.
+        root: current root of that data set, if it has moved since the export.
 
     Raises:
-        DataError: the file is missing, damaged, or no label file of this version.
-        LeakageError: it holds ground truth of frames that are not labeled.
+        DataError: if the file is missing, damaged, or not a label file of this version.
+        LeakageError: if it contains ground truth of frames that are not labeled.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class WeightedLabels(Dataset[Sample]):
         self.frame_ids: tuple[str, ...] = tuple(frame for frame, _ in frames)
         self.labeled = np.array([split == "labeled" for _, split in frames], dtype=bool)
         self._boxes = dict.fromkeys(self.frame_ids, _NO_BOXES)
-        # What a person rejected is background, also where a weight of 0 is to be ignored.
+        # A label that a person rejected is background, even if weight 0 otherwise means ignore.
         rejected = "provenance IS 'human' AND weight IS 0"
         rejected = rejected if self.zero_weight == "ignore" else "false"
         for table, weight, left_out in (
@@ -126,17 +127,16 @@ class WeightedLabels(Dataset[Sample]):
         return len(self.frame_ids)
 
     def __getitem__(self, index: int) -> Sample:
-        """Read the frame's points.
+        """Return a frame with its labels and its points in the camera's view.
 
         Raises:
             DataError: if the frame cannot be read.
         """
         frame_id = self.frame_ids[index]
         frame = self._read(frame_id)
-        seen = in_view(frame.points, frame.calibration, frame.image_size)
         boxes, categories, weights = self._boxes[frame_id]
         labeled = bool(self.labeled[index])
-        points = frame.points[seen]
+        points = frame.points[in_view(frame.points, frame.calibration, frame.image_size)]
         return Sample(frame_id, labeled, points, boxes, categories, weights, self.zero_weight)
 
     def collate(self, samples: Sequence[Sample]) -> LabelBatch:
@@ -154,14 +154,14 @@ class WeightedLabels(Dataset[Sample]):
             points=torch.from_numpy(np.concatenate([sample.points for sample in samples])),
             point_frames=_frame_numbers([len(sample.points) for sample in samples]),
             boxes=numbers[:, :7].float(),
-            box_frames=_frame_numbers([len(own) for own in weights]),
+            box_frames=_frame_numbers([len(of_frame) for of_frame in weights]),
             categories=numbers[:, 7].long(),
             weights=torch.from_numpy(np.concatenate(weights)).float(),
         )
 
 
 def _frame_numbers(counts: Sequence[int]) -> torch.Tensor:
-    """(sum of counts,) the number of each row's frame within the batch."""
+    """Return (sum of counts,) the frame of each row, as its number within the batch."""
     return torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
 
 
@@ -169,30 +169,32 @@ _NO_BOXES = (np.zeros((0, 7)), as_categories([]), np.zeros(0))
 
 
 def _group(
-    path: Path, rows: list[tuple], known: tuple[str, ...]
+    path: Path, rows: list[tuple], categories: tuple[str, ...]
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Boxes, categories and weights of each frame; unknown categories are left out.
+    """Return boxes, categories and weights of each frame; other categories are left out.
+
+    A box of a neighbour category becomes an ignore region of the category that it looks like.
 
     Raises:
-        DataError: if a box is not finite, or a weight not in [0, 1].
+        DataError: if a box is not finite, or a weight is not in [0, 1].
     """
     by_frame: dict[str, list[tuple]] = {}
     for frame, category, *numbers in rows:
-        neighbour = NEIGHBOURS.get(category) if category not in known else None
-        if neighbour in known:
-            by_frame.setdefault(frame, []).append((neighbour, *numbers[:-1], 0.0))
-        elif category in known:
+        similar = NEIGHBOURS.get(category) if category not in categories else None
+        if similar in categories:
+            by_frame.setdefault(frame, []).append((similar, *numbers[:-1], 0.0))
+        elif category in categories:
             by_frame.setdefault(frame, []).append((category, *numbers))
     grouped = {}
     for frame, entries in by_frame.items():
-        numbers_of = _numbers(path, frame, [entry[1:] for entry in entries])
+        box_and_weight = _numbers(path, frame, [entry[1:] for entry in entries])
         names = as_categories([entry[0] for entry in entries])
-        grouped[frame] = (numbers_of[:, :7], names, numbers_of[:, 7])
+        grouped[frame] = (box_and_weight[:, :7], names, box_and_weight[:, 7])
     return grouped
 
 
 def _numbers(path: Path, frame: str, entries: list[tuple]) -> np.ndarray:
-    """Return (m, 8) boxes and weights; a damaged file may hold anything in their place."""
+    """Return (m, 8) boxes and weights; raise DataError for the values of a damaged file."""
     try:
         numbers = np.array(entries, dtype=np.float64)
     except (TypeError, ValueError):
@@ -200,7 +202,7 @@ def _numbers(path: Path, frame: str, entries: list[tuple]) -> np.ndarray:
     if not np.isfinite(numbers).all() or not ((numbers[:, 7] >= 0) & (numbers[:, 7] <= 1)).all():
         raise DataError(
             f"{path}: frame {frame!r} has a box that is not finite or a weight that is not in "
-            "[0, 1]; delete it and export it again"
+            "[0, 1]; delete the file and export it again"
         )
     return numbers
 

@@ -1,45 +1,50 @@
 """The mean teacher: a moving average of the student (Tarvainen and Valpola, NeurIPS 2017).
 
-It starts where the student starts. After the round it is what teaches and what is evaluated, in
-place of the student; SESS and 3DIoUMatch use one.
+It starts with the student's weights. After the round, the average replaces the student: it is the
+next teacher and is evaluated. SESS and 3DIoUMatch use a mean teacher.
 """
 
 import copy
 
 import torch
 
-# A decay is stated for this share of a training, so that the average looks back over the same share
-# of any training: 0.999 forgets over its last tenth.
+# The decay is defined per this share of a training. A decay then averages over the same share of
+# any training, however many steps it has: 0.999 averages over about the last tenth.
 _SHARE = 1 / 10_000
 
 
 class MovingAverage:
-    """Follows a network; averages parameters and the statistics of its normalisations alike.
+    """Moving average of a network's parameters and of the statistics of its normalisations.
 
     Args:
         network: the student before its first step.
-        decay: how much of the average is kept per ten-thousandth of the training, in [0, 1).
-        steps: of the training.
+        decay: share of the average that is kept per ten-thousandth of the training, in [0, 1).
+        steps: number of steps of the training.
 
     Attributes:
-        network: the average.
+        network: the averaged network.
     """
 
     def __init__(self, network: torch.nn.Module, decay: float, steps: int) -> None:
         self.network = copy.deepcopy(network).requires_grad_(requires_grad=False)
-        self._kept = step_decay(decay, steps)
+        self._step_decay = step_decay(decay, steps)
 
-    def follow(self, student: torch.nn.Module) -> None:
-        """Take the student's weights in; counters are copied."""
+    def update(self, student: torch.nn.Module) -> None:
+        """Update the average with the student's current weights; counters are copied."""
         with torch.no_grad():
-            own = self.network.state_dict()
-            for name, present in student.state_dict().items():
-                if present.is_floating_point():
-                    own[name].lerp_(present, 1 - self._kept)
+            average = self.network.state_dict()
+            for name, current in student.state_dict().items():
+                if current.is_floating_point():
+                    average[name].lerp_(current, 1 - self._step_decay)
                 else:
-                    own[name].copy_(present)
+                    average[name].copy_(current)
 
 
 def step_decay(decay: float, steps: int) -> float:
-    """How much of the average is kept per step."""
+    """Return the share of the average that is kept per step.
+
+    Args:
+        decay: share that is kept per ten-thousandth of the training, in [0, 1).
+        steps: number of steps of the training.
+    """
     return float(decay ** (1 / (_SHARE * steps)))

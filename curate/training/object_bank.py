@@ -1,9 +1,9 @@
-"""Cut-and-paste: objects of the labeled frames, set into other frames (SECOND, Sensors 2018).
+"""Ground-truth sampling: objects of labeled frames pasted into other frames (SECOND, Sensors 2018).
 
-An object keeps its distance to the sensor, so that its points stay as dense as the sensor would
-have seen them, and is turned about the sensor's vertical axis to a place that is open to view and
-free: no box overlaps it, also none of weight 0, and no point lies in it but of the ground. There it
-stands on the ground as it stood before, and hides what lies behind it.
+An object is rotated about the sensor's vertical axis to a new azimuth. It keeps its distance to the
+sensor, so the density of its points stays realistic. The new place must be visible and free: no box
+overlaps it, not even one of weight 0, and it contains no points except ground. The object is moved
+vertically onto the ground there, and hides the points behind it.
 """
 
 from collections.abc import Iterable
@@ -21,19 +21,21 @@ from curate.geometry.points_in_boxes import box_of_points, count_points_in_boxes
 from curate.geometry.similarity import Similarity
 from curate.shapes import Float, Float32
 
-# Tries per object that is asked for; crowded frames get fewer objects.
+# Candidates drawn per requested object; crowded frames get fewer objects than requested.
 _TRIES = 2
-# The place is hidden where scene points before it outnumber this share of the object's own points.
+# A place counts as hidden if more scene points are in front of it than this share of the object's
+# own points.
 _HIDDEN_SHARE = 0.3
-# The lowest part of an object is not looked at: ground is before everything and in every place.
+# Height of an object's lowest part, which the checks ignore: ground points are in front of every
+# object and in every place.
 _GROUND_METRES = 0.25
-# A place this much higher or lower than where the object stood is a roof or a wall, not ground.
+# A place with a larger height difference to the object's original place is a roof or a wall.
 _HIGHEST_STEP_METRES = 0.7
 
 
 @dataclass(frozen=True)
 class BankObject:
-    """One object: its category, its (7,) box and its (n, 4) points, where they were seen."""
+    """One object: its category, (7,) box and (n, 4) points, in the LiDAR frame of its frame."""
 
     category: str
     box: Float[np.ndarray, " 7"]
@@ -45,7 +47,7 @@ class ObjectBank:
     """The objects of the labeled frames by category.
 
     Attributes:
-        objects: of each category, in the order of the frames.
+        objects: the objects of each category, in the order of the frames.
     """
 
     objects: dict[str, tuple[BankObject, ...]]
@@ -54,16 +56,21 @@ class ObjectBank:
     def build(
         cls, samples: Iterable[Sample], categories: tuple[str, ...], fewest_points: int = 5
     ) -> Self:
-        """Return the objects in labeled samples that have enough points to be recognised.
+        """Return a bank of the objects in labeled samples.
+
+        Args:
+            samples: samples of labeled frames.
+            categories: categories of the bank.
+            fewest_points: objects with fewer points are left out.
 
         Raises:
-            LeakageError: if a sample is not of the labeled split.
+            LeakageError: if a sample is not from the labeled split.
         """
         objects: dict[str, list[BankObject]] = {category: [] for category in categories}
         for sample in samples:
             if not sample.labeled:
                 raise LeakageError(
-                    f"object bank: frame {sample.frame_id} is not of the labeled split; "
+                    f"object bank: frame {sample.frame_id} is not in the labeled split; "
                     "the bank is built from labeled frames only"
                 )
             owner = box_of_points(sample.points, sample.boxes)
@@ -75,7 +82,7 @@ class ObjectBank:
         return cls({category: tuple(found) for category, found in objects.items()})
 
     def draw(self, count: int, generator: np.random.Generator) -> list[BankObject]:
-        """Up to `count` objects of each category, in random order."""
+        """Return up to `count` random objects of each category, in random order."""
         drawn = [
             objects[i]
             for objects in self.objects.values()
@@ -87,14 +94,17 @@ class ObjectBank:
 def paste_objects(
     sample: Sample, bank: ObjectBank, count: int, generator: np.random.Generator
 ) -> Sample:
-    """Return the sample with up to `count` more objects of each category, each with weight 1."""
+    """Return the sample with up to `count` pasted objects of each category, each with weight 1."""
     drawn = bank.draw(_TRIES * count, generator)
     if not drawn or len(sample.points) == 0:
         return sample
     scene = _Scene(sample.points)
-    turns = _turns(drawn, scene.azimuths, generator)
+    rotations = _rotations(drawn, scene.azimuths, generator)
     boxes = np.concatenate(
-        [turn.apply_to_boxes(found.box[None]) for turn, found in zip(turns, drawn, strict=True)]
+        [
+            rotation.apply_to_boxes(candidate.box[None])
+            for rotation, candidate in zip(rotations, drawn, strict=True)
+        ]
     )
     lifts = sample.ground.at(boxes[:, :2]) - (boxes[:, 2] - boxes[:, 5] / 2)
     lifts = np.where(np.isnan(lifts), 0.0, lifts)
@@ -103,21 +113,21 @@ def paste_objects(
     blocked = np.any(bev_iou(boxes, sample.boxes) > 0, axis=1)
     blocked |= np.abs(lifts) > _HIGHEST_STEP_METRES
     blocked |= _occupied(boxes, sample.points)
-    meets = np.greater(bev_iou(boxes, boxes), 0)
-    wanted = dict.fromkeys(bank.objects, count)
+    overlaps = np.greater(bev_iou(boxes, boxes), 0)
+    remaining = dict.fromkeys(bank.objects, count)
     accepted: list[int] = []
-    for k, found in enumerate(drawn):
-        if blocked[k] or not wanted[found.category]:
+    for k, candidate in enumerate(drawn):
+        if blocked[k] or not remaining[candidate.category]:
             continue
-        points = _lifted(turns[k].apply_to_points(found.points), lifts[k])
+        points = _lift(rotations[k].apply_to_points(candidate.points), lifts[k])
         if scene.insert(outlines, k, points):
             accepted.append(k)
-            blocked |= meets[k]
-            wanted[found.category] -= 1
+            blocked |= overlaps[k]
+            remaining[candidate.category] -= 1
     names = [drawn[k].category for k in accepted]
     return replace(
         sample,
-        points=scene.left(),
+        points=scene.visible_points(),
         boxes=np.concatenate([sample.boxes, boxes[accepted]]),
         categories=as_categories([*sample.categories.tolist(), *names]),
         weights=np.concatenate([sample.weights, np.ones(len(accepted))]),
@@ -126,10 +136,13 @@ def paste_objects(
 
 @dataclass(frozen=True)
 class _Outlines:
-    """Where boxes appear to the sensor: n intervals of azimuth and slope, and their distance.
+    """Outlines of n boxes as seen by the sensor.
 
-    Slope is height over distance. `above_ground` is the slope above which the ground before the
-    object does not reach.
+    Attributes:
+        azimuth: (n, 2) lowest and highest azimuth, radians.
+        slope: (n, 2) lowest and highest slope; slope is height over horizontal distance.
+        distance: (n,) horizontal distance of the nearest corner, metres.
+        above_ground: (n,) slope above which a point in front of the box is not ground.
     """
 
     azimuth: np.ndarray
@@ -152,59 +165,65 @@ class _Outlines:
             (boxes[:, 2] - boxes[:, 5] / 2 + _GROUND_METRES) / nearest,
         )
 
-    def cover(self, which: list[int], seen: "_Seen") -> np.ndarray:
-        """(p,) bool, whether a point appears within one of some outlines, whatever its distance."""
+    def cover(self, rows: list[int], points: "_SensorView") -> np.ndarray:
+        """Return (p,) bool: whether a point is inside one of these outlines, at any distance."""
         within = [
-            (values >= bounds[which, :1].T) & (values <= bounds[which, 1:].T)
+            (values >= bounds[rows, :1].T) & (values <= bounds[rows, 1:].T)
             for values, bounds in (
-                (seen.azimuth[:, None], self.azimuth),
-                (seen.slope[:, None], self.slope),
+                (points.azimuth[:, None], self.azimuth),
+                (points.slope[:, None], self.slope),
             )
         ]
         return np.asarray((within[0] & within[1]).any(axis=1))
 
 
 class _Scene:
-    """The points of a frame as the sensor sees them; what is pasted hides others and is hidden."""
+    """The points of a frame from the sensor's view; pasted objects hide points behind them."""
 
     def __init__(self, points: np.ndarray) -> None:
-        self._points, self._seen = points, _Seen.of(points)
-        self._kept = np.ones(len(points), dtype=bool)
+        self._points, self._view = points, _SensorView.of(points)
+        self._visible = np.ones(len(points), dtype=bool)
         self._pasted: list[int] = []
-        azimuth = self._seen.azimuth
+        azimuth = self._view.azimuth
         self.azimuths = (float(azimuth.min()), float(azimuth.max()))
 
     def insert(self, outlines: _Outlines, k: int, points: np.ndarray) -> bool:
-        """Put the points of object k in that are seen, unless it would be hidden or cut off."""
+        """Insert the points of object k; return False if it would be hidden or cut off.
+
+        Args:
+            outlines: outlines of all candidate objects.
+            k: row of the object in the outlines.
+            points: (n, 4) points of the object at its new place.
+        """
         low, high = outlines.azimuth[k]
         if low < self.azimuths[0] or high > self.azimuths[1]:
             return False
-        azimuth = self._seen.azimuth
-        in_sector = np.flatnonzero((azimuth >= low) & (azimuth <= high) & self._kept)
-        slope, distance = self._seen.slope[in_sector], self._seen.distance[in_sector]
+        azimuth = self._view.azimuth
+        in_sector = np.flatnonzero((azimuth >= low) & (azimuth <= high) & self._visible)
+        slope, distance = self._view.slope[in_sector], self._view.distance[in_sector]
         covered = (slope >= outlines.slope[k, 0]) & (slope <= outlines.slope[k, 1])
-        before = distance < outlines.distance[k]
-        hiding = covered & before & (slope > outlines.above_ground[k])
+        in_front = distance < outlines.distance[k]
+        hiding = covered & in_front & (slope > outlines.above_ground[k])
         if np.count_nonzero(hiding) > _HIDDEN_SHARE * len(points):
             return False
-        own = _Seen.of(points)
+        object_view = _SensorView.of(points)
         nearer = [j for j in self._pasted if outlines.distance[j] < outlines.distance[k]]
-        hidden = outlines.cover(nearer, own)
-        self._kept[in_sector[covered & ~before]] = False
+        hidden = outlines.cover(nearer, object_view)
+        self._visible[in_sector[covered & ~in_front]] = False
         self._points = np.concatenate([self._points, points])
-        self._seen = self._seen.and_also(own)
-        self._kept = np.concatenate([self._kept, ~hidden])
+        self._view = self._view.extended(object_view)
+        self._visible = np.concatenate([self._visible, ~hidden])
         self._pasted.append(k)
         return True
 
-    def left(self) -> np.ndarray:
-        """Return the points that no pasted object has taken the place of or hidden."""
-        return self._points[self._kept]
+    def visible_points(self) -> np.ndarray:
+        """Return the points of frame and pasted objects that no pasted object hides."""
+        return self._points[self._visible]
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """Where n points appear to the sensor: azimuth, slope and distance over the ground."""
+class _SensorView:
+    """Position of n points in the sensor's view: azimuth, slope and horizontal distance."""
 
     azimuth: np.ndarray
     slope: np.ndarray
@@ -212,39 +231,39 @@ class _Seen:
 
     @classmethod
     def of(cls, points: np.ndarray) -> Self:
-        """Of (n, >=3) points."""
+        """Return the view of (n, >=3) points."""
         distance = np.hypot(points[:, 0], points[:, 1])
         slope = points[:, 2] / np.maximum(distance, 1e-3)
         return cls(np.arctan2(points[:, 1], points[:, 0]), slope, distance)
 
-    def and_also(self, more: Self) -> Self:
-        """These points, then more."""
+    def extended(self, more: Self) -> Self:
+        """Return the view of these points followed by more points."""
         names = ("azimuth", "slope", "distance")
-        return type(self)(*(np.append(getattr(self, of), getattr(more, of)) for of in names))
+        return type(self)(*(np.append(getattr(self, name), getattr(more, name)) for name in names))
 
 
 def _occupied(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return (n,) bool, whether there is more than ground where (n, 7) boxes would stand."""
+    """Return (n,) bool: whether the place of each of (n, 7) boxes has points above the ground."""
     above_ground = boxes.copy()
     above_ground[:, 2] += _GROUND_METRES / 2
     above_ground[:, 5] -= _GROUND_METRES
     return np.asarray(count_points_in_boxes(points, above_ground) > 0)
 
 
-def _lifted(points: np.ndarray, lift: float) -> np.ndarray:
-    """Return the points, higher by `lift`; changes them in place."""
+def _lift(points: np.ndarray, lift: float) -> np.ndarray:
+    """Raise points by `lift` in place, and return them."""
     points[:, 2] += lift
     return points
 
 
-def _turns(
+def _rotations(
     drawn: list[BankObject], azimuths: tuple[float, float], generator: np.random.Generator
 ) -> list[Similarity]:
-    """What brings each object to a random azimuth of the view, mirrored or not."""
+    """Return a transform of each object to a random azimuth of the view; half are mirrored."""
     mirrors = generator.random(len(drawn)) < 0.5
     goals = generator.uniform(*azimuths, len(drawn))
-    now = [np.arctan2(found.box[1], found.box[0]) for found in drawn]
+    current = [np.arctan2(candidate.box[1], candidate.box[0]) for candidate in drawn]
     return [
         Similarity(bool(mirror), float(goal + azimuth if mirror else goal - azimuth))
-        for mirror, goal, azimuth in zip(mirrors, goals, now, strict=True)
+        for mirror, goal, azimuth in zip(mirrors, goals, current, strict=True)
     ]

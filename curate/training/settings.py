@@ -1,4 +1,4 @@
-"""The settings of a training and what it reports in the end."""
+"""Settings and report of a training."""
 
 import math
 from dataclasses import dataclass
@@ -13,29 +13,29 @@ Teacher = Literal["student", "ema"]
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How to train; the defaults suit a training from scratch on a few dozen labeled frames.
+    """Settings of a training; the defaults suit training from scratch on few labeled frames.
 
     Attributes:
-        preset: one of the detector's presets; None for its first.
-        steps: optimiser steps.
+        preset: one of the detector's presets; None selects the first.
+        steps: number of optimiser steps.
         batch_size: frames of X_l per step.
-        unlabeled_batch_size: frames of X_u per step, besides: Eq. 6 adds the two sums, so pseudo-
-            labels never take the place of ground truth.
-        learning_rate: peak of the one-cycle schedule; about half of it suits fine-tuning.
+        unlabeled_batch_size: frames of X_u per step, in addition to those of X_l. Eq. 6 adds the
+            two sums, so pseudo-labels do not replace ground truth.
+        learning_rate: peak of the one-cycle schedule; use about half of it for fine-tuning.
         flip_probability: see `Augmentation`.
         rotation_limit_rad: see `Augmentation`.
         scale_range: see `Augmentation`.
-        pasted: see `Augmentation`; 0 does without the object bank.
-        fewest_points: see `Augmentation`; also of the objects of the bank.
-        seed: of the first weights, the order of the frames and the augmentation.
-        threads: of torch, on CPU.
+        pasted: see `Augmentation`; 0 disables the object bank.
+        fewest_points: see `Augmentation`; applies to the objects of the bank too.
+        seed: seed of the initial weights, the order of the frames and the augmentation.
+        threads: number of torch threads, on CPU.
         device: "cpu", or a torch device such as "cuda".
-        teacher: what the training leaves: the "student", or the moving average of its weights,
+        teacher: the network that is saved: the "student", or the moving average of its weights,
             "ema".
         ema_decay: see `MovingAverage`.
-        cache_bytes: of points kept in memory between the steps.
-        snapshot_seconds: between two snapshots from which a killed training goes on.
-        statistics_steps: between two steps of which statistics are kept.
+        cache_bytes: size of the cache of points in memory.
+        snapshot_seconds: time between two snapshots; a killed training resumes from the last one.
+        statistics_steps: number of steps between two records of statistics.
     """
 
     preset: str | None = None
@@ -58,27 +58,31 @@ class TrainingSettings:
     statistics_steps: int = 20
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for a setting that no training can use."""
-        for name, least in (
+        """Raise ConfigError if a setting is out of its range."""
+        for name, lowest in (
             ("steps", 1), ("batch_size", 1), ("threads", 1), ("pasted", 0), ("seed", 0),
             ("fewest_points", 0), ("unlabeled_batch_size", 0), ("statistics_steps", 1),
         ):  # fmt: skip
-            if getattr(self, name) < least:
-                raise ConfigError(f"training: {name} is {getattr(self, name)}, least is {least}")
+            if getattr(self, name) < lowest:
+                raise ConfigError(
+                    f"training: {name} is {getattr(self, name)}, must be at least {lowest}"
+                )
         if not self.learning_rate > 0:
             raise ConfigError(f"training: learning_rate is {self.learning_rate}, must be above 0")
         if not 0 < self.scale_range[0] <= self.scale_range[1]:
-            raise ConfigError(f"training: scale_range {self.scale_range} is no range above 0")
+            raise ConfigError(
+                f"training: scale_range {self.scale_range} is not an ascending range above 0"
+            )
         if not 0 <= self.ema_decay < 1:
             raise ConfigError(
                 f"training: ema_decay is {self.ema_decay}, must be at least 0 and below 1"
             )
         if self.teacher not in get_args(Teacher):
-            known = " or ".join(get_args(Teacher))
-            raise ConfigError(f"training: unknown teacher {self.teacher!r}; choose {known}")
+            choices = " or ".join(get_args(Teacher))
+            raise ConfigError(f"training: unknown teacher {self.teacher!r}; choose {choices}")
 
     def augmentation(self) -> Augmentation:
-        """Return the augmentation that these settings describe."""
+        """Return the augmentation with these settings."""
         return Augmentation(
             self.flip_probability,
             self.rotation_limit_rad,
@@ -90,12 +94,12 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class Statistic:
-    """A number that describes a step of a training.
+    """One statistic of one training step.
 
     Attributes:
-        step: from 1.
+        step: number of the step, from 1.
         name: "loss", one of its terms, "learning_rate" or "gradient_norm" (before clipping).
-        value: at this step.
+        value: value at this step.
     """
 
     step: int
@@ -105,19 +109,19 @@ class Statistic:
 
 @dataclass(frozen=True)
 class TrainingReport:
-    """What a training did.
+    """Report of a finished training.
 
     Attributes:
         checkpoint: the file that was written.
-        steps: optimiser steps in all.
-        resumed_at: step at which it went on from an earlier, killed run; 0 where it began anew.
-        loss: mean of the last steps.
-        seconds: that this run took.
-        labeled_frames: of X_l.
-        unlabeled_frames: of X_u.
-        bank: objects in the bank by category.
-        statistics: of every `statistics_steps`-th step and the last one, also of those before a
-            kill.
+        steps: total number of optimiser steps.
+        resumed_at: step at which this run resumed a killed one; 0 if it started from the beginning.
+        loss: mean loss of the last steps.
+        seconds: duration of this run.
+        labeled_frames: number of frames of X_l.
+        unlabeled_frames: number of frames of X_u.
+        bank: number of objects in the bank by category.
+        statistics: statistics of every `statistics_steps`-th step and of the last one, including
+            steps of killed runs.
     """
 
     checkpoint: Path

@@ -1,4 +1,4 @@
-"""Snapshots of a running training, from which a killed one goes on as if nothing had happened."""
+"""Snapshots of a training: a killed training resumes from the last one with the same result."""
 
 import hashlib
 import io
@@ -18,7 +18,7 @@ from curate.training.settings import TrainingSettings
 
 _log = logging.getLogger(__name__)
 
-# Settings that change where or how often, but not what is computed.
+# Settings that do not change the result.
 _WITHOUT_EFFECT = ("cache_bytes", "snapshot_seconds", "statistics_steps")
 
 
@@ -28,8 +28,8 @@ def fingerprint(
     settings: TrainingSettings,
     start: Path | None,
 ) -> str:
-    """What a training's result depends on, as SHA-256 in hexadecimal."""
-    relevant = {key: at for key, at in asdict(settings).items() if key not in _WITHOUT_EFFECT}
+    """Return the SHA-256, in hexadecimal, of everything that a training's result depends on."""
+    relevant = {key: value for key, value in asdict(settings).items() if key not in _WITHOUT_EFFECT}
     trained = [detector.__module__, detector.__qualname__, detector.checkpoint_version]
     digest = hashlib.sha256(json.dumps([trained, relevant, torch.__version__]).encode())
     for path in (labels, start):
@@ -38,7 +38,7 @@ def fingerprint(
 
 
 def snapshot_path(output: Path) -> Path:
-    """Where the snapshot of the training that will write `output` lies."""
+    """Return the path of the snapshot of the training that writes `output`."""
     return output.with_name(f".{output.name}.training")
 
 
@@ -49,13 +49,13 @@ def save_snapshot(
     optimizer: torch.optim.Optimizer,
     progress: dict[str, Any],
 ) -> None:
-    """Write the state of a training after some step, whole or not at all.
+    """Write the state of a training atomically.
 
     Args:
-        output: checkpoint that the training will write.
-        mark: its `fingerprint`.
-        networks: the student and, where there is one, its average; their weights are kept.
-        optimizer: of the student.
+        output: the checkpoint that the training will write.
+        mark: `fingerprint` of the training.
+        networks: the student and, if there is one, its moving average.
+        optimizer: optimiser of the student.
         progress: plain numbers and lists.
     """
     buffer = io.BytesIO()
@@ -75,10 +75,10 @@ def load_snapshot(
     networks: Sequence[torch.nn.Module],
     optimizer: torch.optim.Optimizer,
 ) -> dict[str, Any] | None:
-    """Take up the snapshot of a killed training, and gives its progress.
+    """Load the snapshot of a killed training into the networks and return its progress.
 
-    None where there is no snapshot, it is damaged, or it is of a training on other labels, with
-    other settings or from another start. Only tensors and plain values are read from the file.
+    Returns None if there is no snapshot, it is damaged, or it is from a training with other labels,
+    other settings or another start. Only tensors and plain values are read from the file.
     """
     path = snapshot_path(output)
     if not path.exists():
@@ -86,12 +86,12 @@ def load_snapshot(
     try:
         content = io.BytesIO(path.read_bytes())
         state = torch.load(content, map_location="cpu", weights_only=True)
-        own = state["fingerprint"] == mark
+        matches = state["fingerprint"] == mark
     except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError):
-        _log.warning("%s is damaged; starting anew", path)
+        _log.warning("%s is damaged; training starts from the beginning", path)
         return None
-    if not own:
-        _log.info("%s is of another training; starting anew", path)
+    if not matches:
+        _log.info("%s is from another training; training starts from the beginning", path)
         return None
     for network, weights in zip(networks, state["networks"], strict=True):
         network.load_state_dict(weights)

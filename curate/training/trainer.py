@@ -1,4 +1,4 @@
-"""Trains a detector on labeled frames and weighted pseudo-labels (Eqs. 6 and 10)."""
+"""Training of a detector on labeled frames and weighted pseudo-labels (Eqs. 6 and 10)."""
 
 import logging
 import math
@@ -24,15 +24,16 @@ from curate.training.snapshot import fingerprint, load_snapshot, save_snapshot, 
 
 _log = logging.getLogger(__name__)
 
-# Step, steps, loss of the step.
+# Arguments: number of the step, number of steps, loss of the step.
 Progress = Callable[[int, int, float], None]
 
 _WEIGHT_DECAY = 0.01
-_LARGEST_GRADIENT = 10.0
+_MAX_GRADIENT_NORM = 10.0
 # One cycle (Smith and Topin, 2018): the rate rises over this share of the steps, then falls.
 _RISING_SHARE = 0.3
+# Learning rate of the first step, as a share of the peak.
 _FIRST_RATE_SHARE = 0.1
-# The reported loss is the mean of so many last steps.
+# The reported loss is the mean over this number of last steps.
 _RECENT_STEPS = 50
 
 
@@ -46,26 +47,27 @@ def train(
     read: Callable[[str], Frame] | None = None,
     progress: Progress | None = None,
 ) -> TrainingReport:
-    """Train a detector and write its checkpoint, or that of its moving average.
+    """Train a detector and write the checkpoint of the student or of its moving average.
 
-    A killed training, called again with the same arguments, goes on from its last snapshot and ends
-    with the weights that it would have had.
+    A killed training resumes from its last snapshot when it is called again with the same
+    arguments. It ends with the same weights as an uninterrupted one.
 
     Args:
-        detector: its class.
-        labels: exported label file; its unlabeled frames may be none.
+        detector: class of the detector.
+        labels: exported label file; it may have no unlabeled frames.
         output: the checkpoint to write.
         settings: see `TrainingSettings`.
-        start: checkpoint to begin from, such as the teacher; from scratch without.
+        start: checkpoint to start from, such as the teacher; by default training starts from
+            scratch.
         read: see `WeightedLabels`.
         progress: called after every step with the step, the number of steps and the loss.
 
     Raises:
         DataError: if the labels or a frame cannot be read.
-        LeakageError: ground truth of unlabeled frames is among the labels.
-        ModelError: if the start cannot be used.
-        ConfigError: the start is of another preset or other categories, or the detector has no such
-            preset or lacks a member, or there is no such device.
+        LeakageError: if the label file contains ground truth of unlabeled frames.
+        ModelError: if the start checkpoint cannot be used.
+        ConfigError: if the start checkpoint has another preset or other categories, the detector
+            has no such preset or its student lacks a member, or the device cannot be used.
     """
     began = time.monotonic()
     labels, output = Path(labels), Path(output)
@@ -85,19 +87,21 @@ def train(
     mark = fingerprint(detector, labels, settings, start)
     average = _average_of(network, settings)
     networks = [network, average.network] if average else [network]
-    nothing: dict[str, Any] = {"step": 0, "losses": [], "statistics": []}
-    state = load_snapshot(output, mark, networks, optimizer) or nothing
+    initial: dict[str, Any] = {"step": 0, "losses": [], "statistics": []}
+    state = load_snapshot(output, mark, networks, optimizer) or initial
     resumed_at, losses = state["step"], state["losses"]
     statistics = [Statistic(*each) for each in state["statistics"]]
     saved = time.monotonic()
     network.train()
     for step in range(resumed_at, settings.steps):
-        described = _learn(student, optimizer, batches, step, settings)
-        losses = [*losses[1 - _RECENT_STEPS :], float(described["loss"])]
+        values = _train_step(student, optimizer, batches, step, settings)
+        losses = [*losses[1 - _RECENT_STEPS :], float(values["loss"])]
         if (step + 1) % settings.statistics_steps == 0 or step + 1 == settings.steps:
-            statistics += [Statistic(step + 1, name, float(of)) for name, of in described.items()]
+            statistics += [
+                Statistic(step + 1, name, float(value)) for name, value in values.items()
+            ]
         if average:
-            average.follow(network)
+            average.update(network)
         if progress:
             progress(step + 1, settings.steps, losses[-1])
         if time.monotonic() - saved >= settings.snapshot_seconds:
@@ -124,7 +128,7 @@ def train(
 
 
 def one_cycle(step: int, steps: int, peak: float) -> float:
-    """The learning rate of a step: a cosine up to the peak, and a longer one down to zero."""
+    """Return the learning rate of a step: a cosine up to the peak, then a longer one to zero."""
     rising = max(1.0, _RISING_SHARE * steps)
     if step < rising:
         share = (1 - math.cos(math.pi * step / rising)) / 2
@@ -133,20 +137,20 @@ def one_cycle(step: int, steps: int, peak: float) -> float:
 
 
 def _average_of(network: torch.nn.Module, settings: TrainingSettings) -> MovingAverage | None:
-    """What follows the student, if its average is to be left."""
+    """Return the moving average of the student, or None if the settings do not use one."""
     if settings.teacher == "student":
         return None
     return MovingAverage(network, settings.ema_decay, settings.steps)
 
 
-def _learn(
+def _train_step(
     student: Student,
     optimizer: torch.optim.Optimizer,
     batches: Batches,
     step: int,
     settings: TrainingSettings,
 ) -> dict[str, float | torch.Tensor]:
-    """Take one step; return its loss and what else describes it."""
+    """Run one optimiser step; return its statistics by name."""
     rate = one_cycle(step, settings.steps, settings.learning_rate)
     for group in optimizer.param_groups:
         group["lr"] = rate
@@ -156,18 +160,18 @@ def _learn(
         terms = student.loss(batch, expected)
     optimizer.zero_grad(set_to_none=True)
     torch.autograd.backward(terms["loss"])
-    norm = torch.nn.utils.clip_grad_norm_(student.network.parameters(), _LARGEST_GRADIENT)
+    norm = torch.nn.utils.clip_grad_norm_(student.network.parameters(), _MAX_GRADIENT_NORM)
     optimizer.step()
-    described = {name: term.detach() for name, term in terms.items()}
-    return {**described, "learning_rate": rate, "gradient_norm": norm}
+    detached = {name: term.detach() for name, term in terms.items()}
+    return {**detached, "learning_rate": rate, "gradient_norm": norm}
 
 
 @contextmanager
 def _torch_seeded(seed: list[int], device: str) -> Iterator[None]:
-    """Seed torch's global generators for a step, and leave them as they were.
+    """Seed torch's global generators for a step, and restore their state afterwards.
 
-    A student's dropout and sampling cannot be given a generator; seeded by the step, they draw the
-    same numbers after a kill.
+    Dropout and sampling in a student do not accept a generator. Seeded per step, they draw the same
+    numbers in a resumed training.
     """
     devices = [] if device == "cpu" else range(torch.cuda.device_count())
     with torch.random.fork_rng(devices=devices):
@@ -181,7 +185,7 @@ def _first_student(
     categories: tuple[str, ...],
     start: Path | None,
 ) -> Student:
-    """Return the student before the first step, on the device of the training."""
+    """Return the student before the first step, on the training device."""
     if start is None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -197,8 +201,8 @@ def _first_student(
         )
     if (student.preset, student.categories) != (settings.preset, categories):
         raise ConfigError(
-            f"{start}: is a {student.preset} detector of {', '.join(student.categories)}; the "
-            f"training is for {settings.preset} and {', '.join(categories)}"
+            f"{start}: has preset {student.preset} and categories {', '.join(student.categories)}; "
+            f"the training needs {settings.preset} and {', '.join(categories)}"
         )
     try:
         student.network.to(settings.device)

@@ -1,1 +1,1 @@
-"""Policies that turn evidence into weights, one file each."""
+"""Policies that compute weights from evidence, one file each."""

@@ -1,4 +1,4 @@
-"""What every curation policy offers: a weight for each label of a round, from its evidence."""
+"""Interface of curation policies: evidence of a round's labels in, weights out."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,20 +12,21 @@ from curate.errors import ConfigError, DataError
 from curate.shapes import Bool, Float, Int, Shaped
 
 ZeroWeight = Literal["background", "ignore"]
-"""What a label of weight 0 is to a student.
+"""Meaning of a label of weight 0 for the student.
 
-"background": no object, and its region teaches so; nearly all labels that get weight 0 are wrong.
-"ignore": neither object nor background, for policies with an explicit band of doubt.
+"background": the label is left out, so its region is trained as background. Nearly all labels of
+weight 0 are wrong. "ignore": the region is neither object nor background; used by policies with an
+explicit band of doubt.
 """
 
 
 @dataclass(frozen=True)
 class Age:
-    """How far the self-paced schedule has come: round e of E.
+    """Position in the self-paced schedule: round e of E.
 
     Attributes:
-        round: e, from 1.
-        rounds: E.
+        round: number e of the round, from 1.
+        rounds: number of rounds E.
     """
 
     round: int
@@ -36,12 +37,12 @@ class Age:
         if not 1 <= self.round <= self.rounds:
             raise ConfigError(
                 f"round {self.round} of {self.rounds} does not exist; "
-                "a round counts from 1 to the number of rounds",
+                "rounds are numbered from 1 to the number of rounds",
             )
 
     @property
     def share(self) -> float:
-        """The share e / E, in (0, 1]."""
+        """Completed share of the schedule, e / E in (0, 1]."""
         return self.round / self.rounds
 
 
@@ -50,12 +51,12 @@ class Memory:
     """The n labels of the previous round that the same policy did not drop, as aligned columns.
 
     Attributes:
-        frame_index: (n,) integer, in the numbering of the evidence.
+        frame_index: (n,) integer, with the same numbering as in the evidence.
         category: (n,) str.
         score: (n,) in [0, 1].
         iou: (n,) as in `Evidence`.
         boxes: (n, 7) in the LiDAR frame.
-        v: (n,) the weight that the policy gave.
+        v: (n,) weight that the policy gave.
     """
 
     frame_index: Int[np.ndarray, " n"]
@@ -68,19 +69,19 @@ class Memory:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of the n labels of a round, over all its frames, as aligned columns.
+    """Evidence for the n labels of a round, over all its frames, as aligned columns.
 
     Attributes:
-        frame_index: (n,) integer, which frame a label belongs to; any numbering.
+        frame_index: (n,) integer number of the label's frame; any numbering.
         category: (n,) str.
         score: (n,) in [0, 1].
-        loss: (n,) consistency loss L, not negative; NaN where no reprediction matched.
-        rho: (n,) trust of each prior by column name ("rho_diff", "rho_anno"), in [0, 1];
-            NaN where a prior has not scored a label.
-        iou: (n,) the detector's own estimate of the label's 3D IoU with its object, in [0, 1]; NaN
-            where it makes none, and everywhere if left out.
-        boxes: (n, 7) in the LiDAR frame; needed beside a memory only.
-        memory: what the policy thought of the previous round, for policies that remember; None in
+        loss: (n,) consistency loss L, not negative; NaN if no reprediction matched.
+        rho: (n,) trust of each prior by column name ("rho_diff", "rho_anno"), in [0, 1]; NaN if the
+            prior has not scored the label.
+        iou: (n,) the detector's estimate of the label's 3D IoU with its object, in [0, 1]; NaN if
+            there is no estimate. All NaN by default.
+        boxes: (n, 7) in the LiDAR frame; needed only with a memory.
+        memory: the policy's labels of the previous round, for policies with `remembers`; None in
             the first round.
     """
 
@@ -94,11 +95,11 @@ class Evidence:
     memory: Memory | None = None
 
     def __post_init__(self) -> None:
-        """Raise DataError where a column is not aligned or out of its range."""
+        """Raise DataError if a column is not aligned or out of its range."""
         if len(self.iou) == 0:
             object.__setattr__(self, "iou", np.full(len(self.loss), np.nan))
         if self.memory is not None and len(self.boxes) != len(self.loss):
-            raise DataError("evidence: a memory needs the boxes of the labels beside it")
+            raise DataError("evidence: a memory was given without the boxes of the labels")
         columns = {"frame_index": self.frame_index, "category": self.category, **self._numbers()}
         for name, column in columns.items():
             if column.shape != (len(self.loss),):
@@ -108,10 +109,10 @@ class Evidence:
                 )
         for name, column in self._numbers().items():
             limit = np.finfo(np.float64).max if name == "loss" else 1.0
-            wrong = np.flatnonzero((column < 0) | (column > limit))
-            if len(wrong):
+            invalid = np.flatnonzero((column < 0) | (column > limit))
+            if len(invalid):
                 raise DataError(
-                    f"evidence: {name} of label {wrong[0]} is {column[wrong[0]]}; "
+                    f"evidence: {name} of label {invalid[0]} is {column[invalid[0]]}; "
                     f"it must be between 0 and {limit:g}",
                 )
 
@@ -120,32 +121,32 @@ class Evidence:
 
     @property
     def matched(self) -> Bool[np.ndarray, " n"]:
-        """(n,) bool, whether a reprediction matched."""
+        """(n,) bool, true if a reprediction matched the label."""
         return np.asarray(~np.isnan(self.loss))
 
     @cached_property
     def rho_det(self) -> Float[np.ndarray, " n"]:
-        """(n,) product of the priors that scored a label; 1 where none did."""
+        """(n,) product of the priors that scored the label; 1 if none did."""
         product = np.ones(len(self))
         for rho in self.rho.values():
             product *= np.where(np.isnan(rho), 1.0, rho)
         return product
 
     def _numbers(self) -> dict[str, np.ndarray]:
-        """Return the columns that have a range."""
+        """Return the numeric columns that have a range."""
         return {"score": self.score, "loss": self.loss, "iou": self.iou, **self.rho}
 
 
 @dataclass(frozen=True)
 class Weights:
-    """A policy's answer for the n labels of a round.
+    """Weights of the n labels of a round.
 
     Attributes:
-        v: (n,) float64 weight in [0, 1]; what 0 means, the policy says: `Policy.zero_weight`.
-        lambda_u: (n,) the age parameter that the label was held against; NaN where the policy has
-            none, or where no label of the label's group matched.
+        v: (n,) float64 weight in [0, 1]; `Policy.zero_weight` defines the meaning of 0.
+        lambda_u: (n,) age parameter lambda of the label's group; NaN if the policy has none, or no
+            label of the group matched.
         dropped: (n,) bool, labels that are not stored at all: their region is background, whatever
-            a weight of 0 means. None, if left out; v is 0 where a label is dropped.
+            a weight of 0 means. v must be 0 for a dropped label. By default no label is dropped.
     """
 
     v: Float[np.ndarray, " n"]
@@ -153,34 +154,34 @@ class Weights:
     dropped: Bool[np.ndarray, " n_or_0"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
-        """Fill in what was left out."""
+        """Set the default of `dropped`."""
         if len(self.dropped) == 0:
             object.__setattr__(self, "dropped", np.zeros(len(self.v), dtype=bool))
 
     @classmethod
     def without_age(cls, v: Float[np.ndarray, " n"]) -> "Weights":
-        """Weights of a policy that has no age parameter."""
+        """Return weights without an age parameter: lambda_u is NaN."""
         return cls(v, np.full(len(v), np.nan))
 
 
 class Policy(Protocol):
-    """Weighs the labels of a round.
+    """Computes the weights of the labels of a round.
 
-    A policy inherits from this class and overrides what differs from the values here.
+    A policy inherits from this class and overrides the defaults that differ.
     """
 
     name: ClassVar[str]
-    """As it is stored beside the weights."""
+    """Name of the policy; stored with the weights."""
     uses_unlabeled: ClassVar[bool] = True
-    """False where a student of this policy trains on X_l alone."""
+    """False if a student of this policy trains on X_l only."""
     zero_weight: ClassVar[ZeroWeight] = "background"
-    """What a label of weight 0 is to the student."""
+    """Meaning of a label of weight 0 for the student."""
     remembers: ClassVar[bool] = False
     """Whether the policy needs `Evidence.memory`."""
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Return which of these columns the policy reads; the others hold NaN or ""."""
+        """Return the columns of `Evidence` that the policy reads; others may be NaN or ""."""
         return ("category", "score", "iou", "loss")
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:

@@ -1,11 +1,13 @@
-"""HSSDA: two thresholds, set by the data, sort labels into sure, ambiguous and poor ones.
+"""HSSDA: two data-driven thresholds divide labels into confident, ambiguous and poor ones.
 
 Source: Liu et al., "Hierarchical Supervision and Shuffle Data Augmentation for 3D Semi-Supervised
-Object Detection", CVPR 2023: of each measure of confidence the two centres of a 2-means clustering,
-per category and round, are its high and its low threshold. There the clusters are of predictions
-that hit labeled objects. A teacher knows the labeled frames by heart, and its scores there say
-little of its scores elsewhere, so here they are of the pseudo-labels that the teacher gave again
-for the augmented copy. The measures are the score and the agreement exp(-L) with that copy.
+Object Detection", CVPR 2023. For each confidence measure, the two centres of a 2-means clustering
+per category and round are the low and the high threshold. The measures here are the score and the
+agreement exp(-L) with the augmented copy.
+
+Difference to the paper: it clusters predictions that match labeled objects. The teacher was trained
+on these frames, so its scores there say little about its scores on other frames. Here the clusters
+are those of the pseudo-labels that matched their augmented copy.
 """
 
 from dataclasses import dataclass
@@ -18,19 +20,19 @@ from curate.shapes import Float
 from curate.weighting.base import Age, Evidence, Policy, Weights, ZeroWeight
 
 Ambiguous = Literal["soft", "ignore"]
-# With fewer labels there is nothing to cluster.
+# Fewer labels are not clustered.
 _FEWEST_LABELS = 3
 
 
 @dataclass(frozen=True)
 class HSSDA(Policy):
-    """v = 1 above both high thresholds; dropped below a low one; between them in doubt.
+    """v = 1 at or above both high thresholds; dropped below a low one; ambiguous in between.
 
-    A label that did not match its augmented copy has no agreement at all and is dropped. In a
-    category with fewer than three matched labels all matched ones are in doubt.
+    A label that did not match its augmented copy has no agreement and is dropped. In a category
+    with fewer than three matched labels, all matched ones are ambiguous.
 
     Attributes:
-        ambiguous: what a label in doubt weighs: "soft" its score, "ignore" nothing.
+        ambiguous: weight of an ambiguous label: its score for "soft", 0 for "ignore".
     """
 
     ambiguous: Ambiguous = "soft"
@@ -38,31 +40,31 @@ class HSSDA(Policy):
     zero_weight: ClassVar[ZeroWeight] = "ignore"
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for a setting without meaning."""
+        """Raise ConfigError if a setting is invalid."""
         if self.ambiguous not in get_args(Ambiguous):
             raise ConfigError(
                 f"policy hssda: unknown ambiguous {self.ambiguous!r}; choose soft or ignore"
             )
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
-        """1, the score or 0 for every label, and which are dropped."""
-        sure, poor = evidence.matched, ~evidence.matched
+        """Return weight 1, the score or 0 for every label, and the dropped labels."""
+        confident, poor = evidence.matched, ~evidence.matched
         for measure in (evidence.score, np.exp(-evidence.loss)):
             for category in np.unique(evidence.category):
-                own = evidence.category == category
-                low, high = two_centres(measure[own & evidence.matched])
-                poor[own] |= measure[own] < low
-                sure[own] &= measure[own] >= high
-        doubt = evidence.score if self.ambiguous == "soft" else np.zeros(len(evidence))
-        v = np.where(sure, 1.0, np.where(poor, 0.0, doubt))
+                rows = evidence.category == category
+                low, high = two_centres(measure[rows & evidence.matched])
+                poor[rows] |= measure[rows] < low
+                confident[rows] &= measure[rows] >= high
+        ambiguous = evidence.score if self.ambiguous == "soft" else np.zeros(len(evidence))
+        v = np.where(confident, 1.0, np.where(poor, 0.0, ambiguous))
         return Weights(v, np.full(len(evidence), np.nan), poor)
 
 
 def two_centres(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return the means of the two clusters of (n,) values that have the least variance within.
+    """Return the means of the two clusters of (n,) values with the least variance within clusters.
 
-    In one dimension the best clusters are separated by a threshold, so all n - 1 of them are tried,
-    and the answer does not depend on a start. Fewer than three values answer (-inf, inf).
+    In one dimension a threshold separates the best clusters. All n - 1 thresholds are tried, so the
+    result does not depend on an initialisation. For fewer than three values it is (-inf, inf).
     """
     if len(values) < _FEWEST_LABELS:
         return -np.inf, np.inf
@@ -71,9 +73,9 @@ def two_centres(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     total = np.cumsum(ordered)
     left = total[:-1] / count
     right = (total[-1] - total[:-1]) / (len(ordered) - count)
-    # Variance within is least where that between the clusters is greatest.
+    # The variance within clusters is least if the variance between them is greatest.
     best = int(np.argmax(count * (len(ordered) - count) * (right - left) ** 2))
-    # Rounding must not put the mean of equal values above or below them.
+    # Clip: rounding must not move the mean of equal values above or below them.
     low, high = (
         float(np.clip(cluster.mean(), cluster[0], cluster[-1]))
         for cluster in np.split(ordered, [best + 1])

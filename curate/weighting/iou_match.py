@@ -1,9 +1,9 @@
-"""3DIoUMatch: a label counts where both its score and its estimated IoU are high enough.
+"""3DIoUMatch: thresholds on both the score and the estimated IoU of a label.
 
 Source: Wang et al., "3DIoUMatch: Leveraging IoU Prediction for Semi-Supervised 3D Object
 Detection", CVPR 2021. The authors' thresholds for KITTI are a class probability of 0.4, and an IoU
-of 0.5 for cars, 0.25 for pedestrians and cyclists. A detector of one stage has one score per
-category, which stands for both objectness and class probability.
+of 0.5 for cars, 0.25 for pedestrians and cyclists. A one-stage detector has one score per category;
+it replaces both objectness and class probability.
 """
 
 from collections.abc import Mapping
@@ -19,13 +19,13 @@ from curate.weighting.threshold import by_category, check_share
 
 @dataclass(frozen=True)
 class IoUMatch(Policy):
-    """v = 1 where the score and the IoU estimate reach their thresholds, else 0.
+    """v = 1 if both the score and the IoU estimate reach their thresholds, else 0.
 
     Attributes:
-        score: least score, in [0, 1].
-        iou: least estimate of the 3D IoU, in [0, 1].
-        score_per_category: of the categories that have their own.
-        iou_per_category: likewise.
+        score: threshold of the score, in [0, 1].
+        iou: threshold of the estimated 3D IoU, in [0, 1].
+        score_per_category: score thresholds of categories that differ from `score`.
+        iou_per_category: IoU thresholds of categories that differ from `iou`.
     """
 
     score: float = 0.4
@@ -35,21 +35,21 @@ class IoUMatch(Policy):
     name: ClassVar[str] = "3dioumatch"
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for a threshold that is no share."""
+        """Raise ConfigError if a threshold is not in [0, 1]."""
         check_share(self.name, "score", {"every category": self.score, **self.score_per_category})
         check_share(self.name, "iou", {"every category": self.iou, **self.iou_per_category})
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
-        """1 or 0 for every label.
+        """Return weight 1 or 0 for every label.
 
         Raises:
-            ConfigError: if the detector estimates no IoU.
+            ConfigError: if a label has no IoU estimate.
         """
-        unknown = int(np.isnan(evidence.iou).sum())
-        if unknown:
+        missing = int(np.isnan(evidence.iou).sum())
+        if missing:
             raise ConfigError(
-                f"policy {self.name}: {unknown} of {len(evidence)} labels have no estimate of "
-                "their IoU; use a detector that makes one, such as pillars, or another policy"
+                f"policy {self.name}: {missing} of {len(evidence)} labels have no IoU estimate; "
+                "use a detector that estimates the IoU, such as pillars, or another policy"
             )
         kept = evidence.score >= by_category(evidence, self.score, self.score_per_category)
         kept &= evidence.iou >= by_category(evidence, self.iou, self.iou_per_category)

@@ -1,7 +1,17 @@
-"""SPSL-3D and PSPSL-3D: easy labels first, harder ones as the detector grows (Eqs. 4, 7, 11).
+"""SPSL-3D and PSPSL-3D: easy labels first, harder ones in later rounds (Eqs. 4, 7, 11).
 
 Source: An et al., Remote Sensing 15(3):627, 2023. Eq. 7 minimises v L + lambda (v^2 / 2 - v) over v
 in [0, 1]. Eq. 11 minimises the same with v / rho in place of v, over v in [0, rho].
+
+Example: four labels with L = 0.2, 0.4, 1.2 and NaN (no match), E = 4 rounds, quantile None.
+The matched losses have mean 0.6 and maximum 1.2.
+
+    round e = 1:  lambda = 1/4 * 1.2 + 3/4 * 0.6 = 0.75   v = 1 - 0.2/0.75 = 0.733, 0.467, 0, 0
+    round e = 4:  lambda = 1.2                            v = 0.833, 0.667, 0, 0
+
+The second label gains weight as lambda grows. The hardest label has L = lambda in the last round
+and weight 0, and so has the label without a match in every round. With PSPSL each v is multiplied
+by the rho_det of its label: rho_det = 0.5 changes 0.733 to 0.367.
 """
 
 from dataclasses import dataclass
@@ -18,13 +28,14 @@ Scope = Literal["round", "category", "frame"]
 
 @dataclass(frozen=True)
 class SPSL(Policy):
-    """v = 1 - L / lambda where L < lambda, else 0 (Eq. 7).
+    """v = 1 - L / lambda if L < lambda, else 0 (Eq. 7).
 
     Attributes:
-        scope: the labels that share one lambda: all of the round, those of a category, or those of
-            a frame (the paper's batch of one; a frame's hardest label then always weighs 0 in the
-            last round, and so does the only label of a frame in every round).
-        quantile: of the losses, in place of their maximum, in (0, 1]; None for the maximum.
+        scope: labels that share one lambda: all labels of the round, of a category, or of a frame.
+            A frame is the paper's batch of one: its hardest label has weight 0 in the last round,
+            and the only label of a frame has weight 0 in every round.
+        quantile: quantile of the losses that replaces their maximum in lambda, in (0, 1]; None for
+            the maximum.
     """
 
     scope: Scope = "round"
@@ -32,11 +43,11 @@ class SPSL(Policy):
     name: ClassVar[str] = "spsl"
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for a setting without meaning."""
+        """Raise ConfigError if a setting is invalid."""
         if self.scope not in get_args(Scope):
-            known = ", ".join(get_args(Scope))
+            choices = ", ".join(get_args(Scope))
             raise ConfigError(
-                f"policy {self.name}: unknown scope {self.scope!r}; choose one of {known}"
+                f"policy {self.name}: unknown scope {self.scope!r}; choose one of {choices}"
             )
         if self.quantile is not None and not 0 < self.quantile <= 1:
             raise ConfigError(
@@ -45,33 +56,33 @@ class SPSL(Policy):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """The columns that it looks at."""
+        """The columns of `Evidence` that the policy reads."""
         return ("loss", "category") if self.scope == "category" else ("loss",)
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
-        """Return the weight of every label; 0 where no reprediction matched."""
+        """Return the weight of every label; 0 if no reprediction matched."""
         lambda_u = age_parameter(evidence, age, self.scope, self.quantile)
         return Weights(easiness(evidence.loss, lambda_u), lambda_u)
 
 
 @dataclass(frozen=True)
 class PSPSL(SPSL):
-    """v = rho_det * (1 - L / lambda) where L < lambda, else 0 (Eq. 11).
+    """v = rho_det * (1 - L / lambda) if L < lambda, else 0 (Eq. 11).
 
     Attributes:
-        self_paced: false leaves the factor 1 - L / lambda out: v = rho_det of every label that
-            matched, to see what the schedule is good for; of every label where none of the round
-            matched, for a detector without a second pass.
+        self_paced: false removes the factor 1 - L / lambda, to measure the effect of the schedule:
+            v = rho_det for every label that matched, else 0. If no label of the round matched, as
+            for a detector without a second pass, v = rho_det for every label.
     """
 
     self_paced: bool = True
     name: ClassVar[str] = "pspsl"
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:
-        """Return the weight of every label; 0 where no reprediction matched."""
+        """Return the weight of every label; see `self_paced` for labels without a match."""
         if not self.self_paced:
-            asked = evidence.matched | (not evidence.matched.any())
-            return Weights.without_age(np.where(asked, evidence.rho_det, 0.0))
+            counted = evidence.matched | (not evidence.matched.any())
+            return Weights.without_age(np.where(counted, evidence.rho_det, 0.0))
         lambda_u = age_parameter(evidence, age, self.scope, self.quantile)
         return Weights(evidence.rho_det * easiness(evidence.loss, lambda_u), lambda_u)
 
@@ -79,10 +90,10 @@ class PSPSL(SPSL):
 def easiness(
     loss: Float[np.ndarray, " n"], lambda_u: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Return (n,) 1 - L / lambda where L < lambda, else 0 (Eq. 7); 0 where L is NaN.
+    """Return (n,) 1 - L / lambda if L < lambda, else 0 (Eq. 7); 0 if L is NaN.
 
-    At lambda = 0 every v minimises the objective of a label with L = 0. It gets 1, the limit from
-    above: such a label is as easy as can be.
+    If both L and lambda are 0, every v minimises the objective. The result is 1, the limit for
+    lambda from above, because no label can be easier.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         v = np.where(loss < lambda_u, 1.0 - loss / lambda_u, 0.0)
@@ -94,7 +105,14 @@ def age_parameter(
 ) -> Float[np.ndarray, " n"]:
     """Return (n,) lambda = (e/E) max(L) + (1 - e/E) mean(L) of each label's group (Eq. 4).
 
-    Unmatched labels do not count; they get their group's lambda, NaN in a group without a match.
+    Unmatched labels do not contribute to lambda, but get that of their group: NaN if no label of
+    the group matched.
+
+    Args:
+        evidence: the labels of the round.
+        age: round e of E.
+        scope: labels that share one lambda, see `SPSL`.
+        quantile: quantile that replaces the maximum, see `SPSL`.
     """
     group, groups = _group(evidence, scope)
     matched = evidence.matched
@@ -105,13 +123,13 @@ def age_parameter(
     maximum = _maximum(loss, member, count)
     hardest = maximum if quantile is None else _quantile(loss, member, count, quantile)
     parameter = age.share * hardest + (1.0 - age.share) * mean
-    # Rounding can lift the mean of equal losses above them all, and would let them pass.
+    # Rounding can move the mean of equal losses above all of them: L < lambda would hold for them.
     lambda_u: np.ndarray = np.minimum(parameter, maximum)[group]
     return lambda_u
 
 
 def _group(evidence: Evidence, scope: Scope) -> tuple[np.ndarray, int]:
-    """Return (n,) int64 number of each label's group, and how many groups there are."""
+    """Return (n,) int64 number of each label's group, and the number of groups."""
     if scope == "round":
         return np.zeros(len(evidence), dtype=np.int64), 1
     if scope == "frame":
@@ -121,19 +139,22 @@ def _group(evidence: Evidence, scope: Scope) -> tuple[np.ndarray, int]:
 
 
 def _number_categories(category: np.ndarray) -> tuple[np.ndarray, int]:
-    """Like np.unique's inverse, without sorting millions of strings that take a few values."""
+    """Return (n,) the group of each category, and the number of groups.
+
+    Unlike np.unique, this does not sort millions of strings with a few distinct values.
+    """
     group = np.full(len(category), -1, dtype=np.int64)
     groups = 0
     while True:
-        rest = np.argmax(group < 0) if len(group) else 0
-        if not len(group) or group[rest] >= 0:
+        first = np.argmax(group < 0) if len(group) else 0
+        if not len(group) or group[first] >= 0:
             return group, groups
-        group[category == category[rest]] = groups
+        group[category == category[first]] = groups
         groups += 1
 
 
 def _maximum(loss: np.ndarray, member: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return (g,) largest loss of each group, NaN where it has none."""
+    """Return (g,) largest loss of each group, NaN for an empty group."""
     largest = np.where(count > 0, -np.inf, np.nan)
     np.maximum.at(largest, member, loss)
     return largest
@@ -142,7 +163,7 @@ def _maximum(loss: np.ndarray, member: np.ndarray, count: np.ndarray) -> np.ndar
 def _quantile(
     loss: np.ndarray, member: np.ndarray, count: np.ndarray, quantile: float
 ) -> np.ndarray:
-    """Return (g,) linearly interpolated quantile of each group's losses, NaN where it has none."""
+    """Return (g,) linearly interpolated quantile of each group's losses, NaN for an empty group."""
     if len(count) == 1:
         return np.array([np.quantile(loss, quantile) if len(loss) else np.nan])
     ordered = loss[np.lexsort((loss, member))]
@@ -150,8 +171,8 @@ def _quantile(
     position = quantile * np.maximum(count - 1, 0)
     below = np.floor(position).astype(np.int64)
     above = np.minimum(below + 1, np.maximum(count - 1, 0))
-    answer = np.full(len(count), np.nan)
-    some = count > 0
-    low, high = ordered[(start + below)[some]], ordered[(start + above)[some]]
-    answer[some] = low + (position - below)[some] * (high - low)
-    return answer
+    quantiles = np.full(len(count), np.nan)
+    filled = count > 0
+    low, high = ordered[(start + below)[filled]], ordered[(start + above)[filled]]
+    quantiles[filled] = low + (position - below)[filled] * (high - low)
+    return quantiles

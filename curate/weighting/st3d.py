@@ -1,10 +1,11 @@
-"""ST3D: bands of confidence to keep, ignore or drop a label, steadied by what is remembered.
+"""ST3D: confidence bands to keep, ignore or drop a label, stabilised by a memory bank.
 
 Source: Yang et al., "ST3D: Self-Training for Unsupervised Domain Adaptation on 3D Object
-Detection", CVPR 2021: the quality-aware triplet memory bank with its consistency ensemble. There
-the better of the remembered and the present box becomes the label, and a remembered box can outlive
-the detector's answer. Here every label is an answer of this round's teacher: its box stays, and the
-better of the two confidences decides its band.
+Detection", CVPR 2021: the quality-aware triplet memory bank with its consistency ensemble.
+
+Difference to the paper: there the more confident of the stored and the current box becomes the
+label, and a stored box can stay without a current prediction. Here every label is a prediction of
+this round's teacher with its own box; the higher of the two confidences selects its band.
 """
 
 from dataclasses import dataclass
@@ -24,10 +25,11 @@ class ST3D(Policy):
     """Keeps (v = 1), ignores (v = 0) or drops a label by its confidence.
 
     Attributes:
-        keep: least confidence to be kept, in [0, 1].
-        ignore: least confidence to be ignored; below it a label is dropped.
-        confidence: the label's "score", or the detector's estimate of its "iou", as in the paper.
-        minimum_iou: 3D IoU from which a remembered label is taken for the same object.
+        keep: lowest confidence of kept labels, in [0, 1].
+        ignore: lowest confidence of ignored labels; labels below it are dropped.
+        confidence: "score" for the label's score, or "iou" for the detector's IoU estimate, as in
+            the paper.
+        minimum_iou: lowest 3D IoU of a label and a stored one that count as the same object.
     """
 
     keep: float = 0.6
@@ -39,7 +41,7 @@ class ST3D(Policy):
     zero_weight: ClassVar[ZeroWeight] = "ignore"
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for a setting without meaning."""
+        """Raise ConfigError if a setting is invalid."""
         if not 0 <= self.ignore <= self.keep <= 1:
             raise ConfigError(
                 f"policy st3d: ignore {self.ignore} and keep {self.keep} must be ascending and in "
@@ -53,16 +55,16 @@ class ST3D(Policy):
             raise ConfigError(f"policy st3d: minimum_iou must be in (0, 1], not {self.minimum_iou}")
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:  # noqa: ARG002 - has no age
-        """1 or 0 for every label, and which are dropped.
+        """Return weight 1 or 0 for every label, and the dropped labels.
 
         Raises:
-            ConfigError: if the confidence is to be the IoU, and the detector estimates none.
+            ConfigError: if `confidence` is "iou" and a label has no IoU estimate.
         """
         confidence = self._confidence(evidence)
         if evidence.memory is not None:
-            past = self._confidence(evidence.memory)
-            rows, remembered = _matches(evidence, evidence.memory, self.minimum_iou)
-            confidence[rows] = np.maximum(confidence[rows], past[remembered])
+            stored_confidence = self._confidence(evidence.memory)
+            rows, stored = _matches(evidence, evidence.memory, self.minimum_iou)
+            confidence[rows] = np.maximum(confidence[rows], stored_confidence[stored])
         return Weights(
             (confidence >= self.keep).astype(np.float64),
             np.full(len(evidence), np.nan),
@@ -70,12 +72,12 @@ class ST3D(Policy):
         )
 
     def _confidence(self, labels: Evidence | Memory) -> np.ndarray:
-        """Return (n,) a copy of the column that decides."""
+        """Return (n,) a copy of the confidence column."""
         if self.confidence == "score":
             return labels.score.copy()
         if np.isnan(labels.iou).any():
             raise ConfigError(
-                "policy st3d: the detector estimates no IoU; set its confidence to score"
+                "policy st3d: the detector does not estimate the IoU; set confidence to score"
             )
         return labels.iou.copy()
 
@@ -83,31 +85,34 @@ class ST3D(Policy):
 def _matches(
     evidence: Evidence, memory: Memory, minimum_iou: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of labels and of the remembered ones that are each other's best match by 3D IoU."""
+    """Return the rows of labels and of stored labels that are each other's best match by 3D IoU.
+
+    Only labels of the same category and frame match.
+    """
     keys = [
-        np.char.add(np.char.add(of_category, "/"), of_frame.astype(np.str_))
-        for of_category, of_frame in (
+        np.char.add(np.char.add(category, "/"), frame.astype(np.str_))
+        for category, frame in (
             (evidence.category, evidence.frame_index),
             (memory.category, memory.frame_index),
         )
     ]
-    groups, member = np.unique(np.concatenate(keys), return_inverse=True)
-    member_of = np.split(member, [len(evidence)])
-    orders = [np.argsort(own, kind="stable") for own in member_of]
-    edges = np.arange(len(groups) + 1)
+    names, group = np.unique(np.concatenate(keys), return_inverse=True)
+    groups = np.split(group, [len(evidence)])
+    orders = [np.argsort(each, kind="stable") for each in groups]
+    edges = np.arange(len(names) + 1)
     starts = [
-        np.searchsorted(own[order], edges) for own, order in zip(member_of, orders, strict=True)
+        np.searchsorted(each[order], edges) for each, order in zip(groups, orders, strict=True)
     ]
-    rows, remembered, _, overlap = overlapping_pairs(
+    rows, stored, _, overlap = overlapping_pairs(
         evidence.boxes[orders[0]], starts[0], memory.boxes[orders[1]], starts[1]
     )
-    rows, remembered = orders[0][rows], orders[1][remembered]
-    best = (overlap >= minimum_iou) & _is_best(rows, overlap) & _is_best(remembered, overlap)
-    return rows[best], remembered[best]
+    rows, stored = orders[0][rows], orders[1][stored]
+    best = (overlap >= minimum_iou) & _is_best(rows, overlap) & _is_best(stored, overlap)
+    return rows[best], stored[best]
 
 
-def _is_best(of: np.ndarray, overlap: np.ndarray) -> np.ndarray:
-    """Which pairs have the greatest overlap among those of the same row."""
-    greatest = np.zeros(int(of.max(initial=-1)) + 1)
-    np.maximum.at(greatest, of, overlap)
-    return np.asarray(overlap == greatest[of])
+def _is_best(rows: np.ndarray, overlap: np.ndarray) -> np.ndarray:
+    """Return (pairs,) bool: whether a pair has the greatest overlap of all pairs with its row."""
+    greatest = np.zeros(int(rows.max(initial=-1)) + 1)
+    np.maximum.at(greatest, rows, overlap)
+    return np.asarray(overlap == greatest[rows])

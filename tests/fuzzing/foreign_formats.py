@@ -82,7 +82,7 @@ def read_parquet(path: Path) -> None:
 
     record = ParquetRecord.read(path)
     for name in record.frame_ids():
-        record.answer(name)
+        record.result(name)
         record.views(name)
 
 

@@ -211,7 +211,7 @@ def _read_list(path: Path) -> None:
 def _read_table(path: Path) -> None:
     record = TableRecord.read(path)
     for name in record.frame_ids():
-        record.answer(name)
+        record.result(name)
 
 
 def _safetensors(path: Path) -> None:

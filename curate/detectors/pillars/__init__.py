@@ -1,4 +1,4 @@
-"""Anchor-free, center-based pillars: the trainable detector."""
+"""Trainable anchor-free, center-based pillar detector."""
 
 from curate.detectors.pillars.detector import PillarDetector
 

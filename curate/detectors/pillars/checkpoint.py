@@ -1,7 +1,8 @@
-"""Checkpoints of the pillar detector: safetensors with what is needed to rebuild the network.
+"""Checkpoints of the pillar detector: safetensors files with all data to rebuild the network.
 
-Nothing in such a file is ever executed, and neither torch nor a GPU is needed to read it. The ONNX
-graph beside a checkpoint is derived from it, and made again where it is missing or of another one.
+Nothing in such a file is ever executed, and reading it needs neither torch nor a GPU. The ONNX
+graph beside a checkpoint is derived from it. It is built again if it is missing or belongs to
+another checkpoint.
 """
 
 import hashlib
@@ -19,12 +20,12 @@ from curate.errors import ModelError, first_line
 from curate.files.atomic import replace_file
 
 FORMAT = "curate-pillars"
-# Version 2 added the estimate of the IoU, version 3 measures heights from the ground.
+# Version 2 added the IoU estimate, version 3 measures heights from the ground.
 FORMAT_VERSION = "3"
-_LENGTH_BYTES = 8  # of the number before a safetensors header, and the header's alignment
+_LENGTH_BYTES = 8  # size of the number before a safetensors header; also the header's alignment
 
-# Key in the graph's metadata of the digest of the checkpoint that it was made from. The number
-# grows with every change of what a graph answers, so that older ones are made again.
+# Metadata key of the graph with the digest of its checkpoint. Increase the number in the key when
+# the outputs of the graph change: older graphs are then built again.
 GRAPH_DIGEST = "checkpoint_sha256_3"
 
 
@@ -34,8 +35,8 @@ class Checkpoint:
 
     Attributes:
         preset: grid and size of the network.
-        categories: what it finds, in the order of its heatmaps.
-        weights: the network's state by name.
+        categories: categories that it detects, in the order of its heatmaps.
+        weights: state of the network, tensors by name.
     """
 
     preset: Preset
@@ -44,7 +45,7 @@ class Checkpoint:
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write the checkpoint and, beside it, its ONNX graph; each file whole or not at all."""
+    """Write the checkpoint and, beside it, its ONNX graph, each file atomically."""
     metadata = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -58,10 +59,10 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def _canonical(content: bytes) -> bytes:
-    """Return the same safetensors file with its header sorted.
+    """Return the same safetensors file with a sorted header.
 
-    The library writes the metadata in an order that it draws anew in every process. Equal weights
-    must have equal bytes: what a teacher has said is kept as long as its hash is the same.
+    The library writes the metadata in an order that differs between processes. Equal weights must
+    have equal bytes, because stored predictions stay valid as long as the teacher's hash does.
     """
     start = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
     entries = json.loads(content[_LENGTH_BYTES:start])
@@ -74,8 +75,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
     """Return the checkpoint in a file.
 
     Raises:
-        ModelError: if the file is missing, damaged, or no checkpoint of this detector, or a weight
-            of it is no number.
+        ModelError: if the file is missing, damaged, or not a checkpoint of this detector, or a
+            weight is not finite.
     """
     try:
         with safe_open(path, framework="numpy") as file:
@@ -97,14 +98,14 @@ def load_checkpoint(path: Path) -> Checkpoint:
         categories = tuple(str(name) for name in json.loads(metadata["categories"]))
     except (KeyError, TypeError, ValueError) as error:
         raise ModelError(f"{path}: damaged metadata: {first_line(error)}; train again") from None
-    broken = [name for name, values in weights.items() if not np.isfinite(values).all()]
-    if broken:  # it would find nothing in any frame, and no one would be told
-        raise ModelError(f"{path}: {broken[0]} holds NaN or infinite weights; train again")
+    not_finite = [name for name, values in weights.items() if not np.isfinite(values).all()]
+    if not_finite:  # such a network finds nothing in any frame, without any error
+        raise ModelError(f"{path}: {not_finite[0]} has NaN or infinite weights; train again")
     return Checkpoint(preset, categories, weights)
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of the checkpoint file, in hexadecimal.
+    """Return the SHA-256 of the checkpoint file, in hexadecimal.
 
     Raises:
         ModelError: if the file cannot be read.
@@ -118,17 +119,17 @@ def digest_of(path: Path) -> str:
 
 
 def graph_path(path: Path) -> Path:
-    """Where the ONNX graph of the checkpoint at `path` lies."""
+    """Return the path of the ONNX graph that belongs to the checkpoint at `path`."""
     return path.with_suffix(".onnx")
 
 
 def write_graph(path: Path, checkpoint: Checkpoint, digest: str) -> None:
-    """Write the ONNX graph beside the checkpoint at `path`, marked with the checkpoint's digest.
+    """Write the ONNX graph beside the checkpoint at `path`, with the digest in its metadata.
 
     Raises:
         ModelError: if the checkpoint lacks tensors, or the graph cannot be written.
     """
-    # Predicting needs onnx only where the graph is missing.
+    # Deferred import: prediction needs onnx only if the graph is missing.
     from curate.detectors.pillars.onnx_graph import build_graph
 
     try:

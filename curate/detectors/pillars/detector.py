@@ -1,4 +1,4 @@
-"""The trained pillar detector: frames in, boxes out, in ONNX Runtime on CPU and torch on a GPU."""
+"""The trained pillar detector: runs in ONNX Runtime on CPU and in torch on a GPU."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -28,23 +28,23 @@ from curate.geometry.nms import nms_bev
 if TYPE_CHECKING:
     from curate.detectors.pillars.training import PillarStudent
 
-Answers = tuple[np.ndarray, np.ndarray, np.ndarray]
+FrameOutput = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Scores, box codes and estimated IoU of one frame."""
 
 
 class PillarDetector:
-    """Finds boxes with a checkpoint that `curate.training` has made.
+    """A `Detector` that runs a checkpoint trained by `curate.training`.
 
     Args:
-        checkpoint: its safetensors file.
+        checkpoint: the safetensors file.
         device: "cpu", or a torch device such as "cuda".
         minimum_score: boxes with a lower score are left out.
-        nms_iou: BEV IoU above which the better box of a category suppresses the other.
-        threads: for the network, on CPU.
+        nms_iou: BEV IoU above which the higher-scored box of a category suppresses the other.
+        threads: number of threads of the network, on CPU.
 
     Raises:
-        ModelError: the checkpoint is missing, damaged or of another kind.
-        ConfigError: there is no such device.
+        ModelError: if the checkpoint is missing, damaged, or of another detector or version.
+        ConfigError: if the device cannot be used.
     """
 
     presets: ClassVar[Collection[str]] = PRESETS.keys()
@@ -64,8 +64,8 @@ class PillarDetector:
         self._checkpoint = load_checkpoint(checkpoint)
         self._minimum_score = minimum_score
         self._nms_iou = nms_iou
-        self._answers = (
-            onnx_answers(checkpoint, self._checkpoint, threads)
+        self._forward = (
+            onnx_forward(checkpoint, self._checkpoint, threads)
             if device == "cpu"
             else torch_forward(checkpoint, self._checkpoint, device)
         )
@@ -91,7 +91,7 @@ class PillarDetector:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """What the detector can find."""
+        """The categories that the detector finds."""
         return self._checkpoint.categories
 
     def predict(self, frame: Frame) -> Detections:
@@ -101,8 +101,7 @@ class PillarDetector:
         pillars = encode_points(ground.lowered(frame.points), preset)
         if len(pillars.slots) == 0:
             return Detections.empty()
-        answers = self._answers(pillars)
-        found = decode(*answers, self.categories, preset, self._minimum_score)
+        found = decode(*self._forward(pillars), self.categories, preset, self._minimum_score)
         kept = [np.zeros(0, dtype=np.int64)]
         for category in self.categories:
             of_category = np.flatnonzero(found.categories == category)
@@ -113,8 +112,13 @@ class PillarDetector:
         return replace(best_first, boxes=ground.raised(best_first.boxes))
 
 
-def onnx_answers(path: Path, checkpoint: Checkpoint, threads: int) -> Callable[[Pillars], Answers]:
-    """Return the checkpoint's ONNX graph in ONNX Runtime; made where it is missing or outdated."""
+def onnx_forward(
+    path: Path, checkpoint: Checkpoint, threads: int
+) -> Callable[[Pillars], FrameOutput]:
+    """Return a function that runs the checkpoint's ONNX graph in ONNX Runtime, on CPU.
+
+    Builds the graph first if it is missing or belongs to another checkpoint.
+    """
     import onnxruntime
     from onnxruntime.capi.onnxruntime_pybind11_state import (
         Fail,
@@ -143,32 +147,35 @@ def onnx_answers(path: Path, checkpoint: Checkpoint, threads: int) -> Callable[[
         write_graph(path, checkpoint, digest)
         session = open_session()
 
-    def answers(pillars: Pillars) -> Answers:
+    def forward(pillars: Pillars) -> FrameOutput:
         inputs = {"features": pillars.features, "slots": pillars.slots[:, None]}
         scores, codes, ious = session.run(["scores", "codes", "ious"], inputs)
         return scores, codes, ious[..., 0]
 
-    return answers
+    return forward
 
 
-def torch_forward(path: Path, checkpoint: Checkpoint, device: str) -> Callable[[Pillars], Answers]:
-    """Return the network itself, on a GPU."""
+def torch_forward(
+    path: Path, checkpoint: Checkpoint, device: str
+) -> Callable[[Pillars], FrameOutput]:
+    """Return a function that runs the network in torch on a device, such as a GPU."""
     import torch
 
     from curate.detectors.pillars.network import SingleFrame, network_of
 
     try:
-        place = torch.device(device)
-        network = SingleFrame(network_of(checkpoint)).eval().to(place)
+        torch_device = torch.device(device)
+        network = SingleFrame(network_of(checkpoint)).eval().to(torch_device)
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(f"device {device!r} cannot be used: {first_line(error)}") from None
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None
 
-    def answers(pillars: Pillars) -> Answers:
+    def forward(pillars: Pillars) -> FrameOutput:
         with torch.inference_mode():
-            features = torch.from_numpy(pillars.features).to(place)
-            scores, codes, ious = network(features, torch.from_numpy(pillars.slots).to(place))
+            features = torch.from_numpy(pillars.features).to(torch_device)
+            slots = torch.from_numpy(pillars.slots).to(torch_device)
+            scores, codes, ious = network(features, slots)
         return scores.cpu().numpy(), codes.cpu().numpy(), ious.cpu().numpy()
 
-    return answers
+    return forward

@@ -1,14 +1,33 @@
-"""Between metres and the network: points to pillar features, boxes to targets, answers to boxes.
+"""Encoding of points as pillar features and of boxes as targets; decoding of outputs to boxes.
 
 Center-based detection after Yin et al., "Center-based 3D Object Detection and Tracking", CVPR 2021,
-on pillars after Lang et al., "PointPillars", CVPR 2019. Three things differ. The gaussian of the
-heatmap is as long, wide and turned as the object, not round. The yaw has two codes, its doubled
-angle and the angle itself: where front and back of an object look alike the second averages out to
-nothing, the first still holds the axis. And heights are measured from the ground, on which all
-objects stand: what is left to learn of an object's z is half its height.
+on pillars after Lang et al., "PointPillars", CVPR 2019. Three differences:
 
-Beside score and box each cell estimates the 3D IoU of its box with the object, after Hu et al.,
-"AFDetV2", AAAI 2022; 3DIoUMatch (Wang et al., CVPR 2021) filters pseudo-labels by such an estimate.
+- The gaussian of the heatmap has the length, width and yaw of the object; it is not round.
+- The yaw has two codes, of the doubled angle and of the angle. If front and back of an object look
+  alike, the code of the angle averages to zero, but that of the doubled angle still gives the axis.
+- Heights are measured from the ground. All objects stand on it, so z is half the object's height.
+
+Each cell also estimates the 3D IoU of its box with the object, after Hu et al., "AFDetV2",
+AAAI 2022. 3DIoUMatch (Wang et al., CVPR 2021) filters pseudo-labels by such an estimate.
+
+Example: preset small (x from 0, y from -32 m, cells of 0.64 m, 80 x 100 of them), a car at
+x = 20.0, y = -3.0, z = 0.75 above the ground, 3.9 x 1.6 x 1.5 m, yaw 0.5
+
+    position in cells     (20.0 - 0) / 0.64 = 31.25,  (-3.0 + 32) / 0.64 = 45.3125
+    centre cell           (31, 45), flat index 31 * 100 + 45 = 3145
+    code 0, 1   offset    31.25 - 31.5 = -0.25,  45.3125 - 45.5 = -0.1875   (from the cell's centre)
+    code 2-5    z, sizes  0.75, ln 3.9 = 1.361, ln 1.6 = 0.470, ln 1.5 = 0.405
+    code 6, 7   axis      sin 1.0 = 0.841, cos 1.0 = 0.540
+    code 8, 9   heading   sin 0.5 = 0.479, cos 0.5 = 0.878
+
+    decoded               x = (31.5 - 0.25) * 0.64 = 20.0,  y = -32 + (45.5 - 0.1875) * 0.64 = -3.0
+                          axis = atan2(0.841, 0.540) / 2 = 0.5; the heading (0.878, 0.479) points
+                          along the axis, not against it, so yaw = 0.5 and not 0.5 - pi
+
+The eight cells around the centre cell learn the same box, with their own offset: cell (32, 45) has
+code 0 = -1.25. The weight v of the car is shared: 57 % for the centre cell, 17 % for its nearest
+neighbour (30, 45), less for the others.
 """
 
 from dataclasses import dataclass
@@ -21,28 +40,29 @@ from curate.geometry.overlap import paired_iou_3d
 from curate.geometry.similarity import wrap_angle
 
 POINT_FEATURES = 9
-# Offset in cells along x and y from the cell's centre, z, logarithms of length, width and height,
-# sine and cosine of twice the yaw, sine and cosine of the yaw.
+# Numbers of a box code: offset in cells along x and y from the cell's centre, z, logarithms of
+# length, width and height, sine and cosine of twice the yaw, sine and cosine of the yaw.
 BOX_CODE = 10
 
-# Spread of an object's gaussian: a sixth of its side, but never so narrow that its neighbour cells
-# do not feel it. Beyond three spreads it has ended.
-_SPREAD_PER_SIDE = 1 / 6
-_NARROWEST_SPREAD_CELLS = 0.7
-_SPREADS = 3.0
-# Cells around the centre that also learn the object's box.
+# Standard deviation of an object's gaussian: a sixth of its side, but at least so large that the
+# neighbouring cells get part of it. The gaussian is cut off at three standard deviations.
+_SIGMA_PER_SIDE = 1 / 6
+_MIN_SIGMA_CELLS = 0.7
+_CUTOFF_SIGMAS = 3.0
+# Cells on each side of the centre cell that also learn the object's box.
 _NEIGHBOURS = 1
+# Highest number of boxes per frame before non-maximum suppression.
 _CANDIDATES = 500
 
 
 @dataclass(frozen=True)
 class Pillars:
-    """The points of one frame as the network takes them.
+    """The points of one frame as the input of the network.
 
     Attributes:
         features: (n, POINT_FEATURES) float32.
         slots: (n,) int64 row of each point's pillar in the canvas. The four pillars of an output
-            cell are adjacent rows, so that the canvas reads as one row of four pillars per cell.
+            cell are adjacent rows: the canvas can be viewed as one row of four pillars per cell.
     """
 
     features: np.ndarray
@@ -51,18 +71,18 @@ class Pillars:
 
 @dataclass(frozen=True)
 class Targets:
-    """What the network shall answer for one frame with m objects, each with a weight v.
+    """Targets of the network for one frame with m objects, each with a weight v.
 
     Attributes:
-        heatmap: (x cells, y cells, categories) float32, 1 at the objects' centres.
-        background: (x cells, y cells) float32, how surely what is not object is background: v
-            in an object's region, the lowest v where regions overlap, 1 elsewhere.
-        centres: (m,) int64 flat cell of each object's centre.
-        categories: (m,) int64.
-        weights: (m,) float32 v.
-        code_cells: (r,) int64 flat cells that learn a box, several per object.
-        codes: (r, BOX_CODE) float32.
-        code_weights: (r,) float32, v shared out among the cells of an object.
+        heatmap: (x cells, y cells, categories) float32, 1 at the centres of objects with v > 0.
+        background: (x cells, y cells) float32 weight of a cell as a negative example: v in an
+            object's region, the lowest v if regions overlap, 1 outside all regions.
+        centres: (m,) int64 flat cell index of each object's centre.
+        categories: (m,) int64 category number of each object.
+        weights: (m,) float32 weight v of each object.
+        code_cells: (r,) int64 flat indices of the cells that learn a box, several per object.
+        codes: (r, BOX_CODE) float32 code of the object's box in each of these cells.
+        code_weights: (r,) float32 weight of each code; the weights of an object sum to its v.
     """
 
     heatmap: np.ndarray
@@ -89,7 +109,7 @@ def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
     x, y, z, intensity = x[inside], y[inside], z[inside], intensity[inside]
     column = ((x - preset.x_range[0]) / preset.pillar_m).astype(np.int64)
     row = ((y - preset.y_range[0]) / preset.pillar_m).astype(np.int64)
-    # Rounding can push a point that lies just below the upper edge onto it.
+    # Rounding can move a point just below the upper edge onto the edge.
     cells_x, cells_y = preset.cells
     np.minimum(column, 2 * cells_x - 1, out=column)
     np.minimum(row, 2 * cells_y - 1, out=row)
@@ -101,6 +121,7 @@ def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
     def mean(values: np.ndarray) -> np.ndarray:
         return np.asarray((np.bincount(slots, values, slot_count) / count)[slots])
 
+    # Distances are in units of a pillar.
     from_centre_x = x - (preset.x_range[0] + (column + 0.5) * preset.pillar_m)
     from_centre_y = y - (preset.y_range[0] + (row + 0.5) * preset.pillar_m)
     features = np.stack(
@@ -123,10 +144,10 @@ def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
 def encode_boxes(
     boxes: np.ndarray, category_ids: np.ndarray, weights: np.ndarray, count: int, preset: Preset
 ) -> Targets:
-    """Return the targets of one frame.
+    """Return the targets of one frame; see the example at the head of this module.
 
     Args:
-        boxes: (n, 7) in the LiDAR frame but z measured from the ground, sides positive; boxes
+        boxes: (n, 7) in the LiDAR frame, but z measured from the ground; sides are positive. Boxes
             with a centre off the grid are left out.
         category_ids: (n,) integers in [0, count).
         weights: (n,) v in [0, 1]; 0 marks an ignore region.
@@ -163,17 +184,17 @@ def decode(
     preset: Preset,
     minimum_score: float,
 ) -> Detections:
-    """Return the boxes in the network's answers, before non-maximum suppression, z from the ground.
+    """Return the predicted boxes before non-maximum suppression, with z measured from the ground.
 
     Args:
-        scores: (x cells, y cells, categories) in [0, 1]. All cells that reach the threshold answer,
-            not only local maxima: two pedestrians can stand in adjacent cells, and cells that see
-            the same object answer the same box, of which suppression leaves one.
+        scores: (x cells, y cells, categories) in [0, 1]. Every cell that reaches the minimum score
+            gives a box, not only local maxima: two pedestrians can stand in adjacent cells. Cells
+            that see the same object give nearly the same box; suppression keeps one of them.
         codes: (x cells, y cells, BOX_CODE).
         ious: (x cells, y cells) estimated 3D IoU of each cell's box with the object.
-        categories: their names.
+        categories: names of the categories.
         preset: the grid.
-        minimum_score: lower scores are left out.
+        minimum_score: boxes with a lower score are left out.
     """
     flat = scores.reshape(-1)
     candidates = np.flatnonzero(flat >= max(minimum_score, np.finfo(np.float32).tiny))
@@ -190,11 +211,12 @@ def decode(
 
 
 def decode_boxes(codes: np.ndarray, cells: np.ndarray, preset: Preset) -> np.ndarray:
-    """Return (n, 7) boxes of (n, BOX_CODE) codes at (n,) flat cells."""
+    """Return (n, 7) boxes, decoded from (n, BOX_CODE) codes at (n,) flat cell indices."""
     column, row = np.divmod(cells, preset.cells[1])
     axis = np.arctan2(codes[:, 6], codes[:, 7]) / 2
-    forward = codes[:, 8] * np.sin(axis) + codes[:, 9] * np.cos(axis)
-    yaw = wrap_angle(np.where(forward >= 0, axis, axis + np.pi))
+    # Cosine of the angle between heading and axis: its sign selects one of the two directions.
+    along_axis = codes[:, 8] * np.sin(axis) + codes[:, 9] * np.cos(axis)
+    yaw = wrap_angle(np.where(along_axis >= 0, axis, axis + np.pi))
     return np.column_stack(
         [
             preset.x_range[0] + (column + 0.5 + codes[:, 0]) * preset.cell_m,
@@ -207,11 +229,18 @@ def decode_boxes(codes: np.ndarray, cells: np.ndarray, preset: Preset) -> np.nda
 
 
 def code_ious(
-    answered: np.ndarray, codes: np.ndarray, cells: np.ndarray, preset: Preset
+    predicted: np.ndarray, target: np.ndarray, cells: np.ndarray, preset: Preset
 ) -> np.ndarray:
-    """(n,) 3D IoU of the boxes of (n, BOX_CODE) answers with those of the codes at their cells."""
+    """Return (n,) 3D IoU between the boxes of predicted and of target codes, row by row.
+
+    Args:
+        predicted: (n, BOX_CODE).
+        target: (n, BOX_CODE).
+        cells: (n,) flat cell index of both codes.
+        preset: the grid.
+    """
     boxes, objects = (
-        decode_boxes(of.astype(np.float64), cells, preset) for of in (answered, codes)
+        decode_boxes(codes.astype(np.float64), cells, preset) for codes in (predicted, target)
     )
     return paired_iou_3d(boxes, objects)
 
@@ -229,11 +258,11 @@ def _draw(
     weights: np.ndarray,
     cell_m: float,
 ) -> None:
-    """Enter the objects' gaussians and regions into the two maps."""
+    """Draw the objects' gaussians into the heatmap and their regions into the background map."""
     sides = boxes[:, 3:5] / cell_m
-    spreads = np.maximum(sides * _SPREAD_PER_SIDE, _NARROWEST_SPREAD_CELLS)
+    sigmas = np.maximum(sides * _SIGMA_PER_SIDE, _MIN_SIGMA_CELLS)
     for k in range(len(boxes)):
-        reach = int(np.ceil(_SPREADS * spreads[k].max()))
+        reach = int(np.ceil(_CUTOFF_SIGMAS * sigmas[k].max()))
         window = tuple(
             slice(
                 max(0, cell[k, axis] - reach),
@@ -245,34 +274,39 @@ def _draw(
         away_y = (np.arange(window[1].start, window[1].stop) - cell[k, 1])[None, :]
         cos, sin = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
         along, across = cos * away_x + sin * away_y, cos * away_y - sin * away_x
-        distance = (along / spreads[k, 0]) ** 2 + (across / spreads[k, 1]) ** 2
+        squared_distance = (along / sigmas[k, 0]) ** 2 + (across / sigmas[k, 1]) ** 2
         in_box = (2 * np.abs(along) <= sides[k, 0]) & (2 * np.abs(across) <= sides[k, 1])
-        region = in_box | (distance <= _SPREADS**2)
-        plane = heatmap[(*window, category_ids[k])]
+        in_gaussian = squared_distance <= _CUTOFF_SIGMAS**2
         if weights[k] > 0:
-            gaussian = np.where(distance <= _SPREADS**2, np.exp(-distance / 2), 0)
+            plane = heatmap[(*window, category_ids[k])]
+            gaussian = np.where(in_gaussian, np.exp(-squared_distance / 2), 0)
             np.maximum(plane, gaussian, out=plane, casting="same_kind")
-        surroundings = background[window]
-        np.minimum(surroundings, weights[k], out=surroundings, where=region)
+        around = background[window]
+        np.minimum(around, weights[k], out=around, where=in_box | in_gaussian)
 
 
 def _box_codes(
     boxes: np.ndarray, position: np.ndarray, cell: np.ndarray, preset: Preset
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Row of the object, flat cell, code and share of every cell that learns a box."""
+    """Return the codes of all cells that learn a box.
+
+    Returns:
+        Of each code: (r,) index of the object, (r,) flat cell index, (r, BOX_CODE) code, and (r,)
+        share of the object's weight.
+    """
     steps = np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
     around = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(1, -1, 2)
     cells = cell[:, None] + around
-    away = position[:, None] - (cells + 0.5)
-    # A neighbour counts by how near the object's centre is to it, the centre's own cell fully.
-    share = np.where((around == 0).all(axis=-1), 1.0, np.exp(-2 * (away**2).sum(axis=-1)))
+    offset = position[:, None] - (cells + 0.5)
+    # The share of a neighbour falls with its distance to the object's centre.
+    share = np.where((around == 0).all(axis=-1), 1.0, np.exp(-2 * (offset**2).sum(axis=-1)))
     share *= ((cells >= 0) & (cells < preset.cells)).all(axis=-1)
     share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-9)
-    rows, which = np.nonzero(share > 0)
+    rows, neighbour = np.nonzero(share > 0)
     yaw = boxes[rows, 6]
     codes = np.column_stack(
         [
-            away[rows, which],
+            offset[rows, neighbour],
             boxes[rows, 2],
             np.log(boxes[rows, 3:6]),
             np.sin(2 * yaw),
@@ -281,5 +315,5 @@ def _box_codes(
             np.cos(yaw),
         ]
     )
-    chosen = cells[rows, which]
-    return rows, chosen[:, 0] * preset.cells[1] + chosen[:, 1], codes, share[rows, which]
+    chosen = cells[rows, neighbour]
+    return rows, chosen[:, 0] * preset.cells[1] + chosen[:, 1], codes, share[rows, neighbour]

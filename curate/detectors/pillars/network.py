@@ -1,4 +1,4 @@
-"""The pillar network: points to pillars, three scales over the ground, boxes and scores."""
+"""The pillar network: point features to pillars, a three-scale BEV backbone, boxes and scores."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -12,17 +12,17 @@ from curate.detectors.pillars.encoding import BOX_CODE, POINT_FEATURES
 from curate.detectors.pillars.presets import Preset
 from curate.errors import ModelError
 
-# A cell holds an object with this probability before anything is learned.
+# Initial probability that a cell contains an object, before training.
 _PRIOR = 0.02
 
 
-class Answers(NamedTuple):
-    """What the network says of every cell of b frames.
+class NetworkOutput(NamedTuple):
+    """Output of the network for every cell of b frames.
 
     Attributes:
-        logits: (b, x cells, y cells, categories).
-        codes: (b, x cells, y cells, BOX_CODE).
-        iou_logits: (b, x cells, y cells) of the 3D IoU of the cell's box with its object.
+        logits: (b, x cells, y cells, categories) logits of the scores.
+        codes: (b, x cells, y cells, BOX_CODE) box codes.
+        iou_logits: (b, x cells, y cells) logits of the 3D IoU of the cell's box with its object.
     """
 
     logits: Tensor
@@ -31,7 +31,7 @@ class Answers(NamedTuple):
 
 
 class PillarNetwork(nn.Module):
-    """Maps the pillar features of b frames to logits, box codes and estimates of the boxes' IoU.
+    """Maps the pillar features of b frames to logits, box codes and IoU estimates of the boxes.
 
     All maps are channels-last: on CPU, convolutions and their gradients are about twice as fast
     that way, and 1 x 1 convolutions are plain matrix products.
@@ -66,13 +66,13 @@ class PillarNetwork(nn.Module):
             bias.zero_()
             bias[:categories] = torch.logit(torch.tensor(_PRIOR))
 
-    def forward(self, features: Tensor, slots: Tensor, frames: int) -> Answers:
-        """Return the answers for a batch.
+    def forward(self, features: Tensor, slots: Tensor, frames: int) -> NetworkOutput:
+        """Return the output for a batch.
 
         Args:
-            features: (n, POINT_FEATURES) of the points of all frames.
+            features: (n, POINT_FEATURES) features of the points of all frames.
             slots: (n,) row of each point's pillar in the canvas of all frames.
-            frames: b.
+            frames: number of frames b.
         """
         cells_x, cells_y = self.preset.cells
         canvas: Tensor = SlotMaximum.apply(  # type: ignore[no-untyped-call]
@@ -84,38 +84,42 @@ class PillarNetwork(nn.Module):
         coarse = self.scale3(middle)
         middle = middle + functional.interpolate(self.up3(coarse), scale_factor=2.0)
         fine = self.side1(fine) + functional.interpolate(self.up2(middle), scale_factor=2.0)
-        answers = self.answer(self.head(fine).permute(0, 2, 3, 1))
-        return Answers(
-            answers[..., : self.categories],
-            answers[..., self.categories : -1],
-            answers[..., -1],
+        output = self.answer(self.head(fine).permute(0, 2, 3, 1))
+        return NetworkOutput(
+            output[..., : self.categories],
+            output[..., self.categories : -1],
+            output[..., -1],
         )
 
 
 class SingleFrame(nn.Module):
-    """The network as it is used after training: one frame in, scores, boxes, IoU out."""
+    """The network for inference: one frame in, scores, box codes and IoU estimates out."""
 
     def __init__(self, network: PillarNetwork) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, features: Tensor, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(x cells, y cells, categories) scores, (.., BOX_CODE) codes, (x cells, y cells) IoU."""
+        """Return the scores, box codes and IoU estimates of the frame's cells.
+
+        Returns:
+            (x cells, y cells, categories), (x cells, y cells, BOX_CODE) and (x cells, y cells).
+        """
         logits, codes, iou_logits = self.network(features, slots, 1)
         return torch.sigmoid(logits[0]), codes[0], torch.sigmoid(iou_logits[0])
 
 
 class SlotMaximum(torch.autograd.Function):
-    """The maximum over the points of each slot, 0 in empty slots; inputs are not negative.
+    """Maximum over the points of each slot, 0 in empty slots; inputs must not be negative.
 
-    autograd's own scatter_reduce divides the gradient among equal maxima in several passes over
-    the whole canvas, which takes as long as a convolution. Here each of them gets it whole; exact
-    ties above zero come from copies of a point only.
+    The gradient of autograd's scatter_reduce divides the gradient among equal maxima in several
+    passes over the whole canvas, which takes as long as a convolution. Here every equal maximum
+    gets the full gradient: ties above zero occur only between copies of a point.
     """
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, slots: Tensor, count: int) -> Tensor:
-        """Return (count, c) of (n, c) values, whose rows go into these slots."""
+        """Return (count, c) maxima of (n, c) values; row i of the values is in slot slots[i]."""
         index = slots[:, None].expand(-1, values.shape[1])
         highest = values.new_zeros(count, values.shape[1])
         highest = highest.scatter_reduce(0, index, values, "amax", include_self=True)
@@ -124,10 +128,10 @@ class SlotMaximum(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        """To each point that is its slot's maximum, the gradient of the slot."""
+        """Return the slot's gradient for each point that is its slot's maximum, otherwise 0."""
         values, slots, highest = ctx.saved_tensors
-        won = values == highest.index_select(0, slots)
-        return gradient.index_select(0, slots) * won, None, None
+        is_maximum = values == highest.index_select(0, slots)
+        return gradient.index_select(0, slots) * is_maximum, None, None
 
 
 class _Pointwise(nn.Module):
@@ -138,7 +142,7 @@ class _Pointwise(nn.Module):
         self.mix = nn.Linear(channels_in, channels_out, bias=False)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Return (b, channels_in, x, y) to (b, channels_out, x, y)."""
+        """Map (b, channels_in, x, y) to (b, channels_out, x, y)."""
         mixed: Tensor = self.mix(maps.permute(0, 2, 3, 1))
         return mixed.permute(0, 3, 1, 2)
 
@@ -177,7 +181,13 @@ def checkpoint_of(
     categories: tuple[str, ...],
     weights: Mapping[str, Tensor] | None = None,
 ) -> Checkpoint:
-    """Return the network's present weights, or others in their place, copied."""
+    """Return a checkpoint with copied weights.
+
+    Args:
+        network: provides the preset.
+        categories: categories that it detects, in the order of its heatmaps.
+        weights: state to save; by default the current state of the network.
+    """
     state = network.state_dict() if weights is None else weights
     arrays = {
         name: tensor.detach().to("cpu", copy=True).contiguous().numpy()

@@ -1,6 +1,6 @@
-"""The trained network as an ONNX graph, written node by node from the checkpoint's tensors.
+"""The trained network as an ONNX graph, built node by node from the tensors of the checkpoint.
 
-The general exporter of torch needs eight seconds for this small network and torch itself; this
+torch's general exporter takes eight seconds for this small network, and needs torch. This builder
 needs neither, and folds each batch norm into the product or convolution before it.
 """
 
@@ -15,11 +15,16 @@ from curate.files.onnx_graph import EPSILON, GraphBuilder
 
 
 def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: int) -> ModelProto:
-    """Return the graph of `network.SingleFrame` with the state `weights` of its `PillarNetwork`.
+    """Return the graph of `network.SingleFrame`.
 
-    Inputs `features` (n, POINT_FEATURES) float32 and `slots` (n, 1) int64, n > 0; outputs `scores`
-    (x cells, y cells, categories), `codes` (x cells, y cells, BOX_CODE) and `ious` (x cells,
-    y cells, 1).
+    The inputs of the graph are `features` (n, POINT_FEATURES) float32 and `slots` (n, 1) int64,
+    n > 0. The outputs are `scores` (x cells, y cells, categories), `codes` (x cells, y cells,
+    BOX_CODE) and `ious` (x cells, y cells, 1).
+
+    Args:
+        weights: state of the `PillarNetwork`.
+        preset: the preset of the network.
+        categories: number of categories.
     """
     graph = _Graph(weights)
     cells_x, cells_y = preset.cells
@@ -38,9 +43,9 @@ def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: i
     fine = graph.node(
         "Add", graph.pointwise(fine, "side1"), graph.doubled(graph.pointwise(middle, "up2"))
     )
-    answers = graph.answers(graph.convolution(fine, "head.0", "head.1"), "answer")
+    outputs = graph.output_maps(graph.convolution(fine, "head.0", "head.1"), "answer")
     channels = {"scores": categories, "codes": BOX_CODE, "ious": 1}
-    logits, codes, ious = graph.split(answers, list(channels.values()))
+    logits, codes, ious = graph.split(outputs, list(channels.values()))
     graph.output(graph.node("Sigmoid", logits), "scores")
     graph.output(codes, "codes")
     graph.output(graph.node("Sigmoid", ious), "ious")
@@ -48,23 +53,23 @@ def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: i
 
 
 class _Graph(GraphBuilder):
-    """The parts of the network."""
+    """Builder of the parts of the network; values are referred to by name."""
 
     def split(self, value: str, sizes: list[int]) -> list[str]:
-        """Return the channels of a map in parts of these sizes."""
+        """Split the channels of a map into parts of these sizes."""
         names = [f"{value}.{part}" for part in range(len(sizes))]
         inputs = [value, self.constant(np.array(sizes))]
         self._nodes.append(helper.make_node("Split", inputs, names, axis=1))
         return names
 
     def product(self, rows: str, mix: str, norm: str) -> str:
-        """ReLU of a normalised matrix product of rows."""
+        """Add a matrix product of rows, batch norm and ReLU; return the output's name."""
         scale, shift = self._norm(norm)
         matrix = self.constant((self._weights[f"{mix}.weight"] * scale[:, None]).T)
         return self.node("Relu", self.node("Gemm", rows, matrix, self.constant(shift)))
 
     def convolution(self, maps: str, name: str, norm: str, stride: int = 1) -> str:
-        """ReLU of a normalised 3 x 3 convolution."""
+        """Add a 3 x 3 convolution, batch norm and ReLU; return the output's name."""
         scale, shift = self._norm(norm)
         kernel = self.constant(self._weights[f"{name}.weight"] * scale[:, None, None, None])
         inputs = [maps, kernel, self.constant(shift)]
@@ -72,35 +77,35 @@ class _Graph(GraphBuilder):
         return self.node("Relu", convolved)
 
     def pointwise(self, maps: str, name: str) -> str:
-        """Return a 1 x 1 convolution."""
+        """Add a 1 x 1 convolution; return the output's name."""
         kernel = self._weights[f"{name}.mix.weight"]
         return self.node("Conv", maps, self.constant(kernel[:, :, None, None]))
 
-    def answers(self, maps: str, name: str) -> str:
-        """Return a 1 x 1 convolution with bias and nothing after it."""
+    def output_maps(self, maps: str, name: str) -> str:
+        """Add a 1 x 1 convolution with bias and without activation; return the output's name."""
         kernel = self.constant(self._weights[f"{name}.weight"][:, :, None, None])
         return self.node("Conv", maps, kernel, self.constant(self._weights[f"{name}.bias"]))
 
     def scale(self, maps: str, name: str, convolutions: int, *, down: bool) -> str:
-        """Return all convolutions of one scale; the first may go down to it."""
+        """Add all convolutions of one scale; `down` gives the first one a stride of 2."""
         for i in range(convolutions):
             stride = 2 if down and i == 0 else 1
             maps = self.convolution(maps, f"{name}.{i}.0", f"{name}.{i}.1", stride)
         return maps
 
     def doubled(self, maps: str) -> str:
-        """Map at twice the resolution, each cell repeated."""
+        """Add an upsampling by 2 that repeats each cell; return the output's name."""
         scales = self.constant(np.array([1, 1, 2, 2], np.float32))
         modes = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric"}
         return self.node("Resize", maps, "", scales, nearest_mode="floor", **modes)
 
     def output(self, maps: str, name: str) -> None:
-        """Name (1, c, x, y) maps, as (x, y, c), an output of the graph."""
+        """Add (1, c, x, y) maps, transposed to (x, y, c), to the outputs of the graph."""
         single = self.node("Squeeze", maps, self.constant(np.array([0])))
         self._nodes.append(helper.make_node("Transpose", [single], [name], perm=[1, 2, 0]))
 
     def model(self, outputs: Mapping[str, tuple[int, ...]]) -> ModelProto:
-        """Return the finished and checked model."""
+        """Return the complete, checked model."""
         describe = helper.make_tensor_value_info
         inputs = [
             describe("features", TensorProto.FLOAT, ["n", POINT_FEATURES]),
@@ -110,7 +115,7 @@ class _Graph(GraphBuilder):
         return self.finish("pillars", inputs, results)
 
     def _norm(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Scale and shift that a batch norm amounts to after training."""
+        """Return the scale and shift that equal a batch norm in evaluation mode."""
         mean, variance = (self._weights[f"{name}.running_{part}"] for part in ("mean", "var"))
         scale = self._weights[f"{name}.weight"] / np.sqrt(variance + EPSILON)
         return scale, self._weights[f"{name}.bias"] - mean * scale

@@ -1,4 +1,4 @@
-"""The two sizes of the pillar detector: what it sees, in which grid, with how many channels."""
+"""Presets of the pillar detector: range, grid and size of the network."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,18 +8,18 @@ from curate.errors import ConfigError
 
 @dataclass(frozen=True)
 class Preset:
-    """A grid over the ground and a network that fits it.
+    """A BEV grid and a network of matching size.
 
     Attributes:
-        name: as in the configuration.
+        name: name in the configuration.
         pillar_m: edge of a pillar in metres.
         x_range: lowest and highest x in metres in the LiDAR frame.
-        y_range: lowest and highest y.
-        height_range: lowest and highest points that are looked at, in metres above the ground.
-        pillar_channels: of the point network.
-        channels: of the three scales; the first is at two pillars per cell.
-        depths: convolutions per scale, after the one that goes down to it.
-        head_channels: of the map from which the answers are read.
+        y_range: lowest and highest y in metres in the LiDAR frame.
+        height_range: lowest and highest z of the points that are used, in metres above the ground.
+        pillar_channels: channels of the point network.
+        channels: channels of the three scales; a cell of the first scale covers 2 x 2 pillars.
+        depths: convolutions per scale, not counting the one that downsamples to it.
+        head_channels: channels of the map from which the outputs are computed.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Preset:
 
     @property
     def cells(self) -> tuple[int, int]:
-        """(along x, along y) output cells; both divisible by 4."""
+        """Number of output cells along x and along y; both divisible by 4."""
         return (
             round((self.x_range[1] - self.x_range[0]) / self.cell_m),
             round((self.y_range[1] - self.y_range[0]) / self.cell_m),
@@ -64,7 +64,7 @@ def preset_named(name: str) -> Preset:
     """Return the preset of that name.
 
     Raises:
-        ConfigError: if there is none.
+        ConfigError: if there is no such preset.
     """
     try:
         return PRESETS[name]

@@ -1,4 +1,4 @@
-"""The pillar detector in training: batches of frames, and the loss of their answers."""
+"""The pillar detector in training: batches of frames and their loss."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ class Batch:
     """The input of the network for b frames, and its targets.
 
     Attributes:
-        features: (n, POINT_FEATURES) of the points of all frames.
+        features: (n, POINT_FEATURES) features of the points of all frames.
         slots: (n,) row of each point's pillar in the canvas of all frames.
-        frames: b.
+        frames: number of frames b.
         targets: see `BatchTargets`.
     """
 
@@ -66,7 +66,7 @@ class PillarStudent:
         return self.network.preset.name
 
     def encode(self, samples: Sequence[Sample], device: str) -> Batch:
-        """Return the pillars of all samples, one below the other, and their targets."""
+        """Return the concatenated pillars of all samples, and their targets."""
         preset, names = self.network.preset, self.categories
         pillars, targets = [], []
         for sample in samples:
@@ -86,8 +86,8 @@ class PillarStudent:
 
     def loss(self, batch: Batch, expected_objects: float) -> Mapping[str, Tensor]:
         """Return the weighted loss and its heatmap, box and IoU terms."""
-        answers = self.network(batch.features, batch.slots, batch.frames)
-        return weighted_loss(answers, batch.targets, self.network.preset, expected_objects)
+        output = self.network(batch.features, batch.slots, batch.frames)
+        return weighted_loss(output, batch.targets, self.network.preset, expected_objects)
 
     def save(self, path: Path, weights: Mapping[str, Tensor]) -> None:
         """Write the checkpoint and its ONNX graph."""

@@ -1,4 +1,4 @@
-"""Any detector's saved answers, in place of the detector: tables, and other projects' formats."""
+"""Detector that reads stored predictions: tables, and result formats of other projects."""
 
 from curate.detectors.recorded.detector import RecordedDetector
 

@@ -1,4 +1,4 @@
-"""The detector that answers from a record."""
+"""Detector that returns stored predictions."""
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -27,67 +27,71 @@ from curate.frames import Calibration, Frame
 from curate.geometry.similarity import Similarity
 
 _log = logging.getLogger(__name__)
-# Formats with the augmented copies in the same file.
+# Formats that store the augmented copies in the same file.
 _TABLES: Mapping[str, Callable[[Path], "Record"]] = {
     "csv": TableRecord.read,
     "parquet": ParquetRecord.read,
 }
 
-# What brings boxes in these axes into ours.
-_TURNS = {
+# Transforms from these axes to the LiDAR frame of this project (x forward, y left).
+_AXES = {
     "forward-left": Similarity(),
     "right-forward": Similarity(rotation_rad=-np.pi / 2),
 }
 
 
 class Record(Protocol):
-    """The answers for frames, and for augmented copies of them."""
+    """Stored results of frames and of their augmented copies."""
 
     @property
     def has_views(self) -> bool:
-        """Whether augmented copies were recorded."""
+        """Whether the record contains augmented copies."""
         ...
 
     def frame_ids(self) -> Iterable[str]:
         """Return the recorded frames, in sorted order."""
         ...
 
-    def answer(self, frame_id: str) -> RecordedResult:
-        """For the frame as it is; DataError where nothing was recorded."""
+    def result(self, frame_id: str) -> RecordedResult:
+        """Return the result of the original frame.
+
+        Raises:
+            DataError: if the frame was not recorded.
+        """
         ...
 
     def views(self, frame_id: str) -> Sequence[tuple[Similarity, RecordedResult]]:
-        """For each augmented copy, in its own frame of reference."""
+        """Return A and the result of each augmented copy A(x), in A's frame of reference."""
         ...
 
 
 class RecordedDetector:
-    """A `Detector` and `RecordedViews` that answers from files.
+    """A `Detector` and `RecordedViews` that returns stored predictions.
 
     Args:
-        path: a CSV or Parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, or
+        path: a CSV or Parquet file, a folder of KITTI result files, OpenPCDet's result.pkl,
             mmdetection3d's results (pickle of arrays, JSON, or folder of JSON), or nuScenes'
             results (JSON).
-        minimum_score: boxes below it are left out.
-        kind: of the format: csv, parquet, kitti, openpcdet, mmdetection3d, nuscenes, or auto to
-            tell it by suffix and contents.
-        passes: of other formats than these tables, the passes over augmented copies; see
+        minimum_score: boxes with a lower score are left out.
+        kind: the format: csv, parquet, kitti, openpcdet, mmdetection3d, nuscenes, or auto to
+            detect it from suffix and contents.
+        passes: the passes over augmented copies, for formats other than CSV and Parquet; see
             `PassesRecord`.
-        classes: the names behind numbered labels, in the order of the model.
-        frame_list: a file of frame ids (relative to the folder of `path`) for results that name no
-            frames.
-        rename: the record's names of categories and ours, e.g. {"car": "Car"}; names that are not
-            in it stay.
-        axes: of boxes in a LiDAR's frame: "forward-left" (x forward, y left), or "right-forward" as
-            nuScenes' sensor has them.
-        frame_ids: of the data set; recorded frames that are not among them are reported.
-        calibration: of a frame of the data set, by its name, for views in KITTI's or nuScenes'
-            form.
-        wants_views: whether somebody counts on a second pass; one that is missing is then said.
+        classes: class names of numbered labels, in the order of the model.
+        frame_list: a file of frame ids (relative to the folder of `path`) for results without
+            frame ids.
+        rename: maps category names of the record to those of the project, e.g. {"car": "Car"};
+            other names stay unchanged.
+        axes: axes of boxes in the LiDAR frame: "forward-left" (x forward, y left), or
+            "right-forward" as in nuScenes' LiDAR frame.
+        frame_ids: the frames of the data set; recorded frames outside it are reported.
+        calibration: returns the calibration of a frame id; needed for views in the formats of
+            KITTI and nuScenes.
+        wants_views: whether the run needs a second pass; if it is missing, a warning is logged.
 
     Raises:
-        DataError: a file is missing or malformed, or none of its frames is in the data set.
-        ConfigError: an option is wrong or missing.
+        DataError: if a file is missing or malformed, or none of its frames is in the data set.
+        ConfigError: if an option is invalid or missing.
     """
 
     def __init__(
@@ -106,12 +110,12 @@ class RecordedDetector:
         wants_views: bool = True,
     ) -> None:
         check_kind(kind)
-        if axes not in _TURNS:
-            raise ConfigError(f"detector.options.axes '{axes}': use one of {', '.join(_TURNS)}")
+        if axes not in _AXES:
+            raise ConfigError(f"detector.options.axes '{axes}': use one of {', '.join(_AXES)}")
         self.path = Path(path)
         self.minimum_score = minimum_score
         self.rename = dict(rename or {})
-        self._turn = _TURNS[axes]
+        self._to_lidar_axes = _AXES[axes]
         self._calibration = calibration
         self._wants_views = wants_views
         listed = self.path.parent / frame_list if frame_list else None
@@ -124,106 +128,113 @@ class RecordedDetector:
         return tuple(self._record.frame_ids())
 
     def predict(self, frame: Frame) -> Detections:
-        """What was recorded for the frame as it is; `frame.points` are not looked at.
+        """Return the stored result of the original frame; `frame.points` is not used.
 
         Raises:
-            DataError: nothing was recorded for the frame, or what was is malformed.
+            DataError: if the frame was not recorded, or its result is malformed.
         """
-        answer = self._record.answer(frame.frame_id)
-        return self._detections(frame.frame_id, answer, lambda _: frame.calibration)
+        result = self._record.result(frame.frame_id)
+        return self._detections(frame.frame_id, result, lambda _: frame.calibration)
 
     def views(self, frame_id: str) -> Sequence[tuple[Similarity, Detections]]:
         """Return the recorded augmented copies of the frame, in the order of their numbers.
 
         Raises:
-            DataError: nothing was recorded for the frame, or what was is malformed.
+            DataError: if the frame was not recorded, or its result is malformed.
         """
         views = self._record.views(frame_id)
         if self._wants_views and not views and not self._record.has_views:
             _warn_once(
                 f"{self.path}: no second pass over augmented copies, so no label has a consistency "
-                "loss, and methods that need one weigh every label 0 unless solve.self_paced = "
-                "false; passes in detector.options bring one"
+                "loss. Methods that need one give every label weight 0 unless solve.self_paced = "
+                "false. Add the second pass under passes in detector.options"
             )
         return [
-            (similarity, self._detections(frame_id, answer, self._calibration))
-            for similarity, answer in views
+            (similarity, self._detections(frame_id, result, self._calibration))
+            for similarity, result in views
         ]
 
     def _detections(
         self,
         frame_id: str,
-        answer: RecordedResult,
+        result: RecordedResult,
         calibration: Callable[[str], Calibration] | None,
     ) -> Detections:
-        """Return the answer in the LiDAR frame, with our names, from the lowest score on."""
-        if not isinstance(answer, Detections):
+        """Return a result in the LiDAR frame, with renamed categories, without low scores."""
+        if not isinstance(result, Detections):
             if calibration is None:
                 raise ConfigError(f"{self.path}: these results need the calibration of the frames")
-            answer = self._placed(frame_id, answer, calibration(frame_id))
-        elif self._turn != Similarity():
-            answer = replace(answer, boxes=self._turn.apply_to_boxes(answer.boxes))
+            result = self._in_lidar(frame_id, result, calibration(frame_id))
+        elif self._to_lidar_axes != Similarity():
+            result = replace(result, boxes=self._to_lidar_axes.apply_to_boxes(result.boxes))
         if self.rename:
-            names = [self.rename.get(name, name) for name in answer.categories.tolist()]
-            answer = replace(answer, categories=as_categories(names))
-        kept = answer.select(np.flatnonzero(answer.scores >= self.minimum_score))
+            names = [self.rename.get(name, name) for name in result.categories.tolist()]
+            result = replace(result, categories=as_categories(names))
+        kept = result.select(np.flatnonzero(result.scores >= self.minimum_score))
         _check_repeated(f"{self.path}: frame {frame_id}", kept)
         return kept
 
-    def _placed(
-        self, frame_id: str, answer: KittiObjects | ForeignBoxes, calibration: Calibration
+    def _in_lidar(
+        self, frame_id: str, result: KittiObjects | ForeignBoxes, calibration: Calibration
     ) -> Detections:
-        """Return the answer in the LiDAR's frame of reference."""
-        if not isinstance(answer, KittiObjects):
-            return answer.in_lidar(calibration)
-        found = to_detections(answer, calibration)
+        """Return a result in the LiDAR frame of reference."""
+        if not isinstance(result, KittiObjects):
+            return result.in_lidar(calibration)
+        found = to_detections(result, calibration)
         place = f"{self.path}: frame {frame_id}"
         return as_detections(place, found.boxes, found.scores, found.categories)
 
     def _report_unmatched(self, frame_ids: Sequence[str]) -> None:
-        """State which recorded frames the data set does not have; DataError where it has none."""
-        known = set(frame_ids)
+        """Warn about recorded frames that are not in the data set.
+
+        Raises:
+            DataError: if no recorded frame is in the data set.
+        """
+        expected = set(frame_ids)
         recorded = sum(1 for _ in self._record.frame_ids())
-        strays = [name for name in self._record.frame_ids() if name not in known]
-        few = ", ".join(strays[:3]) + (", ..." if len(strays) > 3 else "")
-        if strays and len(strays) == recorded:
+        unexpected = [name for name in self._record.frame_ids() if name not in expected]
+        examples = ", ".join(unexpected[:3]) + (", ..." if len(unexpected) > 3 else "")
+        if unexpected and len(unexpected) == recorded:
             raise DataError(
-                f"{self.path}: results for frames that do not exist ({few}); the data set's are "
-                f"named like {frame_ids[0]}"
+                f"{self.path}: results for frames that do not exist ({examples}); frames of the "
+                f"data set are named like {frame_ids[0]}"
             )
-        if strays:
+        if unexpected:
             _warn_once(
-                f"{self.path}: {len(strays)} of {recorded} results are for frames that the "
-                f"data set does not have ({few}); they are left out"
+                f"{self.path}: {len(unexpected)} of {recorded} results are for frames that the "
+                f"data set does not have ({examples}); they are left out"
             )
 
 
 def _check_repeated(place: str, found: Detections) -> None:
-    """Raise DataError if a box comes twice, as all do in a file that was appended to itself."""
+    """Raise DataError if a box occurs twice, as in a file that was appended to itself."""
     numbers = np.column_stack([found.boxes, found.scores]).tolist()
     seen: set[tuple[Any, ...]] = set()
     for category, box in zip(found.categories.tolist(), map(tuple, numbers), strict=True):
         if (category, *box) in seen:
             x, y, score = (round(number, 3) for number in (*box[:2], box[-1]))
             raise DataError(
-                f"{place}: the {category} of score {score} at x {x}, y {y} comes twice; were the "
+                f"{place}: the {category} of score {score} at x {x}, y {y} occurs twice; were the "
                 "results written twice into one file?"
             )
         seen.add((category, *box))
 
 
 def _open(
-    path: Path, kind: str, reading: ReadOptions, passes: Sequence[Mapping[str, Any]]
+    path: Path, kind: str, options: ReadOptions, passes: Sequence[Mapping[str, Any]]
 ) -> Record:
-    told = detect_kind(path) if kind == "auto" else kind
-    if told not in _TABLES:
-        return PassesRecord.read(path, told, reading, passes)
+    kind = detect_kind(path) if kind == "auto" else kind
+    if kind not in _TABLES:
+        return PassesRecord.read(path, kind, options, passes)
     if passes:
-        raise ConfigError(f"{path}: a table holds its augmented copies itself, as views 1, 2, ...")
-    return _TABLES[told](path)
+        raise ConfigError(
+            f"{path}: a table contains its augmented copies as views 1, 2, ...; remove passes from "
+            "detector.options"
+        )
+    return _TABLES[kind](path)
 
 
 @cache
 def _warn_once(message: str) -> None:
-    """Once per process, whatever the number of stages and frames."""
+    """Log a warning once per process, however many stages and frames report it."""
     _log.warning(message)

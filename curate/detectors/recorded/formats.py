@@ -1,4 +1,4 @@
-"""Which format a record is in, by its suffix and contents, and its reader."""
+"""Detection of a record's format by suffix and contents, and the reader of each format."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,26 +10,27 @@ from curate.detectors.recorded.mmdetection3d import holds_boxes, read_mmdetectio
 from curate.detectors.recorded.nuscenes import read_nuscenes
 from curate.detectors.recorded.openpcdet import read_openpcdet
 from curate.detectors.recorded.plain_pickle import read_plain_pickle
-from curate.detectors.recorded.results import Answers, ReadOptions
+from curate.detectors.recorded.results import ReadOptions, ResultsByFrame
 from curate.errors import ConfigError, DataError
 
-_LISTS: Mapping[str, Callable[[Path, Sequence[Any], ReadOptions], Answers]] = {
+# Readers of formats with one list entry per frame.
+_LISTS: Mapping[str, Callable[[Path, Sequence[Any], ReadOptions], ResultsByFrame]] = {
     "openpcdet": read_openpcdet,
     "mmdetection3d": read_mmdetection3d,
 }
 KINDS = ("csv", "parquet", "kitti", *_LISTS, "nuscenes")
 _LIST_SUFFIXES = (".pkl", ".pickle", ".json")
 _EXPECTED = (
-    "a .csv or .parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, or "
+    "a .csv or .parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, "
     "mmdetection3d's results as .pkl, .json or a folder of .json, or nuScenes' results as .json"
 )
 
 
 def detect_kind(path: Path) -> str:
-    """The kind of a record by its suffix: of `KINDS`, or "list" where only the contents tell.
+    """Return the format of a record: one of `KINDS`, or "list" if the contents decide.
 
     Raises:
-        DataError: if the path is missing or of no kind that can be read.
+        DataError: if the path does not exist or its format is not supported.
     """
     if not path.exists():
         raise DataError(f"{path}: no such file of recorded detections")
@@ -37,40 +38,42 @@ def detect_kind(path: Path) -> str:
         return "mmdetection3d" if any(path.glob("*.json")) else "kitti"
     kinds = {".csv": "csv", ".parquet": "parquet"} | dict.fromkeys(_LIST_SUFFIXES, "list")
     if path.suffix.lower() not in kinds:
-        raise DataError(f"{path}: no known record of detections; expected {_EXPECTED}")
+        raise DataError(f"{path}: not a supported format of detections; expected {_EXPECTED}")
     return kinds[path.suffix.lower()]
 
 
-def read_results(path: Path, kind: str, reading: ReadOptions) -> Answers:
-    """Return the answers of one pass in any format but tables.
+def read_results(path: Path, kind: str, options: ReadOptions) -> ResultsByFrame:
+    """Return the results of one pass, in any format except CSV and Parquet.
 
     Args:
         path: file or folder.
         kind: one of `KINDS`, or "list".
-        reading: see there.
+        options: see `ReadOptions`.
 
     Raises:
-        ConfigError: if an option that the format needs is not given.
-        DataError: if the file is missing, damaged or of another format.
+        ConfigError: if an option that the format needs is missing.
+        DataError: if the file is missing, damaged or in another format.
     """
     if kind == "kitti":
         return KittiResults(path)
     if kind in ("list", "nuscenes") and path.suffix.lower() == ".json" and holds_object(path):
         return read_nuscenes(path, stream_results(path))
-    held = _read(path)
+    content = _read(path)
     if kind == "nuscenes":
-        raise DataError(f"{path}: no nuScenes results: an object with meta and results")
-    if not isinstance(held, list | tuple):
-        raise DataError(f"{path}: holds a {type(held).__name__}, not a list of frames")
+        raise DataError(
+            f"{path}: not nuScenes results; expected a JSON object with meta and results"
+        )
+    if not isinstance(content, list | tuple):
+        raise DataError(f"{path}: contains a {type(content).__name__}, not a list of frames")
     if kind == "list":
-        kind = _detect_list_kind(path, held)
-    return _LISTS[kind](path, held, reading)
+        kind = _detect_list_kind(path, content)
+    return _LISTS[kind](path, content, options)
 
 
 def _detect_list_kind(path: Path, entries: Sequence[Any]) -> str:
-    """Return the kind of a list by its first entry."""
+    """Return the format of a list, detected from its first entry."""
     if not entries:
-        raise DataError(f"{path}: holds no frames")
+        raise DataError(f"{path}: contains no frames")
     first = entries[0]
     if holds_boxes(first):
         return "mmdetection3d"
@@ -78,23 +81,23 @@ def _detect_list_kind(path: Path, entries: Sequence[Any]) -> str:
         return "openpcdet"
     names = " ".join(", ".join(map(str, first)).split())[:80] if isinstance(first, Mapping) else ""
     keys = names or type(first).__name__
-    raise DataError(f"{path}: entries of no known format ({keys}); expected {_EXPECTED}")
+    raise DataError(f"{path}: entries of an unknown format ({keys}); expected {_EXPECTED}")
 
 
 def _read(path: Path) -> Any:
-    """What a pickle or a JSON file holds, or the entries of a folder of JSON files."""
+    """Return the content of a pickle or JSON file, or the entries of a folder of JSON files."""
     if path.is_dir():
         entries = []
         for file in sorted(path.glob("*.json")):
             entry = read_json(file)
             if not isinstance(entry, dict):
-                raise DataError(f"{file}: holds no results of a frame")
+                raise DataError(f"{file}: does not contain the results of a frame")
             entries.append({"frame_id": file.stem, **entry})
         return entries
     return read_json(path) if path.suffix.lower() == ".json" else read_plain_pickle(path)
 
 
 def check_kind(kind: str) -> None:
-    """ConfigError for a kind that nobody reads."""
+    """Raise ConfigError if a format is not supported."""
     if kind not in (*KINDS, "auto"):
         raise ConfigError(f"detector.options.kind '{kind}': use one of auto, {', '.join(KINDS)}")

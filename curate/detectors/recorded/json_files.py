@@ -1,4 +1,4 @@
-"""JSON files of records: whole, or the results of one frame at a time where ijson is installed."""
+"""Reading of JSON files: whole, or one frame at a time if ijson is installed."""
 
 import json
 from collections.abc import Iterator
@@ -7,14 +7,14 @@ from typing import Any
 
 from curate.errors import DataError, one_line
 
-_PEEKED = 4096
+_PEEK_BYTES = 4096
 
 
 def read_json(path: Path) -> Any:
-    """What a file holds.
+    """Return the content of a JSON file.
 
     Raises:
-        DataError: if it is missing or no JSON.
+        DataError: if it is missing or not JSON.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -25,21 +25,21 @@ def read_json(path: Path) -> Any:
 
 
 def holds_object(path: Path) -> bool:
-    """Return whether a file begins as a JSON object does."""
+    """Return whether a file starts like a JSON object."""
     try:
         with path.open("rb") as file:
-            return file.read(_PEEKED).lstrip().startswith(b"{")
+            return file.read(_PEEK_BYTES).lstrip().startswith(b"{")
     except OSError:
         return False
 
 
 def stream_results(path: Path) -> Iterator[tuple[str, Any]]:
-    """Key and value of each entry of `results`, in their order in the file.
+    """Yield key and value of each entry of `results`, in the order of the file.
 
-    Without ijson the file is read whole, which takes six times its size.
+    Without ijson the whole file is read, which takes six times its size in memory.
 
     Raises:
-        DataError: if it is no JSON, or `results` is missing or no object.
+        DataError: if it is not JSON, or `results` is missing or not an object.
     """
     try:
         import ijson
@@ -55,20 +55,20 @@ def stream_results(path: Path) -> Iterator[tuple[str, Any]]:
     except (ijson.JSONError, OSError, ValueError) as error:
         raise _damaged(path, error) from None
     if not found:
-        # Nothing, or something else than an object: only what is around it tells which.
+        # `results` is empty, missing, or not an object. Read the whole file to report which.
         yield from _results_of(path, read_json(path)).items()
 
 
-def _results_of(path: Path, held: Any) -> dict[str, Any]:
-    if not isinstance(held, dict) or "results" not in held:
+def _results_of(path: Path, content: Any) -> dict[str, Any]:
+    if not isinstance(content, dict) or "results" not in content:
         raise DataError(
-            f"{path}: holds a {type(held).__name__}, not a list of frames, and no nuScenes "
-            "results: an object with meta and results"
+            f"{path}: contains a {type(content).__name__}, not a list of frames and not nuScenes "
+            "results (an object with meta and results)"
         )
-    results = held["results"]
+    results = content["results"]
     if not isinstance(results, dict):
         raise DataError(
-            f"{path}: results is no object of sample tokens but a {type(results).__name__}"
+            f"{path}: results is a {type(results).__name__}, not an object of sample tokens"
         )
     return results
 

@@ -1,4 +1,4 @@
-"""Results as KITTI's benchmark takes them: a folder with FRAME.txt, sixteen fields per line."""
+"""KITTI benchmark results: a folder with one FRAME.txt per frame, sixteen fields per line."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -8,26 +8,33 @@ from curate.errors import DataError
 
 
 class KittiResults(Mapping[str, KittiObjects]):
-    """The objects of each frame, read when they are asked for, so that a bad file fails alone.
+    """The objects of each frame, each read on access: an invalid file affects only its frame.
 
-    An empty file is a frame without detections. Names of categories are free.
+    An empty file is a frame without detections. Any category name is accepted.
 
     Args:
-        folder: it holds the result files itself, or in `data/` as KITTI's own tools leave them.
+        folder: contains the result files, directly or in `data/` as KITTI's own tools write them.
 
     Raises:
-        DataError: there is no result file.
+        DataError: if there is no result file.
     """
 
     def __init__(self, folder: Path) -> None:
-        homes = (folder, folder / "data")
-        found = [[path for path in home.glob("*.txt") if path.name[0] != "."] for home in homes]
+        candidates = (folder, folder / "data")
+        found = [
+            [path for path in candidate.glob("*.txt") if path.name[0] != "."]
+            for candidate in candidates
+        ]
         self._paths = {path.stem: path for path in sorted(found[0] or found[1])}
         if not self._paths:
-            raise DataError(f"{folder}: holds no KITTI result files (FRAME.txt)")
+            raise DataError(f"{folder}: contains no KITTI result files (FRAME.txt)")
 
     def __getitem__(self, frame_id: str) -> KittiObjects:
-        """Return the objects of a frame; DataError where its file is malformed."""
+        """Return the objects of a frame.
+
+        Raises:
+            DataError: if its file is malformed.
+        """
         return read_objects(self._paths[frame_id], scored=True, categories=None)
 
     def __iter__(self) -> Iterator[str]:

@@ -1,10 +1,10 @@
-"""nuScenes' results of the detection task: boxes in the frame of a map, by sample token.
+"""Results of the nuScenes detection task: boxes in the map frame, by sample token.
 
-Source: nuScenes' detection task (nuscenes.org). A JSON object with `meta` and `results`, of which
-the latter maps each sample token to a list of boxes: translation (centre), size (width, length,
+Source: nuScenes detection task (nuscenes.org). The file is a JSON object with `meta` and `results`.
+`results` maps each sample token to a list of boxes: translation (centre), size (width, length,
 height), rotation (w, x, y, z), detection_name, detection_score; velocity and attribute_name are
-left out. The well-known mistakes are refused by name: sizes in another order, a quaternion that
-begins with x, boxes in the LiDAR's frame of reference.
+ignored. Common mistakes get their own message: sizes in another order, a quaternion that begins
+with x, boxes in the LiDAR frame.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,27 +23,28 @@ from curate.geometry.poses import boxes_in_frame, rotation_matrices
 
 _KEYS = ("translation", "size", "rotation", "detection_name", "detection_score")
 _NUMBERS = 11  # translation, size, rotation, score
-# Whose length exceeds the width, whatever the detector.
-_LONG = ("car", "truck", "bus", "trailer", "bicycle", "motorcycle")
-# So many boxes, and so many of them wider than long, are no accident.
-_FEWEST_LONG, _MOST_WIDE = 10, 0.9
-# No box stands so far from upright, as the cosine of the angle; a misread quaternion does.
-_UPRIGHT = 0.7
-_UNIT_SLACK = 0.01
-# No LiDAR sees so far, metres; vehicles are hundreds of metres from their map's origin.
-_FARTHEST = 200.0
-# Metres; further products of numbers stay finite.
+# Classes with a length greater than the width in every detector's output.
+_LONG_CLASSES = ("car", "truck", "bus", "trailer", "bicycle", "motorcycle")
+# With this many boxes of long classes, and this share of them wider than long, the order of the
+# sizes is wrong.
+_MIN_LONG_BOXES, _MAX_WIDE_SHARE = 10, 0.9
+# Minimum cosine of a box's tilt. A misread quaternion tilts boxes more than any real object.
+_MIN_COS_TILT = 0.7
+_UNIT_TOLERANCE = 0.01
+# Metres: beyond the range of a LiDAR, but less than vehicles are from the origin of their map.
+_MAX_RANGE = 200.0
+# Metres; products of such numbers stay finite.
 _LARGEST = 1e7
 
 
 @dataclass(frozen=True)
 class MapBoxes:
-    """The boxes of one frame in the frame of a map, waiting for the LiDAR's pose.
+    """The boxes of one frame in the map frame; their conversion needs the LiDAR's pose.
 
     Attributes:
         place: file and frame, for messages.
         numbers: (n, 11) translation, size (width, length, height), rotation (w, x, y, z), score.
-        names: (n,) names of the task's classes.
+        names: (n,) class names of the detection task.
     """
 
     place: str
@@ -51,64 +52,69 @@ class MapBoxes:
     names: Sequence[str]
 
     def in_lidar(self, calibration: Calibration) -> Detections:
-        """Return the boxes in the LiDAR's frame of reference, under our categories.
+        """Return the boxes in the LiDAR frame, with the category names of the project.
 
         Raises:
-            DataError: if they are not where the vehicle is, or no detector can have answered them.
+            DataError: if no box is near the vehicle, or a value is invalid.
             ConfigError: if the data set has no poses.
         """
-        centres, sizes, turns = self.numbers[:, :3], self.numbers[:, 3:6], self.numbers[:, 6:10]
+        centres, sizes, rotations = self.numbers[:, :3], self.numbers[:, 3:6], self.numbers[:, 6:10]
         pose = calibration.pose_in_map()
-        away = np.linalg.norm(centres - pose[:3, 3], axis=1)
-        if len(away) and away.min() > _FARTHEST:
-            place = np.round(centres[0], 1).tolist()
-            near = np.linalg.norm(centres, axis=1).max() < _FARTHEST
-            guess = "they are in the frame of the LiDAR or vehicle" if near else "is it their frame"
-            raise DataError(
-                f"{self.place}: boxes such as {place} are {away.min():.0f} m and more from the "
-                f"vehicle, which is at {np.round(pose[:2, 3], 1).tolist()} in the map; results are "
-                f"in the frame of the map: {guess}?"
+        distance = np.linalg.norm(centres - pose[:3, 3], axis=1)
+        if len(distance) and distance.min() > _MAX_RANGE:
+            example = np.round(centres[0], 1).tolist()
+            near_origin = np.linalg.norm(centres, axis=1).max() < _MAX_RANGE
+            hint = (
+                "are these in the LiDAR or vehicle frame?"
+                if near_origin
+                else "are these results of another frame?"
             )
-        boxes = boxes_in_frame(centres, sizes[:, [1, 0, 2]], turns, pose)
+            raise DataError(
+                f"{self.place}: boxes such as {example} are {distance.min():.0f} m or more from "
+                f"the vehicle, which is at {np.round(pose[:2, 3], 1).tolist()} in the map; results "
+                f"must be in the map frame: {hint}"
+            )
+        boxes = boxes_in_frame(centres, sizes[:, [1, 0, 2]], rotations, pose)
         names = [CATEGORIES.get(name, name) for name in self.names]
         return as_detections(self.place, boxes, self.numbers[:, 10], as_categories(names))
 
 
 def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str, MapBoxes]:
-    """Return the results of each frame; in memory are eleven numbers and a name per box.
+    """Return the results of each frame; memory holds only eleven numbers and a name per box.
 
     Args:
         path: the file, for messages.
-        results: sample token and list of boxes of each frame, which are let go one by one.
+        results: sample token and list of boxes of each frame; read one by one.
 
     Raises:
-        DataError: a result lacks a key or cannot be, or the file shows one of the usual mistakes.
+        DataError: if a result lacks a key or has an invalid value, or the file shows one of the
+            common mistakes.
     """
     found: dict[str, MapBoxes] = {}
-    names: dict[str, str] = {}
-    long = wide = 0
+    interned: dict[str, str] = {}
+    long_boxes = wide_boxes = 0
     for token, boxes in results:
-        one = _frame(path, token, boxes, names)
-        _check_rotations(one)
-        own = one.numbers[np.isin(one.names, _LONG), 3:5]
-        long += len(own)
-        wide += int(np.sum(own[:, 0] > own[:, 1]))
-        found[token] = one
-    if long >= _FEWEST_LONG and wide > _MOST_WIDE * long:
+        frame = _frame(path, token, boxes, interned)
+        _check_rotations(frame)
+        width_length = frame.numbers[np.isin(frame.names, _LONG_CLASSES), 3:5]
+        long_boxes += len(width_length)
+        wide_boxes += int(np.sum(width_length[:, 0] > width_length[:, 1]))
+        found[token] = frame
+    if long_boxes >= _MIN_LONG_BOXES and wide_boxes > _MAX_WIDE_SHARE * long_boxes:
         raise DataError(
-            f"{path}: {wide} of {long} boxes of {', '.join(_LONG)} would be wider than long: "
-            "nuScenes' size is width, length, height; swap the first two"
+            f"{path}: {wide_boxes} of {long_boxes} boxes of {', '.join(_LONG_CLASSES)} would be "
+            "wider than long: the order of size is width, length, height; swap the first two"
         )
     return found
 
 
-def _frame(path: Path, token: str, boxes: Any, known: dict[str, str]) -> MapBoxes:
-    """Return the boxes of a frame; a name that many of them have is kept once, in `known`."""
-    place = f"{path}: results of {_words(token)}"
+def _frame(path: Path, token: str, boxes: Any, interned: dict[str, str]) -> MapBoxes:
+    """Return the boxes of a frame; equal names share one string, from `interned`."""
+    place = f"{path}: results of {_shortened(token)}"
     if not isinstance(boxes, list):
         raise DataError(f"{place}: expected a list of boxes, not {type(boxes).__name__}")
     rows = [_row(f"{place}: box {k}", token, box) for k, box in enumerate(boxes)]
-    names = [known.setdefault(box["detection_name"], box["detection_name"]) for box in boxes]
+    names = [interned.setdefault(box["detection_name"], box["detection_name"]) for box in boxes]
     return MapBoxes(place, np.array(rows, dtype=np.float64).reshape(-1, _NUMBERS), names)
 
 
@@ -118,10 +124,12 @@ def _row(place: str, token: str, box: Any) -> list[float]:
     if missing:
         raise DataError(f"{place}: no {', '.join(missing)}; expected {', '.join(_KEYS)}")
     if box.get("sample_token", token) != token:
-        other = _words(box["sample_token"])
-        raise DataError(f"{place}: its sample_token is {other}, another frame's")
+        other = _shortened(box["sample_token"])
+        raise DataError(
+            f"{place}: its sample_token is {other}, but it is listed under {_shortened(token)}"
+        )
     if not isinstance(box["detection_name"], str):
-        raise DataError(f"{place}: its detection_name is no text")
+        raise DataError(f"{place}: its detection_name is not text")
     parts = [box[key] for key in ("translation", "size", "rotation")]
     lengths = [len(part) if isinstance(part, list) else 0 for part in parts]
     try:
@@ -137,26 +145,26 @@ def _row(place: str, token: str, box: Any) -> list[float]:
     return numbers
 
 
-def _words(text: Any) -> str:
-    """Return a foreign text as a message may repeat it."""
+def _shortened(text: Any) -> str:
+    """Return a text from the file, short enough for a message."""
     return " ".join(text.split())[:80] if isinstance(text, str) else f"a {type(text).__name__}"
 
 
 def _check_rotations(found: MapBoxes) -> None:
-    """DataError at the first rotation that is no upright box's."""
-    turns = found.numbers[:, 6:10]
-    lengths = np.linalg.norm(turns, axis=1)
-    if (np.abs(lengths - 1) > _UNIT_SLACK).any():
+    """Raise DataError if a rotation is not a unit quaternion or tilts its box too far."""
+    rotations = found.numbers[:, 6:10]
+    lengths = np.linalg.norm(rotations, axis=1)
+    if (np.abs(lengths - 1) > _UNIT_TOLERANCE).any():
         k = int(np.argmax(np.abs(lengths - 1)))
         raise DataError(
-            f"{found.place}: box {k}: rotation {turns[k].tolist()} is no unit quaternion "
+            f"{found.place}: box {k}: rotation {rotations[k].tolist()} is not a unit quaternion "
             f"(w, x, y, z), its length is {lengths[k]:.3f}"
         )
-    upright = rotation_matrices(turns)[:, 2, 2]
-    if (upright < _UPRIGHT).any():
-        k = int(np.argmin(upright))
-        angle = np.degrees(np.arccos(np.clip(upright[k], -1, 1)))
+    cos_tilt = rotation_matrices(rotations)[:, 2, 2]
+    if (cos_tilt < _MIN_COS_TILT).any():
+        k = int(np.argmin(cos_tilt))
+        angle = np.degrees(np.arccos(np.clip(cos_tilt[k], -1, 1)))
         raise DataError(
             f"{found.place}: box {k} would be tilted by {angle:.0f} degrees: rotation "
-            f"{turns[k].tolist()} must be w, x, y, z, not x, y, z, w"
+            f"{rotations[k].tolist()} must be w, x, y, z, not x, y, z, w"
         )

@@ -1,13 +1,13 @@
 """Detections and augmented views in one Parquet file, such as curate's own export.
 
 The columns are those of the CSV record: frame, category, score, x, y, z, length, width, height,
-yaw, and for augmented copies view, flip_y, rotation_rad, scale; without these four every row is of
-the frame as it is. Other columns are not read, so the labels that `curate export --format parquet`
-writes are a record of the predictions they come from.
+yaw, and for augmented copies view, flip_y, rotation_rad, scale. Without these four columns every
+row belongs to the original frame. Other columns are not read, so the labels that
+`curate export --format parquet` writes are a record of the predictions they come from.
 
-Only the rows' frames and views are held, as runs within row groups; boxes are read when a frame is
-asked for, a row group at a time, and a bad row fails its frame alone. A file that claims more rows
-than boxes can be packed into it is refused.
+Memory holds only where the rows of each frame are, as runs within row groups. Boxes are read when a
+frame is requested, a row group at a time, and an invalid row affects only its frame. A file that
+claims more rows than its bytes can hold is rejected.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,13 +26,13 @@ from curate.files.parquet import load_parquet
 from curate.geometry.similarity import Similarity
 
 VIEW_COLUMNS = ("view", "flip_y", "rotation_rad", "scale")
-_BOXES = ("score", *BOX_COLUMNS)
-_NEEDED = ("frame", "category", *_BOXES)
-_NAMES = frozenset({"frame", "category"})
-_GROUPS_HELD = 2
-# Boxes do not compress further; what does, unfolds to any size.
-_FEWEST_BYTES_PER_ROW = 4
-_MOST_NAME_BYTES = 256 << 20  # of a column of names in a row group
+_REQUIRED = ("frame", "category", "score", *BOX_COLUMNS)
+_TEXT_COLUMNS = frozenset({"frame", "category"})
+_CACHED_GROUPS = 2
+# The numbers of different boxes do not compress below this. A file with fewer bytes per row
+# compresses better than boxes can, and could expand to any size.
+_MIN_BYTES_PER_ROW = 4
+_MAX_TEXT_BYTES = 256 << 20  # of a text column in a row group
 
 View = tuple[Similarity, Detections]
 Runs = Mapping[str, list[tuple[int, int, int]]]
@@ -46,7 +46,7 @@ class ParquetRecord:
     Attributes:
         path: the file.
         has_views: whether it has the columns of augmented copies.
-        runs: where each frame's rows are.
+        runs: location of the rows of each frame.
     """
 
     path: Path
@@ -55,45 +55,53 @@ class ParquetRecord:
 
     @classmethod
     def read(cls, path: Path) -> "ParquetRecord":
-        """Return the record in a file, of which only the column of frames is read.
+        """Return the record in a file; reads only the column of frames.
 
         Raises:
-            ConfigError: pyarrow is not installed.
-            DataError: if the file is missing, damaged or no Parquet, or a column is missing or of a
-                wrong type.
+            ConfigError: if pyarrow is not installed.
+            DataError: if the file is missing, damaged or not a Parquet file, or a column is missing
+                or of a wrong type.
         """
         file = _open(path)
         names = file.schema_arrow.names
-        own = [name for name in VIEW_COLUMNS if name in names]
-        wanted = (*_NEEDED, *(VIEW_COLUMNS if own else ()))
-        missing = [name for name in wanted if name not in names]
+        has_views = any(name in names for name in VIEW_COLUMNS)
+        required = (*_REQUIRED, *(VIEW_COLUMNS if has_views else ()))
+        missing = [name for name in required if name not in names]
         if missing:
             raise DataError(f"{path}: no column {', '.join(missing)}; it has {', '.join(names)}")
-        _check_types(path, file.schema_arrow, wanted)
+        _check_types(path, file.schema_arrow, required)
         _check_expansion(path, file.metadata)
-        return cls(path, bool(own), _runs(path, file))
+        return cls(path, has_views, _runs(path, file))
 
     def frame_ids(self) -> tuple[str, ...]:
         """Return the recorded frames, in sorted order."""
         return tuple(sorted(self.runs))
 
-    def answer(self, frame_id: str) -> Detections:
-        """What was recorded for the frame as it is; DataError where nothing was recorded."""
+    def result(self, frame_id: str) -> Detections:
+        """Return the detections of the original frame.
+
+        Raises:
+            DataError: if the frame was not recorded, or its rows are invalid.
+        """
         _, found = self._views(frame_id).get(0, (Similarity(), Detections.empty()))
         return found
 
     def views(self, frame_id: str) -> Sequence[View]:
-        """Return the augmented copies in the order of their numbers; DataError like `answer`."""
+        """Return the augmented copies of a frame in the order of their numbers.
+
+        Raises:
+            DataError: if the frame was not recorded, or its rows are invalid.
+        """
         return [view for number, view in sorted(self._views(frame_id).items()) if number]
 
     @cached_property
     def _groups(self) -> Any:
-        """Reads a row group, and keeps the last ones."""
-        columns = [*_NEEDED[1:], *(VIEW_COLUMNS if self.has_views else ())]
-        return lru_cache(_GROUPS_HELD)(lambda number: _group(self.path, number, columns))
+        """Function that reads a row group; it caches the last ones."""
+        columns = [*_REQUIRED[1:], *(VIEW_COLUMNS if self.has_views else ())]
+        return lru_cache(_CACHED_GROUPS)(lambda number: _group(self.path, number, columns))
 
     def _views(self, frame_id: str) -> Mapping[int, View]:
-        """Return all that was recorded for a frame, by the number of the view."""
+        """Return all views of a frame by their number."""
         if frame_id not in self.runs:
             raise DataError(f"no recorded detections for frame {frame_id} in {self.path}")
         parts = [self._part(*run) for run in self.runs[frame_id]]
@@ -103,15 +111,15 @@ class ParquetRecord:
         found = as_detections(place, boxes, columns["score"], columns["category"])
         if not self.has_views:
             return {0: (Similarity(), found)}
-        told = np.column_stack([columns[name] for name in VIEW_COLUMNS])
-        _check_views(place, told)
+        view_values = np.column_stack([columns[name] for name in VIEW_COLUMNS])
+        _check_views(place, view_values)
         views = {}
-        for number in np.unique(told[:, 0]):
-            own = np.flatnonzero(told[:, 0] == number)
-            _, flip_y, rotation_rad, scale = told[own[0]].tolist()
+        for number in np.unique(view_values[:, 0]):
+            rows = np.flatnonzero(view_values[:, 0] == number)
+            _, flip_y, rotation_rad, scale = view_values[rows[0]].tolist()
             views[int(number)] = (
                 Similarity(bool(flip_y), rotation_rad, scale),
-                found.select(own),
+                found.select(rows),
             )
         return views
 
@@ -122,30 +130,31 @@ class ParquetRecord:
 def _open(path: Path) -> Any:
     arrow, parquet = load_parquet()
     try:
-        return parquet.ParquetFile(path, read_dictionary=sorted(_NAMES))
+        return parquet.ParquetFile(path, read_dictionary=sorted(_TEXT_COLUMNS))
     except FileNotFoundError:
         raise DataError(f"{path}: no such file of recorded detections") from None
     except (arrow.ArrowException, OSError, UnicodeError) as error:
-        raise DataError(f"{path}: no readable Parquet: {one_line(error)}") from None
+        raise DataError(f"{path}: not a readable Parquet file: {one_line(error)}") from None
 
 
 def _check_types(path: Path, schema: Any, names: Sequence[str]) -> None:
-    """Raise DataError if a column holds neither names nor numbers as it should."""
+    """Raise DataError if a text column does not contain text, or another one no numbers."""
     arrow, _ = load_parquet()
     for name in names:
         kind = schema.field(name).type
         kind = kind.value_type if arrow.types.is_dictionary(kind) else kind
-        of = arrow.types
-        text = of.is_string(kind) or of.is_large_string(kind) or of.is_integer(kind)
-        number = of.is_integer(kind) or of.is_floating(kind) or of.is_boolean(kind)
-        if not (text if name in _NAMES else number):
-            raise DataError(f"{path}: column {name} is of type {kind}")
+        is_a = arrow.types
+        text = is_a.is_string(kind) or is_a.is_large_string(kind) or is_a.is_integer(kind)
+        number = is_a.is_integer(kind) or is_a.is_floating(kind) or is_a.is_boolean(kind)
+        if not (text if name in _TEXT_COLUMNS else number):
+            expected = "text or integers" if name in _TEXT_COLUMNS else "numbers"
+            raise DataError(f"{path}: column {name} is of type {kind}, expected {expected}")
 
 
 def _check_expansion(path: Path, metadata: Any) -> None:
-    """Raise DataError if a file claims far more than its bytes can hold."""
+    """Raise DataError if a file claims far more content than its bytes can hold."""
     size = path.stat().st_size
-    if metadata.num_rows * _FEWEST_BYTES_PER_ROW > size:
+    if metadata.num_rows * _MIN_BYTES_PER_ROW > size:
         raise DataError(
             f"{path}: {metadata.num_rows} rows in {size} bytes cannot be different boxes"
         )
@@ -153,17 +162,18 @@ def _check_expansion(path: Path, metadata: Any) -> None:
         group = metadata.row_group(number)
         for column in map(group.column, range(group.num_columns)):
             if (
-                column.path_in_schema in _NAMES
-                and column.total_uncompressed_size > _MOST_NAME_BYTES
+                column.path_in_schema in _TEXT_COLUMNS
+                and column.total_uncompressed_size > _MAX_TEXT_BYTES
             ):
                 raise DataError(
-                    f"{path}: row group {number}: column {column.path_in_schema} unfolds to "
-                    f"{column.total_uncompressed_size} bytes; up to {_MOST_NAME_BYTES} are read"
+                    f"{path}: row group {number}: column {column.path_in_schema} expands to "
+                    f"{column.total_uncompressed_size} bytes, the limit is {_MAX_TEXT_BYTES}; "
+                    "write smaller row groups"
                 )
 
 
 def _runs(path: Path, file: Any) -> Runs:
-    """Where each frame's rows are, from the column of frames alone."""
+    """Return the location of the rows of each frame; reads only the column of frames."""
     runs: dict[str, list[tuple[int, int, int]]] = {}
     for number in range(file.num_row_groups):
         frames = _read(path, file, number, ["frame"])["frame"]
@@ -181,7 +191,7 @@ def _group(path: Path, number: int, columns: Sequence[str]) -> Mapping[str, np.n
 
 
 def _read(path: Path, file: Any, number: int, columns: Sequence[str]) -> Mapping[str, np.ndarray]:
-    """Columns of a row group: names as objects, numbers as float64."""
+    """Return columns of a row group: text as objects, numbers as float64."""
     arrow, _ = load_parquet()
     try:
         table = file.read_row_group(number, columns=list(columns), use_threads=False)
@@ -192,49 +202,50 @@ def _read(path: Path, file: Any, number: int, columns: Sequence[str]) -> Mapping
 
 def _values(path: Path, number: int, arrow: Any, name: str, column: Any) -> np.ndarray:
     missing = column.null_count
-    if name in _NAMES:
-        chunks = [_coded(arrow, chunk) for chunk in column.chunks]
+    if name in _TEXT_COLUMNS:
+        chunks = [_dictionary_encoded(arrow, chunk) for chunk in column.chunks]
         missing += sum(chunk.dictionary.null_count for chunk in chunks)
     elif arrow.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     if missing:
         raise DataError(f"{path}: row group {number}: {missing} rows have no {name}")
-    if name in _NAMES:
-        return np.concatenate([np.empty(0, object), *map(_named, chunks)])
+    if name in _TEXT_COLUMNS:
+        return np.concatenate([np.empty(0, object), *map(_texts, chunks)])
     return np.asarray(column.cast(arrow.float64()).to_numpy())
 
 
-def _coded(arrow: Any, chunk: Any) -> Any:
-    """Return a chunk of names as numbers of those that it has."""
+def _dictionary_encoded(arrow: Any, chunk: Any) -> Any:
+    """Return a chunk of text as indices into its distinct values."""
     if arrow.types.is_dictionary(chunk.type):
         return chunk
     return chunk.cast(arrow.string()).dictionary_encode()
 
 
-def _named(chunk: Any) -> np.ndarray:
-    """Return (n,) the names; equal ones are one object."""
-    names = np.array([str(name) for name in chunk.dictionary.to_pylist()], dtype=object)
-    named: np.ndarray = names[chunk.indices.to_numpy()]
-    return named
+def _texts(chunk: Any) -> np.ndarray:
+    """Return (n,) the texts of a chunk; equal texts share one object to save memory."""
+    distinct = np.array([str(text) for text in chunk.dictionary.to_pylist()], dtype=object)
+    texts: np.ndarray = distinct[chunk.indices.to_numpy()]
+    return texts
 
 
-def _check_views(place: str, told: np.ndarray) -> None:
-    """Raise DataError if the four columns of views contradict each other."""
-    view, flip_y, _, scale = told.T
-    identity = (told[:, 1:] == [0, 0, 1]).all(axis=1)
-    _, first, own = np.unique(view, return_index=True, return_inverse=True)
-    faults = {
+def _check_views(place: str, view_values: np.ndarray) -> None:
+    """Raise DataError if (n, 4) values of `VIEW_COLUMNS` are invalid or contradict each other."""
+    view, flip_y, _, scale = view_values.T
+    identity = (view_values[:, 1:] == [0, 0, 1]).all(axis=1)
+    _, first_row, view_index = np.unique(view, return_index=True, return_inverse=True)
+    of_first_row = view_values[first_row[view_index]]
+    invalid = {
         "view is not 0, 1, 2, ...": (view < 0) | (view != np.floor(view)),
         "flip_y is neither 0 nor 1": (flip_y != 0) & (flip_y != 1),
-        "rotation_rad or scale is NaN or infinite": ~np.isfinite(told).all(axis=1),
+        "rotation_rad or scale is NaN or infinite": ~np.isfinite(view_values).all(axis=1),
         "scale is not positive": scale <= 0,
-        "view 0 is the frame as it is, but flip_y, rotation_rad, scale are not 0, 0, 1": (
+        "view 0 is the original frame, but flip_y, rotation_rad, scale are not 0, 0, 1": (
             (view == 0) & ~identity
         ),
-        "flip_y, rotation_rad or scale differ within a view": (told != told[first[own]]).any(
+        "flip_y, rotation_rad or scale differ within a view": (view_values != of_first_row).any(
             axis=1
         ),
     }
-    for fault, rows in faults.items():
+    for reason, rows in invalid.items():
         if rows.any():
-            raise DataError(f"{place}: box {int(np.argmax(rows))}: {fault}")
+            raise DataError(f"{place}: box {int(np.argmax(rows))}: {reason}")

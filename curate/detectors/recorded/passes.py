@@ -1,4 +1,4 @@
-"""A detector's passes over a data set: one over the frames, others over augmented copies of all."""
+"""Passes of a detector over a data set: one over the frames, others over augmented copies."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from curate.detectors.recorded.formats import read_results
-from curate.detectors.recorded.results import Answers, ReadOptions, RecordedResult
+from curate.detectors.recorded.results import ReadOptions, RecordedResult, ResultsByFrame
 from curate.errors import ConfigError, DataError
 from curate.geometry.similarity import Similarity
 
@@ -15,88 +15,97 @@ _PARAMETERS = ("flip_y", "rotation_rad", "scale")
 
 @dataclass(frozen=True)
 class PassesRecord:
-    """The answers for each frame, and for A(x) with an A per pass.
+    """The results of each frame x, and of A(x) with one A per further pass.
 
     Attributes:
-        path: of the first pass.
-        plain: the first pass.
-        augmented: path, A and answers of each further pass, in A's frame of reference.
+        path: file or folder of the first pass.
+        plain: results of the first pass.
+        augmented: path, A and results of each further pass, in A's frame of reference.
     """
 
     path: Path
-    plain: Answers
-    augmented: Sequence[tuple[Path, Similarity, Answers]]
+    plain: ResultsByFrame
+    augmented: Sequence[tuple[Path, Similarity, ResultsByFrame]]
 
     @classmethod
     def read(
-        cls, path: Path, kind: str, reading: ReadOptions, passes: Sequence[Mapping[str, Any]]
+        cls, path: Path, kind: str, options: ReadOptions, passes: Sequence[Mapping[str, Any]]
     ) -> "PassesRecord":
-        """Return all passes, in the same format.
+        """Return all passes; they are in the same format.
 
         Args:
             path: file or folder of the first pass.
-            kind: of the format, see `formats`.
-            reading: see there.
-            passes: `path` (relative to the folder of the first), and of `flip_y`, `rotation_rad`
-                and `scale` what A does, of each further pass.
+            kind: the format, see `formats`.
+            options: see `ReadOptions`.
+            passes: `path` of each further pass (relative to the folder of the first), and its A as
+                one or more of `flip_y`, `rotation_rad` and `scale`.
 
         Raises:
-            ConfigError: if a pass has other keys, or no A.
+            ConfigError: if a pass has other keys, or A is missing or the identity.
             DataError: if a file is missing or malformed.
         """
         augmented = []
-        for number, one in enumerate(passes, start=1):
-            similarity = _similarity(number, one)
-            place = path.parent / one["path"]
+        for number, entry in enumerate(passes, start=1):
+            similarity = _similarity(number, entry)
+            place = path.parent / entry["path"]
             if not place.exists():
-                raise DataError(f"{place}: no such record; see detector.options.passes")
-            augmented.append((place, similarity, read_results(place, kind, reading)))
-        return cls(path, read_results(path, kind, reading), augmented)
+                raise DataError(f"{place}: no such file or folder; see detector.options.passes")
+            augmented.append((place, similarity, read_results(place, kind, options)))
+        return cls(path, read_results(path, kind, options), augmented)
 
     @property
     def has_views(self) -> bool:
-        """Whether there is a further pass."""
+        """Whether the record contains a pass over augmented copies."""
         return bool(self.augmented)
 
     def frame_ids(self) -> tuple[str, ...]:
         """Return the frames of the first pass, in sorted order."""
         return tuple(sorted(self.plain))
 
-    def answer(self, frame_id: str) -> RecordedResult:
-        """What the first pass found; DataError where it has no such frame."""
-        return _of(self.plain, frame_id, self.path)
+    def result(self, frame_id: str) -> RecordedResult:
+        """Return the result of the first pass.
+
+        Raises:
+            DataError: if the pass has no such frame.
+        """
+        return _frame_result(self.plain, frame_id, self.path)
 
     def views(self, frame_id: str) -> Sequence[tuple[Similarity, RecordedResult]]:
-        """What the further passes found; DataError where one has no such frame."""
+        """Return A and the result of each further pass.
+
+        Raises:
+            DataError: if a pass has no such frame.
+        """
         return [
-            (similarity, _of(answers, frame_id, path))
-            for path, similarity, answers in self.augmented
+            (similarity, _frame_result(results, frame_id, path))
+            for path, similarity, results in self.augmented
         ]
 
 
-def _of(answers: Answers, frame_id: str, path: Path) -> RecordedResult:
-    if frame_id not in answers:
+def _frame_result(results: ResultsByFrame, frame_id: str, path: Path) -> RecordedResult:
+    if frame_id not in results:
         raise DataError(f"no recorded detections for frame {frame_id} in {path}")
-    return answers[frame_id]
+    return results[frame_id]
 
 
-def _similarity(number: int, one: Mapping[str, Any]) -> Similarity:
-    """A of a pass."""
+def _similarity(number: int, entry: Mapping[str, Any]) -> Similarity:
+    """Return A of a pass."""
     place = f"detector.options.passes: pass {number}"
-    unknown = sorted(set(one) - {"path", *_PARAMETERS})
-    if unknown or "path" not in one:
-        raise ConfigError(f"{place}: takes path, {', '.join(_PARAMETERS)}, not {list(one)}")
+    unknown = sorted(set(entry) - {"path", *_PARAMETERS})
+    if unknown or "path" not in entry:
+        raise ConfigError(f"{place}: takes path, {', '.join(_PARAMETERS)}, not {list(entry)}")
     try:
         similarity = Similarity(
-            bool(one.get("flip_y", False)),
-            float(one.get("rotation_rad", 0.0)),
-            float(one.get("scale", 1.0)),
+            bool(entry.get("flip_y", False)),
+            float(entry.get("rotation_rad", 0.0)),
+            float(entry.get("scale", 1.0)),
         )
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{place}: {error}") from None
     if similarity == Similarity():
         raise ConfigError(
-            f"{place}: name what was done to the points, at least one of {', '.join(_PARAMETERS)}; "
-            "a second look at the same points says nothing of consistency"
+            f"{place}: state how the points were transformed, with at least one of "
+            f"{', '.join(_PARAMETERS)}; a second pass over the same points does not measure "
+            "consistency"
         )
     return similarity

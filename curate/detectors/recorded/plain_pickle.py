@@ -1,8 +1,8 @@
-"""Pickles of numpy arrays and plain containers, read without running anything that they name.
+"""Read pickles of numpy arrays and plain containers without executing code from them.
 
-A pickle is a program: it may name any function and call it. Here every name is looked up in a short
-table of harmless stand-ins, and any other name ends the reading before it is imported. The built-in
-containers need no names.
+A pickle is a program: it can import any function and call it. This reader looks up every imported
+name in a short table of harmless replacements. Any other name stops the reader before anything is
+imported. The built-in containers (list, dict, tuple, ...) need no import.
 """
 
 import collections
@@ -19,11 +19,11 @@ import numpy as np
 
 from curate.errors import DataError, one_line
 
-# Kinds of numpy's types that hold plain values; objects come only as elements that are plain.
+# Kinds of numpy types with plain values. "O" is safe: its elements pass the same table.
 _KINDS = "biufcSUO"
 
-# What a damaged pickle makes the interpreter of pickles raise.
-_DAMAGES = (
+# Exceptions that the unpickler raises for a damaged pickle.
+_DAMAGE_ERRORS = (
     pickle.UnpicklingError,
     AttributeError,
     EOFError,
@@ -37,19 +37,20 @@ _DAMAGES = (
 )
 
 
-_STORES = frozenset({"PUT", "BINPUT", "LONG_BINPUT"})
-_DEEPEST = 40
+_STORE_OPCODES = frozenset({"PUT", "BINPUT", "LONG_BINPUT"})
+_MAX_DEPTH = 40
 
 
 class _RejectedError(Exception):
-    """The pickle names something that is not in the table."""
+    """The pickle imports a name that is not in the table."""
 
 
 def read_plain_pickle(path: Path) -> Any:
-    """What a pickle file of arrays, numbers, strings and containers holds.
+    """Return the content of a pickle file of arrays, numbers, strings and containers.
 
     Raises:
-        DataError: if the file is missing or damaged, or names anything else; the name is given.
+        DataError: if the file is missing or damaged, or imports anything else; the message shows
+            the imported name.
     """
     try:
         content = Path(path).read_bytes()
@@ -59,61 +60,65 @@ def read_plain_pickle(path: Path) -> Any:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from error
     try:
         _check_claimed_sizes(content)
-        held = _PlainUnpickler(io.BytesIO(content)).load()
-        _unfolded(held, 16 * len(content) + 1000)
-    except _RejectedError as refused:
+        value = _PlainUnpickler(io.BytesIO(content)).load()
+        _check_expanded_size(value, 16 * len(content) + 1000)
+    except _RejectedError as rejected:
         raise DataError(
-            f"{path}: refused, the pickle names {refused}; only numpy arrays and plain containers "
-            "are read: save tensors and boxes as arrays (boxes.tensor.numpy())"
+            f"{path}: rejected: the pickle imports {rejected}; only numpy arrays and plain "
+            "containers are read. Save tensors and boxes as arrays (boxes.tensor.numpy())"
         ) from None
-    except _DAMAGES as error:
-        words = one_line(error, 200) or type(error).__name__
-        raise DataError(f"{path}: no pickle, or a damaged one: {words}") from None
-    return held
+    except _DAMAGE_ERRORS as error:
+        reason = one_line(error, 200) or type(error).__name__
+        raise DataError(f"{path}: not a pickle, or a damaged one: {reason}") from None
+    return value
 
 
 def _check_claimed_sizes(content: bytes) -> None:
-    """UnpicklingError for what the interpreter of pickles would take at its word, at any cost.
+    """Check the sizes that a pickle claims before the unpickler allocates memory for them.
 
-    A length beyond the end of the file is a ValueError of pickletools; a number in the table of
-    known objects makes the interpreter lay out that table up to there.
+    pickletools raises ValueError for a length beyond the end of the file. A store opcode with
+    object number n makes the unpickler allocate a table of n entries.
+
+    Raises:
+        UnpicklingError: if an object number is larger than the file.
     """
     for opcode, argument, _ in pickletools.genops(content):
-        if opcode.name in _STORES and int(argument or 0) > len(content):
+        if opcode.name in _STORE_OPCODES and int(argument or 0) > len(content):
             raise pickle.UnpicklingError(f"stores object number {argument}")
 
 
-def _unfolded(held: Any, most: int) -> int:
-    """How much a value is where everything that it names twice is counted twice, up to `most`.
+def _check_expanded_size(value: Any, limit: int) -> None:
+    """Check the size of a value with every shared object counted once per reference.
 
-    A few bytes can name a list of lists of lists, each ten times, which fills any memory as soon as
-    someone makes an array or a text of it.
+    A few bytes can describe a list of ten references to a list of ten references to a list. Such
+    a value fills the memory as soon as it is converted to an array or to text.
 
     Raises:
-        ValueError: if it is more, nested too deep, or holds itself.
+        ValueError: if the size exceeds `limit`, or the value is nested too deep or contains itself.
     """
-    known: dict[int, int | None] = {}
+    # Size of each container by id; None while its size is being computed.
+    sizes: dict[int, int | None] = {}
 
     def size(value: Any, depth: int) -> int:
         parts = _parts(value)
         if parts is None:
-            return 1 + _own_size(value)
-        if depth > _DEEPEST or known.get(id(value), 0) is None:
-            raise ValueError("nested too deep, or in itself")
-        found = known.get(id(value))
-        if found is None:
-            known[id(value)] = None
-            found = 1 + sum(size(part, depth + 1) for part in parts)
-            known[id(value)] = found
-        if found > most:
-            raise ValueError("names the same things so often that they would fill the memory")
-        return found
+            return 1 + _leaf_size(value)
+        if depth > _MAX_DEPTH or sizes.get(id(value), 0) is None:
+            raise ValueError("nested too deep, or contains itself")
+        total = sizes.get(id(value))
+        if total is None:
+            sizes[id(value)] = None
+            total = 1 + sum(size(part, depth + 1) for part in parts)
+            sizes[id(value)] = total
+        if total > limit:
+            raise ValueError("refers to the same objects so often that they would fill the memory")
+        return total
 
-    return size(held, 0)
+    size(value, 0)
 
 
 def _parts(value: Any) -> Iterable[Any] | None:
-    """What a container holds; None for what is none."""
+    """Return the elements of a container; None for other values."""
     if isinstance(value, Mapping):
         return chain(value.keys(), value.values())
     if isinstance(value, list | tuple | set | frozenset):
@@ -123,26 +128,26 @@ def _parts(value: Any) -> Iterable[Any] | None:
     return None
 
 
-def _own_size(value: Any) -> int:
-    """Of a leaf, in about the bytes that it takes in a pickle."""
+def _leaf_size(value: Any) -> int:
+    """Return about the number of bytes that a value takes in a pickle."""
     if isinstance(value, np.ndarray | np.generic):
         return value.nbytes
     return len(value) if isinstance(value, str | bytes | bytearray) else 0
 
 
 class _PlainUnpickler(pickle.Unpickler):
-    """Looks names up in `_ADMITTED` and imports nothing."""
+    """Unpickler that looks names up in `_ALLOWED` and imports nothing."""
 
     def find_class(self, module_name: str, global_name: str, /) -> Any:
-        """Return the stand-in for a name."""
+        """Return the replacement for an imported name."""
         name = f"{module_name}.{global_name}"
-        if name not in _ADMITTED:
+        if name not in _ALLOWED:
             raise _RejectedError(repr(name[:80]).strip("'\""))
-        return _ADMITTED[name]
+        return _ALLOWED[name]
 
 
-class _StandIn:
-    """Calls a function in the place of what a pickle names, and takes no state from the pickle."""
+class _Replacement:
+    """Callable that replaces an imported name; the pickle cannot change its attributes."""
 
     __slots__ = ("_function",)
     _function: Callable[..., Any]
@@ -157,83 +162,92 @@ class _StandIn:
         raise AttributeError(name)
 
 
-class _Type:
-    """Stands in for a numpy.dtype of plain values; of its later state only the byte order counts.
+class _Dtype:
+    """Replacement for numpy.dtype with plain values; reads only the byte order from its state.
 
-    numpy's own would also take fields and flags from the file, and trust them.
+    numpy.dtype itself would also read fields and flags from the file without checking them.
     """
 
     def __init__(self, name: str, _align: object = False, _copy: object = True) -> None:
-        self.made = np.dtype(str(name))
-        if self.made.kind not in _KINDS:
+        self.dtype = np.dtype(str(name))
+        if self.dtype.kind not in _KINDS:
             raise _RejectedError(f"numpy.dtype {name}")
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         if state[1] in {"<", ">"}:
-            self.made = self.made.newbyteorder(state[1])
+            self.dtype = self.dtype.newbyteorder(state[1])
 
 
 class _Array(np.ndarray):
-    """An array whose later state names its type by a `_Type`."""
+    """Array that gets its type from the `_Dtype` in its pickled state."""
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         version, shape, kind, is_fortran, content = state
-        super().__setstate__((version, shape, kind.made, is_fortran, content))
+        super().__setstate__((version, shape, kind.dtype, is_fortran, content))
 
 
 def _empty_array(_kind: object, _shape: object, _dtype: object) -> np.ndarray:
-    """Return the array that the pickle's next instruction fills."""
+    """Return the array that the next instruction of the pickle fills."""
     return _Array((0,), dtype=np.int8)
 
 
-def _scalar(kind: _Type, content: bytes) -> Any:
-    """Return a number or string of numpy's."""
-    return np.frombuffer(content, dtype=kind.made, count=1)[0]
+def _scalar(kind: _Dtype, content: bytes) -> Any:
+    """Return a numpy number or string."""
+    return np.frombuffer(content, dtype=kind.dtype, count=1)[0]
 
 
-def _array_of_bytes(content: Any, kind: _Type, shape: Any, order: Any) -> np.ndarray:
+def _array_from_buffer(content: Any, kind: _Dtype, shape: Any, order: Any) -> np.ndarray:
     """Return an array from its bytes, as protocol 5 writes it."""
-    return np.frombuffer(bytes(content), dtype=kind.made).reshape(shape, order=order)
+    return np.frombuffer(bytes(content), dtype=kind.dtype).reshape(shape, order=order)
 
 
 def _latin1(text: str, _encoding: str) -> bytes:
-    """Bytes, as protocol 2 writes them."""
+    """Return the bytes of a text, as protocol 2 writes them."""
     return text.encode("latin-1")
 
 
-def _of_bytes(kind: type, content: bytes = b"") -> Any:
-    """Either kind of bytes, of bytes; of a number they would be that many zeros."""
+def _bytes_from_content(kind: type, content: bytes = b"") -> Any:
+    """Return `bytes` or `bytearray` from content; a number would allocate that many zeros."""
     if not isinstance(content, bytes | bytearray | list | tuple):
         raise TypeError(f"{kind.__name__} of {type(content).__name__}")
     return kind(content)
 
 
 def _table() -> Mapping[str, Any]:
-    """Name and what stands in for them; numpy's moved from numpy.core to numpy._core in 2.0."""
+    """Return the replacement of each allowed name.
+
+    numpy 2.0 moved some functions from numpy.core to numpy._core; both names are allowed.
+    """
     moved: dict[str, Callable[..., Any]] = {
         "multiarray._reconstruct": _empty_array,
         "multiarray.scalar": _scalar,
-        "numeric._frombuffer": _array_of_bytes,
+        "numeric._frombuffer": _array_from_buffer,
     }
     containers = (set, frozenset, list, dict, tuple, complex)
-    named: dict[str, Any] = {
-        **{f"numpy.{core}.{name}": of for core in ("core", "_core") for name, of in moved.items()},
-        "numpy.ndarray": "numpy.ndarray",  # only ever named, as the first of `_empty_array`
-        "numpy.dtype": _Type,
+    allowed: dict[str, Any] = {
+        **{
+            f"numpy.{core}.{name}": function
+            for core in ("core", "_core")
+            for name, function in moved.items()
+        },
+        "numpy.ndarray": "numpy.ndarray",  # never called: only the first argument of _empty_array
+        "numpy.dtype": _Dtype,
         "_codecs.encode": _latin1,
         "collections.OrderedDict": collections.OrderedDict,
         **{
-            f"{home}.{kind.__name__}": kind
-            for home in ("builtins", "__builtin__")
+            f"{module}.{kind.__name__}": kind
+            for module in ("builtins", "__builtin__")
             for kind in containers
         },
         **{
-            f"{home}.{kind.__name__}": partial(_of_bytes, kind)
-            for home in ("builtins", "__builtin__")
+            f"{module}.{kind.__name__}": partial(_bytes_from_content, kind)
+            for module in ("builtins", "__builtin__")
             for kind in (bytes, bytearray)
         },
     }
-    return {name: _StandIn(made) if callable(made) else made for name, made in named.items()}
+    return {
+        name: _Replacement(value) if callable(value) else value for name, value in allowed.items()
+    }
 
 
-_ADMITTED = _table()
+_ALLOWED = _table()

@@ -1,4 +1,4 @@
-"""What a record holds of each frame, and what no detector can have answered."""
+"""Results of one frame as a record stores them, and the check of their values."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,32 +13,38 @@ from curate.errors import DataError, one_line
 from curate.frames import Calibration
 from curate.geometry.similarity import wrap_angle
 
-# Metres or radians: boxes are in the LiDAR frame, not on a map.
+# Largest valid number, in metres or radians: boxes are in the LiDAR frame, not on a map.
 LARGEST = 1e6
 
 
 class ForeignBoxes(Protocol):
-    """Boxes in another frame of reference, waiting for the calibration of their frame."""
+    """Boxes in another frame of reference; their conversion needs the calibration of the frame."""
 
     def in_lidar(self, calibration: Calibration) -> Detections:
-        """Return the boxes in the LiDAR's frame of reference; DataError where they cannot be."""
+        """Return the boxes in the LiDAR frame of reference.
+
+        Raises:
+            DataError: if a box cannot be a detection of this frame.
+        """
         ...
 
 
 RecordedResult = Detections | KittiObjects | ForeignBoxes
-"""Of one frame; what is not in the LiDAR's frame of reference waits for the calibration."""
+"""Result of one frame. The last two are converted to the LiDAR frame once the calibration is
+loaded."""
 
-Answers = Mapping[str, RecordedResult]
-"""Of one pass of a detector over a data set, by frame."""
+ResultsByFrame = Mapping[str, RecordedResult]
+"""Results of one pass of a detector over a data set, by frame id."""
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What some formats leave to the reader.
+    """Information that some formats do not contain.
 
     Attributes:
-        classes: the names behind numbered labels, in the order of the model's configuration.
-        frame_list: a text file with one frame id per line, for results that are only in order.
+        classes: class names of numbered labels, in the order of the model's configuration.
+        frame_list: a text file with one frame id per line, in the order of the results; for
+            results without frame ids.
     """
 
     classes: Sequence[str] = ()
@@ -46,17 +52,17 @@ class ReadOptions:
 
 
 def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections:
-    """Return the answers for one frame as `Detections`.
+    """Return the result of one frame as `Detections`.
 
     Args:
         place: file and entry, for messages.
-        boxes: (n, >=7) centre boxes in the LiDAR frame; further columns (velocities) are left out.
+        boxes: (n, >=7) centre boxes in the LiDAR frame; further columns (velocities) are ignored.
         scores: (n,) in [0, 1].
-        names: (n,) of the categories.
+        names: (n,) category names.
 
     Raises:
-        DataError: if the lengths differ, a number is not finite, a size not positive, or a score is
-            out of range.
+        DataError: if the lengths differ, a number is not finite, a size is not positive, or a score
+            is out of range.
     """
     try:
         boxes = np.array(boxes, dtype=np.float64)
@@ -74,16 +80,16 @@ def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections
             f"{len(categories)} names do not fit; expected [n, 7], [n] and n"
         )
     boxes = boxes[:, :7]
-    faults = {
+    invalid = {
         "a number is NaN or infinite": ~np.isfinite(np.column_stack([boxes, scores])).all(axis=1),
         f"a number is beyond {LARGEST:g}": (np.abs(boxes) > LARGEST).any(axis=1),
         "length, width or height is not positive": (boxes[:, 3:6] <= 0).any(axis=1),
         "the score is not in [0, 1]": (scores < 0) | (scores > 1),
     }
-    for fault, rows in faults.items():
+    for reason, rows in invalid.items():
         if rows.any():
             k = int(np.argmax(rows))
             numbers = [round(float(number), 3) for number in (*boxes[k], scores[k])]
-            raise DataError(f"{place}: box {k}: {fault}: {numbers} (x, y, z, l, w, h, yaw, score)")
+            raise DataError(f"{place}: box {k}: {reason}: {numbers} (x, y, z, l, w, h, yaw, score)")
     boxes[:, 6] = wrap_angle(boxes[:, 6])
     return Detections(boxes, scores, categories)

@@ -2,13 +2,13 @@
 
 The record is a CSV file with a header and one row per box: frame, view, flip_y, rotation_rad,
 scale, category, score, x, y, z, length, width, height, yaw; other columns are ignored. View 0 is
-the frame as it is; view v >= 1 is an augmented copy A(x) with A given by flip_y, rotation_rad and
+the original frame; view v >= 1 is an augmented copy A(x) with A given by flip_y, rotation_rad and
 scale (see `Similarity`). Boxes are centre boxes in the LiDAR frame of their view, in metres and
 radians.
 
-A frame or view without boxes leaves no row in such a file and cannot be told from one that was
-never recorded. A frame without any row is therefore an error, so that it shows up as a failed frame
-instead of passing for an empty street; a frame with rows of other views only has no detections.
+A frame or view without boxes has no row in such a file and cannot be distinguished from one that
+was never recorded. A frame without any row is therefore an error: it is reported as a failed frame,
+not as an empty scene. A frame that has only rows of other views has no detections in this view.
 """
 
 import codecs
@@ -34,18 +34,18 @@ _NUMBERS = (
     "x", "y", "z", "length", "width", "height", "yaw",
 )  # fmt: skip
 _COLUMNS = ("frame", "category", *_NUMBERS)
-BLOCK_ROWS = 4096  # checked at once
+BLOCK_ROWS = 4096  # rows checked at once
 
 
 @dataclass(frozen=True)
 class TableRecord:
-    """A `Record` that looks its answers up in a CSV file, however long that is.
+    """A `Record` in a CSV file; memory holds only where the rows of each frame are.
 
     Attributes:
         path: the file.
-        order: where each of `_COLUMNS` stands in a row.
-        names: (n,) the frame of each run of neighbouring rows, as UTF-8, sorted.
-        places: (n, 3) where each run begins and ends in the file, and its first line.
+        order: index of each of `_COLUMNS` in a row.
+        names: (n,) the frame of each run of consecutive rows, as UTF-8, sorted.
+        places: (n, 3) first byte, end byte and first line of each run.
     """
 
     path: Path
@@ -55,17 +55,17 @@ class TableRecord:
 
     @classmethod
     def read(cls, path: Path) -> "TableRecord":
-        """Check every row of a file and notes where its frames stand.
+        """Check every row of a file and index the rows of its frames.
 
         Raises:
-            DataError: the file is missing or no CSV file, a column is missing, or a row has a wrong
-                number of fields or a value that cannot be.
+            DataError: if the file is missing or not a CSV file, a column is missing, or a row has a
+                wrong number of fields or an invalid value.
         """
         try:
             with path.open("rb") as file:
                 rows = _Rows(path, file)
                 order = rows.header()
-                runs = [_checked(path, block) for block in rows.blocks(order)]
+                runs = [_check_block(path, block) for block in rows.blocks(order)]
         except FileNotFoundError:
             raise DataError(f"{path}: no such file of recorded detections") from None
         except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -77,20 +77,28 @@ class TableRecord:
 
     @property
     def has_views(self) -> bool:
-        """Its columns say that it may; a copy without boxes leaves no row."""
+        """Always true: the columns for views are required, and a view without boxes has no row."""
         return True
 
     def frame_ids(self) -> Iterator[str]:
         """Return the recorded frames, in sorted order."""
         return (name.decode() for name in np.unique(self.names))
 
-    def answer(self, frame_id: str) -> Detections:
-        """What was recorded for the frame as it is; DataError where nothing was recorded."""
+    def result(self, frame_id: str) -> Detections:
+        """Return the detections of the original frame.
+
+        Raises:
+            DataError: if the frame was not recorded.
+        """
         _, found = self._views(frame_id).get(0, (Similarity(), Detections.empty()))
         return found
 
     def views(self, frame_id: str) -> Sequence[View]:
-        """Return the augmented copies in the order of their numbers; DataError like `answer`."""
+        """Return the augmented copies of a frame in the order of their numbers.
+
+        Raises:
+            DataError: if the frame was not recorded.
+        """
         return [view for number, view in sorted(self._views(frame_id).items()) if number]
 
     def _views(self, frame_id: str) -> Mapping[int, View]:
@@ -112,14 +120,19 @@ class TableRecord:
 
 @dataclass(frozen=True)
 class _Block:
-    """Some rows: their fields in the order of `_COLUMNS`, and where each begins, ends, its line."""
+    """Consecutive rows of the file.
+
+    Attributes:
+        rows: the fields of each row, in the order of `_COLUMNS`.
+        places: (n, 3) first byte, end byte and line of each row.
+    """
 
     rows: Sequence[Sequence[str]]
     places: np.ndarray
 
 
 class _Rows:
-    """The rows of an open CSV file, with the places where they stand."""
+    """The rows of an open CSV file with their positions in the file."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path = path
@@ -128,13 +141,13 @@ class _Rows:
 
     def _lines(self, file: BinaryIO) -> Iterator[str]:
         for line in file:
-            # Spreadsheets write a mark in front of their files.
+            # Spreadsheets write a byte order mark at the start of a file.
             text = line.removeprefix(codecs.BOM_UTF8) if self._end == 0 else line
             self._end += len(line)
             yield text.decode()
 
     def header(self) -> tuple[int, ...]:
-        """Where each of `_COLUMNS` stands; DataError where one is missing."""
+        """Return the index of each of `_COLUMNS`; raise DataError if one is missing."""
         header = next(self._reader, [])
         missing = [name for name in _COLUMNS if name not in header]
         if missing:
@@ -143,11 +156,13 @@ class _Rows:
         return tuple(header.index(name) for name in _COLUMNS)
 
     def blocks(self, order: Sequence[int]) -> Iterator[_Block]:
-        """Yield all rows, some at a time; DataError for one with a wrong number of fields."""
-        for block in batched(self._placed(order), BLOCK_ROWS):
+        """Yield all rows in blocks; raise DataError for a row with a wrong number of fields."""
+        for block in batched(self._rows_with_places(order), BLOCK_ROWS):
             yield _Block([row for row, _ in block], np.array([place for _, place in block]))
 
-    def _placed(self, order: Sequence[int]) -> Iterator[tuple[list[str], tuple[int, int, int]]]:
+    def _rows_with_places(
+        self, order: Sequence[int]
+    ) -> Iterator[tuple[list[str], tuple[int, int, int]]]:
         begin = self._end
         for row in self._reader:
             line = self._reader.line_num
@@ -160,11 +175,11 @@ class _Rows:
             begin = self._end
 
 
-def _checked(path: Path, block: _Block) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames of the runs of neighbouring rows in a block, and their places.
+def _check_block(path: Path, block: _Block) -> tuple[np.ndarray, np.ndarray]:
+    """Check the rows of a block; return frame and place of each run of consecutive rows.
 
     Raises:
-        DataError: if a row has a value that cannot be.
+        DataError: if a row has an invalid value.
     """
     _views_of(path, block.rows, block.places[:, 2].tolist())
     names = np.array([row[0].encode() for row in block.rows])
@@ -175,10 +190,12 @@ def _checked(path: Path, block: _Block) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _views_of(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> dict[int, View]:
-    """Return the views in some rows, by number; those of one frame where the rows are of one frame.
+    """Return the views in the rows of one frame, by number.
+
+    Rows of several frames are checked as well, but their views overwrite each other in the result.
 
     Raises:
-        DataError: if a row has a value that cannot be, or rows of one view do not agree.
+        DataError: if a row has an invalid value, or rows of one view disagree on A.
     """
     numbers = _parse_numbers(path, rows, lines)
     _check_values(path, lines, numbers)
@@ -188,20 +205,20 @@ def _views_of(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -
     categories = as_categories([row[1] for row in rows])
     views: dict[int, View] = {}
     for (_, view), index in _rows_by_view(rows, numbers[:, 0]).items():
-        own = similarities[index[0]]
-        odd = index[(similarities[index] != own).any(axis=1)]
-        if len(odd):
+        first = similarities[index[0]]
+        different = index[(similarities[index] != first).any(axis=1)]
+        if len(different):
             raise DataError(
-                f"{path}:{lines[odd[0]]}: flip_y, rotation_rad or scale differ from line "
+                f"{path}:{lines[different[0]]}: flip_y, rotation_rad or scale differ from line "
                 f"{lines[index[0]]}, which is of the same frame and view"
             )
-        similarity = Similarity(bool(own[0]), float(own[1]), float(own[2]))
+        similarity = Similarity(bool(first[0]), float(first[1]), float(first[2]))
         views[view] = (similarity, Detections(boxes[index], scores[index], categories[index]))
     return views
 
 
 def _parse_numbers(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> np.ndarray:
-    """Return (n, 12) the columns of `_NUMBERS`."""
+    """Return the (n, 12) columns of `_NUMBERS`."""
     numbers = np.empty((len(rows), len(_NUMBERS)))
     for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
         try:
@@ -212,30 +229,30 @@ def _parse_numbers(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[in
 
 
 def _check_values(path: Path, lines: Sequence[int], numbers: np.ndarray) -> None:
-    """DataError at the first row that no detector can have answered."""
+    """Raise DataError for the first row that cannot be a detection."""
     view, flip_y, rotation_rad, scale, score = numbers[:, :5].T
     identity = (flip_y == 0) & (rotation_rad == 0) & (scale == 1)
-    faults = {
+    invalid = {
         "a number is NaN or infinite": ~np.isfinite(numbers).all(axis=1),
         f"a number is beyond {LARGEST:g}": (np.abs(numbers) > LARGEST).any(axis=1),
         "view is not 0, 1, 2, ...": (view < 0) | (view != np.floor(view)),
         "flip_y is neither 0 nor 1": (flip_y != 0) & (flip_y != 1),
         "scale is not positive": scale <= 0,
-        "view 0 is the frame as it is, but flip_y, rotation_rad, scale are not 0, 0, 1": (
+        "view 0 is the original frame, but flip_y, rotation_rad, scale are not 0, 0, 1": (
             (view == 0) & ~identity
         ),
         "score is not in [0, 1]": (score < 0) | (score > 1),
         "length, width or height is not positive": (numbers[:, 8:11] <= 0).any(axis=1),
     }
-    for fault, rows in faults.items():
+    for reason, rows in invalid.items():
         if rows.any():
-            raise DataError(f"{path}:{lines[int(np.argmax(rows))]}: {fault}")
+            raise DataError(f"{path}:{lines[int(np.argmax(rows))]}: {reason}")
 
 
 def _rows_by_view(
     rows: Sequence[Sequence[str]], views: np.ndarray
 ) -> Mapping[tuple[str, int], np.ndarray]:
-    """Return the rows of each frame and view, in the order of the file."""
+    """Return the row indices of each frame and view, in the order of the file."""
     groups: dict[tuple[str, int], list[int]] = {}
     for index, (row, view) in enumerate(zip(rows, views, strict=True)):
         groups.setdefault((row[0], int(view)), []).append(index)

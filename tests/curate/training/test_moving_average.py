@@ -30,8 +30,8 @@ def test_it_starts_at_the_student_and_follows_it():
     """With half kept per step: from 8 to 4, then to (4 + 2) / 2; counters are the student's."""
     average = MovingAverage(filled(8.0), 0.5 ** (1 / 5000), steps=2)
     assert values(average.network)[0].tolist() == [8.0]
-    average.follow(filled(0.0))
-    average.follow(filled(2.0))
+    average.update(filled(0.0))
+    average.update(filled(2.0))
     floats, counters = values(average.network)
     assert floats == pytest.approx([3.0], rel=1e-5)
     assert counters == [2]
@@ -39,7 +39,7 @@ def test_it_starts_at_the_student_and_follows_it():
 
 def test_a_decay_of_0_is_the_student():
     average = MovingAverage(filled(8.0), 0.0, steps=100)
-    average.follow(filled(1.0))
+    average.update(filled(1.0))
     assert values(average.network)[0].tolist() == [1.0]
 
 
@@ -47,7 +47,7 @@ def test_the_student_is_not_modified():
     """The average is a copy without gradients."""
     student = filled(8.0)
     average = MovingAverage(student, 0.5, steps=10_000)
-    average.follow(filled(0.0))
+    average.update(filled(0.0))
     assert values(student)[0].tolist() == [8.0]
     assert not any(weight.requires_grad for weight in average.network.parameters())
 

@@ -175,9 +175,11 @@ def test_a_start_that_does_not_fit_is_rejected(make_labels, tiny, tmp_path):
     teacher = tmp_path / "teacher.safetensors"
     train(make_labels(labeled=2), teacher, quick(tiny, steps=1))
     cars = make_labels(labeled=2, name="cars.sqlite", categories=("Car",))
-    with pytest.raises(ConfigError, match=r"teacher\.safetensors: is a tiny detector of Car, Ped"):
+    with pytest.raises(
+        ConfigError, match=r"teacher\.safetensors: has preset tiny and categories Car, Ped"
+    ):
         train(cars, tmp_path / "out.safetensors", quick(tiny), start=teacher)
-    with pytest.raises(ConfigError, match="the training is for small"):
+    with pytest.raises(ConfigError, match="the training needs small"):
         train(make_labels(), tmp_path / "out.safetensors", quick("small"), start=teacher)
     teacher.write_bytes(b"no model")
     with pytest.raises(ModelError, match="teacher"):
@@ -203,12 +205,12 @@ def test_unlabeled_frames_are_added_to_the_labeled_ones(make_labels, tiny):
     settings = quick(tiny, batch_size=2, unlabeled_batch_size=3)
     mixed = Batches(WeightedLabels(make_labels(2, 6)), settings)
     for step in range(5):
-        chosen = mixed.chosen(step)
+        chosen = mixed.frame_indices(step)
         assert [index in mixed.labeled for index in chosen] == [True] * 2 + [False] * 3
-    seen = {index for step in range(3) for index in mixed.chosen(step)}
+    seen = {index for step in range(3) for index in mixed.frame_indices(step)}
     assert seen == set(range(8))
     alone = Batches(WeightedLabels(make_labels(2, name="b.sqlite")), settings)
-    assert [index in alone.labeled for index in alone.chosen(7)] == [True] * 2
+    assert [index in alone.labeled for index in alone.frame_indices(7)] == [True] * 2
 
 
 def test_labels_of_weight_zero_can_become_background(make_labels, tiny):

@@ -42,7 +42,9 @@ def test_categories_can_have_their_own_thresholds():
 
 def test_a_detector_without_iou_estimates_is_rejected():
     """The error contains how many labels have none, and what to do."""
-    with pytest.raises(ConfigError, match=r"3dioumatch: 1 of 2 labels have no estimate") as info:
+    with pytest.raises(
+        ConfigError, match=r"3dioumatch: 1 of 2 labels have no IoU estimate"
+    ) as info:
         IoUMatch().weigh(labels(("Car", 0.9, 0.9), ("Car", 0.9, np.nan)), Age(1, 1))
     assert "\n" not in str(info.value)
 

@@ -87,14 +87,14 @@ def test_the_confidence_can_be_the_estimated_iou():
     """As in the paper; a detector without estimates is rejected."""
     policy = ST3D(keep=0.5, ignore=0.2, confidence="iou")
     assert bands([car(0), car(20)], [0.0, 0.9], policy=policy, ious=[0.5, 0.1]) == [KEEP, DROP]
-    with pytest.raises(ConfigError, match="st3d: the detector estimates no IoU"):
+    with pytest.raises(ConfigError, match="st3d: the detector does not estimate the IoU"):
         bands([car(0)], [0.9], policy=policy)
 
 
 def test_a_memory_without_current_boxes_is_an_error():
     """It cannot be matched."""
     memory = Memory(**common([car(0)], [0.9]), v=np.ones(1))
-    with pytest.raises(DataError, match="needs the boxes"):
+    with pytest.raises(DataError, match="without the boxes of the labels"):
         Evidence(np.zeros(1, int), as_categories(["Car"]), np.ones(1), np.ones(1), memory=memory)
 
 

@@ -68,4 +68,4 @@ def test_a_file_that_cannot_be_opened_is_a_finding(
     results.write_bytes(b"cos\nsystem\n(S'true'\ntR.")
     code, out, _ = curate("doctor", "-w", tmp_path / "w")
     assert code == 1
-    assert "refused, the pickle names os.system" in out
+    assert "rejected: the pickle imports os.system" in out

@@ -126,7 +126,7 @@ def test_every_method_can_be_run_by_its_name(
 def test_a_detector_without_iou_cannot_use_3dioumatch(curate: Curate, workspace: Workspace) -> None:
     code, _, err = curate("run", "--method", "3dioumatch", "--workspace", workspace.root)
     assert code == ConfigError.exit_code
-    assert "18 of 18 labels have no estimate of their IoU" in err
+    assert "18 of 18 labels have no IoU estimate" in err
 
 
 def test_a_dropped_label_is_not_exported(curate: Curate, workspace: Workspace) -> None:

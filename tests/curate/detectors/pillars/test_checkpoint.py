@@ -131,5 +131,5 @@ def test_weights_that_are_not_finite_are_rejected(tmp_path, checkpoint, value):
     broken = next(name for name, array in weights.items() if array.dtype.kind == "f")
     weights[broken].flat[0] = value
     save_file(weights, path, META | {"categories": '["Car", "Tram"]'})
-    with pytest.raises(ModelError, match=f"{broken} holds NaN or infinite weights; train again"):
+    with pytest.raises(ModelError, match=f"{broken} has NaN or infinite weights; train again"):
         load_checkpoint(path)

@@ -6,7 +6,7 @@ import torch
 
 from curate.detectors.pillars import PillarDetector
 from curate.detectors.pillars.checkpoint import graph_path, save_checkpoint
-from curate.detectors.pillars.detector import onnx_answers, torch_forward
+from curate.detectors.pillars.detector import onnx_forward, torch_forward
 from curate.detectors.pillars.encoding import encode_points
 from curate.detectors.pillars.network import PillarNetwork, SlotMaximum, checkpoint_of
 from curate.detectors.pillars.presets import PRESETS
@@ -63,7 +63,7 @@ def test_onnx_runtime_and_torch_agree(tmp_path, preset, count):
     path, checkpoint = tmp_path / "net.safetensors", lively(preset)
     save_checkpoint(path, checkpoint)
     pillars = encode_points(cloud(count), PRESETS[preset])
-    by_onnx = onnx_answers(path, checkpoint, 1)(pillars)
+    by_onnx = onnx_forward(path, checkpoint, 1)(pillars)
     by_torch = torch_forward(path, checkpoint, "cpu")(pillars)
     assert by_onnx[0].shape == (*PRESETS[preset].cells, 3)
     assert by_onnx[2].shape == PRESETS[preset].cells

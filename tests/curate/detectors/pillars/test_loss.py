@@ -15,7 +15,7 @@ from curate.detectors.pillars.loss import (
     iou_loss,
     weighted_loss,
 )
-from curate.detectors.pillars.network import Answers
+from curate.detectors.pillars.network import NetworkOutput
 from curate.detectors.pillars.presets import PRESETS
 
 PRESET = replace(PRESETS["small"], x_range=(0.0, 20.48), y_range=(-10.24, 10.24))
@@ -45,14 +45,14 @@ def random_outputs(frames=1, seed=0):
         torch.randn(frames, *PRESET.cells, *more, generator=generator, dtype=torch.float64)
         for more in ((1,), (BOX_CODE,), ())
     ]
-    return Answers(*(part.requires_grad_() for part in parts))
+    return NetworkOutput(*(part.requires_grad_() for part in parts))
 
 
 def gradients(targets, seed=0, frames=1):
     """Return the gradients of the whole loss."""
     given = random_outputs(frames, seed)
     weighted_loss(given, targets, PRESET, 1.0)["loss"].backward()
-    return Answers(*(part.grad for part in given))
+    return NetworkOutput(*(part.grad for part in given))
 
 
 def test_background_only():
@@ -97,7 +97,7 @@ def test_the_iou_term_is_least_at_the_true_overlap():
         logits = torch.full(
             (1, *PRESET.cells), math.log(predicted / (1 - predicted)), dtype=torch.float64
         )
-        return float(iou_loss(Answers(silent, codes, logits), targets, PRESET))
+        return float(iou_loss(NetworkOutput(silent, codes, logits), targets, PRESET))
 
     entropy = -(math.log(1 / 3) / 3 + 2 * math.log(2 / 3) / 3)
     assert loss(1 / 3) == pytest.approx(0.5 * entropy, rel=1e-4)
@@ -123,7 +123,7 @@ def test_a_false_positive_has_target_iou_zero():
     for cell, expected in ((far, math.log(2) / 9), (divmod(int(ignored.centres[0]), 32), 0.0)):
         found = silent.clone()
         found[0, *cell, 0] = 0.0
-        cost = iou_loss(Answers(found, codes, undecided), ignored, PRESET)
+        cost = iou_loss(NetworkOutput(found, codes, undecided), ignored, PRESET)
         assert float(cost) == pytest.approx(expected, abs=1e-6)
 
 
@@ -170,7 +170,7 @@ def test_frames_of_a_batch_do_not_mix():
     together = weighted_loss(given, targets_of(*frames), PRESET, 2.0)["loss"]
     alone = [
         weighted_loss(
-            Answers(*(part[i : i + 1] for part in given)), targets_of(frame), PRESET, 2.0
+            NetworkOutput(*(part[i : i + 1] for part in given)), targets_of(frame), PRESET, 2.0
         )["loss"]
         for i, frame in enumerate(frames)
     ]

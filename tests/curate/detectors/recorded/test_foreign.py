@@ -196,7 +196,7 @@ def test_a_missing_second_pass_is_reported_once(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("one", "message"),
     [
-        ({"path": "a.pkl"}, "name what was done"),
+        ({"path": "a.pkl"}, "state how the points were transformed"),
         ({"flip_y": True}, "takes path"),
         ({"path": "a.pkl", "flip": True}, "takes path"),
         ({"path": "a.pkl", "scale": "big"}, "could not convert"),
@@ -251,7 +251,7 @@ def test_impossible_results_are_reported(tmp_path, change, message):
 def test_numbered_labels_need_class_names(tmp_path):
     """The order of classes is the model's; a wrong order would not be noticed."""
     path = write_mmdetection3d(tmp_path / "a.pkl")
-    with pytest.raises(ConfigError, match=r"give detector\.options\.classes"):
+    with pytest.raises(ConfigError, match=r"set detector\.options\.classes"):
         RecordedDetector(path, frame_list="order.txt")
     with pytest.raises(DataError, match="label 2, but"):
         RecordedDetector(path, frame_list="order.txt", classes=["Pedestrian", "Cyclist"])
@@ -265,12 +265,12 @@ def test_numbered_labels_need_class_names(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.json", {"a": 1}, "holds a dict, not a list of frames"),
-        ("a.json", [], "holds no frames"),
-        ("a.json", [{"a": 1}], r"no known format \(a\)"),
-        ("a.json", [3], r"no known format \(int\)"),
+        ("a.json", {"a": 1}, "contains a dict, not a list of frames"),
+        ("a.json", [], "contains no frames"),
+        ("a.json", [{"a": 1}], r"entries of an unknown format \(a\)"),
+        ("a.json", [3], r"entries of an unknown format \(int\)"),
         ("a.json", [{"boxes_lidar": []}], "no frame_id, name, score"),
-        ("a.feather", [], "no known record of detections; expected a .csv or .parquet file"),
+        ("a.feather", [], "not a supported format of detections; expected a .csv or .parquet file"),
     ],
 )
 def test_unsupported_contents_are_rejected(tmp_path, name, content, message):
@@ -297,7 +297,7 @@ def test_the_format_can_be_specified(tmp_path):
     ):
         RecordedDetector(path, kind="yolo")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="holds no KITTI result files"):
+    with pytest.raises(DataError, match="contains no KITTI result files"):
         RecordedDetector(tmp_path / "empty")
 
 
@@ -324,12 +324,12 @@ BOX = nuscenes()["000001"][0]
     [
         ([BOX | {"size": BOX["size"][:2]}], "box 0: translation, size, rotation and"),
         ([BOX | {"translation": [1, "far", 2]}], "box 0: translation, size, rotation and"),
-        ([BOX | {"detection_name": [1]}], "box 0: its detection_name is no text"),
+        ([BOX | {"detection_name": [1]}], "box 0: its detection_name is not text"),
         ([BOX | {"translation": [10**400, 0, 0]}], "box 0: translation|integer overflow"),
         ([BOX | {"detection_score": None}], "box 0: translation, size, rotation and"),
         ([{"translation": [0, 0, 0]}], "box 0: no size, rotation, detection_name"),
-        ([BOX | {"sample_token": "other"}], "box 0: its sample_token is other, another"),
-        ([BOX | {"rotation": [2, 0, 0, 0]}], r"box 0: rotation .* is no unit quaternion"),
+        ([BOX | {"sample_token": "other"}], "box 0: its sample_token is other, but it is listed"),
+        ([BOX | {"rotation": [2, 0, 0, 0]}], r"box 0: rotation .* is not a unit quaternion"),
         ([BOX | {"rotation": [0, 0, 0.6, 0.8]}], "box 0 would be tilted by .* w, x, y, z, not x"),
         ([BOX | {"size": [3.9, 1.6, 1.5]}] * 10, "10 of 10 boxes of .* wider than long"),
         ({"a": 1}, "expected a list of boxes, not dict"),
@@ -347,7 +347,7 @@ def test_common_mistakes_in_nuscenes_results_are_reported(tmp_path, boxes, messa
 def test_nuscenes_results_in_the_lidar_frame_are_rejected(tmp_path):
     """They would be hundreds of metres from the vehicle."""
     path = written_results(tmp_path, [BOX | {"translation": [12.0, 4.0, -0.8]}])
-    with pytest.raises(DataError, match="they are in the frame of the LiDAR or vehicle") as caught:
+    with pytest.raises(DataError, match="are these in the LiDAR or vehicle frame") as caught:
         RecordedDetector(path).predict(frame("000001"))
     assert "results of 000001" in str(caught.value)
     path = written_results(tmp_path, [BOX | {"translation": [5000.0, 4.0, -0.8]}])
@@ -392,9 +392,9 @@ def test_streaming_and_whole_reading_agree(tmp_path):
         ('{"results": {"000001": []}} {}', "cannot be read as JSON"),
         ('{"results": {"000001": [1e}}', "cannot be read as JSON"),
         ('{"results": {"a\\nb": {}}}', "results of a b: expected a list of boxes"),
-        ('{"results": 3}', "results is no object of sample tokens but a int"),
-        ('{"results": null}', "results is no object of sample tokens but a NoneType"),
-        ('{"meta": {}}', "holds a dict, not a list of frames, and no nuScenes results"),
+        ('{"results": 3}', "results is a int, not an object of sample tokens"),
+        ('{"results": null}', "results is a NoneType, not an object of sample tokens"),
+        ('{"meta": {}}', "contains a dict, not a list of frames and not nuScenes results"),
     ],
 )
 def test_damaged_results_are_rejected_in_one_line(tmp_path, text, message):
@@ -408,9 +408,11 @@ def test_damaged_results_are_rejected_in_one_line(tmp_path, text, message):
 def test_a_file_that_is_not_a_nuscenes_result_is_rejected(tmp_path):
     """If the format was specified."""
     (tmp_path / "a.json").write_text("[]")
-    with pytest.raises(DataError, match="no nuScenes results: an object with meta and results"):
+    with pytest.raises(
+        DataError, match="not nuScenes results; expected a JSON object with meta and results"
+    ):
         RecordedDetector(tmp_path / "a.json", kind="nuscenes")
-    with pytest.raises(DataError, match="results is no object of sample tokens"):
+    with pytest.raises(DataError, match=r"results is a \w+, not an object of sample tokens"):
         (tmp_path / "a.json").write_text('{"meta": {}, "results": []}')
         RecordedDetector(tmp_path / "a.json")
 

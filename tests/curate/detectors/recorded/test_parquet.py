@@ -119,7 +119,7 @@ VIEWS = {"view": [0, 1, 1], "flip_y": [0, 1, 1], "rotation_rad": [0, 0, 0], "sca
         ({"z": [None, 1.0, 4.0]}, "row group 0: 1 rows have no z"),
         (VIEWS | {"view": [0.5, 1, 1]}, "box 0: view is not 0, 1, 2"),
         (VIEWS | {"flip_y": [0, 2, 1]}, "box 1: flip_y is neither"),
-        (VIEWS | {"scale": [2, 1, 1]}, "box 0: view 0 is the frame as it is"),
+        (VIEWS | {"scale": [2, 1, 1]}, "box 0: view 0 is the original frame"),
         (VIEWS | {"scale": [1, -1, 1]}, "box 1: scale is not positive"),
         (VIEWS | {"view": [1, 1, 1]}, "box 1: flip_y, rotation_rad or scale differ within a view"),
     ],
@@ -136,7 +136,7 @@ def test_an_invalid_row_fails_only_its_frame(tmp_path, changes, message):
 @pytest.mark.parametrize("content", [b"", b"PAR1", b"no parquet at all"])
 def test_a_damaged_file_is_rejected(tmp_path, content):
     (tmp_path / "a.parquet").write_bytes(content)
-    with pytest.raises(DataError, match=r"a\.parquet: no readable Parquet") as caught:
+    with pytest.raises(DataError, match=r"a\.parquet: not a readable Parquet file") as caught:
         RecordedDetector(tmp_path / "a.parquet")
     assert "\n" not in str(caught.value)
 
@@ -154,7 +154,7 @@ def test_damaged_rows_are_reported(tmp_path):
 
 def test_a_table_accepts_no_second_pass_files(tmp_path):
     """Its copies are views."""
-    with pytest.raises(ConfigError, match="a table holds its augmented copies itself"):
+    with pytest.raises(ConfigError, match="a table contains its augmented copies as views"):
         RecordedDetector(write(tmp_path / "a.parquet"), passes=[{"path": "b", "flip_y": True}])
 
 

@@ -66,7 +66,7 @@ def test_a_duplicate_box_fails_its_frame(tmp_path):
     path = write(tmp_path / "a.csv", PLAIN, MOVED, other, *alike, MOVED)
     detector = RecordedDetector(path)
     assert len(detector.predict(empty_frame("000001"))) == 4
-    with pytest.raises(DataError, match=r"000001: the Car of .* at x 12.0, y 4.2 comes twice"):
+    with pytest.raises(DataError, match=r"000001: the Car of .* at x 12.0, y 4.2 occurs twice"):
         detector.views("000001")
     assert len(RecordedDetector(path, minimum_score=0.85).views("000001")[0][1]) == 0
     path.write_text(path.read_text() + f"{other}\n")
@@ -132,7 +132,7 @@ def test_other_columns_and_their_order_do_not_matter(tmp_path):
         (PLAIN.replace("000001,0", "000001,-1"), "view is not 0, 1, 2, ..."),
         (MOVED.replace("1,1,0.25", "1,2,0.25"), "flip_y is neither 0 nor 1"),
         (MOVED.replace("1.04", "0"), "scale is not positive"),
-        (PLAIN.replace("0.0,1.0", "0.3,1.0"), "view 0 is the frame as it is"),
+        (PLAIN.replace("0.0,1.0", "0.3,1.0"), "view 0 is the original frame"),
         (MOVED.replace("0.25", "0.26"), "differ from line 3, which is of the same frame and view"),
     ],
 )
