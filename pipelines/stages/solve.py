@@ -63,10 +63,10 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     weights = opened.weigh(evidence, context.age)
     columns = _columns(keys, weights, evidence)
     counts = _counts(context.number, policy, keys, weights)
-    weight_index.prepare(workspace.database, policy)
+    weight_index.ensure_index(workspace.database, policy)
 
     def write(connection: Connection) -> None:
-        with weight_index.replacing(connection, policy, len(keys)):
+        with weight_index.rebuilding(connection, policy, len(keys)):
             _store(connection, context.number, policy, columns)
         former = bulk.table("label_count").c
         mine = (former.round == context.number, former.policy == policy)

@@ -176,7 +176,7 @@ def test_wrong_settings_are_named_all_at_once(curate: Curate, made: Path) -> Non
         ("seed = 0", "seed = -1", "run.seed"),
         ("seed = 0", "seed = 99999999999999999999", "run.seed"),
         ('method = "pspsl"', 'method = "nope"', "unknown policy 'nope'"),
-        ("[run]", '[run]\ndatabase = "nonsense"', "run.database: no URL of a database"),
+        ("[run]", '[run]\ndatabase = "nonsense"', "run.database: not the URL of a database"),
         ("[run]", '[run]\ndatabase = "oracle9://x"', "oracle9"),
     ],
 )
