@@ -32,7 +32,9 @@ Metres = Annotated[float, mapped_column(comment="metres, LiDAR frame", info={"un
 Radians = Annotated[float, mapped_column(comment="radians, (-pi, pi]", info={"unit": "rad"})]
 Pixels = Annotated[float, mapped_column(comment="pixels", info={"unit": "px"})]
 Share = Annotated[float, mapped_column(comment="0 to 1", info={"unit": "1"})]
-Bound = Annotated[float | None, mapped_column(comment="bound of its interval")]
+Bound = Annotated[
+    float | None, mapped_column(comment="bound of its interval", doc="bound of the 95 % interval")
+]
 
 
 class Base(DeclarativeBase):
@@ -87,7 +89,7 @@ class Frame(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True, doc="key of the row in this database")
+    id: Mapped[int] = mapped_column(primary_key=True, doc="number of the frame in this database")
     dataset: Mapped[str] = mapped_column(doc="kind of the data set, as in curate.toml")
     frame: Mapped[str] = mapped_column(comment="frame id within the data set")
     split: Mapped[str] = mapped_column(comment="labeled | unlabeled | val")
@@ -133,7 +135,7 @@ class GroundTruth(Base):
     frame_id: Mapped[Key] = mapped_column(doc="frame.id")
     k: Mapped[Key] = mapped_column(doc="number of the object within its frame")
     split: Mapped[str] = mapped_column(doc="labeled | val")
-    category: Mapped[str] = mapped_column(doc="of the object")
+    category: Mapped[str] = mapped_column(doc="category of the object")
     x: Mapped[Metres | None] = mapped_column(doc="box centre, forward of the LiDAR")
     y: Mapped[Metres | None] = mapped_column(doc="box centre, to the left of the LiDAR")
     z: Mapped[Metres | None] = mapped_column(doc="box centre, above the LiDAR")
@@ -156,7 +158,7 @@ class Checkpoint(Base):
     __tablename__ = "checkpoint"
     __table_args__ = (UniqueConstraint("round", "policy"),)
 
-    id: Mapped[int] = mapped_column(primary_key=True, doc="key of the row")
+    id: Mapped[int] = mapped_column(primary_key=True, doc="number of the row")
     round: Mapped[int] = mapped_column(
         comment="the round that made it; 0 before the first",
         doc="number of the round that trained it; 0 = before the first",
@@ -770,7 +772,7 @@ class Task(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True, doc="key of the row")
+    id: Mapped[int] = mapped_column(primary_key=True, doc="number of the row")
     round: Mapped[int] = mapped_column(doc="round.number; 0 before the first")
     stage: Mapped[str] = mapped_column(doc="name of the stage")
     variant: Mapped[str] = mapped_column(

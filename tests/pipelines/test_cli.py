@@ -201,7 +201,7 @@ def test_a_policy_option_of_another_type_is_one_line(curate: Curate, made: Path)
     curate("run")
     code, _, err = curate("solve", "--policy", "threshold")
     assert code == ConfigError.exit_code
-    assert "policy 'threshold' cannot be made" in err
+    assert "policy 'threshold' cannot be created" in err
     assert err.count("\n") == 1
 
 

@@ -11,8 +11,8 @@ from pipelines.engine.rounds import (
     find_teacher,
     newest_checkpoint,
     open_round,
-    peek_round,
     register_checkpoint,
+    stored_round,
 )
 from pipelines.workspace.config import read_config
 from pipelines.workspace.workspace import Workspace, sha256
@@ -51,7 +51,7 @@ def test_a_checkpoint_that_became_a_pipe_counts_as_gone(workspace: Workspace) ->
         register_checkpoint(connection, workspace, 1, workspace.config.run.method, path)
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(WorkspaceError, match="the checkpoint is gone; run `curate train-round"):
+    with pytest.raises(WorkspaceError, match="the checkpoint is missing; run `curate train-round"):
         find_teacher(workspace, 2)
 
 
@@ -66,7 +66,7 @@ def test_a_checkpoint_that_was_exchanged_does_not_answer(workspace: Workspace) -
     for ask in (lambda: open_round(workspace, 2), lambda: newest_checkpoint(workspace)):
         with pytest.raises(WorkspaceError, match=r"has changed since .* run `curate train-round"):
             ask()
-    assert peek_round(workspace, 2) is not None
+    assert stored_round(workspace, 2) is not None
     path.write_bytes(b"made")
     assert newest_checkpoint(workspace) == path
 
