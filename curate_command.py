@@ -1,11 +1,11 @@
-"""The command `curate`, with its own packages first.
+"""The entry point of the command `curate`, which imports curate's own packages first.
 
-`curate`, `db` and `pipelines` are common names. A project of the user may have packages with the
-same names, and Python looks into the current folder and into PYTHONPATH before it looks where
-curate is installed. The name of this module is unlikely to be taken. On import it loads the three
-packages that lie beside it; whatever is imported from them later comes from there as well, and
-`sys.path` is left as the user has set it. Worker processes import this module before they unpickle
-their work: multiprocessing imports the main module of its parent, Ray calls `claim_packages`.
+`curate`, `db` and `pipelines` are common names. The user's project may have packages with the same
+names, and Python searches the current folder and PYTHONPATH before the folder in which curate is
+installed. The name of this module is unlikely to be taken. On import, it loads the three packages
+from the folder that it is in. Later imports of their submodules come from there too, and
+`sys.path` stays as the user has set it. Worker processes import this module before they unpickle
+their work: multiprocessing imports the main module of its parent, and Ray calls `claim_packages`.
 """
 
 import importlib
@@ -17,15 +17,15 @@ PACKAGES = ("curate", "db", "pipelines")
 
 
 def claim_packages() -> None:
-    """Import curate's own packages, whatever else has their names."""
+    """Import curate's own packages, even if other packages on the path have the same names."""
     sys.path.insert(0, str(HOME))
     try:
         for name in PACKAGES:
-            found = Path(importlib.import_module(name).__file__ or "").resolve()
-            if found.parents[1:2] != (HOME,):
+            file = Path(importlib.import_module(name).__file__ or "").resolve()
+            if file.parents[1:2] != (HOME,):
                 sys.exit(
-                    f"error: the package '{name}' of {found.parent} was imported before curate's "
-                    f"own ({HOME / name}); start curate with the command `curate`"
+                    f"error: the package '{name}' in {file.parent} was imported instead of "
+                    f"curate's own ({HOME / name}); start curate with the command `curate`"
                 )
     finally:
         sys.path.remove(str(HOME))

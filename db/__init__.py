@@ -1,1 +1,1 @@
-"""The memory of curate: tables, sessions, bulk reading and writing, migrations."""
+"""The database of curate: tables, views, sessions, bulk reading and writing, migrations."""

@@ -1,4 +1,4 @@
-"""Backups: a database as it is, before its schema is migrated."""
+"""Backups of a database, made before its schema is migrated."""
 
 import logging
 import os
@@ -16,39 +16,42 @@ _log = logging.getLogger(__name__)
 
 
 def back_up(url: URL, revision: str, folder: Path | None) -> None:
-    """Copy a database of an older schema.
+    """Copy a database that has an older schema.
 
-    An SQLite file is copied beside itself. A PostgreSQL database is dumped into `folder` where
-    pg_dump is installed; where it is not, a warning says that there is no copy: the migration is
-    one transaction, and servers have backups of their own.
+    An SQLite file is copied into its own folder. A PostgreSQL database is dumped into `folder` if
+    pg_dump is installed. Otherwise a warning says that there is no copy: the migration is a single
+    transaction, and servers usually have backups of their own.
 
     Args:
-        url: of the database.
-        revision: of its schema.
-        folder: for dumps; None where there is none.
+        url: URL of the database.
+        revision: revision of its schema before the migration.
+        folder: folder for dumps; None if there is none.
 
     Raises:
-        DatabaseError: if there is no room for it, its folder cannot be written, or pg_dump refuses.
+        DatabaseError: if the disk is full, the folder is not writable, or pg_dump fails.
     """
     if url.get_backend_name() == "sqlite":
         path = Path(str(url.database))
         copy = path.with_name(f"{path.name}.schema-{revision}.backup")
         _copy_file(path, copy)
         _log.warning(
-            "%s: schema %s is migrated; the old database is kept as %s", path, revision, copy
+            "%s: migrating schema %s; a copy of the old database is kept as %s",
+            path,
+            revision,
+            copy,
         )
         return
     name = url.set(drivername="postgresql").render_as_string()
     if folder is None or shutil.which("pg_dump") is None:
         _log.warning(
-            "%s: schema %s is migrated without a copy, for pg_dump is not installed here", name,
+            "%s: migrating schema %s without a backup, because pg_dump is not installed here", name,
             revision,
         )  # fmt: skip
         return
     copy = folder / f"curate.schema-{revision}.dump"
     _dump(url, name, copy)
     _log.warning(
-        "%s: schema %s is migrated; the old database is kept as %s, for pg_restore", name,
+        "%s: migrating schema %s; a copy of the old database for pg_restore is kept as %s", name,
         revision, copy,
     )  # fmt: skip
 
@@ -66,16 +69,16 @@ def _copy_file(path: Path, backup: Path) -> None:
 
 def _dump(url: URL, name: str, backup: Path) -> None:
     partial = backup.with_suffix(".partial")
-    # A password stands in the environment, where other users do not see it.
+    # The password is passed in the environment: other users can read a command line.
     secret = {"PGPASSWORD": url.password} if url.password else {}
     address = url.set(drivername="postgresql", password=None).render_as_string()
     command = ["pg_dump", "--format=custom", f"--file={partial}", f"--dbname={address}"]
     try:
-        ended = subprocess.run(  # noqa: S603 - a fixed program, the URL is one argument
+        result = subprocess.run(  # noqa: S603 - a fixed program, the URL is one argument
             command, env=os.environ | secret, capture_output=True, text=True, check=False
         )
-        if ended.returncode:
-            raise _pg_dump_failure(name, " ".join(ended.stderr.split()))
+        if result.returncode:
+            raise _pg_dump_failure(name, " ".join(result.stderr.split()))
         partial.replace(backup)
     except OSError as error:
         raise _failure_message(name, str(error), backup) from error
@@ -85,21 +88,21 @@ def _dump(url: URL, name: str, backup: Path) -> None:
 
 def _failure_message(name: str, reason: str, backup: Path) -> DatabaseError:
     return DatabaseError(
-        f"{name}: cannot be copied before its schema is migrated: {reason}; make room for "
-        f"{backup.name}, let yourself write into its folder, and run the command again"
+        f"{name}: cannot be copied before its schema is migrated: {reason}; free disk space for "
+        f"{backup.name}, give yourself write permission on its folder, and rerun the command"
     )
 
 
 def _pg_dump_failure(name: str, reason: str) -> DatabaseError:
-    remedy = next((each for sign, each in _REMEDIES.items() if sign in reason), "mend that")
+    remedy = next((each for sign, each in _REMEDIES.items() if sign in reason), "fix that")
     return DatabaseError(
-        f"{name}: cannot be copied before its schema is migrated: {reason}; {remedy}, and run the "
-        "command again"
+        f"{name}: cannot be copied before its schema is migrated: {reason}; {remedy}, and rerun "
+        "the command"
     )
 
 
 _REMEDIES = {
-    "version mismatch": "install the pg_dump of the server's version, before others in PATH",
-    "permission denied": "let the database's owner run a command once",
-    "No space left": "make room in the workspace",
+    "version mismatch": "install the pg_dump of the server's version and put it first in PATH",
+    "permission denied": "have the owner of the database run a curate command once",
+    "No space left": "free disk space in the workspace",
 }

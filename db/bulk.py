@@ -1,4 +1,26 @@
-"""The one bulk reader and writer: named columns in, columns or tuples out."""
+"""Bulk reading and writing of tables, in columns or in rows.
+
+An ORM object, or even an SQLAlchemy row, costs more than the stored row itself. With millions of
+labels that is most of the running time, so the functions here pass plain values.
+
+Writing, e.g. the losses of two labels of a frame:
+
+    insert_rows(connection, "consistency", [{"round": 1, "frame_id": 7, "k": 0, "loss": 0.2, ...}])
+    insert(connection, "consistency", {"round": 1, "frame_id": 7, "k": np.array([0, 1]),
+                                       "loss": np.array([0.2, nan]), ...})
+
+`insert_rows` takes a few rows as mappings. `insert` takes columns of any length: here `round` and
+`frame_id` have one value for all rows, and NaN is stored as null. SQLite gets blocks of
+BLOCK_ROWS rows, PostgreSQL gets one COPY.
+
+Reading `SELECT k, loss FROM consistency`:
+
+    select(connection, query)          [(0, 0.2), (1, None)]: all rows as tuples
+    blocks(connection, query)          the same rows, one block at a time, for large results
+    select_columns(connection, query)  {"k": array([0, 1]), "loss": array([0.2, nan])}
+
+`grouped` turns rows into a mapping by their first value: {0: [(0.2,)], 1: [(None,)]}.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, repeat
@@ -13,34 +35,34 @@ from db.models import Base
 
 Row = tuple[Any, ...]
 BLOCK_ROWS = 50_000
-FETCHED_ROWS = 1000  # from SQLite at a time: more do not stay in the processor's cache
+FETCHED_ROWS = 1000  # per fetch from SQLite: a larger block does not fit into the processor's cache
 
-# What the view weighted_labels and the counts are made of.
-_ASKED_TABLES = (
+# The tables behind the view weighted_labels and the counts of labels.
+_ANALYZED_TABLES = (
     "weight", "label_count", "prediction", "consistency", "point_prior", "semantic_prior", "frame",
     "human_label", "human_match", "round", "task",
 )  # fmt: skip
-# 300 sampled rows for each of them, of a table 9,000; a server takes 100 by itself.
+# PostgreSQL samples 300 rows per unit, so 9,000 rows of each table; its default is 100 units.
 _STATISTICS_TARGET = 30
 
 
 SCHEMA_TABLES = frozenset(Base.metadata.tables)
-_OF_SOURCES: dict[str, Table] = {}
+_SOURCE_TABLES: dict[str, Table] = {}
 
 
 def table(name: str) -> Table:
-    """Return the table of that name: of the schema, or of a source that is in use."""
-    return Base.metadata.tables[name] if name in SCHEMA_TABLES else _OF_SOURCES[name]
+    """Return the table with this name, from the schema or from a registered evidence source."""
+    return Base.metadata.tables[name] if name in SCHEMA_TABLES else _SOURCE_TABLES[name]
 
 
 def use_source(declaration: Declaration) -> None:
-    """Make the table of an evidence source known by its name."""
+    """Register the table of an evidence source, so that `table` returns it."""
     if declaration.table not in SCHEMA_TABLES:
-        _OF_SOURCES[declaration.table] = evidence_table(declaration)
+        _SOURCE_TABLES[declaration.table] = evidence_table(declaration)
 
 
 def insert_rows(connection: Connection, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Insert a few rows, each a mapping from column to value; what is left out is null."""
+    """Insert a few rows, each a mapping from column to value; a missing column becomes null."""
     if rows:
         connection.execute(table(name).insert(), list(rows))
 
@@ -49,10 +71,10 @@ def insert(connection: Connection, name: str, values: Mapping[str, Any]) -> None
     """Insert rows that are given as columns.
 
     Args:
-        connection: to the database.
-        name: of the table.
-        values: a list or array per column, all of one length, NaN in an array of floats for null;
-            what is neither is the value of every row.
+        connection: connection to the database.
+        name: name of the table.
+        values: per column a list or (n,) array, or a single value that all n rows get. NaN in an
+            array of floats is stored as null.
     """
     length = next(len(value) for value in values.values() if isinstance(value, list | np.ndarray))
     names = ", ".join(f'"{column}"' for column in values)
@@ -60,7 +82,7 @@ def insert(connection: Connection, name: str, values: Mapping[str, Any]) -> None
         zip(*(_part(value, start, length) for value in values.values()), strict=True)
         for start in range(0, length, BLOCK_ROWS)
     )
-    if on_server(connection):
+    if is_postgresql(connection):
         with connection.connection.cursor().copy(f'COPY "{name}" ({names}) FROM STDIN') as copy:
             for row in rows:
                 copy.write_row(row)
@@ -71,30 +93,30 @@ def insert(connection: Connection, name: str, values: Mapping[str, Any]) -> None
 
 
 def _part(value: Any, start: int, length: int) -> Iterable[Any]:
-    """A block of a column as Python objects, None for NaN; of a single value its repetition."""
+    """Return a block of a column as Python objects: None for NaN, a single value repeated."""
     if not isinstance(value, list | np.ndarray):
         return repeat(value, min(BLOCK_ROWS, length - start))
-    # A column that is too long shows in the last block.
+    # The last block takes all that remains, so that zip(strict=True) notices a longer column.
     end = start + BLOCK_ROWS if start + BLOCK_ROWS < length else len(value)
     part = value[start:end]
     if isinstance(part, list):
         return part
-    found: list[Any] = part.tolist()
+    values: list[Any] = part.tolist()
     if part.dtype.kind == "f":
         for i in np.flatnonzero(np.isnan(part)):
-            found[i] = None
-    return found
+            values[i] = None
+    return values
 
 
-def on_server(connection: Connection) -> bool:
-    """Return whether a PostgreSQL server answers."""
+def is_postgresql(connection: Connection) -> bool:
+    """Return whether the database is PostgreSQL."""
     return connection.dialect.name == "postgresql"
 
 
 def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
     """Return all rows of a query as plain tuples."""
     result = connection.execute(statement)
-    if result.cursor is not None and _unchanged(connection, statement):
+    if result.cursor is not None and _needs_no_conversion(connection, statement):
         rows: Sequence[Row] = result.cursor.fetchall()
         result.close()
         return rows
@@ -102,17 +124,23 @@ def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
 
 
 def grouped(rows: Iterable[Row], keys: Iterable[Any] = ()) -> dict[Any, list[Row]]:
-    """Return the rows by their first value, without it; an empty list for a key without rows."""
-    found: dict[Any, list[Row]] = {key: [] for key in keys}
+    """Group rows by their first value, which is removed from them.
+
+    Args:
+        rows: rows of at least one value.
+        keys: keys that get an empty list if they have no rows.
+    """
+    groups: dict[Any, list[Row]] = {key: [] for key in keys}
     for key, *row in rows:
-        found.setdefault(key, []).append(tuple(row))
-    return found
+        groups.setdefault(key, []).append(tuple(row))
+    return groups
 
 
-def _unchanged(connection: Connection, statement: Select[Any]) -> bool:
-    """Return whether SQLite's driver gives the values that are meant, as it does but for times.
+def _needs_no_conversion(connection: Connection, statement: Select[Any]) -> bool:
+    """Return whether the values from SQLite's driver can be used as they are.
 
-    An object of SQLAlchemy per row takes as long as the row itself.
+    They can, except for times, which SQLAlchemy converts. Without conversion the rows are fetched
+    from the driver directly: creating SQLAlchemy's row object takes as long as fetching the row.
     """
     dialect = connection.dialect
     return dialect.name == "sqlite" and all(
@@ -122,8 +150,8 @@ def _unchanged(connection: Connection, statement: Select[Any]) -> bool:
 
 
 def blocks(connection: Connection, statement: Select[Any]) -> Iterator[Sequence[Row]]:
-    """Yield the rows of a query, some at a time."""
-    if _unchanged(connection, statement):
+    """Yield the rows of a query in blocks."""
+    if _needs_no_conversion(connection, statement):
         result = connection.execute(statement)
         cursor = result.cursor
         while cursor is not None and (rows := cursor.fetchmany(FETCHED_ROWS)):
@@ -139,7 +167,7 @@ def select_columns(connection: Connection, statement: Select[Any]) -> dict[str, 
     """Return the columns of a query by name: (n,) int64, float64 with NaN for null, or str.
 
     Raises:
-        TypeError: if a null among integers.
+        TypeError: if a column of integers contains a null.
     """
     kinds = {column.name: column.type.python_type for column in statement.selected_columns}
     parts = {name: [np.zeros(0, kind)] for name, kind in kinds.items()}
@@ -150,14 +178,14 @@ def select_columns(connection: Connection, statement: Select[Any]) -> dict[str, 
 
 
 def refresh_statistics(connection: Connection) -> None:
-    """Let the database look at samples of the tables that questions about labels touch.
+    """Update the query planner's statistics of the tables that queries for labels read.
 
-    Without them SQLite reads all weights where somebody asks for one frame, and a server joins row
-    by row what this transaction has written, until it looks by itself a minute later. Where another
-    process has a table of a server sampled at this moment, that will do: nobody waits.
+    Without them SQLite reads all weights to find those of one frame. PostgreSQL joins the rows of
+    this transaction one by one, until its own autovacuum runs about a minute later. A table that
+    another process is analyzing at the moment is skipped, which avoids waiting for it.
     """
-    if on_server(connection):
-        tables = ", ".join(_ASKED_TABLES)
+    if is_postgresql(connection):
+        tables = ", ".join(_ANALYZED_TABLES)
         connection.exec_driver_sql(f"SET LOCAL default_statistics_target = {_STATISTICS_TARGET}")
         connection.exec_driver_sql(f"ANALYZE (SKIP_LOCKED) {tables}")
         connection.exec_driver_sql("SET LOCAL default_statistics_target = DEFAULT")
@@ -169,6 +197,14 @@ def refresh_statistics(connection: Connection) -> None:
 def delete_frames(
     connection: Connection, name: str, round_number: int, frame_ids: Sequence[int]
 ) -> None:
-    """Delete the rows of some frames of a round, and what hangs on them."""
-    of = table(name)
-    connection.execute(of.delete().where(of.c.round == round_number, of.c.frame_id.in_(frame_ids)))
+    """Delete the rows of some frames of a round, and the rows of other tables that refer to them.
+
+    Args:
+        connection: connection to the database.
+        name: name of the table.
+        round_number: number of the round.
+        frame_ids: keys of the frames.
+    """
+    rows = table(name)
+    selected = (rows.c.round == round_number, rows.c.frame_id.in_(frame_ids))
+    connection.execute(rows.delete().where(*selected))

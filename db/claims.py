@@ -1,8 +1,21 @@
-"""Claims: what one process works on, no other one touches, and who asks is told who has it.
+"""Claims, which keep two processes from working on the same round.
 
-A claim is held by the kernel (a lock on a file beside an SQLite database) or by the server (an
-advisory lock of a PostgreSQL session). It thus ends with its process, however that ends, and
-nothing stale is ever left behind.
+A claim is a lock of the kernel on a file beside an SQLite database, or an advisory lock of a
+PostgreSQL session. Either ends with its process, even if that crashes, so a claim is never stale.
+
+A stage of frames (predict, repredict, score) claims its round alone. A stage that works for one
+policy (solve, export, train-round) shares the round with the stages of other policies, and claims
+the round of its policy alone. Example with the policies pspsl and st3d of round 1:
+
+    command                     "round 1"   "round 1 of pspsl"   "round 1 of st3d"
+    curate solve (pspsl)        shared      exclusive
+    curate export (st3d)        shared                           exclusive      runs beside it
+    curate solve (pspsl) again  shared      taken                               rejected
+    curate predict              taken                                           rejected
+
+The last command needs "round 1" exclusively, so it has to wait until both policies are done. A
+rejected process reports who holds the claim and since when. A shared lock file holds no owner's
+name, as several processes share it; `_file_owner` finds one in the files of the policies.
 """
 
 import os
@@ -25,7 +38,7 @@ from curate.errors import DatabaseError
 if TYPE_CHECKING:
     from io import TextIOWrapper
 
-# The first of the two numbers of every advisory lock of curate: "cura" in ASCII.
+# PostgreSQL identifies an advisory lock by two numbers; curate's first one is "cura" in ASCII.
 _POSTGRES_CLASS = 0x63757261
 _POSTGRES_OWNER = text("""
     SELECT coalesce(nullif(a.application_name, ''), 'database user ' || a.usename), a.backend_start
@@ -35,22 +48,22 @@ _POSTGRES_OWNER = text("""
           AND l.database = (SELECT oid FROM pg_database WHERE datname = current_database())
     ORDER BY a.backend_start LIMIT 1
 """)
-# Who asks whose a claim is, or finds half of its own taken, holds it for a moment; that moment is
-# waited out.
+# A process that looks up the owner of a claim holds its lock for a moment, and so does one that
+# gets the first of its two claims but not the second. A few tries outlast such moments.
 _TRIES, _PAUSE_S = 5, 0.01
-LONGEST_NAME = 63  # bytes of an application's name that PostgreSQL keeps
+LONGEST_NAME = 63  # bytes: PostgreSQL cuts a longer application name
 
 Check = Callable[[], object]
-"""Raises where a claim was lost."""
+"""A function that raises an error if a claim was lost."""
 
 
 @dataclass(frozen=True)
 class Resource:
-    """Something that is claimed.
+    """Something that a process can claim.
 
     Attributes:
-        name: as the message calls it, e.g. "round 1".
-        shared: whether others may hold a shared claim of it at the same time.
+        name: its name in messages, e.g. "round 1".
+        shared: whether other processes may hold shared claims on it at the same time.
     """
 
     name: str
@@ -58,10 +71,10 @@ class Resource:
 
 
 def round_resources(number: int, policy: str | None = None) -> tuple[Resource, ...]:
-    """What a stage claims: the whole round, or only what a policy makes of it.
+    """Return what a stage claims: the whole round, or the round of one policy.
 
-    The policies of a round stand side by side, so their stages share the round, which no stage can
-    then change under them.
+    Stages of different policies may run at the same time. They share the round, so that no stage
+    can change its predictions and evidence meanwhile.
     """
     if policy is None:
         return (Resource(f"round {number}"),)
@@ -70,38 +83,43 @@ def round_resources(number: int, policy: str | None = None) -> tuple[Resource, .
 
 @contextmanager
 def claimed(engine: Engine, resources: Sequence[Resource], purpose: str) -> Iterator[Check]:
-    """Hold resources against every other process until the block ends.
+    """Claim resources until the block ends.
 
     Yields:
-        What raises where the claim was lost in the meantime, so that others may work on the same.
+        A function that raises DatabaseError if a claim was lost meanwhile, e.g. because its file
+        was deleted. Another process may then work on the same resource.
 
     Raises:
-        DatabaseError: if another process has one of them; the message says which and since when.
+        DatabaseError: if another process holds one of them; the message says which process, and
+            since when.
     """
     owner = f"{purpose}, process {os.getpid()} on {socket.gethostname()}"
     checks: list[Check] = []
-    with ExitStack() as held:
+    with ExitStack() as stack:
         if engine.dialect.name == "postgresql":
-            connection = held.enter_context(_session(engine, owner))
+            connection = stack.enter_context(_session(engine, owner))
             for resource in resources:
                 _claim_session(connection, resource)
             checks = [partial(connection.execute, text("SELECT 1"))]
         elif engine.url.database:
-            # Who opens the file by a link works on the same one.
+            # A process may open the same file by a link.
             folder = Path(f"{os.path.realpath(engine.url.database)}-locks")
-            checks = [held.enter_context(_claimed_file(folder, one, owner)) for one in resources]
+            checks = [stack.enter_context(_claimed_file(folder, each, owner)) for each in resources]
         yield lambda: [check() for check in checks]
 
 
-def one_at_a_time(connection: Connection, lock: int) -> None:
-    """Wait for other transactions with this lock to end; SQLite's writers always do."""
+def wait_for_transactions(connection: Connection, lock: int) -> None:
+    """Wait until other transactions with this lock have ended.
+
+    On SQLite this does nothing: a writing transaction waits for all others anyway.
+    """
     if connection.dialect.name == "postgresql":
         connection.execute(text(f"SELECT pg_advisory_xact_lock({lock})"))
 
 
 @contextmanager
 def _session(engine: Engine, owner: str) -> Iterator[Connection]:
-    """A connection of its own, which ends with its claims."""
+    """Yield a connection outside the pool; closing it ends its claims."""
     connection = engine.connect().execution_options(isolation_level="AUTOCOMMIT")
     connection.detach()
     with connection:
@@ -111,8 +129,8 @@ def _session(engine: Engine, owner: str) -> Iterator[Connection]:
         try:
             yield connection
         finally:
-            # A server notices the end of a connection a little later. One that is lost has lost
-            # its claims, too, and what was lost with it is told by whoever worked.
+            # Unlock explicitly: a server notices the end of a connection a little later. A lost
+            # connection has lost its claims already, and the caller's check reports it.
             with suppress(DBAPIError):
                 if not connection.invalidated:
                     connection.execute(text("SELECT pg_advisory_unlock_all()"))
@@ -149,15 +167,15 @@ def _claimed_file(folder: Path, resource: Resource, owner: str) -> Iterator[Chec
 
 
 def _check_lock_file(path: Path, file: "TextIOWrapper") -> None:
-    """Raise DatabaseError if the file that is locked is not the one that others would try."""
+    """Raise DatabaseError if the locked file is no longer the one that other processes open."""
     try:
         same = os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except FileNotFoundError:
         same = False
     if not same:
         raise DatabaseError(
-            f"{path}: was moved or deleted while this command held it, so another one may work on "
-            "the same; run the command again, finished frames are kept"
+            f"{path}: was moved or deleted while this command held a lock on it, so another "
+            "process may work on the same data; rerun the command, finished frames are kept"
         )
 
 
@@ -185,7 +203,11 @@ def _try_lock(file: "TextIOWrapper", mode: int) -> bool:
 
 
 def _file_owner(path: Path) -> str:
-    """Who holds a file, or one of those that share it: each of them holds another one alone."""
+    """Return the owner of a lock file as its text describes it; "" if none is found.
+
+    A shared file has several owners. Each of them also holds the file of its policy exclusively,
+    and that one has the owner's name.
+    """
     import fcntl
 
     for other in (path, *sorted(path.parent.glob(f"{path.name}-*"))):
@@ -198,5 +220,5 @@ def _file_owner(path: Path) -> str:
 def _conflict_message(resource: Resource, owner: str) -> DatabaseError:
     return DatabaseError(
         f"{resource.name} is being worked on by {owner or 'another process'}; "
-        "wait until it has ended, or end it"
+        "wait until it has ended, or stop it"
     )

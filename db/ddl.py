@@ -1,6 +1,7 @@
-"""Columns and tables as migrations write them; the naming convention of the models names the rest.
+"""Short forms of columns and tables for migrations.
 
-Migrations are history: what is written here must never change a schema that they made.
+Indexes and constraints get their names from the naming convention of the models. Migrations are
+history: a change here must never change the schema that an old migration creates.
 """
 
 from functools import partial
@@ -17,7 +18,7 @@ SIDES = ("x", "y", "z", "length", "width", "height")
 def _column(
     kind: TypeEngine[Any], name: str, comment: str | None = None, **options: Any
 ) -> sa.Column[Any]:
-    """Return a column that is never null, unless `nullable=True` says otherwise."""
+    """Return a column, not nullable by default; `refers` is the column of a foreign key."""
     foreign = [sa.ForeignKey(options.pop("refers"))] if "refers" in options else []
     return sa.Column(name, kind, *foreign, comment=comment, **{"nullable": False, **options})
 
@@ -38,12 +39,17 @@ def box(*, nullable: bool = False) -> list[sa.Column[Any]]:
 
 
 def prediction_key() -> list[sa.Column[Any]]:
-    """Return the key of what belongs to a prediction."""
+    """Return the key columns of a table with rows that belong to predictions."""
     return [key("round"), key("frame_id"), key("k")]
 
 
-def leaves_with(other: str, *columns: str) -> sa.ForeignKeyConstraint:
-    """Return the constraint that deletes a row together with the one of another table."""
+def deleted_with(other: str, *columns: str) -> sa.ForeignKeyConstraint:
+    """Return a foreign key that deletes a row together with the row that it refers to.
+
+    Args:
+        other: name of the other table.
+        columns: names of the columns of the key, the same in both tables.
+    """
     return sa.ForeignKeyConstraint(
         columns, [f"{other}.{column}" for column in columns], ondelete="CASCADE"
     )

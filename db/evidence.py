@@ -1,8 +1,8 @@
-"""Tables of evidence sources, made from what the sources declare.
+"""Tables of evidence sources, created from the columns that the sources declare.
 
 `point_prior` and `semantic_prior` are tables of the schema. Any other source has a table
-`prior_NAME`, made when the source is first used and recorded in `evidence_source`. From this record
-the columns behind the core ones of `weighted_labels` follow.
+`prior_NAME`, which is created when the source is first used, and a row in `evidence_source` with
+its declaration. From these rows the view `weighted_labels` gets its columns after the core ones.
 """
 
 import json
@@ -30,7 +30,7 @@ from curate.priors.base import Column as Declared
 from db.models import Base, EvidenceSource
 
 OWN_TABLES: Mapping[str, str] = {"points": "point_prior", "semantic": "semantic_prior"}
-"""The tables of sources that are part of the schema."""
+"""Sources with a table in the schema, and the name of that table."""
 _KEY = ("round", "frame_id", "k")
 _TYPES: Mapping[str, TypeEngine[Any]] = {
     "int32": Integer(), "int64": BigInteger(), "float64": Float(53), "name": Text(),
@@ -40,12 +40,12 @@ _RECORD = Base.metadata.tables[EvidenceSource.__tablename__]
 
 @dataclass(frozen=True)
 class Declaration:
-    """What an evidence source stores.
+    """The columns that an evidence source stores.
 
     Attributes:
-        name: of the source.
-        source: as the configuration names it.
-        columns: beside the key of the label.
+        name: name of the source.
+        source: its name in the configuration: a registered name, or `package.module:Class`.
+        columns: its columns, without the key of the label.
         rho_column: see `curate.priors.base.EvidenceDeclaration`.
     """
 
@@ -56,7 +56,7 @@ class Declaration:
 
     @property
     def table(self) -> str:
-        """The name of its table."""
+        """Name of the source's table."""
         return OWN_TABLES.get(self.name, f"prior_{self.name}")
 
 
@@ -78,7 +78,7 @@ def evidence_table(declaration: Declaration) -> Table:
 
 
 def read_declarations(connection: Connection) -> tuple[Declaration, ...]:
-    """Return what sources have declared that are not part of the schema, by name."""
+    """Return the declarations of all sources outside the schema, sorted by name."""
     c = _RECORD.c
     rows = connection.execute(select(c.name, c.source, c.columns, c.rho_column).order_by(c.name))
     return tuple(
@@ -93,10 +93,11 @@ def read_declarations(connection: Connection) -> tuple[Declaration, ...]:
 
 
 def declare(connection: Connection, declaration: Declaration) -> None:
-    """Make the table of a source where there is none, and record its declaration.
+    """Create the table of a source if it is missing, and record its declaration.
 
-    A table of the same name with other columns, or of another class, is made anew, and the tasks of
-    that source are deleted: evidence can be computed again. The caller makes the views anew.
+    A table of the same name with other columns, or of another class, is replaced by an empty one,
+    and the tasks of that source are deleted, so that its evidence is computed again. The caller
+    recreates the views.
     """
     former = {each.name: each for each in read_declarations(connection)}.get(declaration.name)
     if declaration.name in OWN_TABLES or former == declaration:

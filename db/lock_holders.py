@@ -1,4 +1,4 @@
-"""Who holds the lock for which a writer waits, where the system tells.
+"""Find the process that holds the write lock of an SQLite database (Linux only).
 
 Source: SQLite's documentation of locking ("File Locking And Concurrency", "WAL-mode File Format"):
 a writer holds a POSIX lock on the file itself, in WAL mode on byte 120 of its -shm file.
@@ -12,26 +12,26 @@ WAL_WRITE_BYTE = 120
 _LOCKS = Path("/proc/locks")  # Linux
 
 
-def holders(database: Path) -> tuple[str, ...]:
-    """Return the processes that write a SQLite database, as "process 123 (its command line)"."""
-    database = database.resolve()  # what SQLite keeps beside it lies beside no link
+def find_writers(database: Path) -> tuple[str, ...]:
+    """Return the processes that write an SQLite database, as "process 123 (its command line)"."""
+    database = database.resolve()  # SQLite creates the -shm file beside the file, not beside a link
     shared = database.with_name(database.name + "-shm")
-    # In the file itself any locked byte counts.
+    # In the database file any locked byte counts, in the -shm file only the writer's.
     spans = {
         path.stat().st_ino: span
         for path, span in ((database, (0, inf)), (shared, (WAL_WRITE_BYTE, WAL_WRITE_BYTE)))
         if path.exists()
     }
-    found = {
+    writers = {
         pid: f"process {pid} ({_command(pid)})"
         for pid, inode, first, last in _write_locks()
         if inode in spans and first <= spans[inode][1] and last >= spans[inode][0]
     }
-    return tuple(found.values())
+    return tuple(writers.values())
 
 
 def _write_locks() -> Iterator[tuple[int, int, int, float]]:
-    """Process, inode, first and last byte of every lock for writing on this machine."""
+    """Yield process, inode, first and last byte of every write lock on this machine."""
     try:
         lines = _LOCKS.read_text().splitlines()
     except OSError:
@@ -44,7 +44,6 @@ def _write_locks() -> Iterator[tuple[int, int, int, float]]:
 
 
 def _command(pid: int) -> str:
-    """Return the command line of a process, in one line."""
     try:
         text = Path(f"/proc/{pid}/cmdline").read_text()
     except OSError:

@@ -1,8 +1,8 @@
 """The tables of curate, in pipeline order.
 
 Boxes are x, y, z of the centre, length, width, height in metres and yaw in radians in the LiDAR
-frame. Everything that a stage found out about label k of a frame carries the same key
-(round, frame_id, k), so evidence joins without a thought and leaves with its prediction.
+frame. All evidence of label k of a frame has the key of its prediction, (round, frame_id, k). The
+tables therefore join by the same three columns, and deleting a prediction deletes its evidence.
 """
 
 from datetime import datetime
@@ -25,18 +25,20 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 RECTANGLE_COLUMNS = ("image_left", "image_top", "image_right", "image_bottom")
 
-# `comment` is stored in the database, `doc` is not and replaces it in the descriptions that
-# `pipelines.queries.schema` makes; `info["unit"]` is the unit.
+# `comment` is stored in the database by the migrations. `doc` is not stored, and replaces `comment`
+# in the descriptions that `pipelines.queries.schema` generates. `info["unit"]` is the unit.
 Key = Annotated[int, mapped_column(primary_key=True, autoincrement=False)]
 Metres = Annotated[float, mapped_column(comment="metres, LiDAR frame", info={"unit": "m"})]
 Radians = Annotated[float, mapped_column(comment="radians, (-pi, pi]", info={"unit": "rad"})]
 Pixels = Annotated[float, mapped_column(comment="pixels", info={"unit": "px"})]
 Share = Annotated[float, mapped_column(comment="0 to 1", info={"unit": "1"})]
-Bound = Annotated[float | None, mapped_column(comment="bound of its interval")]
+Bound = Annotated[
+    float | None, mapped_column(comment="bound of its interval", doc="bound of the 95 % interval")
+]
 
 
 class Base(DeclarativeBase):
-    """Root of the models."""
+    """The base class of all models."""
 
     type_annotation_map: ClassVar = {str: Text, float: Float(53)}
 
@@ -52,7 +54,7 @@ class Base(DeclarativeBase):
 
 
 class Box:
-    """The seven numbers of a box."""
+    """The seven columns of a box."""
 
     x: Mapped[Metres] = mapped_column(doc="box centre, forward of the LiDAR")
     y: Mapped[Metres] = mapped_column(doc="box centre, to the left of the LiDAR")
@@ -64,7 +66,7 @@ class Box:
 
 
 def _evidence(*more: Any) -> tuple[Any, ...]:
-    """Keys of a table whose rows belong to a prediction and leave with it."""
+    """Return the arguments of a table with rows that are deleted with their prediction."""
     key = ForeignKeyConstraint(
         ["round", "frame_id", "k"],
         ["prediction.round", "prediction.frame_id", "prediction.k"],
@@ -74,7 +76,7 @@ def _evidence(*more: Any) -> tuple[Any, ...]:
 
 
 class Frame(Base):
-    """A LiDAR-camera frame and the split that it belongs to."""
+    """A LiDAR-camera frame and its split."""
 
     __tablename__ = "frame"
     __table_args__ = (
@@ -87,7 +89,7 @@ class Frame(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True, doc="key of the row in this database")
+    id: Mapped[int] = mapped_column(primary_key=True, doc="number of the frame in this database")
     dataset: Mapped[str] = mapped_column(doc="kind of the data set, as in curate.toml")
     frame: Mapped[str] = mapped_column(comment="frame id within the data set")
     split: Mapped[str] = mapped_column(comment="labeled | unlabeled | val")
@@ -100,7 +102,7 @@ class Frame(Base):
 
 
 class SplitList(Base):
-    """The lists of frames as `curate init` found and chose them; the firewall compares."""
+    """The split lists that `curate init` found and chose; the leakage firewall checks them."""
 
     __tablename__ = "split_list"
     __table_args__ = ({"sqlite_with_rowid": False},)
@@ -111,16 +113,16 @@ class SplitList(Base):
     name: Mapped[str] = mapped_column(
         primary_key=True, comment="labeled | unlabeled | val, or of the data set's list"
     )
-    path: Mapped[str | None] = mapped_column(comment="of the file")
-    frames: Mapped[int] = mapped_column(comment="how many")
-    sha256: Mapped[str] = mapped_column(comment="of names")
+    path: Mapped[str | None] = mapped_column(comment="of the file", doc="path of the file")
+    frames: Mapped[int] = mapped_column(comment="how many", doc="number of frames")
+    sha256: Mapped[str] = mapped_column(comment="of names", doc="hash of `names`")
     names: Mapped[str] = mapped_column(comment="the sorted names, one per line")
 
 
 class GroundTruth(Base):
-    """What annotators wrote, for labeled and val frames only.
+    """The annotated objects of labeled and val frames.
 
-    The key holds the frame's split as well, so a row for an unlabeled frame cannot exist.
+    The foreign key includes the frame's split, so the database rejects a row of an unlabeled frame.
     """
 
     __tablename__ = "ground_truth"
@@ -133,7 +135,7 @@ class GroundTruth(Base):
     frame_id: Mapped[Key] = mapped_column(doc="frame.id")
     k: Mapped[Key] = mapped_column(doc="number of the object within its frame")
     split: Mapped[str] = mapped_column(doc="labeled | val")
-    category: Mapped[str] = mapped_column(doc="of the object")
+    category: Mapped[str] = mapped_column(doc="category of the object")
     x: Mapped[Metres | None] = mapped_column(doc="box centre, forward of the LiDAR")
     y: Mapped[Metres | None] = mapped_column(doc="box centre, to the left of the LiDAR")
     z: Mapped[Metres | None] = mapped_column(doc="box centre, above the LiDAR")
@@ -151,41 +153,58 @@ class GroundTruth(Base):
 
 
 class Checkpoint(Base):
-    """A trained detector, or the one that the user brought."""
+    """The checkpoint of a detector, trained by a round or supplied by the user."""
 
     __tablename__ = "checkpoint"
     __table_args__ = (UniqueConstraint("round", "policy"),)
 
-    id: Mapped[int] = mapped_column(primary_key=True, doc="key of the row")
-    round: Mapped[int] = mapped_column(comment="the round that made it; 0 before the first")
-    policy: Mapped[str] = mapped_column(comment="whose weights it learned from; '' for round 0")
+    id: Mapped[int] = mapped_column(primary_key=True, doc="number of the row")
+    round: Mapped[int] = mapped_column(
+        comment="the round that made it; 0 before the first",
+        doc="number of the round that trained it; 0 = before the first",
+    )
+    policy: Mapped[str] = mapped_column(
+        comment="whose weights it learned from; '' for round 0",
+        doc="policy that weighted the labels it was trained on; '' for round 0",
+    )
     detector: Mapped[str] = mapped_column(doc="as in curate.toml")
     path: Mapped[str] = mapped_column(comment="relative to the workspace, or absolute")
-    sha256: Mapped[str] = mapped_column(doc="of the file")
+    sha256: Mapped[str] = mapped_column(doc="hash of the file")
     created_at: Mapped[datetime] = mapped_column(DateTime(timezone=True), doc="time in UTC")
 
 
 class TrainingStatistics(Base):
-    """The curves of a training: loss terms, learning rate and gradient norm of every few steps."""
+    """Training curves: loss terms, learning rate and gradient norm of every few steps."""
 
     __tablename__ = "training_statistics"
     __table_args__ = ({"sqlite_with_rowid": False},)
 
     round: Mapped[int] = mapped_column(
-        primary_key=True, autoincrement=False, comment="as of the checkpoint"
+        primary_key=True,
+        autoincrement=False,
+        comment="as of the checkpoint",
+        doc="round of the checkpoint",
     )
-    policy: Mapped[str] = mapped_column(primary_key=True, comment="as of the checkpoint")
+    policy: Mapped[str] = mapped_column(
+        primary_key=True, comment="as of the checkpoint", doc="policy of the checkpoint"
+    )
     step: Mapped[int] = mapped_column(
-        primary_key=True, autoincrement=False, comment="of the optimiser, from 1"
+        primary_key=True,
+        autoincrement=False,
+        comment="of the optimiser, from 1",
+        doc="optimiser step, from 1",
     )
     name: Mapped[str] = mapped_column(
         primary_key=True, comment="loss, a term of it, learning_rate or gradient_norm"
     )
-    value: Mapped[float | None] = mapped_column(comment="of this step alone; null = not finite")
+    value: Mapped[float | None] = mapped_column(
+        comment="of this step alone; null = not finite",
+        doc="value at this step, not averaged; null = not finite",
+    )
 
 
 class Round(Base):
-    """One round e of E: the teacher's answers, their evidence, their weights, the student."""
+    """One round e of E: predictions of the teacher, their evidence and weights, and the student."""
 
     __tablename__ = "round"
 
@@ -195,8 +214,8 @@ class Round(Base):
         ForeignKey("checkpoint.id"), doc="checkpoint.id of the detector that predicts"
     )
     config: Mapped[str] = mapped_column(comment="the whole configuration, JSON")
-    code_version: Mapped[str] = mapped_column(doc="of curate")
-    seed: Mapped[int] = mapped_column(doc="of all random draws of the round")
+    code_version: Mapped[str] = mapped_column(doc="version of curate")
+    seed: Mapped[int] = mapped_column(doc="seed of all random draws of the round")
 
 
 class Prediction(Box, Base):
@@ -212,17 +231,18 @@ class Prediction(Box, Base):
         ForeignKey("round.number"), primary_key=True, doc="round.number"
     )
     frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
-    k: Mapped[Key] = mapped_column(doc="number of the label within its frame, by falling score")
-    category: Mapped[str] = mapped_column(doc="of the object")
-    score: Mapped[Share] = mapped_column(doc="s of the detector, 0 to 1")
+    k: Mapped[Key] = mapped_column(doc="number of the label within its frame, by descending score")
+    category: Mapped[str] = mapped_column(doc="category of the object")
+    score: Mapped[Share] = mapped_column(doc="detector score s, 0 to 1")
     iou: Mapped[float | None] = mapped_column(
         sort_order=1,
         comment="the detector's estimate of its 3D IoU with the object; null = it makes none",
+        doc="the detector's estimate of the box's 3D IoU with the object; null = no estimate",
     )
 
 
 class RepredictionView(Base):
-    """The similarity A of one augmented view of a frame."""
+    """The similarity transform A of one augmented view of a frame."""
 
     __tablename__ = "reprediction_view"
     __table_args__ = ({"sqlite_with_rowid": False},)
@@ -232,15 +252,21 @@ class RepredictionView(Base):
     )
     frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
     view: Mapped[Key] = mapped_column(doc="number of the view, from 0")
-    flip_y: Mapped[int] = mapped_column(comment="1 if y was mirrored, first")
-    rotation_rad: Mapped[float] = mapped_column(
-        comment="about z, radians, second", info={"unit": "rad"}
+    flip_y: Mapped[int] = mapped_column(
+        comment="1 if y was mirrored, first", doc="applied first: 1 if y is mirrored"
     )
-    scale: Mapped[float] = mapped_column(comment="of all coordinates, third")
+    rotation_rad: Mapped[float] = mapped_column(
+        comment="about z, radians, second",
+        doc="applied second: rotation about z",
+        info={"unit": "rad"},
+    )
+    scale: Mapped[float] = mapped_column(
+        comment="of all coordinates, third", doc="applied third: scale of all coordinates"
+    )
 
 
 class Reprediction(Box, Base):
-    """One box of A^-1 f(A(x); w), and the prediction that it was matched with."""
+    """One box of A^-1 f(A(x); w), and the prediction that it is matched with."""
 
     __tablename__ = "reprediction"
     __table_args__ = (
@@ -258,16 +284,21 @@ class Reprediction(Box, Base):
     k: Mapped[int] = mapped_column(
         primary_key=True, autoincrement=False, comment="number within the view"
     )
-    category: Mapped[str] = mapped_column(doc="of the object")
-    score: Mapped[Share] = mapped_column(doc="s' of the detector, 0 to 1")
+    category: Mapped[str] = mapped_column(doc="category of the object")
+    score: Mapped[Share] = mapped_column(doc="detector score s', 0 to 1")
     matched_k: Mapped[int | None] = mapped_column(comment="prediction.k; null = no match")
     iou: Mapped[float | None] = mapped_column(comment="BEV IoU of the match")
-    score_loss: Mapped[float | None] = mapped_column(comment="-ln of this score")
-    box_loss: Mapped[float | None] = mapped_column(comment="sum of smooth L1, beta 1/9")
+    score_loss: Mapped[float | None] = mapped_column(
+        comment="-ln of this score", doc="-ln s'; null = no match"
+    )
+    box_loss: Mapped[float | None] = mapped_column(
+        comment="sum of smooth L1, beta 1/9",
+        doc="sum of smooth L1 (beta 1/9) over the box residual; null = no match",
+    )
 
 
 class Consistency(Base):
-    """The consistency loss L of a prediction, the mean over the views that matched."""
+    """The consistency loss L of a prediction: the mean over the views with a match."""
 
     __tablename__ = "consistency"
     __table_args__ = _evidence()
@@ -276,12 +307,12 @@ class Consistency(Base):
     frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
     k: Mapped[Key] = mapped_column(doc="prediction.k")
     loss: Mapped[float | None] = mapped_column(comment="L; null = no match, no evidence")
-    views: Mapped[int] = mapped_column(doc="augmented views of the frame")
-    matched_views: Mapped[int] = mapped_column(doc="views with a matched reprediction")
+    views: Mapped[int] = mapped_column(doc="number of augmented views of the frame")
+    matched_views: Mapped[int] = mapped_column(doc="number of views with a matched reprediction")
 
 
 class PointPrior(Base):
-    """Eq. 8: LiDAR points inside the box against those inside labeled boxes."""
+    """Eq. 8: LiDAR points inside the box, compared with those inside labeled boxes."""
 
     __tablename__ = "point_prior"
     __table_args__ = _evidence()
@@ -289,7 +320,7 @@ class PointPrior(Base):
     round: Mapped[Key] = mapped_column(doc="prediction.round")
     frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
     k: Mapped[Key] = mapped_column(doc="prediction.k")
-    points: Mapped[int] = mapped_column(comment="m")
+    points: Mapped[int] = mapped_column(comment="m", doc="LiDAR points in the box, m")
     points_threshold: Mapped[float] = mapped_column(comment="m_th of the category")
     rho_diff: Mapped[Share] = mapped_column(doc="trust in [0, 1], Eq. 8")
 
@@ -303,33 +334,46 @@ class SemanticPrior(Base):
     round: Mapped[Key] = mapped_column(doc="prediction.round")
     frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
     k: Mapped[Key] = mapped_column(doc="prediction.k")
-    mask_pixels: Mapped[int] = mapped_column(comment="S")
-    box_pixels: Mapped[int] = mapped_column(comment="A; 0 = outside the image")
+    mask_pixels: Mapped[int] = mapped_column(
+        comment="S", doc="pixels of the category's classes in the box's rectangle, S"
+    )
+    box_pixels: Mapped[int] = mapped_column(
+        comment="A; 0 = outside the image",
+        doc="pixels of the projected box's rectangle, A; 0 = outside the image",
+    )
     rho_anno: Mapped[Share] = mapped_column(doc="trust in [0, 1], Eq. 9")
 
 
 class EvidenceSource(Base):
-    """What an evidence source has declared that has a table `prior_NAME` of its own."""
+    """The declaration of an evidence source with a table `prior_NAME`."""
 
     __tablename__ = "evidence_source"
     __table_args__ = ({"sqlite_with_rowid": False},)
 
-    name: Mapped[str] = mapped_column(primary_key=True, comment="its table is prior_NAME")
-    source: Mapped[str] = mapped_column(comment="as run.priors names it")
+    name: Mapped[str] = mapped_column(
+        primary_key=True,
+        comment="its table is prior_NAME",
+        doc="name of the source; its table is prior_NAME",
+    )
+    source: Mapped[str] = mapped_column(
+        comment="as run.priors names it", doc="name of the source in run.priors"
+    )
     columns: Mapped[str] = mapped_column(
-        comment="JSON: name, kind, unit, meaning and optional of each"
+        comment="JSON: name, kind, unit, meaning and optional of each",
+        doc="JSON: name, kind, unit, meaning and optional of each column",
     )
     rho_column: Mapped[str | None] = mapped_column(
-        comment="the column with its trust in [0, 1]; null = not a prior"
+        comment="the column with its trust in [0, 1]; null = not a prior",
+        doc="name of the column with the trust in [0, 1]; null = the source is not a prior",
     )
 
 
 class Weight(Base):
-    """The reliability weight v that one policy gives a label; policies stand side by side.
+    """The reliability weight v that one policy gives a label; a label has one row per policy.
 
-    What v = 0 means is a member of the policy: background, or ignored where the policy has a band
-    of doubt. A label that a policy drops has no row of that policy. Each policy has an index by
-    value of its own, see `db.weight_index`.
+    The policy defines what v = 0 means: background, or ignored if the policy has a band of doubt.
+    A label that a policy drops has no row for that policy. The weights of each policy have an index
+    of their own, see `db.weight_index`.
     """
 
     __tablename__ = "weight"
@@ -338,16 +382,18 @@ class Weight(Base):
     round: Mapped[Key] = mapped_column(doc="prediction.round")
     frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
     k: Mapped[Key] = mapped_column(doc="prediction.k")
-    policy: Mapped[str] = mapped_column(primary_key=True, doc="that gave the weight")
-    lambda_u: Mapped[float | None] = mapped_column(comment="Eq. 4; null where unused")
+    policy: Mapped[str] = mapped_column(primary_key=True, doc="name of the policy")
+    lambda_u: Mapped[float | None] = mapped_column(
+        comment="Eq. 4; null where unused", doc="Eq. 4; null = not used by the policy"
+    )
     rho_det: Mapped[float | None] = mapped_column(comment="product of the priors")
-    v: Mapped[Share] = mapped_column(doc="weight in [0, 1]; what 0 means, the policy says")
+    v: Mapped[Share] = mapped_column(doc="weight in [0, 1]; the policy defines what 0 means")
 
 
 class LabelCount(Base):
-    """How many labels a policy has weighed in a round; written by solve together with `weight`.
+    """The number of labels that a policy has weighted in a round, per category.
 
-    Counting millions of them anew would take seconds.
+    `solve` writes it together with `weight`, because counting millions of labels takes seconds.
     """
 
     __tablename__ = "label_count"
@@ -356,35 +402,48 @@ class LabelCount(Base):
     round: Mapped[int] = mapped_column(
         ForeignKey("round.number"), primary_key=True, doc="round.number"
     )
-    policy: Mapped[str] = mapped_column(primary_key=True, doc="that weighted the labels")
-    category: Mapped[str] = mapped_column(primary_key=True, doc="of the labels")
-    labels: Mapped[int] = mapped_column(comment="that the policy did not drop")
-    kept: Mapped[int] = mapped_column(comment="with a weight above 0")
-    trusted: Mapped[int] = mapped_column(comment="with a weight above 0.5")
+    policy: Mapped[str] = mapped_column(primary_key=True, doc="policy that weighted the labels")
+    category: Mapped[str] = mapped_column(primary_key=True, doc="category of the labels")
+    labels: Mapped[int] = mapped_column(
+        comment="that the policy did not drop", doc="labels that the policy did not drop"
+    )
+    kept: Mapped[int] = mapped_column(
+        comment="with a weight above 0", doc="labels with a weight above 0"
+    )
+    trusted: Mapped[int] = mapped_column(
+        comment="with a weight above 0.5", doc="labels with a weight above 0.5"
+    )
     weight: Mapped[float] = mapped_column(comment="sum of the weights")
 
 
 class Review(Base):
-    """Labels that were handed to an editor, and when the answer was taken back."""
+    """An export of labels for an editor, and the import of its results."""
 
     __tablename__ = "review"
 
     id: Mapped[str] = mapped_column(primary_key=True, comment="hash of its manifest")
-    round: Mapped[int] = mapped_column(comment="whose labels")
-    policy: Mapped[str] = mapped_column(comment="whose weights chose them")
+    round: Mapped[int] = mapped_column(comment="whose labels", doc="round of the labels")
+    policy: Mapped[str] = mapped_column(
+        comment="whose weights chose them", doc="policy with the weights that selected the labels"
+    )
     editor: Mapped[str] = mapped_column(comment="kitti | labelcloud | cvat")
-    frames: Mapped[int] = mapped_column(doc="frames that were exported")
-    boxes: Mapped[int] = mapped_column(comment="in all, those for context included")
-    asked: Mapped[int] = mapped_column(comment="of the boxes")
+    frames: Mapped[int] = mapped_column(doc="number of exported frames")
+    boxes: Mapped[int] = mapped_column(
+        comment="in all, those for context included",
+        doc="number of exported boxes, including those shown for context",
+    )
+    asked: Mapped[int] = mapped_column(
+        comment="of the boxes", doc="number of boxes that need a decision"
+    )
     exported_at: Mapped[str] = mapped_column(comment="ISO 8601, UTC")
     imported_at: Mapped[str | None] = mapped_column(comment="ISO 8601, UTC; null = not yet")
 
 
 class HumanLabel(Box, Base):
-    """What a person decided about an object of an unlabeled frame; it counts in later rounds too.
+    """A person's decision about an object of an unlabeled frame, valid in later rounds too.
 
-    The key holds the frame's split as well, so a row for a labeled or val frame cannot exist. The
-    box is the object's; of a rejected label the one that was refused.
+    The foreign key includes the frame's split, so the database rejects a row of a labeled or val
+    frame. The box is the object's, or the rejected box.
     """
 
     __tablename__ = "human_label"
@@ -404,34 +463,33 @@ class HumanLabel(Box, Base):
         comment="number of the box in the review; null = added"
     )
     decision: Mapped[str] = mapped_column(comment="accepted | rejected | moved | added")
-    category: Mapped[str] = mapped_column(doc="of the object")
-    from_round: Mapped[int] = mapped_column(comment="it counts in this round and later")
+    category: Mapped[str] = mapped_column(doc="category of the object")
+    from_round: Mapped[int] = mapped_column(
+        comment="it counts in this round and later", doc="first round in which it is valid"
+    )
     seen_x: Mapped[float | None] = mapped_column(
         sort_order=1,
         comment="metres, LiDAR frame: the box as it was shown; null = none",
-        doc="of the box as it was shown; null = none",
+        doc="x of the box that the editor showed; null = added",
         info={"unit": "m"},
     )
-    seen_y: Mapped[Metres | None] = mapped_column(sort_order=1, doc="of the box as it was shown")
-    seen_z: Mapped[Metres | None] = mapped_column(sort_order=1, doc="of the box as it was shown")
-    seen_length: Mapped[Metres | None] = mapped_column(
-        sort_order=1, doc="of the box as it was shown"
+    seen_y: Mapped[Metres | None] = mapped_column(sort_order=1, doc="y of the shown box")
+    seen_z: Mapped[Metres | None] = mapped_column(sort_order=1, doc="z of the shown box")
+    seen_length: Mapped[Metres | None] = mapped_column(sort_order=1, doc="length of the shown box")
+    seen_width: Mapped[Metres | None] = mapped_column(sort_order=1, doc="width of the shown box")
+    seen_height: Mapped[Metres | None] = mapped_column(sort_order=1, doc="height of the shown box")
+    seen_yaw: Mapped[Radians | None] = mapped_column(sort_order=1, doc="yaw of the shown box")
+    reviewer: Mapped[str] = mapped_column(
+        sort_order=2, comment="who decided", doc="name of the person who decided"
     )
-    seen_width: Mapped[Metres | None] = mapped_column(
-        sort_order=1, doc="of the box as it was shown"
-    )
-    seen_height: Mapped[Metres | None] = mapped_column(
-        sort_order=1, doc="of the box as it was shown"
-    )
-    seen_yaw: Mapped[Radians | None] = mapped_column(sort_order=1, doc="of the box as it was shown")
-    reviewer: Mapped[str] = mapped_column(sort_order=2, comment="who decided")
     decided_at: Mapped[str] = mapped_column(sort_order=2, comment="ISO 8601, UTC")
 
 
 class HumanMatch(Base):
-    """A prediction that a human label speaks for, so that no object is labeled twice.
+    """A prediction that matches a human label, so that no object is labeled twice.
 
-    A rejected one weighs 0 whatever a policy says; others give way to the human label's own box.
+    If the label is `rejected`, the prediction has weight 0 under every policy. Otherwise the box of
+    the human label replaces the prediction in `weighted_labels`.
     """
 
     __tablename__ = "human_match"
@@ -446,107 +504,147 @@ class HumanMatch(Base):
     frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
     k: Mapped[Key] = mapped_column(doc="prediction.k")
     n: Mapped[int] = mapped_column(comment="human_label.n")
-    iou: Mapped[float] = mapped_column(comment="BEV IoU with its box, or the one seen")
+    iou: Mapped[float] = mapped_column(
+        comment="BEV IoU with its box, or the one seen",
+        doc="BEV IoU of the prediction with the human label's box, or with the shown box",
+    )
     leads: Mapped[int] = mapped_column(
-        comment="1 if the human label stands in weighted_labels under this k"
+        comment="1 if the human label stands in weighted_labels under this k",
+        doc="1 if the human label has this k in weighted_labels",
     )
 
 
 class _Audited:
-    """The key of a row of an audit."""
+    """The key columns of the audit tables."""
 
-    round: Mapped[int] = mapped_column(primary_key=True, sort_order=-1, comment="of the teacher")
+    round: Mapped[int] = mapped_column(
+        primary_key=True, sort_order=-1, comment="of the teacher", doc="round of the teacher"
+    )
     frames: Mapped[str] = mapped_column(
-        primary_key=True, sort_order=-1, comment="which: val, labeled, or e.g. 5 folds"
+        primary_key=True,
+        sort_order=-1,
+        comment="which: val, labeled, or e.g. 5 folds",
+        doc="frames of the audit: val, labeled, or e.g. 5 folds",
     )
     overlap: Mapped[str] = mapped_column(primary_key=True, sort_order=-1, comment="bev | 3d")
     policy: Mapped[str] = mapped_column(
         primary_key=True,
         sort_order=-1,
         comment="or score, rho_det, consistency: evidence by itself",
+        doc="policy, or score, rho_det, consistency: evidence used as the weight",
     )
-    category: Mapped[str] = mapped_column(primary_key=True, sort_order=-1, comment="or 'all'")
+    category: Mapped[str] = mapped_column(
+        primary_key=True, sort_order=-1, comment="or 'all'", doc="category, or 'all'"
+    )
 
 
-class _Judgement:
-    """What is said of the labels of an audit; every figure is null where it is undefined."""
+class _Figures:
+    """The figures of an audit; each is null if it is undefined."""
 
-    labels: Mapped[int] = mapped_column(comment="that are right or wrong")
-    neutral: Mapped[int] = mapped_column(comment="further labels that are neither")
-    right_labels: Mapped[int] = mapped_column(comment="of the labels")
-    objects: Mapped[int | None] = mapped_column(comment="to be found; null = unknown")
+    labels: Mapped[int] = mapped_column(
+        comment="that are right or wrong", doc="number of labels, without the neutral ones"
+    )
+    neutral: Mapped[int] = mapped_column(
+        comment="further labels that are neither",
+        doc="number of labels that are neither correct nor wrong",
+    )
+    right_labels: Mapped[int] = mapped_column(
+        comment="of the labels", doc="number of correct labels"
+    )
+    objects: Mapped[int | None] = mapped_column(
+        comment="to be found; null = unknown", doc="number of ground-truth objects; null = unknown"
+    )
     share_right: Mapped[float | None] = mapped_column(doc="right_labels / labels")
     share_right_low: Mapped[Bound]
     share_right_high: Mapped[Bound]
     auroc: Mapped[float | None] = mapped_column(
-        comment="chance that a right label weighs more than a wrong one"
+        comment="chance that a right label weighs more than a wrong one",
+        doc="probability that a correct label has a greater weight than a wrong one",
     )
     auroc_low: Mapped[Bound]
     auroc_high: Mapped[Bound]
     average_precision: Mapped[float | None] = mapped_column(
-        comment="of the labels ranked by weight"
+        comment="of the labels ranked by weight",
+        doc="average precision of the labels ranked by weight",
     )
     average_precision_low: Mapped[Bound]
     average_precision_high: Mapped[Bound]
     weighted_precision: Mapped[float | None] = mapped_column(
-        comment="share of the weight that lies on right labels"
+        comment="share of the weight that lies on right labels",
+        doc="share of the total weight that is on correct labels",
     )
     weighted_precision_low: Mapped[Bound]
     weighted_precision_high: Mapped[Bound]
     weighted_recall: Mapped[float | None] = mapped_column(
-        comment="weight on right labels per object"
+        comment="weight on right labels per object",
+        doc="total weight of correct labels / objects",
     )
     weighted_recall_low: Mapped[Bound]
     weighted_recall_high: Mapped[Bound]
     calibration_error: Mapped[float | None] = mapped_column(
-        comment="expected distance of weight and share of right labels"
+        comment="expected distance of weight and share of right labels",
+        doc="expected difference between the weight and the share of correct labels",
     )
     calibration_error_low: Mapped[Bound]
     calibration_error_high: Mapped[Bound]
 
 
-class Audit(_Audited, _Judgement, Base):
-    """How well a policy's weight tells right labels from wrong ones, on frames with ground truth.
+class Audit(_Audited, _Figures, Base):
+    """How well a policy's weights separate correct from wrong labels on frames with ground truth.
 
-    The frames were treated as if they were unlabeled. Intervals are of 95 %, over frames.
+    The frames are processed as if they were unlabeled. Bounds are those of 95 % confidence
+    intervals, resampled over frames.
     """
 
     __tablename__ = "audit"
     __table_args__ = ({"sqlite_with_rowid": False},)
 
 
-class AuditSlice(_Audited, _Judgement, Base):
-    """The same for a range of distances from the LiDAR, or of LiDAR points in the label."""
+class AuditSlice(_Audited, _Figures, Base):
+    """The figures of an audit for labels in a range of distance or of LiDAR points."""
 
     __tablename__ = "audit_slice"
     __table_args__ = ({"sqlite_with_rowid": False},)
 
     kind: Mapped[str] = mapped_column(primary_key=True, comment="distance | points")
-    low: Mapped[float] = mapped_column(primary_key=True, comment="metres or points, included")
+    low: Mapped[float] = mapped_column(
+        primary_key=True,
+        comment="metres or points, included",
+        doc="lower bound of the range in metres or points, inclusive",
+    )
     high: Mapped[float | None] = mapped_column(
-        comment="metres or points, not included; null = open"
+        comment="metres or points, not included; null = open",
+        doc="upper bound in metres or points, exclusive; null = unbounded",
     )
 
 
 class AuditBin(_Audited, Base):
-    """The labels of an audit whose weight lies in a bin; the last bin holds its upper edge."""
+    """The labels of an audit with a weight in a bin; the last bin includes its upper edge."""
 
     __tablename__ = "audit_bin"
     __table_args__ = ({"sqlite_with_rowid": False},)
 
-    low: Mapped[float] = mapped_column(primary_key=True, comment="weight, included")
-    high: Mapped[float] = mapped_column(comment="weight, not included")
-    labels: Mapped[int] = mapped_column(doc="that are right or wrong, in the bin")
-    mean_weight: Mapped[float | None] = mapped_column(doc="of the labels in the bin")
-    precision: Mapped[float | None] = mapped_column(comment="share of right labels in the bin")
-    recall: Mapped[float | None] = mapped_column(comment="right labels of the bin per object")
+    low: Mapped[float] = mapped_column(
+        primary_key=True, comment="weight, included", doc="lower edge of the bin, inclusive"
+    )
+    high: Mapped[float] = mapped_column(
+        comment="weight, not included", doc="upper edge of the bin, exclusive"
+    )
+    labels: Mapped[int] = mapped_column(doc="number of labels in the bin, without the neutral ones")
+    mean_weight: Mapped[float | None] = mapped_column(doc="mean weight of the labels in the bin")
+    precision: Mapped[float | None] = mapped_column(
+        comment="share of right labels in the bin", doc="share of correct labels in the bin"
+    )
+    recall: Mapped[float | None] = mapped_column(
+        comment="right labels of the bin per object", doc="correct labels in the bin / objects"
+    )
 
 
 class EvaluationObject(Box, Base):
-    """What became of an object or a detection of a val frame under KITTI's rules.
+    """The outcome of an object or a detection of a val frame under KITTI's rules.
 
-    An object is found (tp), missed (fn) or ignored, a detection is right (tp), false (fp) or
-    ignored. People query it through the view `evaluation`.
+    An object is found (tp), missed (fn) or ignored. A detection is correct (tp), false (fp) or
+    ignored. The view `evaluation` adds the frame's name and the object's annotation.
     """
 
     __tablename__ = "evaluation_object"
@@ -558,26 +656,42 @@ class EvaluationObject(Box, Base):
     )
 
     source: Mapped[str] = mapped_column(
-        primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
+        primary_key=True,
+        comment="whose detections: e.g. round 1, or a checkpoint's path",
+        doc="source of the detections: e.g. round 1, or a checkpoint's path",
     )
     frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
     side: Mapped[str] = mapped_column(primary_key=True, comment="object | detection")
     k: Mapped[int] = mapped_column(
-        primary_key=True, autoincrement=False, comment="of ground_truth or of prediction"
+        primary_key=True,
+        autoincrement=False,
+        comment="of ground_truth or of prediction",
+        doc="ground_truth.k of an object, number of a detection",
     )
     category: Mapped[str] = mapped_column(
-        primary_key=True, comment="under evaluation; a Van is an ignored object of Car"
+        primary_key=True,
+        comment="under evaluation; a Van is an ignored object of Car",
+        doc="evaluated category; e.g. a Van is an ignored object of Car",
     )
     outcome: Mapped[str] = mapped_column(comment="tp | fp | fn | ignored")
-    matched_k: Mapped[int | None] = mapped_column(comment="of the other side")
+    matched_k: Mapped[int | None] = mapped_column(
+        comment="of the other side", doc="k of the match on the other side; null = no match"
+    )
     iou: Mapped[float] = mapped_column(
-        comment="with the match, else the greatest with any that took part"
+        comment="with the match, else the greatest with any that took part",
+        doc="IoU with the match; without a match, the greatest IoU with any candidate",
     )
     score: Mapped[float | None] = mapped_column(
-        comment="of the detection, for objects of the matched one"
+        comment="of the detection, for objects of the matched one",
+        doc="score of the detection; for an object, that of its match",
     )
-    overlap: Mapped[str] = mapped_column(comment="what iou is: image | bev | 3d")
-    difficulty: Mapped[str] = mapped_column(comment="objects beyond it are ignored")
+    overlap: Mapped[str] = mapped_column(
+        comment="what iou is: image | bev | 3d", doc="kind of IoU: image | bev | 3d"
+    )
+    difficulty: Mapped[str] = mapped_column(
+        comment="objects beyond it are ignored",
+        doc="easy | moderate | hard; harder objects are ignored",
+    )
 
 
 class EvaluationAp(Base):
@@ -587,12 +701,16 @@ class EvaluationAp(Base):
     __table_args__ = ({"sqlite_with_rowid": False},)
 
     source: Mapped[str] = mapped_column(
-        primary_key=True, comment="whose detections: e.g. round 1, or a checkpoint's path"
+        primary_key=True,
+        comment="whose detections: e.g. round 1, or a checkpoint's path",
+        doc="source of the detections: e.g. round 1, or a checkpoint's path",
     )
-    category: Mapped[str] = mapped_column(primary_key=True, doc="under evaluation")
+    category: Mapped[str] = mapped_column(primary_key=True, doc="evaluated category")
     figure: Mapped[str] = mapped_column(primary_key=True, comment="image | aos | bev | 3d")
     difficulty: Mapped[str] = mapped_column(primary_key=True, comment="easy | moderate | hard")
-    objects: Mapped[int] = mapped_column(comment="that count")
+    objects: Mapped[int] = mapped_column(
+        comment="that count", doc="number of objects, without ignored ones"
+    )
     ap_r40: Mapped[float | None] = mapped_column(
         comment="percent", doc="at 40 recall positions", info={"unit": "%"}
     )
@@ -602,29 +720,33 @@ class EvaluationAp(Base):
 
 
 class LabelFile(Base):
-    """An exported label file as it was written; the firewall notices what changed since."""
+    """An exported label file; the leakage firewall detects later changes by its hash."""
 
     __tablename__ = "label_file"
     __table_args__ = ({"sqlite_with_rowid": False},)
 
     path: Mapped[str] = mapped_column(primary_key=True, comment="relative to the workspace")
     round: Mapped[int] = mapped_column(comment="0 = ground truth of X_l alone")
-    policy: Mapped[str] = mapped_column(doc="whose weights it holds; '' for ground truth alone")
-    sha256: Mapped[str] = mapped_column(comment="of the file")
+    policy: Mapped[str] = mapped_column(
+        doc="policy of the weights in the file; '' for ground truth alone"
+    )
+    sha256: Mapped[str] = mapped_column(comment="of the file", doc="hash of the file")
 
 
 class ViewDefinition(Base):
-    """The views as they were made last; those with another definition are made anew."""
+    """The definition of each view in the database; a view with an older one is recreated."""
 
     __tablename__ = "view_definition"
     __table_args__ = ({"sqlite_with_rowid": False},)
 
-    name: Mapped[str] = mapped_column(primary_key=True, comment="of the view")
-    sha256: Mapped[str] = mapped_column(comment="of its definition")
+    name: Mapped[str] = mapped_column(
+        primary_key=True, comment="of the view", doc="name of the view"
+    )
+    sha256: Mapped[str] = mapped_column(comment="of its definition", doc="hash of its definition")
 
 
 class Task(Base):
-    """What was done: one row per frame of a frame stage, one without frame per round stage."""
+    """The finished work: one row per stage and frame, or per round, stage and policy."""
 
     __tablename__ = "task"
     __table_args__ = (
@@ -650,14 +772,20 @@ class Task(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True, doc="key of the row")
+    id: Mapped[int] = mapped_column(primary_key=True, doc="number of the row")
     round: Mapped[int] = mapped_column(doc="round.number; 0 before the first")
     stage: Mapped[str] = mapped_column(doc="name of the stage")
-    variant: Mapped[str] = mapped_column(comment="policy or format of a round stage, else ''")
+    variant: Mapped[str] = mapped_column(
+        comment="policy or format of a round stage, else ''",
+        doc="policy of a round stage, sequence of a stage of sequences, else ''",
+    )
     frame_id: Mapped[int | None] = mapped_column(
         ForeignKey("frame.id"), doc="frame.id; null for a stage of the whole round"
     )
-    fingerprint: Mapped[str] = mapped_column(comment="of all that the result depends on")
+    fingerprint: Mapped[str] = mapped_column(
+        comment="of all that the result depends on",
+        doc="hash of everything that the result depends on",
+    )
     state: Mapped[str] = mapped_column(comment="done | empty | failed")
-    error: Mapped[str | None] = mapped_column(doc="message; null unless failed")
+    error: Mapped[str | None] = mapped_column(doc="error message; null unless failed")
     seconds: Mapped[float] = mapped_column(doc="time that the work took", info={"unit": "s"})

@@ -1,4 +1,4 @@
-"""Opening a database: pragmas, migrations, and errors in our own words."""
+"""Opening a database: connection settings, migrations, and errors with a remedy."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -12,32 +12,33 @@ from curate.errors import ConfigError, DatabaseError, LeakageError, joined_lines
 from db import bulk
 from db.addresses import parse_url
 from db.backups import back_up
-from db.claims import Check, claimed, one_at_a_time, round_resources
-from db.lock_holders import holders
+from db.claims import Check, claimed, round_resources, wait_for_transactions
+from db.lock_holders import find_writers
 from db.models import Base
 from db.views import create_views, drop_views, refresh_views, views_are_current
 
-# A writer that finds another one waits this long before it gives up.
+# A writer waits this long for another one before it fails.
 BUSY_TIMEOUT_MS = 30_000
 _MIGRATIONS = Path(__file__).parent / "migrations"
-# By the names of their files: to open a database of this schema does not need alembic, which takes
+# From the file names: opening a database with the current schema does not need alembic, which takes
 # as long to import as SQLAlchemy.
 REVISIONS = sorted(path.stem.partition("_")[0] for path in _MIGRATIONS.glob("versions/*.py"))
-# On a server two processes may find an old schema at once; this number of theirs is one lock.
+# Two processes may find an old schema on a server at the same time; this lock lets one migrate it.
 _MIGRATION_LOCK = 0x637572617465  # "curate" in ASCII
 
 
 class Database:
-    """A migrated database behind one engine.
+    """A database with the current schema. Opening one with an older schema migrates it.
 
     Args:
-        url: an SQLAlchemy URL, e.g. "sqlite:////data/run/curate.db", or
-            "postgresql://user@host/curate", which psycopg 3 answers.
-        backups: folder for a copy of a server's database before its schema is migrated.
+        url: an SQLAlchemy URL, e.g. "sqlite:////data/run/curate.db" or
+            "postgresql://user@host/curate" (with psycopg 3).
+        backups: folder for a dump of a PostgreSQL database before its schema is migrated.
 
     Raises:
-        ConfigError: the URL is none, or its driver is not installed.
-        DatabaseError: it cannot be opened, is damaged, or a newer curate has written it.
+        ConfigError: if the URL is invalid, or its driver is not installed.
+        DatabaseError: if the database cannot be opened, is damaged, or was written by a newer
+            curate.
     """
 
     def __init__(self, url: str | URL, backups: Path | None = None) -> None:
@@ -52,14 +53,14 @@ class Database:
 
     @property
     def name(self) -> str:
-        """The database as messages call it: a path, or a URL without its password."""
+        """The name of the database in messages: a path, or a URL without its password."""
         if self.engine.dialect.name == "sqlite":
             return str(self.url.database)
         return self.url.set(drivername=self.url.get_backend_name()).render_as_string()
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A connection for queries."""
+        """Yield a connection for queries."""
         with self._translate_errors(), self.engine.connect() as connection:
             yield connection
 
@@ -70,41 +71,43 @@ class Database:
 
     @contextmanager
     def writing(self, *, keys_known: bool = False) -> Iterator[Connection]:
-        """One transaction: all of it is kept, or nothing.
+        """Yield a connection in one transaction, which is committed as a whole or not at all.
 
         Args:
-            keys_known: that the rows which others refer to were read under a claim, so SQLite need
-                not look each of them up, nor delete what refers to deleted rows.
+            keys_known: whether the rows that new rows refer to were read under a claim. SQLite then
+                skips its foreign keys: it looks up no key, and deletes no rows that refer to
+                deleted ones.
 
         Raises:
-            DatabaseError: a claim was lost, so that others may write the same; nothing is written.
+            DatabaseError: if a claim was lost, so that another process may write the same rows;
+                nothing is written.
         """
         writer = self.engine.execution_options(
             sqlite_begin="IMMEDIATE", sqlite_foreign_keys=not keys_known
         )
         with self._translate_errors():
-            for still_held in self._claims:
-                still_held()
+            for check in self._claims:
+                check()
             with writer.begin() as connection:
                 yield connection
 
     @contextmanager
     def claiming_round(self, number: int, policy: str | None, purpose: str) -> Iterator[None]:
-        """Keep every other process off a round, or off what a policy makes of it.
+        """Claim a round, or the round of one policy, until the block ends; see `db.claims`.
 
         Raises:
-            DatabaseError: if another process works on it; the message says who.
+            DatabaseError: if another process works on it; the message says which one.
         """
         resources = round_resources(number, policy)
-        with ExitStack() as held:
+        with ExitStack() as stack:
             with self._translate_errors():
-                still_held = held.enter_context(claimed(self.engine, resources, purpose))
-            self._claims.append(still_held)
-            held.callback(self._claims.remove, still_held)
+                check = stack.enter_context(claimed(self.engine, resources, purpose))
+            self._claims.append(check)
+            stack.callback(self._claims.remove, check)
             yield
 
     def close(self) -> None:
-        """Return every connection back."""
+        """Close all connections of the pool."""
         self.engine.dispose()
 
     def _migrate(self, backups: Path | None) -> None:
@@ -120,9 +123,9 @@ class Database:
         if views_current:
             return
         with self.writing() as connection:
-            one_at_a_time(connection, _MIGRATION_LOCK)
-            # Whoever had the lock before may have migrated it: its copy is of the older schema,
-            # and one that is made now would take its place.
+            wait_for_transactions(connection, _MIGRATION_LOCK)
+            # Another process may have migrated the database while this one waited. It has also
+            # made a backup of the older schema, which a backup made now would replace.
             current = self._revision(connection)
             if current == head:
                 refresh_views(connection)
@@ -134,41 +137,49 @@ class Database:
             create_views(connection)
 
     def _write_ahead(self) -> None:
-        """Let readers of an SQLite file go on beside a writer; the file remembers it."""
+        """Switch an SQLite file to write-ahead logging, so that readers do not wait for a writer.
+
+        The setting is stored in the file.
+        """
         if self.engine.dialect.name == "sqlite":
             with closing(self.engine.raw_connection()) as connection:
                 connection.cursor().execute("PRAGMA journal_mode = WAL")
 
     def _require_tables(self, connection: Connection) -> None:
-        """Raise DatabaseError if somebody has dropped a table of this schema."""
+        """Raise DatabaseError if a table of this schema is missing."""
         missing = sorted(set(Base.metadata.tables) - set(inspect(connection).get_table_names()))
         if missing:
             raise DatabaseError(
-                f"{self.name}: has no table {', '.join(missing)}; restore a backup of it"
+                f"{self.name}: table {', '.join(missing)} is missing; restore a backup"
             )
 
     def _check_tables(self, connection: Connection) -> None:
-        """Raise DatabaseError if a database without a schema of ours has tables.
+        """Raise DatabaseError if a database without curate's schema has tables.
 
-        A server's database may hold others beside ours, a file is for curate alone.
+        A PostgreSQL database may also hold tables of other programs. An SQLite file may not.
         """
         found = set(inspect(connection).get_table_names()) - {"alembic_version"}
         if self.engine.dialect.name != "sqlite":
             found &= set(Base.metadata.tables)
         if found:
             raise DatabaseError(
-                f"{self.name}: has a table {min(found)} but no schema of curate in table "
-                "alembic_version: move it away if it is another program's, restore a backup if not"
+                f"{self.name}: has a table {min(found)}, but table alembic_version has no schema "
+                "of curate; if the database belongs to another program, move it away or choose "
+                "another one, else restore a backup"
             )
 
     def _revision(self, connection: Connection) -> str | None:
-        """Of the schema; None for an empty database, DatabaseError where it is unknown here."""
+        """Return the revision of the schema, None for an empty database.
+
+        Raises:
+            DatabaseError: if this version of curate does not have the revision.
+        """
         if not inspect(connection).has_table("alembic_version"):
             return None
         found = connection.execute(text("SELECT version_num FROM alembic_version")).scalars().all()
-        if len(found) > 1:  # which no curate writes
+        if len(found) > 1:  # no version of curate writes more than one
             raise DatabaseError(
-                f"{self.name}: table alembic_version names several schemas; restore a backup"
+                f"{self.name}: table alembic_version lists several schemas; restore a backup"
             )
         if found and found[0] not in REVISIONS:
             raise DatabaseError(
@@ -178,13 +189,13 @@ class Database:
 
     @contextmanager
     def _translate_errors(self) -> Iterator[None]:
-        """Turn the driver's errors into one line that names the database and the remedy."""
+        """Turn the driver's errors into a DatabaseError with the database and a remedy."""
         try:
             yield
         except DBAPIError as error:
             raise self._translated(error.orig or error) from error
         except self.engine.dialect.loaded_dbapi.Error as error:
-            # The bulk paths speak to the driver itself.
+            # db.bulk uses the driver directly, so SQLAlchemy does not wrap its errors.
             raise self._translated(error) from error
 
     def _translated(self, error: BaseException) -> DatabaseError | LeakageError:
@@ -196,17 +207,17 @@ class Database:
     def _remedy(self, message: str) -> str:
         backend = self.engine.dialect.name
         if backend == "sqlite" and "locked" in message:
-            writing = holders(Path(str(self.url.database)))
-            if writing:
+            writers = find_writers(Path(str(self.url.database)))
+            if writers:
                 return (
-                    f"; waited {BUSY_TIMEOUT_MS / 1000:g} s for {', '.join(writing)}, which is "
-                    "writing: wait for it or end it, then run the command again"
+                    f"; waited {BUSY_TIMEOUT_MS / 1000:g} s for {', '.join(writers)}, which is "
+                    "writing: wait for it or stop it, then rerun the command"
                 )
         return next((each for sign, each in _REMEDIES[backend].items() if sign in message), "")
 
 
 def _upgrade(connection: Connection) -> None:
-    """Run the migrations that the connection's database has not seen yet."""
+    """Run the migrations that the database does not have yet."""
     from alembic import command
     from alembic.config import Config
 
@@ -227,18 +238,18 @@ def _engine(url: URL) -> Engine:
             "pip install 'curate-pseudo-labels[postgres]'"
         ) from error
     if engine.dialect.name not in _REMEDIES:
-        known = " and ".join(_REMEDIES)
-        raise ConfigError(f"database {url!r}: curate keeps its tables in {known} only")
+        supported = " and ".join(_REMEDIES)
+        raise ConfigError(f"database {url!r}: curate supports {supported} only")
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_pragmas)
         event.listen(engine, "begin", _begin)
     else:
-        event.listen(engine, "connect", _begin_immediate)
+        event.listen(engine, "connect", _disable_jit)
     return engine
 
 
-def _begin_immediate(connection: Any, _record: Any) -> None:
-    # A server that compiles a question first takes longer for it than for most answers.
+def _disable_jit(connection: Any, _record: Any) -> None:
+    # Compiling a query takes the server longer than running most of them.
     connection.execute("SET jit = off")
     connection.commit()
 
@@ -253,9 +264,10 @@ def _set_pragmas(connection: Any, _record: Any) -> None:
 
 
 def _begin(connection: Connection) -> None:
-    # Taking the write lock at once lets a second writer wait instead of failing half way.
+    # A writer takes the lock at once (IMMEDIATE): a second writer then waits, while one that asks
+    # for the lock later in its transaction fails.
     options = connection.get_execution_options()
-    # Within a transaction this one has no effect.
+    # This pragma has no effect within a transaction, so it comes before BEGIN.
     checked = "ON" if options.get("sqlite_foreign_keys", True) else "OFF"
     connection.exec_driver_sql(f"PRAGMA foreign_keys = {checked}")
     connection.exec_driver_sql(f"BEGIN {options.get('sqlite_begin', 'DEFERRED')}")
@@ -264,22 +276,22 @@ def _begin(connection: Connection) -> None:
 _REMEDIES = {
     "sqlite": {
         "malformed": "; restore a backup, or rebuild it with `sqlite3 OLD .recover | sqlite3 NEW`",
-        "not a database": "; this file is damaged or of another kind, move it away or restore it",
-        "locked": "; another process is writing, wait for it or end it",
+        "not a database": "; this file is damaged or not a database, move it away or restore it",
+        "locked": "; another process is writing, wait for it or stop it",
         "readonly": "; give yourself write permission on the file and its folder",
         "unable to open": "; check that the folder exists and can be written",
         "disk I/O error": "; check the disk and its mount, finished frames are kept",
-        "full": "; free space on the disk and run the command again, finished frames are kept",
+        "full": "; free space on the disk and rerun the command, finished frames are kept",
     },
     "postgresql": {
         "password": "; put the password into ~/.pgpass or PGPASSWORD",
         "role": "; check the user in run.database of curate.toml",
-        "does not exist": "; make it with `createdb`, or mend run.database of curate.toml",
-        "permission denied": "; let its owner grant you the rights to create and write tables",
-        "read-only": "; this server only answers, write to its primary",
-        "No space left": "; free space on the server and run the command again, finished frames "
-        "are kept",
-        "connection": "; check that the server runs, and run.database of curate.toml; then run the "
-        "command again, finished frames are kept",
+        "does not exist": "; create it with `createdb`, or fix run.database of curate.toml",
+        "permission denied": "; ask its owner for the rights to create and write tables",
+        "read-only": "; this server is read-only, use its primary",
+        "No space left": "; free space on the server and rerun the command, finished frames are "
+        "kept",
+        "connection": "; check that the server runs, and run.database of curate.toml; then rerun "
+        "the command, finished frames are kept",
     },
 }

@@ -1,6 +1,6 @@
-"""Views for people who query, generated from what evidence sources declare.
+"""The views of the database. `weighted_labels` follows from the declared evidence sources.
 
-A view is made anew where the hash of its definition is not the one in `view_definition`.
+A view is recreated if the hash of its definition differs from the one in `view_definition`.
 """
 
 import hashlib
@@ -12,13 +12,11 @@ from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db.evidence import Declaration, label_columns, read_declarations
 from db.models import BOX_COLUMNS, Base, ViewDefinition
 
-# The view with its core columns, to select from.
+# The view with its core columns, for use in a FROM clause.
 WEIGHTED_LABELS = table("weighted_labels", *map(column, WEIGHTED_LABEL_COLUMNS))
 _DEFINITIONS = Base.metadata.tables[ViewDefinition.__tablename__]
 
-# A label whose prediction stands: (round, frame_id, k) of w, p and the evidence. The conditions of
-# a question reach the tables, and its order an index, only where each part of the union gives the
-# column itself, or an expression of the column's type: hence the casts.
+# The evidence of a label joins by the key (round, frame_id, k) of its weight w.
 _EVIDENCE = """
         LEFT JOIN consistency AS c
             ON c.round = w.round AND c.frame_id = w.frame_id AND c.k = w.k
@@ -43,23 +41,32 @@ _NULLS = {
 _REAL, _INTEGER = _NULLS["float64"], _NULLS["int32"]
 
 
-# What the policies say where nobody has decided, predictions that people rejected, and what they
-# hold for objects. Decisions are few: SQLite, which keeps the order of a CROSS JOIN, walks through
-# them first and looks their frames up one by one. A condition on frames alone, the split's for one,
-# would make it read all frames into a Bloom filter before the first row, hence the CASE on a k.
-# A server finds one frame's labels of all rounds by their key only where it is given the rounds.
+# The view is a union of three parts:
+# 1. predictions without a human decision, with the weight of the policy;
+# 2. predictions that a person rejected, with weight 0;
+# 3. objects that a person accepted, moved or added, with weight 1.
+# How the query planners determine the form of the query:
+# - A condition of an outer query (WHERE weight > 0.9) is pushed down into the parts of the union,
+#   and its ORDER BY uses an index, only if each part returns the column itself or an expression of
+#   the same type. Hence the casts.
+# - There are few human decisions. SQLite keeps the order of a CROSS JOIN, so parts 2 and 3 start
+#   with the decisions and look up the frame of each.
+# - A condition on frames alone, such as split = 'unlabeled', makes SQLite read all frames into a
+#   Bloom filter before it returns the first row. The CASE, which contains w.k, prevents that.
+# - PostgreSQL finds the labels of one frame in all rounds by their primary key only if it has the
+#   round numbers. Hence the join with `round` in part 1.
 def _weighted_labels(further: Sequence[Declaration]) -> str:
-    """Return the view with the columns of further sources behind the core ones."""
+    """Return the query of the view, with the columns of further sources after the core ones."""
     aliases = {each: f"s{i}" for i, each in enumerate(further)}
     columns = [(alias, column) for each, alias in aliases.items() for column in each.columns]
-    found = "".join(f', {alias}."{column.name}"' for alias, column in columns)
-    nothing = "".join(f", {_NULLS[column.kind]}" for _, column in columns)
+    stored = "".join(f', {alias}."{column.name}"' for alias, column in columns)
+    nulls = "".join(f", {_NULLS[column.kind]}" for _, column in columns)
     evidence = _EVIDENCE + "".join(
         _FURTHER.format(table=each.table, alias=alias) for each, alias in aliases.items()
     )
     return f"""
         SELECT p.round, f.frame, {_PREDICTED}, 'detector' AS provenance, w.policy,
-               w.v AS weight{found}
+               w.v AS weight{stored}
         FROM round AS r
         JOIN weight AS w ON w.round = r.number
         JOIN prediction AS p ON p.round = w.round AND p.frame_id = w.frame_id AND p.k = w.k
@@ -71,7 +78,7 @@ def _weighted_labels(further: Sequence[Declaration]) -> str:
         )
         UNION ALL
         SELECT p.round, (SELECT f.frame FROM frame AS f WHERE f.id = m.frame_id), {_PREDICTED},
-               'human', w.policy, CAST(0.0 AS DOUBLE PRECISION){found}
+               'human', w.policy, CAST(0.0 AS DOUBLE PRECISION){stored}
         FROM human_match AS m CROSS JOIN human_label AS h CROSS JOIN weight AS w
         CROSS JOIN prediction AS p
         {evidence}
@@ -84,13 +91,13 @@ def _weighted_labels(further: Sequence[Declaration]) -> str:
                h.x, h.y, h.z, h.length, h.width, h.height, h.yaw,
                CAST(1.0 AS DOUBLE PRECISION), {_REAL}, {_INTEGER}, {_REAL}, {_REAL},
                {_INTEGER}, {_INTEGER}, {_REAL}, {_REAL}, {_REAL},
-               'human', t.variant, CAST(1.0 AS DOUBLE PRECISION){nothing}
+               'human', t.variant, CAST(1.0 AS DOUBLE PRECISION){nulls}
         FROM human_label AS h CROSS JOIN round AS r CROSS JOIN task AS t
         LEFT JOIN human_match AS m
             ON m.round = r.number AND m.frame_id = h.frame_id AND m.n = h.n AND m.leads = 1
         WHERE h.decision <> 'rejected' AND r.number >= h.from_round
           AND t.round = r.number AND t.stage = 'solve' AND t.frame_id IS NULL
-"""  # noqa: S608 - made of constants
+"""  # noqa: S608 - composed of constants
 
 
 _VIEWS = {
@@ -121,29 +128,29 @@ VIEW_COLUMNS: Mapping[str, tuple[str, ...]] = {
     ),
     "failed_frames": ("task.round", "task.stage", "frame.frame", "frame.split", "task.error"),
 }  # fmt: skip
-"""The column of a table behind each column of a view, in the order of the view."""
+"""For each view, the table column behind each of its columns, in the order of the view."""
 
 
 def weighted_labels(connection: Connection) -> TableClause:
-    """Return the view with all its columns, to select from."""
+    """Return the view `weighted_labels` with all its columns, for use in a FROM clause."""
     names = (each.name for each in label_columns(read_declarations(connection)))
     return table("weighted_labels", *map(column, names))
 
 
 def definitions(connection: Connection) -> Mapping[str, str]:
-    """Return the query of each view."""
+    """Return the defining query of each view by name."""
     return {"weighted_labels": _weighted_labels(read_declarations(connection)), **_VIEWS}
 
 
 def refresh_views(connection: Connection) -> None:
-    """Make the views anew that are not as they are defined now."""
+    """Recreate all views if one of them differs from its current definition."""
     if not views_are_current(connection):
         drop_views(connection)
         create_views(connection)
 
 
 def views_are_current(connection: Connection) -> bool:
-    """Return whether the views are as they are defined now."""
+    """Return whether all views in the database have their current definition."""
     current = {name: _hash(query) for name, query in definitions(connection).items()}
     return current == _stored(connection)
 
@@ -156,7 +163,7 @@ def create_views(connection: Connection) -> None:
 
 
 def drop_views(connection: Connection) -> None:
-    """Drop every view, so that the tables beneath can change."""
+    """Drop every view, so that the tables which they read can change."""
     for name in ("weighted_labels", *_VIEWS):
         connection.execute(text(f"DROP VIEW IF EXISTS {name}"))
     if inspect(connection).has_table(_DEFINITIONS.name):

@@ -1,4 +1,18 @@
-"""An index of the weights by value for each policy, so that solving one touches no other's."""
+"""Partial indexes of the table `weight`: one per policy, by round and weight.
+
+A query for the labels of a policy with a weight in some range reads only those rows. One index
+over all policies would do that too, but then every solve would change an index that holds the
+weights of all other policies. Example with the policies pspsl and st3d:
+
+    CREATE INDEX ix_weight_v_pspsl ON weight (round, v) WHERE policy = 'pspsl'
+    CREATE INDEX ix_weight_v_st3d  ON weight (round, v) WHERE policy = 'st3d'
+
+    SELECT * FROM weighted_labels WHERE policy = 'pspsl' AND round = 2 AND weight > 0.9
+
+The query uses the first index. A solve of pspsl deletes and inserts entries of the first index
+only. With many rows, SQLite is faster if the index is dropped before and created after (see
+`rebuilding`): then its entries are sorted once, instead of a search in the index for each row.
+"""
 
 import re
 from collections.abc import Iterator
@@ -9,55 +23,67 @@ from sqlalchemy import Connection, Index, MetaData, func, inspect, select
 from sqlalchemy.schema import CreateIndex, DropIndex
 
 from db import bulk
-from db.claims import one_at_a_time
+from db.claims import wait_for_transactions
 from db.session import Database
 
 PREFIX = "ix_weight_v_"
 _BULK_CACHE_KIB = 64 * 1024
 
-# Building an index anew costs a sixth of a row's way in and out of it, measured at 10 million rows.
+# Rebuilding an index costs, per row, a sixth of a deletion and an insertion, measured with 10
+# million rows.
 REBUILT_FROM = 100_000
 _REBUILT_SHARE = 1 / 5
-# The longest name that PostgreSQL keeps has 63 letters; SQLite's index names ignore their case.
+# PostgreSQL cuts names at 63 bytes, and SQLite ignores the case of an index name. The name of any
+# other policy is hashed.
 _PLAIN = re.compile(r"[a-z0-9_]{1,40}")
-# Two processes may want the index of one policy at once; this number of theirs is one lock.
+# Two processes may create the index of one policy at the same time; this lock makes one wait.
 _LOCK = 0x776569676874  # "weight" in ASCII
 
 
 def index_of(policy: str) -> Index:
     """Return the index of a policy's weights, by round and value."""
-    named = _PLAIN.fullmatch(policy)
-    name = policy if named else sha256(policy.encode()).hexdigest()[:32]
-    # A copy of the table: an index joins the models of the one that it is made for.
+    plain = _PLAIN.fullmatch(policy)
+    name = policy if plain else sha256(policy.encode()).hexdigest()[:32]
+    # A copy of the table: SQLAlchemy would add the index to the table of the models.
     weight = bulk.table("weight").to_metadata(MetaData())
-    mine = weight.c.policy == policy
+    of_policy = weight.c.policy == policy
     return Index(
-        PREFIX + name, weight.c.round, weight.c.v, sqlite_where=mine, postgresql_where=mine
+        PREFIX + name,
+        weight.c.round,
+        weight.c.v,
+        sqlite_where=of_policy,
+        postgresql_where=of_policy,
     )
 
 
-def prepare(database: Database, policy: str) -> None:
-    """See to it that a policy has its index.
+def ensure_index(database: Database, policy: str) -> None:
+    """Create the index of a policy if it is missing.
 
-    In a transaction of its own: a server waits for whoever is writing weights, who must not be the
-    one that asks.
+    Call it outside any transaction that writes weights: it uses a transaction of its own, and
+    PostgreSQL makes that wait until all writers of the table have finished.
     """
     index = index_of(policy)
     with database.reading() as connection:
         if _exists(connection, index):
             return
     with database.writing() as connection:
-        one_at_a_time(connection, _LOCK)
+        wait_for_transactions(connection, _LOCK)
         if not _exists(connection, index):
             connection.execute(CreateIndex(index))
 
 
 @contextmanager
-def replacing(connection: Connection, policy: str, count: int) -> Iterator[None]:
-    """Within it so many weights of a policy come, or leave and come again.
+def rebuilding(connection: Connection, policy: str, count: int) -> Iterator[None]:
+    """Rebuild the index of a policy around a block that inserts or replaces many of its weights.
 
-    Where they are a good part of all that it has, SQLite's index is made anew afterwards: row by
-    row, each entry is a seek of its own. A server's table stays open to others.
+    The index is dropped before the block and created after it, on SQLite only, and only if the
+    weights are a large share of those that the policy has. On PostgreSQL dropping an index would
+    lock the table for other processes.
+
+    Args:
+        connection: connection in the writing transaction.
+        policy: name of the policy.
+        count: number of weights that the block writes.
     """
     worthwhile = connection.dialect.name == "sqlite" and count >= REBUILT_FROM
     if worthwhile:
@@ -69,7 +95,7 @@ def replacing(connection: Connection, policy: str, count: int) -> Iterator[None]
         return
     index = index_of(policy)
     connection.execute(DropIndex(index))
-    # Room for the pages in work, and a second core that sorts the index.
+    # A larger cache for the pages in use, and a second thread that helps to sort the index.
     usual = connection.exec_driver_sql("PRAGMA cache_size").scalar_one()
     connection.exec_driver_sql(f"PRAGMA cache_size = -{_BULK_CACHE_KIB}")
     connection.exec_driver_sql("PRAGMA threads = 1")

@@ -1,4 +1,7 @@
-"""The one place that makes objects from sections of the configuration, and checks that it can."""
+"""Creation of objects from the configuration, and checks that it is possible.
+
+No other module creates detectors, segmenters, priors or policies.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
@@ -25,8 +28,8 @@ SHIPPED_SEGMENTER = Path(__file__).parent.parent / "curate/segmenters/models/sim
 
 
 @contextmanager
-def _naming(key: str) -> Iterator[None]:
-    """Put the key whose value is wrong in front of the message."""
+def _error_prefix(key: str) -> Iterator[None]:
+    """Put the configuration key in front of the message of an error."""
     try:
         yield
     except CurateError as error:
@@ -34,7 +37,7 @@ def _naming(key: str) -> Iterator[None]:
 
 
 def open_detector(config: Config, path: Path) -> Detector:
-    """Return the detector behind a checkpoint, a model or result files."""
+    """Return the configured detector, loaded from a checkpoint, a model or result files."""
     section = config.detector
     detector: Detector = registry.DETECTORS.build(
         section.name, path, offered=_offered_to_detectors(config), options=section.options
@@ -49,7 +52,7 @@ def check_detector(config: Config) -> None:
         ConfigError: if it cannot be imported, does not accept its options, or does not have the
             configured preset.
     """
-    with _naming("detector.name"):
+    with _error_prefix("detector.name"):
         registry.DETECTORS.check(
             config.detector.name,
             config.detector.path,
@@ -73,11 +76,11 @@ def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:
 
 @dataclasses.dataclass(frozen=True)
 class Trainable:
-    """A detector that curate trains.
+    """A detector that curate can train.
 
     Attributes:
-        detector: its class.
-        preset: the configured one of its presets.
+        detector: class of the detector.
+        preset: name of the configured preset.
     """
 
     detector: type[TrainableDetector]
@@ -91,7 +94,7 @@ def trainable_detector(config: Config) -> Trainable | None:
         ConfigError: if the detector has no preset of the configured name, or its class cannot be
             used.
     """
-    with _naming("detector.name"):
+    with _error_prefix("detector.name"):
         detector = registry.trainable(config.detector.name)
     preset = config.train.preset
     if detector is None:
@@ -103,19 +106,19 @@ def trainable_detector(config: Config) -> Trainable | None:
 
 
 def trained_detector(config: Config) -> Trainable:
-    """Return the configured detector, which curate must be able to train.
+    """Return the configured detector, which has to be one that curate can train.
 
     Raises:
-        ConfigError: if it is external, or see `trainable_detector`.
+        ConfigError: if it is external, or `trainable_detector` raises it.
     """
     found = trainable_detector(config)
     if found is None:
-        raise ConfigError(f"detector '{config.detector.name}' is not trained by curate")
+        raise ConfigError(f"detector '{config.detector.name}' cannot be trained by curate")
     return found
 
 
 def wants_views(config: Config) -> bool:
-    """Return whether the method reads the consistency loss; the priors alone do not need it."""
+    """Return whether the method uses the consistency loss, for which augmented views are needed."""
     return config.run.method != "pspsl" or config.solve.self_paced
 
 
@@ -126,7 +129,7 @@ def _calibrations(config: Config) -> Callable[[str], Calibration]:
 
 
 def device(config: Config) -> str:
-    """Return where the detector runs: "cpu" or "cuda"."""
+    """Return the device of the detector: "cpu" or "cuda"."""
     if config.detector.device != "auto":
         return config.detector.device
     import torch
@@ -138,8 +141,8 @@ def open_segmenter(config: Config) -> Segmenter:
     """Return the segmenter.
 
     Raises:
-        ConfigError: if none is configured, or a setting is missing or wrong.
-        CurateError: if its model or folder is missing or of another kind.
+        ConfigError: if no segmenter is configured, or a setting is missing or wrong.
+        CurateError: if its model or folder is missing or invalid.
     """
     section = config.segmenter
     path = segmenter_path(config)
@@ -168,7 +171,7 @@ def check_segmenter(config: Config) -> None:
     """
     name = "onnx" if config.segmenter.name == "simulated" else config.segmenter.name
     if name != "none":
-        with _naming("segmenter.name"):
+        with _error_prefix("segmenter.name"):
             registry.SEGMENTERS.check(
                 name,
                 segmenter_path(config),
@@ -182,7 +185,7 @@ def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, .
 
     if classes is None:
         raise ConfigError(
-            f"segmenter '{segmenter}': nothing says what its class numbers mean: set "
+            f"segmenter '{segmenter}': the meaning of its class numbers is not configured: set "
             f"segmenter.classes to one of {', '.join(CLASS_MAPS)}, or segmenter.options.classes "
             "to a table like {Car = [7]}"
         )
@@ -190,7 +193,10 @@ def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, .
 
 
 def segmenter_path(config: Config) -> Path | None:
-    """Return the segmenter's model or folder; curate ships the model for simulated images."""
+    """Return the path of the segmenter's model or folder; None if it is not configured.
+
+    For simulated images it is the model that is part of curate.
+    """
     return SHIPPED_SEGMENTER if config.segmenter.name == "simulated" else config.segmenter.path
 
 
@@ -210,12 +216,12 @@ def open_policy(config: Config, name: str) -> Policy:
 
 
 def check_policy(config: Config, name: str) -> None:
-    """Check that a policy can be made with its settings.
+    """Check that a policy can be created with its settings.
 
     Raises:
         ConfigError: if it cannot be imported, or rejects its options.
     """
-    with _naming("run.method" if name == config.run.method else "--policy"):
+    with _error_prefix("run.method" if name == config.run.method else "--policy"):
         open_policy(config, name)
 
 
@@ -227,22 +233,22 @@ def check_executor(config: Config) -> None:
     """
     section = config.run
     options = section.executor_options.get(section.executor, {})
-    with _naming("run.executor"):
+    with _error_prefix("run.executor"):
         registry.EXECUTORS.check(section.executor, offered=("workers",), options=options)
 
 
 def check_labels_format(config: Config) -> None:
-    """Check that the labels can be exported in the format that the user's trainer gets.
+    """Check that the labels can be exported in the format for the user's trainer.
 
     Raises:
-        ConfigError: if the exporter cannot be imported or made.
+        ConfigError: if the exporter cannot be imported or created.
     """
-    with _naming("train.labels_format"):
+    with _error_prefix("train.labels_format"):
         registry.EXPORTERS.build(config.train.labels_format, offered={}, options={})
 
 
 def check_extensions(config: Config) -> None:
-    """Check every class that the configuration names, without loading a model.
+    """Check every class that the configuration refers to, without loading a model.
 
     Raises:
         ConfigError: if a class cannot be imported or does not accept its options.
@@ -255,7 +261,7 @@ def check_extensions(config: Config) -> None:
 
 
 def consistency_settings(config: Config) -> ConsistencySettings:
-    """Return how predictions and repredictions are compared."""
+    """Return the settings of the comparison of predictions and repredictions."""
     return _from_section(ConsistencySettings, config.repredict)
 
 
@@ -268,7 +274,7 @@ def open_prior(
         config: the configuration.
         name: name of the prior.
         thresholds: points per category, learned from X_l; passed to priors with this argument.
-        measures: whether the prior will look at frames; only then its segmenter is opened.
+        measures: whether the prior will read frames; its segmenter is opened only then.
     """
     prior: EvidenceSource = registry.PRIORS.build(
         name,
@@ -283,7 +289,7 @@ def open_prior(
 
 
 def open_sequence_source(config: Config, name: str) -> SequenceSource:
-    """Return a source of evidence that looks at whole sequences, with its options."""
+    """Return an evidence source that processes whole sequences, with its options."""
     source: SequenceSource = registry.PRIORS.build(
         name, offered={}, options=config.run.prior_options.get(name, {})
     )
@@ -291,12 +297,12 @@ def open_sequence_source(config: Config, name: str) -> SequenceSource:
 
 
 def check_prior(config: Config, name: str) -> None:
-    """Check that a source of evidence can be made with its options; its segmenter is opened.
+    """Check that an evidence source can be created with its options; this opens its segmenter.
 
     Raises:
-        CurateError: if it cannot be imported or made, or its segmenter cannot be opened.
+        CurateError: if it cannot be imported or created, or its segmenter cannot be opened.
     """
-    with _naming("run.priors"):
+    with _error_prefix("run.priors"):
         if hasattr(registry.PRIORS.load(name), "score_sequence"):
             open_sequence_source(config, name)
         else:
@@ -304,16 +310,16 @@ def check_prior(config: Config, name: str) -> None:
 
 
 def point_settings(config: Config) -> PointSettings:
-    """Return how points per category are learned from X_l."""
+    """Return the settings for learning the points per category from X_l."""
     return _from_section(PointSettings, config.points)
 
 
 def semantic_settings(config: Config) -> SemanticSettings:
-    """Return how the semantic prior turns pixels into trust."""
+    """Return the settings of the semantic prior's formula."""
     return _from_section(SemanticSettings, config.semantic)
 
 
 def _from_section(settings: type[Kind], section: Any) -> Kind:
-    """Return a settings object with the section's values of the same names."""
+    """Return a settings object whose fields have the section's values of the same names."""
     names = [field.name for field in dataclasses.fields(settings)]  # type: ignore[arg-type]
     return settings(**{name: getattr(section, name) for name in names})

@@ -1,7 +1,7 @@
-"""Every extension point with the names that a configuration may use: one line per extension.
+"""The extension points, and the names of the registered extensions: one line each.
 
-A class from outside is named as `package.module:Class`; it is found on PYTHONPATH and in the
-current folder.
+The configuration refers to any other class as `package.module:Class`, which is imported from
+PYTHONPATH or the current folder.
 """
 
 import importlib
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Registry:
-    """Names and the classes behind them, imported when they are asked for.
+    """The registered classes of one extension point. A class is imported when it is first used.
 
     Attributes:
-        kind: of extension, for messages.
-        protocol: what each of them offers, as `package.module:Class`.
-        classes: likewise, by name.
+        kind: kind of extension, for messages.
+        protocol: the protocol that all classes implement, as `package.module:Class`.
+        classes: the classes by name, as `package.module:Class`.
     """
 
     kind: str
@@ -36,7 +36,7 @@ class Registry:
         """Check a name without importing anything.
 
         Raises:
-            ConfigError: if it is neither registered, nor `module:Class`, nor one of the others.
+            ConfigError: if it is not registered, not a `module:Class`, and not one of `others`.
         """
         names = sorted((*self.classes, *others))
         if name not in names and not name.partition(":")[2]:
@@ -46,10 +46,11 @@ class Registry:
             )
 
     def load(self, name: str) -> Any:
-        """Return the class behind a name.
+        """Return the class with a name.
 
         Raises:
-            ConfigError: nobody knows the name, or what it names cannot be imported or called.
+            ConfigError: if the name is unknown, or the class cannot be imported, is not callable or
+                lacks a member of the protocol.
         """
         self.check_name(name)
         module_name, _, class_name = self.classes.get(name, name).partition(":")
@@ -58,11 +59,10 @@ class Registry:
             module = importer(module_name)
         except (ImportError, AttributeError, ConfigError) as error:
             raise ConfigError(f"{self.kind} '{name}' cannot be imported: {error}") from error
-        except (Exception, SystemExit) as error:  # the module may be the user's, and do anything
-            words = one_line(error, 200)
+        except (Exception, SystemExit) as error:  # a user's module may raise anything
             raise ConfigError(
                 f"{self.kind} '{name}' cannot be imported: its module raises "
-                f"{type(error).__name__}: {words}"
+                f"{type(error).__name__}: {one_line(error, 200)}"
             ) from error
         if not hasattr(module, class_name):
             public = [each for each, value in vars(module).items() if isinstance(value, type)]
@@ -70,49 +70,49 @@ class Registry:
                 f"{self.kind} '{name}' cannot be imported: {module_name} has no '{class_name}'"
                 f"{did_you_mean(class_name, public)}"
             )
-        found = getattr(module, class_name)
-        if not callable(found):
-            raise ConfigError(f"{self.kind} '{name}' is not a class but {found!r:.80}")
-        missing = [member for member in _members(self.protocol) if not hasattr(found, member)]
-        if isinstance(found, type) and missing:
+        loaded = getattr(module, class_name)
+        if not callable(loaded):
+            raise ConfigError(f"{self.kind} '{name}' is not a class but {loaded!r:.80}")
+        missing = [member for member in _members(self.protocol) if not hasattr(loaded, member)]
+        if isinstance(loaded, type) and missing:
             raise ConfigError(
                 f"{self.kind} '{name}' has no {', '.join(missing)}; see "
                 f"{self.protocol.replace(':', '.')}"
             )
-        return found
+        return loaded
 
     def takes(self, name: str, argument: str) -> bool:
-        """Return whether the constructor behind a name has an argument of that name."""
+        """Return whether the constructor of a class has the argument."""
         return argument in inspect.signature(self.load(name)).parameters
 
     def check(
         self, name: str, *given: Any, offered: Collection[str], options: Mapping[str, Any]
     ) -> Any:
-        """Return the class behind a name, once it is known to accept its arguments.
+        """Return the class with a name, after a check that it accepts its arguments.
 
         Args:
             name: see `build`.
             given: see `build`.
-            offered: names of the keyword arguments that the caller can make.
+            offered: names of the keyword arguments that the caller can supply.
             options: see `build`.
 
         Raises:
-            ConfigError: if it cannot be imported, does not know an option, or needs an argument
-                that nobody gives.
+            ConfigError: if the class cannot be imported, does not have an option, or requires
+                an argument that is not supplied.
         """
         factory = self.load(name)
         parameters = inspect.signature(factory).parameters
-        anything = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
-        unknown = [] if anything else [key for key in options if key not in parameters]
+        variadic = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
+        unknown = [] if variadic else [key for key in options if key not in parameters]
         if unknown:
-            known = list(parameters)[len(given) :]
+            names = list(parameters)[len(given) :]
             raise ConfigError(
                 f"{self.kind} '{name}' has no option '{unknown[0]}'"
-                f"{did_you_mean(unknown[0], known)}; it has {', '.join(known) or 'none'}"
+                f"{did_you_mean(unknown[0], names)}; it has {', '.join(names) or 'none'}"
             )
-        made = dict.fromkeys(key for key in offered if key in parameters)
+        supplied = dict.fromkeys(key for key in offered if key in parameters)
         try:
-            inspect.signature(factory).bind(*given, **{**made, **options})
+            inspect.signature(factory).bind(*given, **{**supplied, **options})
         except TypeError as error:
             raise ConfigError(f"{self.kind} '{name}': {error}") from error
         return factory
@@ -124,28 +124,29 @@ class Registry:
         offered: Mapping[str, Callable[[], Any]],
         options: Mapping[str, Any],
     ) -> Any:
-        """Return an instance.
+        """Return an instance of the class with a name.
 
         Args:
             name: a registered name or `package.module:Class`.
-            given: positional arguments, passed as they are.
-            offered: keyword arguments, of which those are made that the constructor has.
-            options: the user's keyword arguments, all of which the constructor must have.
+            given: positional arguments.
+            offered: functions that return keyword arguments. Only those that the constructor has
+                are called and passed.
+            options: the user's keyword arguments. The constructor must have all of them.
 
         Raises:
-            ConfigError: see `check`, or if the constructor raises; every `CurateError` passes as
-                it is.
+            ConfigError: if `check` raises it, or the constructor raises an exception other than a
+                `CurateError`, which is passed on unchanged.
         """
         factory = self.check(name, *given, offered=offered.keys(), options=options)
-        wanted = inspect.signature(factory).parameters.keys() - options.keys()
-        keywords = {key: make() for key, make in offered.items() if key in wanted}
+        accepted = inspect.signature(factory).parameters.keys() - options.keys()
+        keywords = {key: make() for key, make in offered.items() if key in accepted}
         try:
             return factory(*given, **keywords, **options)
         except CurateError:
             raise
-        except Exception as error:  # the class may be the user's, and raise anything
-            words = " ".join(f"{type(error).__name__}: {error}".split())
-            raise ConfigError(f"{self.kind} '{name}' cannot be made: {words}") from error
+        except Exception as error:  # a user's class may raise anything
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ConfigError(f"{self.kind} '{name}' cannot be created: {reason}") from error
 
 
 DATASETS = Registry(
@@ -244,12 +245,12 @@ def trainable(name: str) -> "type[TrainableDetector] | None":
     """Return the class of a detector that curate can train; None for any other detector.
 
     Raises:
-        ConfigError: if nobody knows the name, it cannot be imported, or its class has some members
-            of `TrainableDetector` but lacks others.
+        ConfigError: if the name is unknown, the class cannot be imported, or it has only some of
+            the members of `TrainableDetector`.
     """
-    found: type[TrainableDetector] = DETECTORS.load(name)
+    detector: type[TrainableDetector] = DETECTORS.load(name)
     members = _members(_TRAINABLE)
-    missing = [member for member in members if not hasattr(found, member)]
+    missing = [member for member in members if not hasattr(detector, member)]
     if missing == members:
         return None
     if missing:
@@ -257,7 +258,7 @@ def trainable(name: str) -> "type[TrainableDetector] | None":
             f"detector '{name}' cannot be trained: it has no {', '.join(missing)}; see "
             f"{_TRAINABLE.replace(':', '.')}"
         )
-    return found
+    return detector
 
 
 def trainable_names() -> list[str]:
@@ -266,16 +267,16 @@ def trainable_names() -> list[str]:
 
 
 def _members(protocol: str) -> list[str]:
-    """Return the class attributes and methods that a protocol itself declares."""
+    """Return the class attributes and public methods that a protocol declares itself."""
     module_name, _, class_name = protocol.partition(":")
     members = vars(getattr(importlib.import_module(module_name), class_name))
-    fixed = [
+    attributes = [
         name
         for name, kind in members.get("__annotations__", {}).items()
         if get_origin(kind) is ClassVar
     ]
     methods = [name for name, member in members.items() if _is_method(member)]
-    return [*fixed, *(name for name in methods if not name.startswith("_"))]
+    return [*attributes, *(name for name in methods if not name.startswith("_"))]
 
 
 def _is_method(member: object) -> bool:

@@ -1,4 +1,4 @@
-"""The round as a graph on one screen; a stage depends on those that write what it reads."""
+"""The graph of a round. A stage depends on the stages that write the tables it reads."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -80,10 +80,14 @@ _DECIDE = (
 
 
 def round_graph(priors: Sequence[str] = DEFAULT_PRIORS, *, pretrained: bool = True) -> Graph:
-    """Return the graph with some priors, and with or without the training of the first teacher.
+    """Return the graph of a round.
+
+    Args:
+        priors: names of the evidence sources, as in run.priors.
+        pretrained: whether curate trains the first teacher, so that the graph starts with pretrain.
 
     Raises:
-        ConfigError: if there is no such prior, or its evidence cannot be stored.
+        ConfigError: if there is no such prior, or its declaration is invalid.
     """
     first: tuple[Stage, ...] = _FIRST if pretrained else ()
     scores = score.stages(priors)
@@ -94,7 +98,7 @@ def round_graph(priors: Sequence[str] = DEFAULT_PRIORS, *, pretrained: bool = Tr
 
 
 def graph_of(workspace: Workspace) -> Graph:
-    """Return the graph of a workspace; it has pretrain where curate trains the first teacher."""
+    """Return the graph of a workspace, see `round_graph`."""
     return round_graph(workspace.config.run.priors, pretrained=is_pretrained(workspace))
 
 

@@ -1,4 +1,4 @@
-"""Runs migrations on the connection that `db.session` hands over, or on -x url=..."""
+"""Run migrations on the connection that `db.session` passes, or on `-x url=...`."""
 
 from alembic import context
 from sqlalchemy import create_engine

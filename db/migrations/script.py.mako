@@ -11,10 +11,10 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Goes forward."""
+    """Upgrade the schema."""
     ${upgrades if upgrades else "pass"}
 
 
 def downgrade() -> None:
-    """Goes back."""
+    """Downgrade the schema."""
     ${downgrades if downgrades else "pass"}

@@ -222,7 +222,7 @@ def _evaluate(
     frames = sorted(
         (key, name) for name, key in workspace.frames(split).items() if name not in failed
     )
-    complete = plan.complete_frames(plan.graph.of_rounds("solve"), split)
+    complete = plan.complete_frames(plan.graph.round_stage("solve"), split)
     _, evidence = read_evidence(workspace, context.number, complete)
     labels = evaluate_frames(
         _frames(workspace, context, split, frames, complete),

@@ -9,7 +9,7 @@ from curate.errors import FramesFailed, WorkspaceError
 from pipelines.engine.executors.base import FrameJob
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
-from pipelines.engine.rounds import peek_round
+from pipelines.engine.rounds import stored_round
 from pipelines.engine.runner import open_executor
 from pipelines.round import graph_of
 from pipelines.stages.predict import Predict, as_detections
@@ -48,11 +48,11 @@ def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]
         WorkspaceError: if the round has no teacher, or lacks predictions for some val frames.
     """
     keys = workspace.frames("val")
-    context = peek_round(workspace, round_number)
+    context = stored_round(workspace, round_number)
     if context is None:
         raise WorkspaceError(f"round {round_number} has no teacher yet; run `curate run`")
     plan = Plan(workspace, context, graph_of(workspace))
-    states = plan.counts(plan.graph.of_frames("predict"), "val")
+    states = plan.counts(plan.graph.frames_stage("predict"), "val")
     missing = states.waiting + states.failed
     if missing:
         raise WorkspaceError(

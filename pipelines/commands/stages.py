@@ -44,14 +44,14 @@ def run_frame_command(
         raise ConfigError(f"--prior {unknown[0]}: not in run.priors {list(priors)}")
     check_executor(workspace.config)
     graph = graph_of(workspace)
-    selected = [graph.of_frames(name) for name in names]
+    selected = [graph.frames_stage(name) for name in names]
     for stage in selected:
         if stage.check:
             stage.check(workspace)
     if dry_run:
         context = preview_round(workspace, round_number)
         preview = Preview(workspace, graph, context.number, context)
-        planned = (preview.of_frames(stage, split, alone=True) for stage in selected)
+        planned = (preview.frames_stage(stage, split, alone=True) for stage in selected)
         print_preview(planned, as_json=as_json)
         return
     plan = Plan(workspace, open_round(workspace, round_number), graph)
@@ -83,16 +83,16 @@ def run_round_command(
 
     chosen = policy or workspace.config.run.method
     graph = graph_of(workspace)
-    stage = graph.of_rounds(name)
+    stage = graph.round_stage(name)
     if stage.check:
         stage.check(workspace, chosen)
     if dry_run:
         context = preview_round(workspace, round_number)
         plan = Plan(workspace, context, graph)
         plan.require(stage, chosen)
-        plan.frames_to_weigh(stage, chosen)
+        plan.frames_to_weight(stage, chosen)
         preview = Preview(workspace, graph, context.number, context)
-        print_preview([preview.of_round(stage, chosen)], as_json=as_json)
+        print_preview([preview.round_stage(stage, chosen)], as_json=as_json)
         return
     plan = Plan(workspace, open_round(workspace, round_number), graph)
     report = run_round(plan, name, chosen, Bar())

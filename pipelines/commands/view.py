@@ -63,7 +63,7 @@ def view(
     """
     from curate.errors import ConfigError
     from curate.viewing.palette import find_style
-    from pipelines.labels.of_one_frame import chosen_round, labeled_by
+    from pipelines.labels.of_one_frame import chosen_round, weighted_frame_names
     from pipelines.reports.pictures import draw_view
 
     colours, kind = find_style(style), _image_format(image_format, output)
@@ -72,7 +72,7 @@ def view(
         raise ConfigError("give the ids of the frames to draw, or --all")
     number = chosen_round(opened, round_number)
     method = policy or opened.config.run.method
-    names = frames or labeled_by(opened, number, method, limit)
+    names = frames or weighted_frame_names(opened, number, method, limit)
     if output is not None and (recording is not None or len(names) > 1):
         raise ConfigError("--output is for the image of one frame; leave it out")
     if recording is not None:

@@ -1,1 +1,4 @@
-"""The engine: what is stale, who works on it, and who writes; it knows no stage."""
+"""The engine: it finds stale work, runs it in an executor, and writes the results.
+
+It receives the graph of stages as a value, and imports no stage.
+"""

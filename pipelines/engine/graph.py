@@ -1,4 +1,4 @@
-"""The graph of a round: its stages in order; a stage depends on those that write what it reads."""
+"""The graph of a round. A stage depends on the stages that write the tables it reads."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,16 +9,16 @@ from pipelines.engine.stage import FirstStage, FramesStage, RoundStage, Stage
 
 @dataclass(frozen=True)
 class Graph:
-    """The stages of a workspace, in an order in which each comes after those that it depends on.
+    """The stages of a workspace in topological order.
 
     Attributes:
-        stages: all of them; those before the first round come first.
+        stages: all stages; those before the first round come first.
     """
 
     stages: tuple[Stage, ...]
 
     def stage(self, name: str) -> Stage:
-        """Return the stage of that name.
+        """Return the stage with this name.
 
         Raises:
             ConfigError: if there is no such stage.
@@ -26,43 +26,43 @@ class Graph:
         for stage in self.stages:
             if stage.name == name:
                 return stage
-        known = ", ".join(stage.name for stage in self.stages)
-        raise ConfigError(f"unknown stage '{name}': use one of {known}")
+        names = ", ".join(stage.name for stage in self.stages)
+        raise ConfigError(f"unknown stage '{name}': use one of {names}")
 
-    def of_frames(self, name: str) -> FramesStage:
-        """Return the stage of that name, whose rows belong to frames.
+    def frames_stage(self, name: str) -> FramesStage:
+        """Return the stage with this name, which has to be a stage of frames.
 
         Raises:
-            ConfigError: if there is no such stage of frames.
+            ConfigError: if there is no such stage, or its rows do not belong to frames.
         """
         stage = self.stage(name)
         if not isinstance(stage, FramesStage):
-            raise ConfigError(f"stage '{name}' is not done per frame")
+            raise ConfigError(f"stage '{name}' does not run per frame")
         return stage
 
-    def of_rounds(self, name: str) -> RoundStage:
-        """Return the stage of that name, which is done once per round and policy.
+    def round_stage(self, name: str) -> RoundStage:
+        """Return the stage with this name, which has to run once per round and policy.
 
         Raises:
-            ConfigError: if there is no such stage of rounds.
+            ConfigError: if there is no such stage, or it does not run once per round.
         """
         stage = self.stage(name)
         if not isinstance(stage, RoundStage):
-            raise ConfigError(f"stage '{name}' is not done once per round")
+            raise ConfigError(f"stage '{name}' does not run once per round")
         return stage
 
     @property
     def first_stages(self) -> Iterator[FirstStage]:
-        """The stages that are done once, before the first round."""
+        """The stages that run once, before the first round."""
         return (stage for stage in self.stages if isinstance(stage, FirstStage))
 
     @property
     def frames_stages(self) -> Iterator[FramesStage]:
-        """The stages whose rows belong to frames."""
+        """The stages with rows that belong to frames."""
         return (stage for stage in self.stages if isinstance(stage, FramesStage))
 
     def before(self, stage: Stage) -> tuple[FramesStage, ...]:
-        """Return the stages of frames whose rows a stage needs, directly or through others."""
+        """Return the stages of frames that a stage depends on, directly or through others."""
         needed = set(stage.reads)
         found: list[FramesStage] = []
         for other in reversed(self.stages[: self.stages.index(stage)]):
@@ -73,7 +73,7 @@ class Graph:
         return tuple(found)
 
     def as_mermaid(self) -> str:
-        """Return a flowchart of tables (rounded) and stages (boxes)."""
+        """Return a Mermaid flowchart of tables (rounded) and stages (boxes)."""
         lines = ["flowchart LR"]
         for stage in self.stages:
             node = stage.name.replace("-", "_")

@@ -1,11 +1,34 @@
-"""What is stale and what is done, asked of the database.
+"""The plan of a round: which frames of which stages are done, and which are stale.
 
-The fingerprint of a stage is a hash of all that its rows depend on: its settings and the
-fingerprints of the stages that write what it reads. A frame is done where its task carries the
-current fingerprint; a changed setting thus makes stale what follows, and only that.
+The fingerprint of a stage is a hash of everything that its rows depend on: its settings, and the
+fingerprints of the stages that write the tables it reads. A frame is done if its task has the
+current fingerprint. Example: `repredict.minimum_iou` changes, a setting of repredict.
 
-The fingerprint of a stage that recalls what it has measured has two parts, MEASURED.REST. A frame
-whose task carries the current first part needs not be measured again.
+    stage       reads                               fingerprint    its frames
+    predict     frame, teacher                      a1 -> a1       done
+    repredict   frame, teacher, prediction          b1 -> b2       stale
+    points      frame, ground_truth, prediction     c1 -> c1       done
+    solve       prediction, consistency,            d1 -> d2       stale, since repredict
+                point_prior                                        writes consistency
+
+The waiting frames of repredict, in SQL (state is done, empty or failed):
+
+    SELECT ... FROM frame
+    LEFT JOIN task AS own_task ON own_task.stage = 'repredict' AND own_task.frame_id = frame.id
+    JOIN task AS task_predict ON task_predict.stage = 'predict' AND task_predict.frame_id = frame.id
+        AND task_predict.fingerprint = 'a1' AND task_predict.state IN ('done', 'empty')
+    WHERE own_task.id IS NULL                              -- the stage never saw this frame
+        OR own_task.fingerprint <> 'b2'                    -- it did, with other settings or input
+        OR own_task.state NOT IN ('done', 'empty')         -- it failed, and is tried again
+
+    frame    task of predict    task of repredict    waits?
+    000001   a1, done           b1, done             yes, stale
+    000002   a1, done           b2, done             no
+    000003   a1, failed         none                 no, until predict has finished it
+
+A stage with reusable measurements has a fingerprint of two parts, MEASURED.ALL. If only ALL has
+changed, e.g. with `semantic.mean`, then the frame's rows are computed again from its stored
+measurements, without running the segmenter.
 """
 
 import hashlib
@@ -27,12 +50,12 @@ from pipelines.engine.stage import FirstStage, FramesStage, FrameStage, RoundCon
 from pipelines.workspace.workspace import Workspace
 
 FINISHED = ("done", "empty")
-PAGE = 1024  # frames that are read at once
+PAGE = 1024  # frames per query
 
 
 @dataclass(frozen=True)
 class Counts:
-    """How many frames of a stage are in which state; `waiting` is all that is to be done."""
+    """The number of frames of a stage in each state; `waiting` frames are missing or stale."""
 
     done: int
     empty: int
@@ -42,12 +65,12 @@ class Counts:
 
 @dataclass(frozen=True)
 class WaitingFrame:
-    """A frame to work on.
+    """A frame that a stage has to process.
 
     Attributes:
-        key: of the frame.
-        name: of the frame.
-        empty: whether an earlier stage found nothing in it.
+        key: key of the frame.
+        name: name of the frame.
+        empty: whether an earlier stage found no objects in it.
     """
 
     key: int
@@ -57,12 +80,12 @@ class WaitingFrame:
 
 @dataclass(frozen=True)
 class TaskKey:
-    """The key of the task of a stage that is done once, not per frame.
+    """The key of the task of a stage that runs once per round, not per frame.
 
     Attributes:
-        round: e; 0 for what comes before the first.
-        stage: its name.
-        variant: the policy; "" where there is none.
+        round: number e of the round; 0 for a stage before the first round.
+        stage: name of the stage.
+        variant: name of the policy; "" if the stage has none.
     """
 
     round: int
@@ -70,18 +93,21 @@ class TaskKey:
     variant: str
 
     def conditions(self) -> tuple[ColumnElement[bool], ...]:
-        """Return the task's row in SQL."""
+        """Return the SQL conditions that select the task's row."""
         task = bulk.table("task")
-        mine = {"round": self.round, "stage": self.stage, "variant": self.variant}
-        return (*(task.c[name] == value for name, value in mine.items()), task.c.frame_id.is_(None))
+        values = {"round": self.round, "stage": self.stage, "variant": self.variant}
+        return (
+            *(task.c[name] == value for name, value in values.items()),
+            task.c.frame_id.is_(None),
+        )
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done in a round. Fingerprints are computed once per plan.
+    """The state of a round's stages. Fingerprints are computed once per plan.
 
     Attributes:
-        workspace: see `Workspace`.
+        workspace: the workspace.
         context: the round.
         graph: the stages.
     """
@@ -92,7 +118,7 @@ class Plan:
 
     @cached_property
     def _sources(self) -> dict[str, str]:
-        """The fingerprints of what no stage of a round writes."""
+        """The fingerprints of the inputs that no stage of the round writes."""
         return {
             "frame": self.workspace.config.dataset.kind,
             "ground_truth": digest(sorted(self.workspace.frames("labeled"))),
@@ -102,15 +128,15 @@ class Plan:
     @cached_property
     def _of_frames(self) -> dict[str, str]:
         """The fingerprints of the stages of frames."""
-        known, prints = dict(self._sources), {}
+        inputs, prints = dict(self._sources), {}
         for stage in self.graph.frames_stages:
             settings = stage.settings(self.workspace, self.context)
-            prints[stage.name] = _fingerprint(stage.name, settings, stage.reads, known)
-            if isinstance(stage, FrameStage) and stage.recall:
-                settings = stage.recall.settings(self.workspace, self.context)
-                measured = _fingerprint(stage.name, settings, stage.recall.reads, known)
+            prints[stage.name] = _fingerprint(stage.name, settings, stage.reads, inputs)
+            if isinstance(stage, FrameStage) and stage.reusable:
+                settings = stage.reusable.settings(self.workspace, self.context)
+                measured = _fingerprint(stage.name, settings, stage.reusable.reads, inputs)
                 prints[stage.name] = f"{measured}.{prints[stage.name]}"
-            known |= dict.fromkeys(stage.writes, prints[stage.name])
+            inputs |= dict.fromkeys(stage.writes, prints[stage.name])
         return prints
 
     @cached_property
@@ -120,18 +146,17 @@ class Plan:
     def fingerprints(self, policy: str) -> Mapping[str, str]:
         """Return the current fingerprint of every stage of the round.
 
-        A round stage's fingerprint here says what its frames must have gone through;
-        `round_fingerprint` adds which frames these were.
+        That of a round stage does not include the frames it reads; `round_fingerprint` adds them.
         """
         if policy not in self._by_policy:
-            known, prints = dict(self._sources), dict(self._of_frames)
+            inputs, prints = dict(self._sources), dict(self._of_frames)
             for stage in self.graph.stages:
                 if isinstance(stage, FirstStage):
                     continue
                 if isinstance(stage, RoundStage):
                     settings = stage.settings(self.workspace, self.context, policy)
-                    prints[stage.name] = _fingerprint(stage.name, settings, stage.reads, known)
-                known |= dict.fromkeys(stage.writes, prints[stage.name])
+                    prints[stage.name] = _fingerprint(stage.name, settings, stage.reads, inputs)
+                inputs |= dict.fromkeys(stage.writes, prints[stage.name])
             self._by_policy[policy] = prints
         return self._by_policy[policy]
 
@@ -140,20 +165,25 @@ class Plan:
         return self._of_frames[stage.name]
 
     def waiting_frames(
-        self, of: FrameStage, split: str, *, measured: bool
+        self, stage: FrameStage, split: str, *, measured: bool
     ) -> Iterator[WaitingFrame]:
-        """Yield the frames to work on.
+        """Yield the frames that a stage has to process.
 
-        They are those of the split that all earlier stages have finished and this one has not, or
-        not with its current fingerprint. They are read page by page: what becomes of them meanwhile
-        changes nothing in those that follow. With `measured` they are those whose stored
-        measurements still hold, else the others.
+        These are the frames that all earlier stages have finished, and that this stage has not
+        finished with its current fingerprint. They are read in pages, by ranges of their key, so
+        that writing the results of one page does not affect the next.
+
+        Args:
+            stage: the stage.
+            split: split of the frames.
+            measured: True for the frames with stored measurements that are still valid, False for
+                all other frames.
         """
         frame = bulk.table("frame")
-        query, holds = self._waiting(of, split)
-        query = query.where(holds if measured else not_(holds)).order_by(frame.c.id)
-        ends = select(func.min(frame.c.id), func.max(frame.c.id)).where(frame.c.split == split)
-        [(lowest, highest)] = self.workspace.database.rows(ends)
+        query, reusable = self._waiting(stage, split)
+        query = query.where(reusable if measured else not_(reusable)).order_by(frame.c.id)
+        bounds = select(func.min(frame.c.id), func.max(frame.c.id)).where(frame.c.split == split)
+        [(lowest, highest)] = self.workspace.database.rows(bounds)
         if lowest is None:
             return
         for first in range(lowest, highest + 1, PAGE):
@@ -163,38 +193,38 @@ class Plan:
                 yield WaitingFrame(key, name, bool(empty))
 
     def waiting_sequences(
-        self, of: FramesStage, split: str
+        self, stage: FramesStage, split: str
     ) -> Iterator[tuple[str, list[WaitingFrame]]]:
-        """Yield the sequences to work on, each with all its frames in the order of their names.
+        """Yield the sequences that a stage has to process, each with all its frames sorted by name.
 
-        They are those with a frame that waits, where no frame still waits for an earlier stage. A
-        frame that failed in an earlier stage is left out of its sequence.
+        A sequence is yielded if one of its frames is waiting, and all of them have been finished by
+        the earlier stages. Frames that failed in an earlier stage are left out.
         """
-        waiting = {frame.name for frame in self._frames(of, split, undone=True)}
-        ready = {frame.name: frame for frame in self._frames(of, split, undone=False)}
-        failed = self._failed_before(of, split)
+        waiting = {frame.name for frame in self._frames(stage, split, undone=True)}
+        ready = {frame.name: frame for frame in self._frames(stage, split, undone=False)}
+        failed = self._failed_before(stage, split)
         names = self.workspace.frames(split)
         sequences = sequences_of(self.workspace.dataset, names)
         for sequence, members in group_by_sequence(sequences, names).items():
-            wanted = sorted(name for name in members if name not in failed)
-            if waiting & set(wanted) and all(name in ready for name in wanted):
-                yield sequence, [ready[name] for name in wanted]
+            usable = sorted(name for name in members if name not in failed)
+            if waiting & set(usable) and all(name in ready for name in usable):
+                yield sequence, [ready[name] for name in usable]
 
-    def count_waiting(self, of: FramesStage, split: str) -> int:
-        """Return how many frames are to be worked on."""
-        query, _ = self._waiting(of, split)
+    def count_waiting(self, stage: FramesStage, split: str) -> int:
+        """Return the number of frames that a stage has to process now."""
+        query, _ = self._waiting(stage, split)
         found = self.workspace.database.rows(select(func.count()).select_from(query.subquery()))
         return int(found[0][0])
 
-    def counts(self, of: FramesStage, split: str) -> Counts:
-        """Return how far a stage is with a split."""
-        frame, own = bulk.table("frame"), bulk.table("task").alias("own")
-        mine = and_(self._task_of(own, of), own.c.fingerprint == self.fingerprint(of))
+    def counts(self, stage: FramesStage, split: str) -> Counts:
+        """Return the number of frames of a split in each state of a stage."""
+        frame, own_task = bulk.table("frame"), bulk.table("task").alias("own_task")
+        current = own_task.c.fingerprint == self.fingerprint(stage)
         query = (
-            select(own.c.state, func.count())
-            .select_from(frame.outerjoin(own, mine))
+            select(own_task.c.state, func.count())
+            .select_from(frame.outerjoin(own_task, and_(self._task_of(own_task, stage), current)))
             .where(frame.c.split == split)
-            .group_by(own.c.state)
+            .group_by(own_task.c.state)
         )
         found: dict[str | None, int] = dict(self.workspace.database.rows(query))
         done, empty, failed, waiting = (
@@ -202,13 +232,15 @@ class Plan:
         )
         return Counts(done, empty, failed, waiting)
 
-    def complete_frames(self, of: RoundStage, split: str = "unlabeled") -> list[int]:
-        """Return the frames that all stages before a round stage have finished, with a label.
+    def complete_frames(self, stage: RoundStage, split: str = "unlabeled") -> list[int]:
+        """Return the keys of the frames with labels that all stages before have finished.
+
+        Frames that failed are left out.
 
         Raises:
-            WorkspaceError: if frames wait; failed ones do not wait, they are left out.
+            WorkspaceError: if an earlier stage has not processed some frames.
         """
-        needed = self.graph.before(of)
+        needed = self.graph.before(stage)
         frames = self.workspace.frames(split).values()
         with self.workspace.database.reading() as connection:
             states = {other: self._states(connection, other) for other in needed}
@@ -217,131 +249,140 @@ class Plan:
             missing = sum(key not in states[other] and key not in failed for key in frames)
             if missing:
                 raise WorkspaceError(
-                    f"{other.name}: {missing} frames of round {self.context.number} are not done "
-                    f"with the current settings; run `curate {other.command}`, or `curate run` for "
-                    "all stages"
+                    f"{other.name}: {missing} frames of round {self.context.number} are missing "
+                    f"or out of date; run `curate {other.command}`, or `curate run` for all stages"
                 )
         return [key for key in frames if all(at.get(key) == "done" for at in states.values())]
 
-    def frames_to_weigh(self, of: RoundStage, policy: str) -> list[int]:
-        """Return the complete frames; none while some wait for a policy that uses no label of them.
+    def frames_to_weight(self, stage: RoundStage, policy: str) -> list[int]:
+        """Return the complete frames, see `complete_frames`.
+
+        For a policy that uses no pseudo-labels the list is empty if some frames are not complete.
 
         Raises:
-            WorkspaceError: if frames wait whose labels the policy uses.
+            WorkspaceError: if frames are not complete and the policy uses their labels.
         """
         try:
-            return self.complete_frames(of)
+            return self.complete_frames(stage)
         except WorkspaceError:
             if open_policy(self.workspace.config, policy).uses_unlabeled:
                 raise
             return []
 
-    def round_fingerprint(self, of: RoundStage, policy: str, frames: Sequence[int]) -> str:
-        """Return the fingerprint of a round stage together with the frames that it would see."""
-        return digest([self.fingerprints(policy)[of.name], list(frames)])
+    def round_fingerprint(self, stage: RoundStage, policy: str, frames: Sequence[int]) -> str:
+        """Return the fingerprint of a round stage together with the frames that it reads."""
+        return digest([self.fingerprints(policy)[stage.name], list(frames)])
 
-    def round_state(self, of: RoundStage, policy: str) -> str:
-        """Return the state of a round stage.
-
-        It is "done", "stale", or "waiting" for its first run or its input.
-        """
-        what = TaskKey(self.context.number, of.name, policy)
-        query = select(bulk.table("task").c.fingerprint).where(*what.conditions())
+    def round_state(self, stage: RoundStage, policy: str) -> str:
+        """Return the state of a round stage: "done", "stale", or "waiting" if it never ran."""
+        key = TaskKey(self.context.number, stage.name, policy)
+        query = select(bulk.table("task").c.fingerprint).where(*key.conditions())
         stored = self.workspace.database.rows(query)
         if not stored:
             return "waiting"
         try:
-            frames = self.frames_to_weigh(of, policy)
+            frames = self.frames_to_weight(stage, policy)
         except WorkspaceError:
             return "stale"
-        current = self.round_fingerprint(of, policy, frames)
-        file = of.file(self.workspace, self.context, policy) if of.file else None
+        current = self.round_fingerprint(stage, policy, frames)
+        file = stage.file(self.workspace, self.context, policy) if stage.file else None
         return "done" if stored == [(current,)] and (file is None or file.exists()) else "stale"
 
-    def require(self, of: RoundStage, policy: str) -> None:
-        """Check that the round stages which a stage needs are up to date.
+    def require(self, stage: RoundStage, policy: str) -> None:
+        """Check that the round stages in `stage.needs` are up to date.
 
         Raises:
-            WorkspaceError: if one is not; the message names the command that runs it.
+            WorkspaceError: if one is not; the message has the command that runs it.
         """
-        for name in of.needs:
-            other = self.graph.of_rounds(name)
+        for name in stage.needs:
+            other = self.graph.round_stage(name)
             if self.round_state(other, policy) != "done":
                 number = self.context.number
-                chosen = "" if policy == self.workspace.config.run.method else f" --policy {policy}"
+                option = "" if policy == self.workspace.config.run.method else f" --policy {policy}"
                 raise WorkspaceError(
-                    f"{of.name}: {name} of round {number} for policy {policy} is missing or older "
-                    f"than its input; run `curate {other.command} --round {number}{chosen}`"
+                    f"{stage.name}: {name} of round {number} for policy {policy} is missing or "
+                    "older than its input; run "
+                    f"`curate {other.command} --round {number}{option}`"
                 )
 
-    def _waiting(self, of: FramesStage, split: str) -> tuple[Select[Any], ColumnElement[bool]]:
-        """The query for the frames to work on, and the condition that measurements still hold."""
-        query, own = self._ready(of, split)
-        current = self.fingerprint(of)
-        holds = and_(
-            own.c.id.is_not(None),
-            func.coalesce(own.c.state, "") == "done",
-            func.coalesce(own.c.fingerprint, "").startswith(current.partition(".")[0] + "."),
-        )
-        undone = or_(own.c.id.is_(None), own.c.fingerprint != current, own.c.state.not_in(FINISHED))
-        return query.where(undone), holds
+    def _waiting(self, stage: FramesStage, split: str) -> tuple[Select[Any], ColumnElement[bool]]:
+        """Return the query for waiting frames, and the condition for reusable measurements.
 
-    def _ready(self, of: FramesStage, split: str) -> tuple[Select[Any], Any]:
-        """The query for the frames that all earlier stages have finished, and their own tasks."""
+        The condition is never null, so that its negation selects all other frames.
+        """
+        query, own_task = self._ready(stage, split)
+        current = self.fingerprint(stage)
+        reusable = and_(
+            own_task.c.id.is_not(None),
+            func.coalesce(own_task.c.state, "") == "done",
+            func.coalesce(own_task.c.fingerprint, "").startswith(current.partition(".")[0] + "."),
+        )
+        undone = or_(
+            own_task.c.id.is_(None),
+            own_task.c.fingerprint != current,
+            own_task.c.state.not_in(FINISHED),
+        )
+        return query.where(undone), reusable
+
+    def _ready(self, stage: FramesStage, split: str) -> tuple[Select[Any], Any]:
+        """Return the query for frames that all earlier stages have finished, and the stage's tasks.
+
+        The tasks are a table in the query, for further conditions.
+        """
         frame = bulk.table("frame")
-        own = bulk.table("task").alias("own")
-        source = frame.outerjoin(own, self._task_of(own, of))
+        own_task = bulk.table("task").alias("own_task")
+        source = frame.outerjoin(own_task, self._task_of(own_task, stage))
         empty: list[ColumnElement[bool]] = [false()]
-        for other in self.graph.before(of):
+        for other in self.graph.before(stage):
             task = bulk.table("task").alias(f"task_{other.name}")
             finished = (task.c.fingerprint == self.fingerprint(other), task.c.state.in_(FINISHED))
             source = source.join(task, and_(self._task_of(task, other), *finished))
             empty.append(task.c.state == "empty")
         query = select(frame.c.id, frame.c.frame, or_(*empty)).select_from(source)
-        return query.where(frame.c.split == split), own
+        return query.where(frame.c.split == split), own_task
 
-    def _frames(self, of: FramesStage, split: str, *, undone: bool) -> list[WaitingFrame]:
-        """The frames that all earlier stages have finished; with `undone` those that wait."""
-        query = self._waiting(of, split)[0] if undone else self._ready(of, split)[0]
+    def _frames(self, stage: FramesStage, split: str, *, undone: bool) -> list[WaitingFrame]:
+        """Return the frames that all earlier stages have finished, or only the waiting ones."""
+        query = self._waiting(stage, split)[0] if undone else self._ready(stage, split)[0]
         found = self.workspace.database.rows(query)
         return [WaitingFrame(key, name, bool(empty)) for key, name, empty in found]
 
-    def _failed_before(self, of: FramesStage, split: str) -> set[str]:
-        """Return the frames that failed in an earlier stage."""
+    def _failed_before(self, stage: FramesStage, split: str) -> set[str]:
+        """Return the names of the frames that failed in an earlier stage."""
         with self.workspace.database.reading() as connection:
-            states = [self._states(connection, other) for other in self.graph.before(of)]
+            states = [self._states(connection, other) for other in self.graph.before(stage)]
         failed = {key for each in states for key, state in each.items() if state == "failed"}
         return {name for name, key in self.workspace.frames(split).items() if key in failed}
 
-    def _states(self, connection: Connection, of: FramesStage) -> Mapping[int, str]:
-        """Return the state of each frame's task that carries the current fingerprint."""
+    def _states(self, connection: Connection, stage: FramesStage) -> Mapping[int, str]:
+        """Return, by frame key, the states of the tasks with the current fingerprint."""
         task = bulk.table("task")
         query = select(task.c.frame_id, task.c.state).where(
             task.c.round == self.context.number,
-            task.c.stage == of.name,
-            task.c.fingerprint == self.fingerprint(of),
+            task.c.stage == stage.name,
+            task.c.fingerprint == self.fingerprint(stage),
             task.c.frame_id.is_not(None),
         )
         return dict(bulk.select(connection, query))
 
-    def _task_of(self, task: Any, of: FramesStage) -> ColumnElement[bool]:
-        """Return the join of a frame with its task of a stage."""
+    def _task_of(self, task: Any, stage: FramesStage) -> ColumnElement[bool]:
+        """Return the condition that joins a frame with its task of a stage."""
         return and_(
             task.c.round == self.context.number,
-            task.c.stage == of.name,
+            task.c.stage == stage.name,
             task.c.frame_id == bulk.table("frame").c.id,
         )
 
 
-def is_current(workspace: Workspace, what: TaskKey, fingerprint: str) -> bool:
-    """Return whether it has been done with all that it depends on."""
-    query = select(bulk.table("task").c.fingerprint).where(*what.conditions())
+def is_current(workspace: Workspace, key: TaskKey, fingerprint: str) -> bool:
+    """Return whether the task is stored with this fingerprint."""
+    query = select(bulk.table("task").c.fingerprint).where(*key.conditions())
     return workspace.database.rows(query) == [(fingerprint,)]
 
 
-def _fingerprint(name: str, settings: Any, reads: Sequence[str], known: Mapping[str, str]) -> str:
-    """Return the hash of a stage's settings and of the fingerprints of what it reads."""
-    return digest([name, settings, [known[each] for each in reads if each in known]])
+def _fingerprint(name: str, settings: Any, reads: Sequence[str], inputs: Mapping[str, str]) -> str:
+    """Return the hash of a stage's settings and of the fingerprints of its inputs."""
+    return digest([name, settings, [inputs[each] for each in reads if each in inputs]])
 
 
 def digest(value: Any) -> str:

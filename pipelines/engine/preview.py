@@ -1,10 +1,9 @@
-"""What a run would do, why, and how long it takes, without doing or writing anything.
+"""Preview of a run: what it would do, why, and how long it would take. Nothing is written.
 
-A frame is to be worked on where its task is missing, has failed, or carries another fingerprint
-than the current one. A changed setting changes the fingerprints of all stages that follow, so
-these tasks alone say what is to be done. Why a fingerprint differs follows from the configuration
-that the round was last worked on with: either a setting of the stage itself has another value
-there, or its input changes.
+A frame would be processed if its task is missing, has failed, or has an outdated fingerprint. A
+changed setting changes the fingerprints of all stages that follow, so the tasks are enough to find
+these frames. The reason is found by a comparison with the configuration of the round's last run:
+either a setting of the stage has changed since, or the stage's input changes.
 """
 
 from collections import Counter
@@ -37,7 +36,7 @@ from pipelines.workspace.workspace import Workspace
 
 SHOWN_FRAMES = 5
 MEASURED_TASKS = 1000
-"""The rate of a stage follows from this many of its latest tasks."""
+"""Number of a stage's latest tasks from which its speed is estimated."""
 NEVER = "never ran"
 
 
@@ -46,12 +45,12 @@ class PlannedStage:
     """What a stage would do.
 
     Attributes:
-        round: e; 0 for what comes before the first.
-        stage: its name.
-        frames: how many frames it would work on; None for a stage that is not done per frame.
-        first_frames: the first of them, by name.
-        reasons: why it would run; none where it is up to date.
-        seconds: how long it would take by what it took before; None if no earlier run says it.
+        round: number e of the round; 0 for a stage before the first round.
+        stage: name of the stage.
+        frames: number of frames it would process; None for a stage that does not run per frame.
+        first_frames: names of the first of them.
+        reasons: why it would run; empty if it is up to date.
+        seconds: estimated duration, from earlier runs; None if it never ran.
     """
 
     round: int
@@ -64,14 +63,14 @@ class PlannedStage:
 
 @dataclass(frozen=True)
 class _Reason:
-    """Why a stage would work on a frame, and whether its stored measurements still hold."""
+    """Why a stage would process a frame, and whether its stored measurements are still valid."""
 
     words: str
     measured: bool = False
 
 
 def preview_all(workspace: Workspace, graph: Graph, rounds: int | None) -> Iterator[PlannedStage]:
-    """Yield what `run_all` would do with the same arguments, stage by stage."""
+    """Yield, stage by stage, what `run_all` would do with the same arguments."""
     trained = is_student_trained(workspace)
     changing = []
     for first in graph.first_stages:
@@ -84,16 +83,16 @@ def preview_all(workspace: Workspace, graph: Graph, rounds: int | None) -> Itera
         preview = Preview(workspace, graph, number, context)
         for stage in graph.stages:
             if isinstance(stage, FramesStage):
-                yield preview.of_frames(stage)
+                yield preview.frames_stage(stage)
             elif isinstance(stage, RoundStage) and (trained or "student" not in stage.writes):
-                planned = preview.of_round(stage, workspace.config.run.method)
+                planned = preview.round_stage(stage, workspace.config.run.method)
                 if planned.reasons and "student" in stage.writes:
                     changing.append(stage.name)
                 yield planned
 
 
 def preview_first(workspace: Workspace, stage: FirstStage) -> PlannedStage:
-    """Return what a stage would do that is done once, before the first round."""
+    """Return what a stage before the first round would do."""
     key, file = TaskKey(0, stage.name, ""), stage.file(workspace)
     reasons: tuple[str, ...] = ()
     if not _has_task(workspace, key):
@@ -106,13 +105,16 @@ def preview_first(workspace: Workspace, stage: FirstStage) -> PlannedStage:
 
 
 class Preview:
-    """What the stages of a round would do; in their order, as each sees what came before.
+    """Preview of the stages of a round.
+
+    Call the methods in the order of the stages: each call takes the changes of the earlier ones
+    into account.
 
     Args:
-        workspace: see `Workspace`.
+        workspace: the workspace.
         graph: the stages.
-        number: e.
-        context: the round; None as long as its teacher is still to be trained.
+        number: number e of the round.
+        context: the round; None if its teacher is not trained yet.
     """
 
     def __init__(
@@ -124,21 +126,22 @@ class Preview:
         self._plan = None if context is None else Plan(workspace, context, graph)
         self._changing: list[Stage] = []
 
-    def of_frames(
+    def frames_stage(
         self, stage: FramesStage, split: str = "unlabeled", *, alone: bool = False
     ) -> PlannedStage:
         """Return what a stage would do with the frames of a split.
 
         Args:
-            stage: of frames.
-            split: of the frames.
-            alone: whether no earlier stage runs before, so that frames may wait for one.
+            stage: the stage of frames.
+            split: split of the frames.
+            alone: whether only this stage would run. Frames that an earlier stage has not finished
+                are then left out.
         """
         names = self._workspace.frames(split)
         if self._plan is None:
             found = dict.fromkeys(names, _Reason("its teacher is still to be trained"))
         else:
-            found = self._to_do(self._plan, stage, names)
+            found = self._stale_frames(self._plan, stage, names)
         if found and isinstance(stage, SequenceStage):
             found = self._whole_sequences(names, found)
         if alone:
@@ -161,8 +164,8 @@ class Preview:
             _seconds(self._workspace, stage, costly, words),
         )
 
-    def of_round(self, stage: RoundStage, policy: str) -> PlannedStage:
-        """Return what a stage would do that looks at all labels of a round."""
+    def round_stage(self, stage: RoundStage, policy: str) -> PlannedStage:
+        """Return what a round stage would do for a policy."""
         inputs = self._changing_inputs(stage)
         reasons: tuple[str, ...] = ()
         if self._plan is None:
@@ -182,12 +185,12 @@ class Preview:
         seconds = _seconds(self._workspace, stage, 1, reasons)
         return PlannedStage(self._number, stage.name, None, (), reasons, seconds)
 
-    def _to_do(
+    def _stale_frames(
         self, plan: Plan, stage: FramesStage, names: Mapping[str, int]
     ) -> dict[str, _Reason]:
-        """Return the frames that a stage would work on."""
+        """Return the frames that a stage would process, with the reasons, by name."""
         current, tasks = plan.fingerprint(stage), self._tasks(stage)
-        recalls = isinstance(stage, FrameStage) and stage.recall is not None
+        reusable = isinstance(stage, FrameStage) and stage.reusable is not None
         measured = current.partition(".")[0]
         stale = self._why(stage, "") if any(tasks[key][1] != current for key in tasks) else ""
         found = {}
@@ -197,13 +200,13 @@ class Preview:
                 found[name] = _Reason(NEVER)
             elif fingerprint != current:
                 same = fingerprint.partition(".")[0] == measured
-                found[name] = _Reason(stale, measured=recalls and state == "done" and same)
+                found[name] = _Reason(stale, measured=reusable and state == "done" and same)
             elif state not in FINISHED:
                 found[name] = _Reason("failed before")
         return found
 
     def _tasks(self, stage: FramesStage) -> Mapping[int, tuple[str, str]]:
-        """State and fingerprint of the task of each frame that has one."""
+        """Return, by frame key, state and fingerprint of the stage's tasks."""
         task = bulk.table("task")
         query = select(task.c.frame_id, task.c.state, task.c.fingerprint).where(
             task.c.round == self._number,
@@ -219,7 +222,7 @@ class Preview:
     def _whole_sequences(
         self, names: Mapping[str, int], found: Mapping[str, _Reason]
     ) -> dict[str, _Reason]:
-        """Return all frames of the sequences in which a frame is to be worked on."""
+        """Return all frames of the sequences that contain one of the found frames."""
         sequences = sequences_of(self._workspace.dataset, list(names))
         other = _Reason("another frame of its sequence changes")
         return {
@@ -240,12 +243,12 @@ class Preview:
         return waiting
 
     def _changing_inputs(self, stage: Stage) -> list[str]:
-        """Return the stages that would change what a stage reads."""
+        """Return the names of the stages that would change the input of a stage."""
         reads = set(stage.reads)
         return [other.name for other in self._changing if reads & set(other.writes)]
 
     def _why(self, stage: FramesStage | RoundStage, policy: str) -> str:
-        """Why the fingerprint of a stage differs from that of its last run."""
+        """Return why the fingerprint of a stage differs from that of its last run."""
         changed = self._changed_settings(stage, policy)
         if changed:
             return f"changed settings: {', '.join(changed)}"
@@ -260,34 +263,34 @@ class Preview:
     def _changed_settings(self, stage: FramesStage | RoundStage, policy: str) -> list[str]:
         """Return the settings of a stage that differ from those of the round's last run.
 
-        A stage has names of its own for some of them; they are called as in curate.toml where a
-        setting of the same name has changed there.
+        A stage may use another dotted name than curate.toml. The name from curate.toml is returned
+        if a key with the same last part has changed there.
         """
         if self._recorded is None or self._plan is None:
             return []
         try:
             former = _settings(stage, self._recorded, self._plan.context, policy)
-        except CurateError:  # what they name may be gone
+        except CurateError:  # a file or class of the former settings may no longer exist
             return []
         now = _settings(stage, self._workspace, self._plan.context, policy)
         changed = {key.rpartition(".")[2] for key in _changes(former, now)}
         sections = (_flat(each.config.model_dump()) for each in (self._recorded, self._workspace))
-        known = [key for key in _changes(*sections) if key.rpartition(".")[2] in changed]
-        return known or sorted(changed)
+        keys = [key for key in _changes(*sections) if key.rpartition(".")[2] in changed]
+        return keys or sorted(changed)
 
     @cached_property
     def _recorded(self) -> Workspace | None:
-        """The workspace with the settings that the round was last worked on with."""
+        """The workspace with the settings of the round's last run; None if it has none."""
         document = recorded_config(self._workspace, self._number)
         try:
             config = make_config(document, "the round's configuration") if document else None
-        except CurateError:  # an older curate may have known other settings
+        except CurateError:  # it may be of an older curate with other settings
             return None
         return None if config is None else replace(self._workspace, config=config)
 
     @cached_property
     def _recorded_teacher(self) -> str | None:
-        """The hash of the teacher that the round was last worked on with."""
+        """The hash of the teacher in the round's last run; None if there was none."""
         table, checkpoint = bulk.table("round"), bulk.table("checkpoint")
         query = (
             select(checkpoint.c.sha256)
@@ -302,7 +305,7 @@ class Preview:
 def _settings(
     stage: FramesStage | RoundStage, workspace: Workspace, context: RoundContext, policy: str
 ) -> dict[str, Any]:
-    """Return the settings of a stage, as text by dotted name."""
+    """Return the settings of a stage as text, by dotted name."""
     if isinstance(stage, RoundStage):
         return _flat(stage.settings(workspace, context, policy))
     return _flat(stage.settings(workspace, context))
@@ -329,7 +332,7 @@ def _has_task(workspace: Workspace, key: TaskKey) -> bool:
 def _seconds(
     workspace: Workspace, stage: Stage, count: int, reasons: tuple[str, ...]
 ) -> float | None:
-    """How long a stage takes for so many frames, or once; None where no task says it."""
+    """Return the estimated duration of a stage for `count` frames; None if it never ran."""
     if not reasons:
         return 0.0
     task = bulk.table("task")
@@ -346,8 +349,8 @@ def _seconds(
     if isinstance(stage, FirstStage | RoundStage):
         return float(rows[0][1])
     workers = workspace.config.run.workers
-    if isinstance(stage, SequenceStage):  # each of its frames carries the seconds of all
+    if isinstance(stage, SequenceStage):  # each frame's task has the seconds of the sequence
         whole: dict[str, float] = dict(rows)
         return count * sum(whole.values()) / len(rows) / workers
-    # The median, as the first frame of a run is slower than the others.
+    # The median, because the first frame of a run takes longer than the others.
     return count * float(median(seconds for _, seconds in rows)) / workers

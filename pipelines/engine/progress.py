@@ -1,4 +1,4 @@
-"""How a command shows that it is alive: a bar on a terminal, a line now and then in a log."""
+"""Progress of long work: a bar on a terminal, a line every few seconds in a log."""
 
 import sys
 import time
@@ -13,24 +13,24 @@ LINE_EVERY_S = 15.0
 
 
 class Progress(Protocol):
-    """Shows the state of something long."""
+    """Shows the progress of long work."""
 
     @contextmanager
     def track(self, what: str, total: int) -> Iterator[Advance]:
-        """Yield a function that takes how much more is done and a word on how it goes."""
+        """Yield a function that takes the number of newly finished steps and a short note."""
         ...
 
 
 class TotalProgress(Protocol):
-    """Takes how much is done in all, and of how much."""
+    """A callback that takes the number of all finished steps."""
 
     def __call__(self, done: int, total: int, note: str = "", /) -> None:
-        """Show it, with a word on how it goes."""
+        """Show that `done` of `total` steps are finished, with a short note."""
         ...
 
 
 def as_total(advance: Advance) -> TotalProgress:
-    """Move `advance` for work that tells how much is done in all, not how much more."""
+    """Return a callback for work that reports all finished steps, not the new ones."""
     before = 0
 
     def reach(done: int, _total: int, note: str = "") -> None:
@@ -42,7 +42,7 @@ def as_total(advance: Advance) -> TotalProgress:
 
 
 class Bar:
-    """A bar with rate and time left on a terminal; lines on anything else, to standard error."""
+    """Progress on standard error: a bar with rate and time left on a terminal, else lines."""
 
     @contextmanager
     def track(self, what: str, total: int) -> Iterator[Advance]:
@@ -52,11 +52,10 @@ class Bar:
 
 
 class Pace:
-    """How fast work is done, and when it will be finished.
+    """Rate and remaining time of work.
 
-    The first step is not counted: it loads models and compiles kernels, or counts what an earlier
-    run had done, so it says nothing about those that follow. Until the second step ends, rate and
-    time left are unknown.
+    The first step is not part of the rate: it includes loading models and compiling kernels, or it
+    reports what an earlier run had done. Rate and remaining time are unknown until the second step.
     """
 
     def __init__(self, total: int) -> None:
@@ -66,20 +65,20 @@ class Pace:
         self._start = 0.0
 
     def advance(self, step: int) -> None:
-        """Count finished work."""
+        """Add newly finished steps."""
         if step > 0 and self._warm_up == 0:
             self._warm_up, self._start = step, time.monotonic()
         self.done += step
 
     @property
     def rate(self) -> float | None:
-        """How much is done in a second; None as long as nothing can be said."""
+        """Steps per second; None if unknown."""
         measured, seconds = self.done - self._warm_up, time.monotonic() - self._start
         return measured / seconds if measured > 0 and seconds > 0 else None
 
     @property
     def seconds_left(self) -> float | None:
-        """How long the rest takes; None as long as nothing can be said."""
+        """Estimated time until all steps are finished; None if unknown."""
         rate = self.rate
         return None if rate is None else (self._total - self.done) / rate
 
@@ -89,7 +88,7 @@ class Pace:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in words: "0.2 s", "42 s", "3 min 20 s", "2 h 5 min"."""
+    """Return a duration as text: "0.2 s", "42 s", "3 min 20 s", "2 h 5 min"."""
     if seconds < 10:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)

@@ -1,4 +1,4 @@
-"""Which round it is, and which detector answers in it."""
+"""Rounds as stored in the database, and the detector that predicts in each."""
 
 import json
 from pathlib import Path
@@ -24,37 +24,37 @@ def is_trainable(workspace: Workspace) -> bool:
 
 
 def is_pretrained(workspace: Workspace) -> bool:
-    """Return whether curate trains the first teacher, as the user brings no checkpoint of it."""
+    """Return whether curate trains the first teacher: the user supplies no checkpoint for it."""
     return is_trainable(workspace) and workspace.config.detector.path is None
 
 
 def is_student_trained(workspace: Workspace) -> bool:
-    """Return whether rounds end with a student: curate's own, or that of the user's command."""
+    """Return whether rounds train a student, by curate or by the user's command."""
     return is_trainable(workspace) or workspace.config.train.command is not None
 
 
 def open_round(
     workspace: Workspace, number: int | None = None, rounds: int | None = None
 ) -> RoundContext:
-    """Return a round, made where it does not exist yet.
+    """Return a round, and record it in the database with the current configuration.
 
     Args:
-        workspace: see `Workspace`.
-        number: e; None for the first that has no student yet.
-        rounds: E for a round that has no student yet; None for the configured number.
+        workspace: the workspace.
+        number: number e of the round; None for the first round without a student.
+        rounds: number E of rounds, for a round without a student; None for the configured number.
 
     Raises:
-        WorkspaceError: if the detector that would answer in the round does not exist yet or is not
-            the one that was stored, or the workspace has no frames.
+        WorkspaceError: if the workspace has no frames, or the round's teacher does not exist yet or
+            differs from the stored one.
         DatabaseError: if another process works on the round with other settings.
     """
     if not _has_frames(workspace):
         raise WorkspaceError(
-            f"{workspace.root}: holds no frames, its init was interrupted; "
-            "run `curate init` again with the same arguments"
+            f"{workspace.root}: the workspace has no frames, because its init was interrupted; "
+            "rerun `curate init` with the same arguments"
         )
     number, rounds = choose_round(workspace, number, rounds)
-    teacher_id, teacher = find_teacher(workspace, number, to_work=True)
+    teacher_id, teacher = find_teacher(workspace, number, for_use=True)
     row = {
         "number": number,
         "rounds": rounds,
@@ -68,22 +68,22 @@ def open_round(
 
 
 def choose_round(workspace: Workspace, number: int | None, rounds: int | None) -> tuple[int, int]:
-    """Return the number e of the round to work on and the count E of rounds, see `open_round`."""
+    """Return the number e of the round to work on and the number E of rounds, see `open_round`."""
     students = _students(workspace)
-    wanted = rounds or workspace.config.run.rounds
+    requested = rounds or workspace.config.run.rounds
     if number is None:
-        number = next(e for e in range(1, wanted + 1) if e not in students or e == wanted)
+        number = next(e for e in range(1, requested + 1) if e not in students or e == requested)
     stored = _stored_rounds(workspace, number)
-    return number, stored if stored and number in students else max(wanted, number)
+    return number, stored if stored and number in students else max(requested, number)
 
 
 def preview_round(
     workspace: Workspace, number: int | None = None, rounds: int | None = None
 ) -> RoundContext:
-    """Return a round as `open_round` would make it, without writing anything.
+    """Return the round that `open_round` would return, without writing anything.
 
     Raises:
-        WorkspaceError: if the detector of the round does not exist yet.
+        WorkspaceError: if the round's teacher does not exist yet.
     """
     number, rounds = choose_round(workspace, number, rounds)
     _, teacher = find_teacher(workspace, number)
@@ -91,7 +91,7 @@ def preview_round(
 
 
 def recorded_config(workspace: Workspace, number: int) -> dict[str, Any] | None:
-    """Return the configuration that a round was last worked on with; None for a new round."""
+    """Return the configuration of a round's last run; None for a new round."""
     table = bulk.table("round")
     with workspace.database.reading() as connection:
         rows = bulk.select(connection, select(table.c.config).where(table.c.number == number))
@@ -99,16 +99,16 @@ def recorded_config(workspace: Workspace, number: int) -> dict[str, Any] | None:
 
 
 def _recorded_config(workspace: Workspace) -> str:
-    """Return the configuration as JSON, without what says where and by how many the work is done.
+    """Return the configuration as JSON, without executor, workers, threads and database URL.
 
-    Several processes that differ only in this share a round; and the URL may hold a password.
+    Processes that differ only in these can share a round, and the URL may contain a password.
     """
     exclude = {"run": {"executor", "workers", "database"}, "train": {"threads"}}
     return json.dumps(workspace.config.model_dump(mode="json", exclude=exclude))
 
 
 def _record_round(workspace: Workspace, row: dict[str, Any]) -> None:
-    """Store a round; one that another process works on keeps its settings."""
+    """Store a round, unless it is stored with the same values already."""
     table, number = bulk.table("round"), row["number"]
     query = select(*(table.c[name] for name in row)).where(table.c.number == number)
     stored = workspace.database.rows(query)
@@ -123,8 +123,8 @@ def _record_round(workspace: Workspace, row: dict[str, Any]) -> None:
             connection.execute(table.insert().values(**row))
 
 
-def peek_round(workspace: Workspace, number: int) -> RoundContext | None:
-    """A round as it is stored, without making or changing it; None where its teacher is gone."""
+def stored_round(workspace: Workspace, number: int) -> RoundContext | None:
+    """Return a round without creating or changing it; None if its teacher does not exist."""
     try:
         _, teacher = find_teacher(workspace, number)
     except WorkspaceError:
@@ -134,29 +134,31 @@ def peek_round(workspace: Workspace, number: int) -> RoundContext | None:
 
 
 def find_teacher(
-    workspace: Workspace, number: int, *, to_work: bool = False
+    workspace: Workspace, number: int, *, for_use: bool = False
 ) -> tuple[int | None, Teacher]:
-    """Return the key and the file of the detector that answers in a round.
+    """Return the key and the file of the detector that predicts in a round.
 
-    A detector or checkpoint that the user brings answers in the first round, and in later ones as
-    well where it is not trained; where it is, the student of the round before does.
+    In the first round it is the user's detector or checkpoint, or the one from `curate pretrain`.
+    In later rounds it is the student of the round before. Without students, the user's detector
+    predicts in every round.
 
     Args:
-        workspace: see `Workspace`.
-        number: e.
-        to_work: whether it is about to answer, so that its file must be the one that was stored.
-            Otherwise nothing is written, and an external detector that was never used has no key.
+        workspace: the workspace.
+        number: number e of the round.
+        for_use: whether the detector is about to predict. Then its file is compared with the stored
+            hash, and an external detector is recorded. Otherwise nothing is written, and the key of
+            an external detector that was never used is None.
 
     Raises:
-        WorkspaceError: if it does not exist yet, or is another.
+        WorkspaceError: if the detector does not exist yet, or differs from the stored one.
         ConfigError: if the user's file does not exist.
-        ModelError: if it is about to answer and is not a checkpoint of the configured detector.
+        ModelError: if `for_use`, and the file is not a checkpoint of the configured detector.
     """
     trainable = trainable_detector(workspace.config)
-    brought = not is_pretrained(workspace)
-    if brought and number == 1:
-        key, teacher = _external_detector(workspace, record=to_work)
-        if to_work and trainable:
+    supplied = not is_pretrained(workspace)
+    if supplied and number == 1:
+        key, teacher = _external_detector(workspace, record=for_use)
+        if for_use and trainable:
             trainable.detector.check_checkpoint(teacher.path)
         return key, teacher
     table = bulk.table("checkpoint")
@@ -165,46 +167,46 @@ def find_teacher(
         table.c.round == number - 1, table.c.policy == policy
     )
     found = workspace.database.rows(query)
-    before = "curate pretrain" if number == 1 else f"curate train-round --round {number - 1}"
-    if not found and brought and not is_student_trained(workspace):
-        return _external_detector(workspace, record=to_work)
+    command = "curate pretrain" if number == 1 else f"curate train-round --round {number - 1}"
+    if not found and supplied and not is_student_trained(workspace):
+        return _external_detector(workspace, record=for_use)
     if not found:
-        raise WorkspaceError(f"round {number} has no teacher yet; run `{before}`")
+        raise WorkspaceError(f"round {number} has no teacher yet; run `{command}`")
     key, path, digest, detector = found[0]
-    place = workspace.root / path
-    if not (place.is_file() or place.is_dir()):  # a pipe in its place would never end
-        raise WorkspaceError(f"{place}: the checkpoint is gone; run `{before}`")
-    if to_work and sha256(place) != digest:  # its answers would be taken for those of the other
+    file = workspace.root / path
+    if not (file.is_file() or file.is_dir()):  # reading a named pipe would block forever
+        raise WorkspaceError(f"{file}: the checkpoint is missing; run `{command}`")
+    if for_use and sha256(file) != digest:  # its predictions would be stored as the old one's
         raise WorkspaceError(
-            f"{place}: has changed since it was made; put the one that was made back, or take the "
-            f"file away and run `{before}`"
+            f"{file}: the checkpoint has changed since it was trained; restore the original, or "
+            f"delete the file and run `{command}`"
         )
-    if to_work and trainable:
-        now = workspace.config.detector.name
-        if detector != now:
+    if for_use and trainable:
+        configured = workspace.config.detector.name
+        if detector != configured:
             raise WorkspaceError(
-                f"{place}: is a checkpoint of detector '{detector}', and detector.name is '{now}'; "
-                f"run `{before}`, or set detector.name back"
+                f"{file}: is a checkpoint of detector '{detector}', but detector.name is "
+                f"'{configured}'; run `{command}`, or set detector.name back"
             )
-        trainable.detector.check_checkpoint(place)
-    return key, Teacher(place, digest)
+        trainable.detector.check_checkpoint(file)
+    return key, Teacher(file, digest)
 
 
 def newest_checkpoint(workspace: Workspace) -> Path:
-    """Return the student of the last round under the configured policy, else the first teacher.
+    """Return the file of the newest student under the configured policy, or the first teacher's.
 
     Raises:
-        WorkspaceError: if there is no detector yet.
+        WorkspaceError: if no detector exists yet.
     """
     students = _students(workspace)
     number = max(students, default=0) + 1
-    return find_teacher(workspace, number, to_work=True)[1].path
+    return find_teacher(workspace, number, for_use=True)[1].path
 
 
 def register_checkpoint(
     connection: Connection, workspace: Workspace, round_number: int, policy: str, path: Path
 ) -> None:
-    """Store a checkpoint in place of an earlier one of the same round and policy."""
+    """Store a checkpoint; it replaces an earlier one of the same round and policy."""
     table = bulk.table("checkpoint")
     row = {
         "detector": workspace.config.detector.name,
@@ -218,7 +220,7 @@ def register_checkpoint(
 
 
 def _external_detector(workspace: Workspace, *, record: bool) -> tuple[int | None, Teacher]:
-    """Return the detector that the user brought, which answers in every round."""
+    """Return the key and the file of the detector that the user supplied."""
     path = workspace.config.detector.path
     if path is None:
         raise WorkspaceError(
@@ -244,7 +246,7 @@ def _has_frames(workspace: Workspace) -> bool:
 
 
 def _students(workspace: Workspace) -> set[int]:
-    """Return the rounds that have trained a student with the configured policy."""
+    """Return the numbers of the rounds that have trained a student with the configured policy."""
     table = bulk.table("checkpoint")
     query = select(table.c.round).where(table.c.policy == workspace.config.run.method)
     return {row[0] for row in workspace.database.rows(query)}

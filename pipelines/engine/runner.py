@@ -1,7 +1,7 @@
-"""Runs stages: plans by SQL, hands frames to an executor, and is the only writer.
+"""Running stages: find the stale frames, process them in an executor, and write the results.
 
-Rows and task states go into one transaction per batch, so a kill at any moment leaves every frame
-whole or untouched.
+The process that runs a stage is its only writer. Rows and task states of a batch are written in one
+transaction, so a frame is stored completely or not at all, even if the process is killed.
 """
 
 import time
@@ -39,24 +39,24 @@ from pipelines.engine.stage import (
 )
 from pipelines.workspace.workspace import Workspace
 
-READ_AHEAD = 256  # frames whose earlier rows are read at once
+READ_AHEAD = 256  # frames per query of predictions and measurements
 FLUSH_FRAMES = 64
 FLUSH_S = 1.0
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a stage did.
+    """What a run of a stage did.
 
     Attributes:
-        stage: its name.
-        round: e.
-        done, empty, failed: frames that this run brought into these states.
-        kept: frames that had been finished before.
-        labels: rows written into the stage's main table.
+        stage: name of the stage.
+        round: number e of the round.
+        done, empty, failed: numbers of frames that this run processed, by their state.
+        kept: number of frames that were finished before.
+        labels: number of rows written into the stage's main table.
         seconds: wall-clock time.
-        summary: what a round stage says of itself; "" for a frame stage.
-        errors: (frame, error) of the failed frames.
+        summary: summary of a round stage's result; "" for a stage of frames.
+        errors: (frame name, error) of the failed frames.
     """
 
     stage: str
@@ -73,7 +73,7 @@ class Report:
 
 @contextmanager
 def open_executor(workspace: Workspace) -> Iterator[Executor]:
-    """The configured executor, whose workers serve several stages."""
+    """Yield the configured executor, which can run several stages with the same workers."""
     section = workspace.config.run
     executor: Executor = registry.EXECUTORS.build(
         section.executor,
@@ -89,10 +89,10 @@ def open_executor(workspace: Workspace) -> Iterator[Executor]:
 def run_frames(
     plan: Plan, stage: FramesStage, executor: Executor, progress: Progress, split: str = "unlabeled"
 ) -> Report:
-    """Bring a stage up to date for every frame of a split that can be worked on.
+    """Bring a stage up to date for all frames of a split that the earlier stages have finished.
 
     Raises:
-        DatabaseError: if another process works on the round; the message says which.
+        DatabaseError: if another process works on the round; the message says which one.
     """
     database, number = plan.workspace.database, plan.context.number
     with database.claiming_round(number, None, stage.name):
@@ -128,19 +128,19 @@ def run_frames(
 
 
 def run_round(plan: Plan, name: str, policy: str, progress: Progress) -> Report:
-    """Bring the round stage of that name up to date for a policy.
+    """Bring the round stage with this name up to date for a policy.
 
     Raises:
         WorkspaceError: if a stage that it needs is not up to date.
         DatabaseError: if another process works on the round, or on the same policy in it.
-        LeakageError: if what guards the stage does not hold.
+        LeakageError: if the stage's guard finds data leakage.
     """
-    workspace, context, stage = plan.workspace, plan.context, plan.graph.of_rounds(name)
+    workspace, context, stage = plan.workspace, plan.context, plan.graph.round_stage(name)
     with workspace.database.claiming_round(context.number, policy, stage.name):
         if stage.guard:
             stage.guard(workspace, context, policy)
         plan.require(stage, policy)
-        frames = plan.frames_to_weigh(stage, policy)
+        frames = plan.frames_to_weight(stage, policy)
         return _run_once(
             workspace,
             TaskKey(context.number, stage.name, policy),
@@ -151,11 +151,11 @@ def run_round(plan: Plan, name: str, policy: str, progress: Progress) -> Report:
 
 
 def run_first(workspace: Workspace, stage: FirstStage, progress: Progress) -> Report:
-    """Bring a stage that is done once, before the first round, up to date.
+    """Bring a stage that runs once, before the first round, up to date.
 
     Raises:
         DatabaseError: if another process works on it.
-        LeakageError: if what guards the stage does not hold.
+        LeakageError: if the stage's guard finds data leakage.
     """
     settings = stage.settings(workspace)
     with workspace.database.claiming_round(0, None, stage.name):
@@ -171,33 +171,33 @@ def run_first(workspace: Workspace, stage: FirstStage, progress: Progress) -> Re
 
 def _run_once(
     workspace: Workspace,
-    what: TaskKey,
+    key: TaskKey,
     fingerprint: str,
     file: Path | None,
     make: Callable[[], Product],
 ) -> Report:
-    """Does what is done once, unless it has been done with this fingerprint and its file is there.
+    """Run a task that has no frames, unless it is stored with this fingerprint and its file exists.
 
     Its rows and its task are stored in one transaction.
     """
     start = time.perf_counter()
-    if is_current(workspace, what, fingerprint) and (file is None or file.exists()):
-        return Report(what.stage, what.round, kept=1, summary="up to date")
+    if is_current(workspace, key, fingerprint) and (file is None or file.exists()):
+        return Report(key.stage, key.round, kept=1, summary="up to date")
     product = make()
     seconds = time.perf_counter() - start
     with workspace.database.writing(keys_known=product.keys_known) as connection:
         product.write(connection)
-        connection.execute(bulk.table("task").delete().where(*what.conditions()))
+        connection.execute(bulk.table("task").delete().where(*key.conditions()))
         task = {
-            "round": what.round,
-            "stage": what.stage,
-            "variant": what.variant,
+            "round": key.round,
+            "stage": key.stage,
+            "variant": key.variant,
             "fingerprint": fingerprint,
             "state": "done",
             "seconds": seconds,
         }
         bulk.insert_rows(connection, "task", [task])
-    return Report(what.stage, what.round, done=1, seconds=seconds, summary=product.summary)
+    return Report(key.stage, key.round, done=1, seconds=seconds, summary=product.summary)
 
 
 def _outcomes(
@@ -207,23 +207,26 @@ def _outcomes(
     executor: Executor,
     skip: Callable[[Sequence[int]], None],
 ) -> Iterator[Outcome]:
-    """Yield the executor works on frames or sequences; frames with valid measurements need none."""
+    """Yield the outcomes of all waiting frames or sequences.
+
+    Frames with reusable measurements are processed last and in this process, without the executor.
+    """
     if isinstance(stage, SequenceStage):
         jobs: Iterator[Job] = _sequence_jobs(plan, plan.waiting_sequences(stage, split))
     else:
         frames = plan.waiting_frames(stage, split, measured=False)
         jobs = _frame_jobs(plan, "prediction" in stage.reads, frames, skip)
-    # The models are loaded only where a frame needs them.
+    # Start the executor, which loads the models, only if there is a first job.
     for first in jobs:
         function: JobFunction = stage.function(plan.workspace, plan.context)
         yield from executor.map(function, chain([first], jobs))
-    if isinstance(stage, SequenceStage) or not stage.recall:
+    if isinstance(stage, SequenceStage) or not stage.reusable:
         return
     frames = plan.waiting_frames(stage, split, measured=True)
-    jobs = _frame_jobs(plan, "prediction" in stage.reads, frames, skip, stage.recall)
+    jobs = _frame_jobs(plan, "prediction" in stage.reads, frames, skip, stage.reusable)
     for first in jobs:
-        rate = stage.recall.function(plan.workspace, plan.context)
-        yield from SerialExecutor().map(rate, chain([first], jobs))
+        function = stage.reusable.function(plan.workspace, plan.context)
+        yield from SerialExecutor().map(function, chain([first], jobs))
 
 
 def _frame_jobs(
@@ -231,11 +234,11 @@ def _frame_jobs(
     with_predictions: bool,
     frames: Iterable[WaitingFrame],
     skip: Callable[[Sequence[int]], None],
-    recall: ReusableMeasurements | None = None,
+    reusable: ReusableMeasurements | None = None,
 ) -> Iterator[FrameJob]:
-    """Yield the jobs of frames, with their predictions and measurements where they are needed.
+    """Yield the jobs of frames, with the predictions and measurements that the stage needs.
 
-    Frames that an earlier stage found empty are not jobs; `skip` records them.
+    Frames that an earlier stage found empty get no job; `skip` records them as empty.
     """
     workspace, context = plan.workspace, plan.context
     for batch in batched(frames, READ_AHEAD):
@@ -243,7 +246,7 @@ def _frame_jobs(
             skip(empty)
         keys = [frame.key for frame in batch if not frame.empty]
         found = workspace.predictions(context.number, keys) if with_predictions else {}
-        measured = recall.read(workspace, context, keys) if recall else {}
+        measured = reusable.read(workspace, context, keys) if reusable else {}
         for frame in batch:
             if not frame.empty:
                 key = frame.key
@@ -253,7 +256,7 @@ def _frame_jobs(
 def _sequence_jobs(
     plan: Plan, sequences: Iterable[tuple[str, list[WaitingFrame]]]
 ) -> Iterator[SequenceJob]:
-    """Yield the jobs of sequences, each frame with its predictions, empty ones too."""
+    """Yield the jobs of sequences, with the predictions of each frame; frames may be empty."""
     for name, frames in sequences:
         keys = [frame.key for frame in frames]
         found = plan.workspace.predictions(plan.context.number, keys)
@@ -263,43 +266,43 @@ def _sequence_jobs(
 
 
 class _Writer:
-    """Collects outcomes and writes them, with their tasks, a batch per transaction."""
+    """Collects outcomes and writes them with their tasks, one transaction per batch."""
 
     def __init__(self, plan: Plan, stage: FramesStage) -> None:
-        self.database = plan.workspace.database
+        self._database = plan.workspace.database
         self.round = plan.context.number
         self.stage = stage
         self.fingerprint = plan.fingerprint(stage)
-        self.of_sequences = [
+        self._sequence_stages = [
             other.name for other in plan.graph.stages if isinstance(other, SequenceStage)
         ]
         self.done = self.empty = self.failed = self.labels = 0
         self.errors: list[tuple[str, str]] = []
-        self._waiting: list[Outcome] = []
+        self._pending: list[Outcome] = []
         self._flushed = time.monotonic()
 
     def add(self, outcome: Outcome) -> None:
-        """Take an outcome; it is stored with its batch."""
-        self._waiting.append(outcome)
-        if len(self._waiting) >= FLUSH_FRAMES or time.monotonic() - self._flushed > FLUSH_S:
+        """Add an outcome to the batch, and write the batch if it is due."""
+        self._pending.append(outcome)
+        if len(self._pending) >= FLUSH_FRAMES or time.monotonic() - self._flushed > FLUSH_S:
             self.flush()
 
     def skip(self, keys: Sequence[int]) -> None:
         """Record frames without predictions as empty."""
-        with self.database.writing() as connection:
+        with self._database.writing() as connection:
             self._clear(connection, keys)
             tasks = [self._task(key, "empty", None, 0.0) for key in keys]
             bulk.insert_rows(connection, "task", tasks)
         self.empty += len(keys)
 
     def flush(self) -> None:
-        """Store what has been collected, whole or not at all."""
-        outcomes, self._waiting = self._waiting, []
+        """Write the batch in one transaction."""
+        outcomes, self._pending = self._pending, []
         self._flushed = time.monotonic()
         if not outcomes:
             return
         frames = [pair for outcome in outcomes for pair in _frames_of(outcome)]
-        with self.database.writing() as connection:
+        with self._database.writing() as connection:
             self._clear(connection, [job.frame_id for job, _ in frames])
             for table in self.stage.writes:
                 columns = _joined([(job.frame_id, rows.get(table, {})) for job, rows in frames])
@@ -331,14 +334,15 @@ class _Writer:
             self.errors.append((job.frame, outcome.error))
 
     def _clear(self, connection: Connection, keys: Sequence[int]) -> None:
-        """Remove what an earlier run stored, and the tasks of all whose rows leave with it.
+        """Delete the stage's former rows of these frames, and the tasks whose rows are lost.
 
-        All that is known of a frame hangs on its predictions and leaves with them. A task that
-        stayed would make the frame count as done once the former settings are back.
+        Deleting predictions deletes all evidence and weights of the frame by foreign keys. If a
+        task of such evidence stayed, the frame would count as done after a change back to the
+        former settings.
         """
         whole = "prediction" in self.stage.writes
-        if whole:  # as long as the weights say which policies these are
-            self._forget_weights(connection, keys)
+        if whole:  # first: the weights, which are deleted below, show which policies are affected
+            self._delete_weight_tasks(connection, keys)
         for table in self.stage.writes:
             bulk.delete_frames(connection, table, self.round, keys)
         task = bulk.table("task")
@@ -346,13 +350,13 @@ class _Writer:
         if not whole:
             connection.execute(task.delete().where(*here, task.c.stage == self.stage.name))
             return
-        of_sequences = (task.c.round == self.round, task.c.stage.in_(self.of_sequences))
-        touched = select(task.c.variant).where(*of_sequences, task.c.frame_id.in_(keys))
-        connection.execute(task.delete().where(*of_sequences, task.c.variant.in_(touched)))
+        sequence_tasks = (task.c.round == self.round, task.c.stage.in_(self._sequence_stages))
+        touched = select(task.c.variant).where(*sequence_tasks, task.c.frame_id.in_(keys))
+        connection.execute(task.delete().where(*sequence_tasks, task.c.variant.in_(touched)))
         connection.execute(task.delete().where(*here))
 
-    def _forget_weights(self, connection: Connection, keys: Sequence[int]) -> None:
-        """Remove tasks and counts of the policies that have weighed labels of these frames."""
+    def _delete_weight_tasks(self, connection: Connection, keys: Sequence[int]) -> None:
+        """Delete tasks and counts of the policies that have weighted labels of these frames."""
         task, weight, count = map(bulk.table, ("task", "weight", "label_count"))
         weighted = (weight.c.round == self.round, weight.c.frame_id.in_(keys))
         policies = select(weight.c.policy).where(*weighted)
@@ -370,7 +374,7 @@ class _Writer:
     def _task(
         self, key: int, state: str, error: str | None, seconds: float, job: Job | None = None
     ) -> dict[str, Any]:
-        """Return a row of `task`; its variant is the sequence, for a stage of sequences."""
+        """Return a row of `task`; for a stage of sequences its variant is the sequence."""
         return {
             "round": self.round,
             "stage": self.stage.name,
@@ -384,7 +388,7 @@ class _Writer:
 
 
 def _frames_of(outcome: Outcome) -> Iterator[tuple[FrameJob, FrameRows]]:
-    """Return each frame of an outcome with its rows, which a failed one does not have."""
+    """Return each frame of an outcome with its rows; a failed one has no rows."""
     rows = outcome.rows or ({},) * len(outcome.job.frames)
     return zip(outcome.job.frames, rows, strict=True)
 
@@ -394,7 +398,7 @@ def _length(columns: Mapping[str, Sequence[Any]]) -> int:
 
 
 def _joined(parts: Sequence[tuple[int, Mapping[str, Sequence[Any]]]]) -> dict[str, list[Any]]:
-    """Return the columns of several frames below each other, with the key of the frame."""
+    """Return the concatenated columns of several frames, with the frame's key in each row."""
     joined: dict[str, list[Any]] = {"frame_id": []}
     for key, columns in parts:
         joined["frame_id"] += [key] * _length(columns)

@@ -1,4 +1,4 @@
-"""All rounds, stage after stage."""
+"""Running all stages of all rounds."""
 
 from collections.abc import Iterator
 
@@ -21,18 +21,18 @@ def run_all(
     train: bool = True,
     evidence: bool = True,
 ) -> Iterator[Report]:
-    """Bring every stage of every round up to date, and report what each did as it ends.
+    """Bring every stage of every round up to date, and yield the report of each when it ends.
 
-    An external detector is trained only by the user's own command (`train.command`); without it,
-    it has one round, without a student.
+    An external detector is trained only by the user's own command (`train.command`). Without one,
+    there is a single round without a student.
 
     Args:
-        workspace: see `Workspace`.
+        workspace: the workspace.
         graph: the stages.
-        rounds: E; None for the configured number.
-        progress: see `Progress`.
-        train: whether students are trained; without them only the first round can be run.
-        evidence: whether frames are predicted and scored; false only for a policy that uses no
+        rounds: number E of rounds; None for the configured number.
+        progress: shows the progress of each stage.
+        train: whether students are trained; without them only the first round can run.
+        evidence: whether to run the stages of frames; False only for a policy that uses no
             unlabeled frames.
     """
     trained = train and is_student_trained(workspace)
@@ -52,10 +52,10 @@ def run_all(
 
 
 def check_stages(workspace: Workspace, graph: Graph, policy: str, *, evidence: bool = True) -> None:
-    """Check what can be known to be wrong with the stages' settings before any work.
+    """Check the settings of the executor and of all stages before any of them runs.
 
     Raises:
-        CurateError: if a stage or the executor could not work.
+        CurateError: if a setting is wrong.
     """
     check_executor(workspace.config)
     for stage in graph.stages:

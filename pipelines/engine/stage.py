@@ -1,4 +1,4 @@
-"""What a stage is: a named step that reads some tables and writes others."""
+"""The types of stages. A stage is a named step that reads some tables and writes others."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ Settings = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Teacher:
-    """The detector that answers in a round.
+    """The detector that predicts in a round.
 
     Attributes:
-        path: its checkpoint, or the file that the user brought.
-        sha256: of that file.
+        path: its checkpoint, or the file or folder that the user supplied.
+        sha256: hash of that file or folder.
     """
 
     path: Path
@@ -31,13 +31,13 @@ class Teacher:
 
 @dataclass(frozen=True)
 class RoundContext:
-    """Which round it is.
+    """A round and its teacher.
 
     Attributes:
-        number: e, from 1.
-        rounds: E.
-        seed: of the workspace.
-        teacher: see `Teacher`.
+        number: number e of the round, from 1.
+        rounds: number E of rounds.
+        seed: seed of the workspace.
+        teacher: the detector that predicts.
     """
 
     number: int
@@ -47,17 +47,17 @@ class RoundContext:
 
     @property
     def age(self) -> Age:
-        """Number and count of rounds, for the policies."""
+        """Number of the round and number of rounds, for the policies."""
         return Age(self.number, self.rounds)
 
 
 @dataclass(frozen=True)
 class RoundJob:
-    """What a round stage works on.
+    """The input of a round stage.
 
     Attributes:
         context: the round.
-        policy: whose weights.
+        policy: name of the policy.
         frames: keys of the unlabeled frames that all earlier stages have finished.
     """
 
@@ -68,11 +68,11 @@ class RoundJob:
 
 @dataclass(frozen=True)
 class Product:
-    """What a round stage has made.
+    """The result of a round stage.
 
     Attributes:
-        summary: what it did, in a few words.
-        write: stores its rows, in the transaction that also records the stage as done.
+        summary: the result in a few words, for the report.
+        write: function that stores its rows, in the transaction that records the stage as done.
         keys_known: see `db.session.Database.writing`.
     """
 
@@ -83,13 +83,13 @@ class Product:
 
 @dataclass(frozen=True)
 class ReusableMeasurements:
-    """How a stage goes on from what it once measured, where only the formula has changed.
+    """How a stage computes its rows from stored measurements, if only the formula has changed.
 
     Attributes:
-        reads: tables or sources; together with `settings` all that its measurements depend on.
-        settings: what they depend on beside what it reads.
-        read: the measured columns of some frames, by key.
-        function: what it does with a frame and its measurements, without looking at the frame.
+        reads: tables or sources that the measurements depend on.
+        settings: function that returns the settings that they depend on.
+        read: function that returns the measured columns of some frames, by frame key.
+        function: what the stage does with a frame's measurements, without reading the frame.
     """
 
     reads: tuple[str, ...]
@@ -100,13 +100,13 @@ class ReusableMeasurements:
 
 @dataclass(frozen=True)
 class _Stage:
-    """What all stages have.
+    """The common part of all stages.
 
     Attributes:
-        name: of the stage and, with underscores, of its file.
-        command: that runs it.
-        reads: tables or sources; together with `settings` all that its rows depend on.
-        writes: tables or files.
+        name: name of the stage and, with underscores, of its module.
+        command: command that runs it.
+        reads: tables or sources that its rows depend on.
+        writes: tables or files that it writes.
     """
 
     name: str
@@ -117,13 +117,13 @@ class _Stage:
 
 @dataclass(frozen=True, kw_only=True)
 class FirstStage(_Stage):
-    """A stage that is done once in a workspace, before the first round.
+    """A stage that runs once in a workspace, before the first round.
 
     Attributes:
-        settings: all that its result depends on.
-        run: does it.
-        file: what it leaves on disk.
-        guard: what must hold at every start, even where the stage is up to date; raises.
+        settings: function that returns everything that the result depends on.
+        run: function that does the work.
+        file: function that returns the path of the file it writes.
+        guard: check at every start, even if the stage is up to date; raises LeakageError.
     """
 
     settings: Callable[[Workspace], Any]
@@ -134,12 +134,13 @@ class FirstStage(_Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class _FramesStage(_Stage):
-    """What the stages have whose rows belong to frames.
+    """The common part of the stages with rows that belong to frames.
 
     Attributes:
-        settings: what its rows depend on beside what it reads and recalls.
-        check: what can be known before the first frame to be wrong with its settings; raises.
-        prepare: makes what it writes to, where that is not there yet.
+        settings: function that returns the settings that its rows depend on, without those of
+            its reusable measurements.
+        check: check of its settings before the first frame; raises an error.
+        prepare: function that creates the tables it writes to, if they are missing.
     """
 
     settings: Callable[[Workspace, RoundContext], Settings]
@@ -149,25 +150,26 @@ class _FramesStage(_Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class FrameStage(_FramesStage):
-    """A stage that treats every frame alone.
+    """A stage that processes every frame by itself.
 
     Attributes:
-        function: what it does with a frame.
-        recall: see `Recall`; None where there is nothing that could be kept.
+        function: function that returns what the stage does with a frame.
+        reusable: how it reuses its stored measurements; None if it has none.
     """
 
     function: Callable[[Workspace, RoundContext], FrameFunction]
-    recall: ReusableMeasurements | None = None
+    reusable: ReusableMeasurements | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceStage(_FramesStage):
-    """A stage that looks at all frames of a sequence together, planned and resumed per sequence.
+    """A stage that processes all frames of a sequence together.
 
-    A frame of no known sequence is a sequence of its own. Frames that failed before are left out.
+    It is planned and resumed per sequence. A frame without a sequence forms one by itself. Frames
+    that failed in an earlier stage are left out.
 
     Attributes:
-        function: what it does with a sequence.
+        function: function that returns what the stage does with a sequence.
     """
 
     function: Callable[[Workspace, RoundContext], SequenceFunction]
@@ -175,15 +177,16 @@ class SequenceStage(_FramesStage):
 
 @dataclass(frozen=True, kw_only=True)
 class RoundStage(_Stage):
-    """A stage that looks at all labels of a round at once, for one policy.
+    """A stage that processes all labels of a round at once, for one policy.
 
     Attributes:
-        settings: what its result depends on beside what it reads; the last argument is the policy.
-        run: does it.
-        file: what it leaves on disk, if anything.
-        guard: what must hold at every start, even where the stage is up to date; raises.
+        settings: function that returns the settings that its result depends on; the last argument
+            is the policy.
+        run: function that does the work.
+        file: function that returns the path of the file it writes; None if it writes none.
+        guard: check at every start, even if the stage is up to date; raises LeakageError.
         needs: round stages that must be up to date for the same policy before this one runs.
-        check: what can be known before any work to be wrong with its settings; raises.
+        check: check of its settings before any work; raises an error.
     """
 
     settings: Callable[[Workspace, RoundContext, str], Settings]
@@ -195,5 +198,5 @@ class RoundStage(_Stage):
 
 
 FramesStage = FrameStage | SequenceStage
-"""A stage whose rows belong to frames."""
+"""A stage with rows that belong to frames."""
 Stage = FirstStage | FrameStage | SequenceStage | RoundStage

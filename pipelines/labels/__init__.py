@@ -1,1 +1,1 @@
-"""Stored labels and their evidence, read back from the database."""
+"""Reading stored labels and their evidence from the database."""

@@ -1,4 +1,4 @@
-"""Whether a policy has weighted the labels of a round, and with weights that can be."""
+"""Checks of the stored weights: whether a round has any, and whether they are in [0, 1]."""
 
 from sqlalchemy import BindParameter, Connection, bindparam, func, or_, select
 
@@ -9,7 +9,7 @@ from pipelines.workspace.workspace import Workspace
 
 
 def weighted_round(workspace: Workspace, policy: str, number: int | None = None) -> int | None:
-    """The round asked for, or the last one; None where the policy has weighted nothing in it."""
+    """Return the given round, or the last one with weights of a policy; None if it has none."""
     weight = bulk.table("weight")
     query = select(func.max(weight.c.round)).where(weight.c.policy == policy)
     if number is not None:
@@ -19,8 +19,8 @@ def weighted_round(workspace: Workspace, policy: str, number: int | None = None)
     return found
 
 
-def unweighted(round_number: int, policy: str) -> WorkspaceError:
-    """What is wrong where a policy has weighted nothing in a round."""
+def not_weighted_error(round_number: int, policy: str) -> WorkspaceError:
+    """Return the error for a round without weights of a policy."""
     return WorkspaceError(
         f"round {round_number} has no labels weighted by {policy}; "
         f"run `curate solve --round {round_number} --policy {policy}`"
@@ -32,17 +32,18 @@ def check_weights(
 ) -> None:
     """Raise DataError if a weight of a round, or of one frame in it, is not in [0, 1].
 
-    No policy makes one, but SQLite keeps whatever else writes into the table.
+    No policy returns such a weight, but another program can write it into an SQLite file.
     """
     weight, frames = bulk.table("weight"), bulk.table("frame")
-    # A value in the text of the query lets the policy's own index answer it.
-    chosen: BindParameter[str] = bindparam("policy", policy, literal_execute=True)
-    # Text and NaN are beyond 1, in the order of either database.
-    impossible = or_(weight.c.v < 0, weight.c.v > 1, weight.c.v.is_(None))
+    # The policy is written into the text of the query: with a parameter, SQLite could not use the
+    # partial index of the policy.
+    selected: BindParameter[str] = bindparam("policy", policy, literal_execute=True)
+    # SQLite orders text after all numbers, and PostgreSQL orders NaN so: both are greater than 1.
+    invalid = or_(weight.c.v < 0, weight.c.v > 1, weight.c.v.is_(None))
     query = (
         select(frames.c.frame, weight.c.k, weight.c.v)
         .join(frames, frames.c.id == weight.c.frame_id)
-        .where(weight.c.round == round_number, weight.c.policy == chosen, impossible)
+        .where(weight.c.round == round_number, weight.c.policy == selected, invalid)
         .limit(1)
     )
     if frame is not None:

@@ -1,4 +1,4 @@
-"""The labels of rounds as aligned columns, all at once or a block of frames at a time."""
+"""Labels of rounds as aligned columns: all at once, or a block of frames at a time."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,24 +13,24 @@ from db import bulk
 from db.evidence import weighted_label_columns
 from db.models import BOX_COLUMNS
 from db.views import weighted_labels
-from pipelines.labels.by_frame import check_weights, unweighted
+from pipelines.labels.by_frame import check_weights, not_weighted_error
 from pipelines.workspace.workspace import Workspace
 
 _BLOCK_FRAMES = 1000
-# SQLite looks so few frames up one by one; for more it would walk through the whole round.
-_ASKED_FRAMES = 8
+# SQLite looks up this many frames one by one; with more it would scan the whole round.
+_FRAMES_PER_QUERY = 8
 
 
 @dataclass(frozen=True)
 class LabelColumns:
-    """The n labels of a round with the weights of one policy, by frame and k.
+    """The n labels of a round with the weights of one policy, sorted by frame name and k.
 
     Attributes:
-        frame_names: name of each frame that has labels.
-        frames: (n,) int64 place in `frame_names`.
-        k: (n,) int64.
-        categories: (n,) int64 place in `category_names`.
-        category_names: those of the configuration.
+        frame_names: sorted names of the frames with labels.
+        frames: (n,) int64 index into `frame_names`.
+        k: (n,) int64 number of the label within its frame.
+        categories: (n,) int64 index into `category_names`.
+        category_names: the configured categories, then others that occur.
         boxes: (n, 7) in the LiDAR frame.
         numbers: (n,) float64 columns of `weighted_labels` by name; NaN for null.
     """
@@ -48,12 +48,12 @@ class LabelColumns:
 
     @property
     def weights(self) -> np.ndarray:
-        """(n,) in [0, 1]."""
+        """(n,) weights in [0, 1]."""
         return self.numbers["weight"]
 
 
 def numeric_columns(connection: Connection) -> list[str]:
-    """Return the numeric columns of `weighted_labels` beside the keys and the box."""
+    """Return the names of the numeric columns of `weighted_labels` without keys and box."""
     return [
         column.name
         for column in weighted_label_columns(connection)
@@ -72,7 +72,7 @@ def read_columns(workspace: Workspace, round_number: int, policy: str) -> LabelC
         check_weights(connection, round_number, policy)
         found = _read(workspace, connection, round_number, policy)
     if not len(found):
-        raise unweighted(round_number, policy)
+        raise not_weighted_error(round_number, policy)
     return found
 
 
@@ -87,9 +87,10 @@ def read_frame_columns(
 def read_blocks(
     workspace: Workspace, rounds: Sequence[int], policy: str
 ) -> Iterator[tuple[LabelColumns, ...]]:
-    """The labels of some rounds, the same frames of each at a time, in the order of their names.
+    """Yield the labels of some rounds in blocks of frames; a block has the same frames of each.
 
-    So much of millions of labels is in memory as a thousand frames hold.
+    The frames are in the order of their names. Only the labels of a thousand frames per round are
+    in memory at a time.
 
     Raises:
         WorkspaceError: if the policy has weighted nothing in one of the rounds.
@@ -107,7 +108,7 @@ def read_blocks(
             yield tuple(found[each] for each in rounds)
     for each, count in labels.items():
         if not count:
-            raise unweighted(each, policy)
+            raise not_weighted_error(each, policy)
 
 
 def _read(
@@ -115,34 +116,35 @@ def _read(
     connection: Connection,
     round_number: int,
     policy: str,
-    wanted: Sequence[str] | None = None,
+    frames: Sequence[str] | None = None,
 ) -> LabelColumns:
-    """Return the labels of a round, of all frames or of the wanted ones."""
+    """Return the labels of a round, of all frames or of those with the given names."""
     view = weighted_labels(connection).c
     kinds: dict[str, Any] = {"frame": Text(), "k": Integer(), "category": Text()}
     kinds |= dict.fromkeys((*BOX_COLUMNS, *numeric_columns(connection)), Float())
-    # Not ordered: the database would write millions of whole rows to its disk to sort them.
+    # Without ORDER BY: to sort millions of rows, the database would write them to the disk.
     columns = [type_coerce(view[name], kind).label(name) for name, kind in kinds.items()]
     query: Select[Any] = select(*columns)
     query = query.where(view.round == round_number, view.policy == policy)
     queries = [query]
-    if wanted is not None:
-        queries = [query.where(view.frame.in_(part)) for part in batched(wanted, _ASKED_FRAMES)]
+    if frames is not None:
+        batches = batched(frames, _FRAMES_PER_QUERY)
+        queries = [query.where(view.frame.in_(batch)) for batch in batches]
     parts = [bulk.select_columns(connection, each) for each in queries]
     found = {name: np.concatenate([part[name] for part in parts]) for name in kinds}
     return ordered(found, workspace.config.dataset.categories)
 
 
 def ordered(found: dict[str, np.ndarray], categories: tuple[str, ...]) -> LabelColumns:
-    """Return (n,) columns by frame and k, whatever the order in which the database gave them.
+    """Return columns sorted by frame name and k.
 
     Args:
-        found: frame, k, category, the box and further numbers by name.
-        categories: that come first in the numbering.
+        found: (n,) columns by name, in any order: frame, k, category, the box, further numbers.
+        categories: the configured categories, which are numbered first.
     """
     names, frames = np.unique(found["frame"], return_inverse=True)
     order = np.lexsort([found["k"], frames])
-    present, own = np.unique(found["category"], return_inverse=True)
+    present, inverse = np.unique(found["category"], return_inverse=True)
     categories = tuple(dict.fromkeys((*categories, *present.tolist())))
     number = np.array([categories.index(name) for name in present], dtype=np.int64)
     keys = ("frame", "k", "category", *BOX_COLUMNS)
@@ -150,7 +152,7 @@ def ordered(found: dict[str, np.ndarray], categories: tuple[str, ...]) -> LabelC
         names.tolist(),
         frames[order],
         found["k"][order],
-        number[own[order]],
+        number[inverse[order]],
         categories,
         np.stack([found[name][order] for name in BOX_COLUMNS], axis=1),
         {name: values[order] for name, values in found.items() if name not in keys},
@@ -158,7 +160,7 @@ def ordered(found: dict[str, np.ndarray], categories: tuple[str, ...]) -> LabelC
 
 
 def as_rounds(before: LabelColumns, after: LabelColumns) -> tuple[RoundLabels, RoundLabels]:
-    """Both rounds with one numbering of frames and categories."""
+    """Return both rounds with a common numbering of frames and categories."""
     frames = np.union1d(np.array(before.frame_names, str), np.array(after.frame_names, str))
     names = tuple(dict.fromkeys((*before.category_names, *after.category_names)))
     one, other = (

@@ -1,4 +1,24 @@
-"""What is known of the labels of a round, read from the database in columns."""
+"""Reading the evidence of a round's labels as aligned columns, for the policies.
+
+`prediction` has one row per label, and each table of evidence has at most one row with the same
+key. Left joins of these tables therefore give exactly one row per label, in the order of the key:
+
+    SELECT p.frame_id, p.k, p.category, p.score, c.loss, pp.rho_diff, sp.rho_anno
+    FROM prediction AS p
+    LEFT JOIN consistency AS c     ON (c.round, c.frame_id, c.k) = (p.round, p.frame_id, p.k)
+    LEFT JOIN point_prior AS pp    ON ...the same key
+    LEFT JOIN semantic_prior AS sp ON ...the same key
+    WHERE p.round = 1 ORDER BY p.frame_id, p.k
+
+    frame_id   k   category     score   loss   rho_diff   rho_anno
+    7          0   Car          0.91    0.12   1.0        0.83
+    7          1   Pedestrian   0.34    NaN    0.4        0.21      no view matched: no evidence L
+    9          0   Car          0.55    0.70   0.9        NaN       frame 9 failed in semantic
+
+Rows of frames that are not complete, such as frame 9, are then dropped. The first three columns
+become `LabelKeys`, the others `Evidence`. `solve` computes a weight for each row, and stores it
+with the row's keys.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,11 +38,11 @@ from pipelines.workspace.workspace import Workspace
 
 @dataclass(frozen=True)
 class LabelKeys(Columns):
-    """The keys and categories of the n labels of some frames, by frame and k.
+    """The keys and categories of n labels, sorted by frame key and k.
 
     Attributes:
-        frame_id: (n,) int64.
-        k: (n,) int64.
+        frame_id: (n,) int64 key of the frame.
+        k: (n,) int64 number of the label within its frame.
         category: (n,) str.
     """
 
@@ -39,24 +59,24 @@ def read_evidence(
     boxes: bool = False,
     columns: Collection[str] | None = None,
 ) -> tuple[LabelKeys, Evidence]:
-    """Return the evidence of all labels of some frames, and their keys.
+    """Return the keys of all labels of some frames, and their evidence.
 
     Args:
-        workspace: see `Workspace`.
-        round_number: e.
+        workspace: the workspace.
+        round_number: number e of the round.
         frames: keys of the frames.
-        boxes: whether to read the boxes, which few policies look at.
-        columns: of "category", "score", "iou" and "loss", those that the evidence holds; None for
-            all. The others are NaN and not read. The category is read in any case, for the keys
-            hold it and solve counts labels by it: to count in SQL takes nearly twice as long as
-            to read it. The evidence has "" in its place.
+        boxes: whether to read the boxes, which only few policies need.
+        columns: those of "category", "score", "iou" and "loss" to return; None for all. The others
+            are not read, and are NaN in the evidence ("" for the category). The keys have the
+            category in any case: solve counts labels per category, which takes twice as long in
+            SQL.
     """
-    wanted = {"category", "score", "iou", "loss"} if columns is None else set(columns)
+    requested = {"category", "score", "iou", "loss"} if columns is None else set(columns)
     for source in sources_of(workspace.config.run.priors):
         prepare_table(workspace, source)
     rho = rho_columns(workspace.config.run.priors)
     measured = {"score": "prediction", "iou": "prediction", "loss": "consistency"}
-    tables = {name: table for name, table in measured.items() if name in wanted} | rho
+    tables = {name: table for name, table in measured.items() if name in requested} | rho
     if boxes:
         tables |= dict.fromkeys(BOX_COLUMNS, "prediction")
     with workspace.database.reading() as connection:
@@ -68,7 +88,7 @@ def read_evidence(
     missing = np.broadcast_to(np.nan, len(keys))
     return keys, Evidence(
         frame_index=keys.frame_id,
-        category=keys.category if "category" in wanted else np.broadcast_to("", len(keys)),
+        category=keys.category if "category" in requested else np.broadcast_to("", len(keys)),
         score=found.get("score", missing),
         loss=found.get("loss", missing),
         rho={column: found[column] for column in rho},
@@ -78,11 +98,11 @@ def read_evidence(
 
 
 def _aligned(round_number: int, tables: Mapping[str, str]) -> Select[Any]:
-    """Return the predictions of a round by frame and k, each with columns of several tables.
+    """Return the query for the predictions of a round with columns of several tables.
 
     Args:
-        round_number: e.
-        tables: the table of each column; null where it has no row of a label.
+        round_number: number e of the round.
+        tables: table of each column; a label without a row in it gets null.
     """
     label = bulk.table("prediction")
     joined: FromClause = label
@@ -101,10 +121,10 @@ def _aligned(round_number: int, tables: Mapping[str, str]) -> Select[Any]:
 
 
 def read_memory(workspace: Workspace, round_number: int, policy: str) -> Memory:
-    """Return the labels of a round that a policy has weighed and not dropped.
+    """Return the labels of a round that a policy has weighted and not dropped.
 
     Raises:
-        WorkspaceError: if the policy has not weighed that round.
+        WorkspaceError: if the policy has not weighted that round.
     """
     weight, prediction = bulk.table("weight"), bulk.table("prediction")
     same = and_(*(weight.c[key] == prediction.c[key] for key in ("round", "frame_id", "k")))
@@ -119,7 +139,7 @@ def read_memory(workspace: Workspace, round_number: int, policy: str) -> Memory:
     )
     if solved_fingerprint(workspace, round_number, policy) is None:
         raise WorkspaceError(
-            f"policy {policy} remembers round {round_number}, which it has not weighed; "
+            f"policy {policy} needs its weights of round {round_number}, which do not exist yet; "
             f"run `curate solve --policy {policy} --round {round_number}`"
         )
     with workspace.database.reading() as connection:
@@ -129,9 +149,11 @@ def read_memory(workspace: Workspace, round_number: int, policy: str) -> Memory:
 
 
 def solved_fingerprint(workspace: Workspace, round_number: int, policy: str) -> str | None:
-    """What the stored weights of a round and policy were made from; None where there are none."""
+    """Return the fingerprint of a policy's stored weights of a round; None if there are none."""
     task = bulk.table("task")
-    mine = {"round": round_number, "stage": "solve", "variant": policy}
-    query = select(task.c.fingerprint).where(*(task.c[name] == at for name, at in mine.items()))
+    key = {"round": round_number, "stage": "solve", "variant": policy}
+    query = select(task.c.fingerprint).where(
+        *(task.c[name] == value for name, value in key.items())
+    )
     found = workspace.database.rows(query)
     return found[0][0] if found else None

@@ -1,4 +1,4 @@
-"""The stored decisions of people, and the predictions of each round that they speak for."""
+"""The stored human labels, and the predictions of each round that match them."""
 
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -15,21 +15,21 @@ from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.workspace.workspace import Workspace
 
-# Frames that one statement names; SQLite takes some thousands of parameters.
-_ASKED_AT_ONCE = 400
+# SQLite limits the number of parameters of a statement.
+_FRAMES_PER_STATEMENT = 400
 
 SEEN_COLUMNS = tuple(f"seen_{name}" for name in BOX_COLUMNS)
 FIRST_K = 1_000_000
-"""Human labels for which no prediction stands have k from here on in `weighted_labels`."""
+"""In `weighted_labels`, a human label without a matching prediction has k = FIRST_K + n."""
 
 
 @dataclass(frozen=True)
 class StoredLabels:
-    """The human labels of one frame with their numbers.
+    """The n human labels of one frame.
 
     Attributes:
-        n: (n,) int64, their key within the frame.
-        labels: see `HumanLabels`.
+        n: (n,) int64 number of each label within the frame.
+        labels: the labels.
     """
 
     n: np.ndarray
@@ -41,23 +41,23 @@ def read_human_labels(
     frame_ids: Collection[int] | None = None,
     *,
     until_round: int | None = None,
-    but_of: str | None = None,
+    exclude_review: str | None = None,
 ) -> dict[int, StoredLabels]:
     """Return the human labels by frame key.
 
     Args:
-        connection: to the database.
-        frame_ids: of which frames; None for all.
-        until_round: only those that count in this round.
-        but_of: leaves those of a review out.
+        connection: connection to the database.
+        frame_ids: keys of the frames; None for all.
+        until_round: number of a round; only the labels that are valid in it are returned.
+        exclude_review: id of a review; its labels are not returned.
     """
     table = bulk.table("human_label")
     names = ("frame_id", "n", "decision", "category", *BOX_COLUMNS, *SEEN_COLUMNS)
     query = select(*(table.c[name] for name in names)).order_by(table.c.frame_id, table.c.n)
     if until_round is not None:
         query = query.where(table.c.from_round <= until_round)
-    if but_of is not None:
-        query = query.where(table.c.review != but_of)
+    if exclude_review is not None:
+        query = query.where(table.c.review != exclude_review)
     return {
         frame_id: _stored(rows)
         for frame_id, rows in bulk.grouped(bulk.select(connection, query)).items()
@@ -68,25 +68,25 @@ def read_human_labels(
 def refresh_matches(
     connection: Connection, round_number: int, frame_ids: Collection[int] | None = None
 ) -> int:
-    """Find anew which predictions of a round the human labels speak for.
+    """Match the predictions of a round with the human labels again, and store the matches.
 
     Args:
-        connection: of the transaction that changed predictions or human labels.
-        round_number: e.
-        frame_ids: of which frames; None for all.
+        connection: connection in the transaction that changed predictions or human labels.
+        round_number: number e of the round.
+        frame_ids: keys of the frames; None for all.
 
     Returns:
-        How many predictions it is.
+        The number of matched predictions.
     """
     match = bulk.table("human_match")
-    gone = match.delete().where(match.c.round == round_number)
+    delete = match.delete().where(match.c.round == round_number)
     if frame_ids is None:
-        connection.execute(gone)
-    for batch in batched(sorted(frame_ids or ()), _ASKED_AT_ONCE):
-        connection.execute(gone.where(match.c.frame_id.in_(batch)))
+        connection.execute(delete)
+    for batch in batched(sorted(frame_ids or ()), _FRAMES_PER_STATEMENT):
+        connection.execute(delete.where(match.c.frame_id.in_(batch)))
     labels = read_human_labels(connection, frame_ids, until_round=round_number)
     rows: list[dict[str, Any]] = []
-    for batch in batched(labels, _ASKED_AT_ONCE):
+    for batch in batched(labels, _FRAMES_PER_STATEMENT):
         predictions = _predictions(connection, round_number, batch)
         for frame_id, predicted in predictions.items():
             rows += _match_rows(round_number, frame_id, predicted, labels[frame_id])
@@ -95,14 +95,14 @@ def refresh_matches(
 
 
 def refresh_all_matches(connection: Connection, frame_ids: Collection[int]) -> None:
-    """`refresh_matches` for every round."""
+    """Match the predictions of all rounds with the human labels again, see `refresh_matches`."""
     table = bulk.table("round")
     for (number,) in bulk.select(connection, select(table.c.number)):
         refresh_matches(connection, number, frame_ids)
 
 
 def fingerprint(workspace: Workspace, round_number: int) -> str | None:
-    """What the human labels that count in a round change about it; None without any."""
+    """Return a hash of the human labels that are valid in a round; None if there are none."""
     table = bulk.table("human_label")
     names = ("frame_id", "decision", "category", *BOX_COLUMNS, *SEEN_COLUMNS)
     query = select(*(table.c[name] for name in names)).where(table.c.from_round <= round_number)
@@ -111,7 +111,7 @@ def fingerprint(workspace: Workspace, round_number: int) -> str | None:
 
 
 def counts(workspace: Workspace, round_number: int) -> dict[str, int]:
-    """Return how many human labels of each decision count in a round."""
+    """Return the number of human labels valid in a round, by decision."""
     table = bulk.table("human_label")
     query = select(table.c.decision).where(table.c.from_round <= round_number)
     found = [row[0] for row in workspace.database.rows(query)]
@@ -119,7 +119,13 @@ def counts(workspace: Workspace, round_number: int) -> dict[str, int]:
 
 
 def human_boxes(workspace: Workspace, round_number: int, frame_id: int) -> np.ndarray:
-    """Return (n, 7) boxes of the objects of a frame that people decided on, in the LiDAR frame."""
+    """Return the (n, 7) boxes of a frame's human labels, in the LiDAR frame, without rejected ones.
+
+    Args:
+        workspace: the workspace.
+        round_number: number of a round; only the labels that are valid in it are returned.
+        frame_id: key of the frame.
+    """
     with workspace.database.reading() as connection:
         found = read_human_labels(connection, [frame_id], until_round=round_number)
     if frame_id not in found:
@@ -141,7 +147,7 @@ def _stored(rows: Sequence[bulk.Row]) -> StoredLabels:
 def _predictions(
     connection: Connection, round_number: int, frame_ids: Sequence[int]
 ) -> Mapping[int, list[bulk.Row]]:
-    """Number, category and box of the predictions of some frames of a round."""
+    """Return, by frame key, k, category and box of the predictions of some frames."""
     table = bulk.table("prediction")
     names = ("frame_id", "k", "category", *BOX_COLUMNS)
     query = (
@@ -156,13 +162,13 @@ def _match_rows(
     round_number: int, frame_id: int, predicted: Sequence[bulk.Row], stored: StoredLabels
 ) -> Iterable[dict[str, Any]]:
     boxes = np.array([row[2:] for row in predicted], dtype=np.float64)
-    spoken = match_human_labels(boxes, as_categories([row[1] for row in predicted]), stored.labels)
-    for place in np.flatnonzero(spoken.label >= 0).tolist():
+    matches = match_human_labels(boxes, as_categories([row[1] for row in predicted]), stored.labels)
+    for i in np.flatnonzero(matches.label >= 0).tolist():
         yield {
             "round": round_number,
             "frame_id": frame_id,
-            "k": predicted[place][0],
-            "n": int(stored.n[spoken.label[place]]),
-            "iou": float(spoken.iou[place]),
-            "leads": int(spoken.leads[place]),
+            "k": predicted[i][0],
+            "n": int(stored.n[matches.label[i]]),
+            "iou": float(matches.iou[i]),
+            "leads": int(matches.leads[i]),
         }

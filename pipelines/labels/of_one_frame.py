@@ -1,4 +1,4 @@
-"""What is stored of one frame in a round: labels, repredictions and, outside X_u, ground truth."""
+"""The stored boxes of one frame in a round: labels, repredictions, ground truth outside X_u."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from curate.review.human_labels import REJECTED
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
-from pipelines.labels.by_frame import check_weights, unweighted
+from pipelines.labels.by_frame import check_weights, not_weighted_error
 from pipelines.labels.human_labels import human_boxes
 from pipelines.workspace.workspace import Workspace
 
@@ -21,14 +21,14 @@ class FrameBoxes:
     """The boxes of a frame.
 
     Attributes:
-        split: of the frame.
-        labels: the predictions.
+        split: split of the frame.
+        labels: the n predictions, without those that a human label replaces.
         numbers: (n,) k of each label.
-        weights: (n,) of one policy; 0 where it dropped the label, NaN where it weighted nothing.
-        repredictions: of all views, with the weight of the label that each was matched with.
-        truth: NaN boxes for DontCare; None for frames of X_u.
-        human_boxes: (h, 7) what people decided on; predictions that give way to them are left out
-            of the labels, rejected ones weigh 0.
+        weights: (n,) weights of one policy; 0 for labels that it dropped or a person rejected, NaN
+            if it has weighted none of the frame's labels.
+        repredictions: the repredictions of all views, each with the weight of its matched label.
+        truth: ground truth, with NaN boxes for DontCare; None for frames of X_u.
+        human_boxes: (h, 7) boxes of the human labels, in the LiDAR frame.
     """
 
     split: str
@@ -41,15 +41,15 @@ class FrameBoxes:
 
     @property
     def truth_boxes(self) -> np.ndarray | None:
-        """(m, 7) in the LiDAR frame, NaN for DontCare; None for frames of X_u."""
+        """(m, 7) ground-truth boxes in the LiDAR frame, NaN for DontCare; None for X_u."""
         return None if self.truth is None else self.truth.boxes
 
 
 def chosen_round(workspace: Workspace, number: int | None) -> int:
-    """Return a round that has predictions; None asks for the last one.
+    """Return the number of the given round, or of the last round with predictions.
 
     Raises:
-        WorkspaceError: if there is none, or not that one.
+        WorkspaceError: if the round, or every round, has no predictions.
     """
     table = bulk.table("prediction")
     query = select(func.max(table.c.round))
@@ -66,8 +66,10 @@ def chosen_round(workspace: Workspace, number: int | None) -> int:
     return int(found)
 
 
-def labeled_by(workspace: Workspace, round_number: int, policy: str, limit: int) -> list[str]:
-    """Return the first frames, by name, of which a policy has weighted labels in a round.
+def weighted_frame_names(
+    workspace: Workspace, round_number: int, policy: str, limit: int
+) -> list[str]:
+    """Return the names of the first `limit` frames with weights of a policy in a round.
 
     Raises:
         WorkspaceError: if there are none.
@@ -83,12 +85,12 @@ def labeled_by(workspace: Workspace, round_number: int, policy: str, limit: int)
     )
     names = [row[0] for row in workspace.database.rows(query)]
     if not names:
-        raise unweighted(round_number, policy)
+        raise not_weighted_error(round_number, policy)
     return names
 
 
 def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) -> FrameBoxes:
-    """Return the stored boxes of a frame.
+    """Return the stored boxes of a frame, with the weights of a policy.
 
     Raises:
         ConfigError: if no frame has that name.
@@ -116,20 +118,20 @@ def _find(workspace: Workspace, name: str) -> tuple[str, int]:
     query = select(table.c.split, table.c.id).where(table.c.frame == name)
     found = workspace.database.rows(query)
     if not found:
-        raise ConfigError(f"no frame is named '{name}' here; the table frame lists all of them")
+        raise ConfigError(f"no frame is named '{name}'; the table frame lists all frames")
     return found[0][0], found[0][1]
 
 
 def _weights(
     workspace: Workspace, round_number: int, frame: tuple[int, str], policy: str, count: int
 ) -> np.ndarray:
-    """Return (count,) by k, of the frame with that key and name."""
+    """Return the (count,) weights of a frame, given by key and name, in the order of k."""
     table = bulk.table("weight")
     key, name = frame
-    here = (table.c.round == round_number, table.c.policy == policy, table.c.frame_id == key)
+    selected = (table.c.round == round_number, table.c.policy == policy, table.c.frame_id == key)
     with workspace.database.reading() as connection:
         check_weights(connection, round_number, policy, name)
-        found = bulk.select(connection, select(table.c.k, table.c.v).where(*here))
+        found = bulk.select(connection, select(table.c.k, table.c.v).where(*selected))
     weights = np.full(count, 0.0 if found else np.nan)
     for k, v in found:
         weights[k] = v
@@ -139,7 +141,7 @@ def _weights(
 def _decided(
     workspace: Workspace, round_number: int, key: int, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (count,) bool by k: rejected by people, and giving way to a human label's own box."""
+    """Return two (count,) bool by k: rejected by a person, and replaced by a human label."""
     match, label = bulk.table("human_match"), bulk.table("human_label")
     same = (label.c.frame_id == match.c.frame_id, label.c.n == match.c.n)
     query = select(match.c.k, label.c.decision).where(
@@ -162,5 +164,5 @@ def _repredictions(
     )
     rows = workspace.database.rows(query)
     boxes = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 7)
-    own = [0.0 if row[0] is None else float(weights[row[0]]) for row in rows]
-    return ShownRepredictions(boxes, np.array(own, dtype=np.float64))
+    matched = [0.0 if row[0] is None else float(weights[row[0]]) for row in rows]
+    return ShownRepredictions(boxes, np.array(matched, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""The evidence sources of a workspace: their declarations, and the tables that follow from them."""
+"""The evidence sources of a workspace: their declarations and their tables."""
 
 import logging
 from collections.abc import Sequence
@@ -21,13 +21,13 @@ _FRAME_MEMBERS = ("measured_columns", "measure", "rate")
 
 @dataclass(frozen=True)
 class Source:
-    """An evidence source as the configuration names it.
+    """An evidence source of the configuration.
 
     Attributes:
         configured: its name in run.priors.
-        declaration: what it stores.
-        measured_columns: those that are measured, of a source that looks at one frame.
-        of_sequences: whether it looks at whole sequences.
+        declaration: its name and its columns.
+        measured_columns: names of the columns that it measures; empty for a source of sequences.
+        of_sequences: whether it processes whole sequences, not single frames.
     """
 
     configured: str
@@ -37,13 +37,13 @@ class Source:
 
     @property
     def table(self) -> str:
-        """The name of its table."""
+        """Name of the source's table."""
         return self.declaration.table
 
 
 @cache
 def source_of(configured: str) -> Source:
-    """Return the source behind a name of run.priors.
+    """Return the source with a name from run.priors.
 
     Raises:
         ConfigError: if there is no such source, or its declaration is invalid.
@@ -56,17 +56,20 @@ def source_of(configured: str) -> Source:
             f"evidence source '{configured}' has neither score_sequence nor {', '.join(missing)}; "
             "see curate.priors.base.EvidenceSource"
         )
-    own = {column.name for column in kind.columns} if configured in OWN_TABLES else set()
-    check_declaration(kind, _RESERVED - own)
+    core = {column.name for column in kind.columns} if configured in OWN_TABLES else set()
+    check_declaration(kind, _RESERVED - core)
     if kind.name in OWN_TABLES and configured not in PRIORS.classes:
-        raise ConfigError(f"evidence source '{configured}': the name '{kind.name}' is taken")
+        raise ConfigError(
+            f"evidence source '{configured}': the name '{kind.name}' is taken by a source of "
+            "curate; give your class another name"
+        )
     declaration = Declaration(kind.name, configured, tuple(kind.columns), kind.rho_column)
     measured = () if of_sequences else tuple(kind.measured_columns)
     return Source(configured, declaration, measured, of_sequences)
 
 
 def sources_of(names: Sequence[str]) -> tuple[Source, ...]:
-    """Return the sources of run.priors.
+    """Return the sources with names from run.priors.
 
     Raises:
         ConfigError: if one is unknown or invalid, or two have the same name or a column in common.
@@ -90,10 +93,10 @@ def sources_of(names: Sequence[str]) -> tuple[Source, ...]:
 
 
 def prepare_table(workspace: Workspace, source: Source) -> None:
-    """Make the table of a source on its first use, and the views that show it.
+    """Create the table of a source on its first use, and recreate the views with its columns.
 
     Raises:
-        ConfigError: if a source that is stored already declares one of its columns.
+        ConfigError: if another stored source has a column of the same name.
     """
     bulk.use_source(source.declaration)
     database, declaration = workspace.database, source.declaration
@@ -109,7 +112,7 @@ def prepare_table(workspace: Workspace, source: Source) -> None:
         }
         if other.name != declaration.name and shared:
             raise ConfigError(
-                f"evidence source '{declaration.name}': column {min(shared)} is stored already by "
+                f"evidence source '{declaration.name}': column {min(shared)} is already stored by "
                 f"source '{other.name}' ({other.table}); rename the column, or drop that table"
             )
     with database.writing() as connection:
@@ -118,15 +121,15 @@ def prepare_table(workspace: Workspace, source: Source) -> None:
         create_views(connection)
     if any(other.name == declaration.name for other in stored):
         _log.warning(
-            "evidence source '%s' declares other columns than before, or is another class: table "
-            "%s is made anew, and its evidence computed again",
+            "evidence source '%s' has other columns than before, or is another class: table %s is "
+            "replaced, and its evidence is computed again",
             declaration.name,
             declaration.table,
         )
 
 
 def report_unused(workspace: Workspace) -> None:
-    """Warn of sources with stored evidence that run.priors does not list any more."""
+    """Log a warning for each source with stored evidence that is no longer in run.priors."""
     active = {source_of(name).declaration.name for name in workspace.config.run.priors}
     with workspace.database.reading() as connection:
         stored = read_declarations(connection)
@@ -134,8 +137,8 @@ def report_unused(workspace: Workspace) -> None:
         if each.name not in active:
             columns = ", ".join(column.name for column in each.columns)
             _log.warning(
-                "evidence source '%s' is not in run.priors any more: %s keeps what it stored, "
-                "weighted_labels shows it (%s), no weight uses it",
+                "evidence source '%s' is no longer in run.priors: table %s keeps its evidence, "
+                "weighted_labels still shows it (%s), but no weight uses it",
                 each.name,
                 each.table,
                 columns,
@@ -143,7 +146,7 @@ def report_unused(workspace: Workspace) -> None:
 
 
 def rho_columns(names: Sequence[str]) -> dict[str, str]:
-    """Return the trust column of each prior among some sources, with its table."""
+    """Return, for each prior among some sources, its trust column and its table."""
     found: dict[str | None, str] = {
         source.declaration.rho_column: source.table for source in sources_of(names)
     }

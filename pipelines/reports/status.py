@@ -8,7 +8,7 @@ from sqlalchemy import select, text
 from curate.errors import WorkspaceError
 from db import bulk
 from pipelines.engine.plan import Plan
-from pipelines.engine.rounds import find_teacher, is_student_trained, peek_round
+from pipelines.engine.rounds import find_teacher, is_student_trained, stored_round
 from pipelines.engine.stage import FirstStage, FramesStage, RoundStage
 from pipelines.round import graph_of
 from pipelines.workspace.workspace import Workspace
@@ -28,7 +28,7 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
     graph = graph_of(workspace)
     rows = [_first_row(workspace, first) for first in graph.first_stages]
     for number in numbers:
-        context = peek_round(workspace, number)
+        context = stored_round(workspace, number)
         if context is None:
             rows.append((number, "predict", "unlabeled", "", "no teacher", 0, 0, 0, 0))
             continue

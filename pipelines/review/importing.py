@@ -216,7 +216,7 @@ def _superseded(
 ) -> list[tuple[int, int]]:
     """Return the keys of the decisions of other reviews that the new ones replace."""
     later = _by_frame(rows)
-    former = read_human_labels(connection, later.keys(), but_of=review)
+    former = read_human_labels(connection, later.keys(), exclude_review=review)
     return [
         (frame_id, n)
         for frame_id, stored in former.items()

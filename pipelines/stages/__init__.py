@@ -1,1 +1,1 @@
-"""The stages of a round, one file each with the name of its command."""
+"""The stages of a round: one module per stage, with the name of its command."""

@@ -1,4 +1,4 @@
-"""export: the weighted labels of a round as files that trainers read."""
+"""export: write the weighted labels of a round to files that trainers read."""
 
 import shutil
 from collections.abc import Iterator
@@ -37,9 +37,9 @@ _CHUNK = 10_000
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
-    """What the exported file depends on beside weights and ground truth.
+    """Return what the exported file depends on besides weights and ground truth.
 
-    That is what people decided, and what a weight of 0 means.
+    These are the human labels, the meaning of weight 0, and the columns of further evidence.
     """
     human = fingerprint(workspace, context.number)
     further = _further_columns(workspace)
@@ -52,20 +52,22 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
 
 
 def _further_columns(workspace: Workspace) -> list[str]:
-    """Return the columns behind the core ones, as they are declared."""
+    """Return the declarations of the columns after the core ones, as text."""
     with workspace.database.reading() as connection:
         return [repr(each) for each in read_declarations(connection)]
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
-    """Return the exported file of a round and policy."""
+    """Return the path of the exported file of a round and policy."""
     return workspace.root / "exports" / f"round-{context.number:02d}-{policy}.sqlite"
 
 
 def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
-    """Raise LeakageError if ground truth would reach what it must not, see `firewall`.
+    """Check the leakage firewall and the stored weights.
 
-    DataError where a weight is not in [0, 1].
+    Raises:
+        LeakageError: if ground truth of unlabeled or val frames would be exported.
+        DataError: if a weight is not in [0, 1].
     """
     from pipelines.firewall.rules import enforce
 
@@ -75,7 +77,7 @@ def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
 
 
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
-    """Write the round's file; `labels.sqlite` becomes a copy where the policy is the trainer's."""
+    """Write the round's file; for the configured policy also copy it to `labels.sqlite`."""
     path = file(workspace, job.context, job.policy)
     current = path.with_name(CURRENT) if job.policy == workspace.config.run.method else None
     if current:
@@ -99,7 +101,7 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
 def register_label_file(
     connection: Connection, workspace: Workspace, path: Path, round_number: int, policy: str
 ) -> None:
-    """Store the hash of a label file in place of an earlier one's."""
+    """Store the hash of a label file; it replaces that of an earlier file."""
     table, name = bulk.table("label_file"), workspace.relative(path)
     connection.execute(table.delete().where(table.c.path == name))
     row = {"path": name, "round": round_number, "policy": policy, "sha256": sha256(path)}
@@ -107,10 +109,16 @@ def register_label_file(
 
 
 def write_label_file(workspace: Workspace, path: Path, round_number: int, policy: str) -> int:
-    """The file that the trainer reads, with the labels that a policy weighted; none for policy "".
+    """Write the file that the trainer reads.
+
+    Args:
+        workspace: the workspace.
+        path: path of the file.
+        round_number: number e of the round.
+        policy: policy with the weights to export; "" for ground truth alone.
 
     Returns:
-        How many labels were written.
+        The number of exported labels.
     """
     return SqliteExporter().write(path, label_set(workspace, round_number, policy))
 
@@ -118,11 +126,11 @@ def write_label_file(workspace: Workspace, path: Path, round_number: int, policy
 def export_as(
     workspace: Workspace, exporter: Exporter, round_number: int, policy: str, path: Path
 ) -> int:
-    """Write a policy's labels in some format; returns how many.
+    """Write the labels of a policy in the format of an exporter; return their number.
 
     Raises:
         WorkspaceError: if the policy has weighted nothing in that round.
-        LeakageError: ground truth would reach what it must not.
+        LeakageError: if ground truth of unlabeled or val frames would be exported.
     """
     from pipelines.firewall.rules import enforce
 
@@ -137,7 +145,7 @@ def export_as(
 
 
 def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:
-    """X_l with its ground truth, and X_u with the labels that a policy weighted in a round."""
+    """Return X_l with its ground truth, and X_u with the labels weighted by a policy in a round."""
     config = workspace.config
     description = LabelFileDescription(
         dataset=config.dataset.kind,
@@ -161,13 +169,13 @@ def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:
 
 @dataclass(frozen=True)
 class StoredLabels:
-    """The labels of a round and policy in blocks, by frame and k, read as they are walked.
+    """The labels of a round and policy, sorted by frame and k, read from the database in blocks.
 
     Attributes:
-        workspace: that holds them.
-        round_number: that made them.
-        policy: that weighted them.
-        columns: of `weighted_labels`.
+        workspace: the workspace.
+        round_number: number e of the round.
+        policy: policy that weighted the labels.
+        columns: columns of `weighted_labels` to read.
     """
 
     workspace: Workspace
@@ -176,7 +184,7 @@ class StoredLabels:
     columns: tuple[Column, ...]
 
     def __iter__(self) -> Iterator[Block]:
-        """Yield a few thousand at a time: two million labels would fill the memory."""
+        """Yield blocks of some thousand labels: millions at once would not fit into memory."""
         names = [each.name for each in self.columns]
         query = self._of(*map(column, names)).order_by(column("frame"), column("k"))
         with self.workspace.database.reading() as connection:
@@ -185,20 +193,20 @@ class StoredLabels:
                 yield dict(zip(names, zip(*rows, strict=True), strict=True))
 
     def frames(self, connection: Connection) -> set[str]:
-        """Return the frames that have labels."""
+        """Return the names of the frames with labels."""
         return set(connection.execute(self._of(column("frame")).distinct()).scalars())
 
     def _of(self, *columns: ColumnElement[Any]) -> Select[Any]:
         labels = WEIGHTED_LABELS.c
-        chosen = (labels.round == self.round_number, labels.policy == self.policy)
-        return select(*columns).select_from(WEIGHTED_LABELS).where(*chosen)
+        selected = (labels.round == self.round_number, labels.policy == self.policy)
+        return select(*columns).select_from(WEIGHTED_LABELS).where(*selected)
 
 
 def _frames(connection: Connection, with_labels: set[str]) -> list[FrameFiles]:
-    """Return all labeled frames, with or without objects, and the unlabeled ones that have labels.
+    """Return all labeled frames, with or without objects, and the unlabeled frames with labels.
 
-    An unlabeled frame in which the teacher found nothing is left out: no weight vouches for its
-    emptiness, and as background it would teach what the teacher has missed.
+    An unlabeled frame in which the teacher found nothing is left out: objects that the teacher
+    missed would be trained as background, and no weight can reduce their effect.
     """
     frame = bulk.table("frame").c
     query = select(

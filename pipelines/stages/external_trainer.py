@@ -1,9 +1,10 @@
-"""Students that a trainer of the user's trains: any command, told where labels and output are.
+"""Training of students by the user's own command (`train.command`).
 
-The command is split like a shell would (shlex), but no shell runs it: no pipes, no variables, no
-globbing. In its arguments {labels}, {output}, {teacher}, {round} and {policy} are replaced, each
-within its argument, so that a space in a path does no harm; the same are in the environment as
-CURATE_LABELS and so on. It runs in the current folder, and what it prints goes to standard error.
+The command is split like in a shell (shlex), but no shell runs it: there are no pipes, variables or
+globs. In its arguments {labels}, {output}, {teacher}, {round} and {policy} are replaced by their
+values. A value with spaces stays within its argument. The values are also in the environment, as
+CURATE_LABELS and so on. The command runs in the current folder, and its output goes to standard
+error.
 """
 
 import os
@@ -23,14 +24,15 @@ _STANDARD_ERROR = 2
 
 
 def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
-    """Run the configured command, checks what it has produced and moves it to `output`.
+    """Run the configured command, check the checkpoint that it wrote, and move it to `output`.
 
-    The command writes to another place, where what a killed run has left stays for it to continue
-    from; a former student in `output` is replaced only by a finished one.
+    The command writes to another path, in the folder `training`. Files of a killed run stay there,
+    so that the next run can resume from them. A former student at `output` is replaced only if the
+    training succeeds.
 
     Raises:
-        ConfigError: if the command cannot be taken apart or started.
-        TrainerFailed: if it ended with an error, or without having written the output.
+        ConfigError: if the command cannot be parsed or started.
+        TrainerFailed: if it ends with an error, or does not write its output.
     """
     draft = output.parent / "training" / output.name
     values = {
@@ -49,22 +51,24 @@ def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
 
 
 def split_command(command: str, values: dict[str, str]) -> list[str]:
-    """Return the arguments of a command with values in the place of {names}; other braces stay.
+    """Return the arguments of a command, with each {name} replaced by its value.
+
+    Braces with other names stay as they are.
 
     Raises:
-        ConfigError: if a quote is open, or there is no command.
+        ConfigError: if a quote is not closed, or the command is empty.
     """
     try:
         arguments = shlex.split(command)
     except ValueError as error:
-        raise ConfigError(f"train command `{command}`: {error}; mend its quotes") from None
+        raise ConfigError(f"train command `{command}`: {error}; fix its quotes") from None
     if not arguments:
-        raise ConfigError("train command: is empty; name a program and its arguments")
+        raise ConfigError("train command: is empty; write a program and its arguments")
     return [_filled(argument, values) for argument in arguments]
 
 
 def _filled(argument: str, values: dict[str, str]) -> str:
-    """One pass over the argument, so that a value that holds a {name} stays as it is."""
+    """Replace {names} in one pass, so that a value which contains a {name} is not changed."""
     head, brace, rest = argument.partition("{")
     name, end, tail = rest.partition("}")
     if not brace:
@@ -75,7 +79,7 @@ def _filled(argument: str, values: dict[str, str]) -> str:
 
 
 def _labels(workspace: Workspace, job: RoundJob) -> Path:
-    """Return the exported labels in the format that the trainer wants."""
+    """Return the path of the labels in the configured format; export them if it is not SQLite."""
     path = export.file(workspace, job.context, job.policy)
     name = workspace.config.train.labels_format
     if name == "sqlite":
@@ -90,19 +94,19 @@ def _run(arguments: list[str], values: dict[str, str]) -> None:
     environment = {f"CURATE_{name.upper()}": value for name, value in values.items()}
     sys.stderr.flush()
     try:
-        ended = subprocess.run(  # noqa: S603 - the user's own command, without a shell
+        result = subprocess.run(  # noqa: S603 - the user's own command, without a shell
             arguments, env=os.environ | environment, stdout=_STANDARD_ERROR, check=False
         )
     except OSError as error:
         raise ConfigError(
             f"train command: {arguments[0]} cannot be started: {error.strerror}"
         ) from None
-    if ended.returncode:
-        code = ended.returncode
-        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+    if result.returncode:
+        code = result.returncode
+        reason = f"signal {-code}" if code < 0 else f"exit code {code}"
         raise TrainerFailed(
-            f"the trainer {shlex.join(arguments[:2])} ended with {how}; its own output above says "
-            "why; the same command runs it again"
+            f"the trainer {shlex.join(arguments[:2])} ended with {reason}; see its output above, "
+            "fix the cause and rerun the command"
         )
 
 
@@ -110,23 +114,23 @@ def _check(draft: Path, before: tuple[int, int] | None) -> None:
     """Raise TrainerFailed if the trainer has not written its output."""
     after = _state(draft)
     if after is None:
-        fault = "was not written"
+        problem = "was not written"
     elif after[1] == 0:
-        fault = "is empty"
+        problem = "is empty"
     elif after == before:
-        fault = "is left from an earlier run and was not written again"
+        problem = "is left from an earlier run and was not written again"
     else:
         return
     raise TrainerFailed(
-        f"{draft}: {fault}, though the trainer ended well; let it write its checkpoint, a file or "
-        "a folder as your detector reads it, to {output} or $CURATE_OUTPUT"
+        f"{draft}: {problem}, although the trainer ended without an error; it must write its "
+        "checkpoint, a file or a folder that your detector reads, to {output} or $CURATE_OUTPUT"
     )
 
 
 def _state(path: Path) -> tuple[int, int] | None:
-    """When the file, or the last one in the folder, was written, and how long they are.
+    """Return the latest modification time (ns) and total size of a file or a folder's files.
 
-    None where there is nothing.
+    None if the path does not exist.
     """
     if not path.exists():
         return None
@@ -136,7 +140,7 @@ def _state(path: Path) -> tuple[int, int] | None:
 
 
 def _take_place(draft: Path, output: Path) -> None:
-    """Move what was written to its place; unlike a file, a folder does not replace anything."""
+    """Move the checkpoint to `output`; what a folder cannot replace is deleted first."""
     if output.is_dir():
         shutil.rmtree(output)
     elif draft.is_dir():

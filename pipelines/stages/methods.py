@@ -1,7 +1,7 @@
-"""The methods that can be compared: each a policy and how its student learns, by one word.
+"""The methods that can be compared. A method is a policy and a way to get the next teacher.
 
-The name of a method is the name of its policy, under which its weights and students are stored.
-What a label of weight 0 is to the student, the policy says, see `Policy.zero_weight`.
+The name of a method is the name of its policy; its weights and students are stored under it. The
+policy defines what a label of weight 0 means in training, see `Policy.zero_weight`.
 """
 
 from collections.abc import Mapping
@@ -21,17 +21,17 @@ ZERO_WEIGHT_WORDS: Final[Mapping[ZeroWeight, str]] = {
     "background": "background",
     "ignore": "regions to ignore",
 }
-"""What the labels of weight 0 are, in words."""
+"""The treatment of labels with weight 0, as text for reports."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """How labels are weighed, and who teaches the next round.
+    """A policy, and the choice of the next round's teacher.
 
     Attributes:
-        policy: of `POLICIES`, or package.module:Class.
-        teacher: the "student" itself, or the moving average of its weights ("ema").
-        note: what it is, in one line.
+        policy: name of the policy: registered in `POLICIES`, or `package.module:Class`.
+        teacher: "student" for the student itself, "ema" for the moving average of its weights.
+        note: description in one line.
     """
 
     policy: str
@@ -43,9 +43,11 @@ METHODS: Final[Mapping[str, Method]] = {
     method.policy: method
     for method in (
         Method("baseline", "student", "X_l alone, trained for as long as the others"),
-        Method("uda", "student", "every label weighs 1 (UDA, Xie et al. 2020)"),
-        Method("uda-cl", "student", "the easiest share e/E of the labels weighs 1 (UDA+CL)"),
-        Method("sess", "ema", "every label weighs 1, averaged teacher (SESS, Zhao et al. 2020)"),
+        Method("uda", "student", "weight 1 for every label (UDA, Xie et al. 2020)"),
+        Method("uda-cl", "student", "weight 1 for the easiest share e/E of the labels (UDA+CL)"),
+        Method(
+            "sess", "ema", "weight 1 for every label, averaged teacher (SESS, Zhao et al. 2020)"
+        ),
         Method(
             "3dioumatch", "ema",
             "score and IoU thresholds, averaged teacher (3DIoUMatch, Wang et al. 2021)",
@@ -54,7 +56,7 @@ METHODS: Final[Mapping[str, Method]] = {
         Method(
             "pspsl", "student", "PSPSL-3D: v = rho_det (1 - L / lambda) (An et al. 2023, Eq. 11)"
         ),
-        Method("threshold", "student", "every label with a score from 0.3 on weighs 1"),
+        Method("threshold", "student", "weight 1 for every label with a score of at least 0.3"),
         Method("st3d", "student", "keep, ignore, drop with a memory (ST3D, Yang et al. 2021)"),
         Method("hssda", "ema", "two thresholds from the data (HSSDA, Liu et al. 2023)"),
     )
@@ -62,7 +64,9 @@ METHODS: Final[Mapping[str, Method]] = {
 
 
 def method_named(name: str) -> Method:
-    """The method of that name; any other policy is a method whose student teaches the next round.
+    """Return the method with this name.
+
+    A policy that is not in METHODS is a method too; its teacher is the student itself.
 
     Raises:
         ConfigError: if there is no such method or policy.
@@ -81,7 +85,7 @@ def with_method(config: Config, name: str) -> Config:
     """Return the configuration with another method.
 
     Raises:
-        ConfigError: if there is no such method; the known ones are named.
+        ConfigError: if there is no such method; the message lists the available ones.
     """
     method = method_named(name)
     return config.model_copy(
@@ -90,12 +94,12 @@ def with_method(config: Config, name: str) -> Config:
 
 
 def method_of(config: Config, policy: str) -> Method:
-    """Return the method of a policy, save where `train.teacher` is set."""
+    """Return the method of a policy; the setting `train.teacher` overrides its teacher."""
     method, teacher = method_named(policy), config.train.teacher
     return method if teacher == "method" else replace(method, teacher=teacher)
 
 
 def zero_weight_of(config: Config, policy: str) -> ZeroWeight:
-    """Return what a label of weight 0 is: the policy says, unless `train.zero_weight` is set."""
-    chosen = config.train.zero_weight
-    return open_policy(config, policy).zero_weight if chosen == "method" else chosen
+    """Return the meaning of weight 0: that of `train.zero_weight` if set, else the policy's."""
+    setting = config.train.zero_weight
+    return open_policy(config, policy).zero_weight if setting == "method" else setting

@@ -1,4 +1,4 @@
-"""predict: l = f(x; w), the teacher's boxes with low scores too."""
+"""predict: l = f(x; w), the boxes of the teacher, including those with low scores."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,13 +25,18 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Predict:
-    """Finds the boxes of a frame."""
+    """Predicts the boxes of a frame.
+
+    Attributes:
+        config: the configuration.
+        teacher: checkpoint of the teacher.
+    """
 
     config: Config
     teacher: Path
 
     def open(self) -> None:
-        """Load the detector."""
+        """Open the data set and load the detector."""
         self.dataset = open_dataset(self.config)
         self.detector = open_detector(self.config, self.teacher)
 
@@ -41,66 +46,72 @@ class Predict:
         return {"prediction": {**detection_columns(found), "iou": _or_none(found.iou)}}
 
     def detect(self, frame_id: str) -> Detections:
-        """Return the boxes of a frame, by falling score."""
+        """Return the detections of a frame, by descending score."""
         frame = visible(self.dataset.read(frame_id), self.config)
         return checked(self.detector.predict(frame), self.config)
 
 
 def visible(frame: Frame, config: Config) -> Frame:
-    """The frame as the detector sees it: only points in the camera's view, if so configured."""
+    """Return the frame for the detector: with `detector.camera_view`, only points in the image."""
     if not config.detector.camera_view:
         return frame
-    seen = in_view(frame.points, frame.calibration, frame.image_size)
-    return frame.with_points(np.compress(seen, frame.points, axis=0))  # six times as fast as [seen]
+    inside = in_view(frame.points, frame.calibration, frame.image_size)
+    # np.compress is six times as fast as frame.points[inside].
+    return frame.with_points(np.compress(inside, frame.points, axis=0))
 
 
 def checked(found: Detections, config: Config) -> Detections:
-    """Return the detections of the configured categories and scores, by falling score.
+    """Return the detections with configured categories and sufficient scores, by descending score.
 
     Raises:
-        ModelError: a box is not finite or has no size, or a category is written in other letters.
+        ModelError: if a box is not finite or has no size, or a category differs from a configured
+            one only in upper and lower case.
     """
-    wanted = np.isin(found.categories, config.dataset.categories)
-    if not wanted.all():
-        _report_others(np.unique(found.categories[~wanted]).tolist(), config)
-    found = found.select(wanted & (found.scores >= config.detector.minimum_score))
+    configured = np.isin(found.categories, config.dataset.categories)
+    if not configured.all():
+        _report_unexpected(np.unique(found.categories[~configured]).tolist(), config)
+    found = found.select(configured & (found.scores >= config.detector.minimum_score))
     numbers = np.column_stack([found.boxes, found.scores])
     wrong = ~np.isfinite(numbers).all(axis=1) | (found.boxes[:, 3:6] <= 0).any(axis=1)
     if wrong.any():
-        shown = [round(float(number), 3) for number in numbers[wrong][0]]
+        example = [round(float(number), 3) for number in numbers[wrong][0]]
         raise ModelError(
-            f"the detector answered a box that is not finite or has no size: {shown} "
+            f"the detector returned a box that is not finite or has no size: {example} "
             "(x, y, z, l, w, h, yaw, score)"
         )
     return found.select(np.argsort(-found.scores, kind="stable"))
 
 
-def _report_others(others: Sequence[str], config: Config) -> None:
-    """State which categories are left out; ModelError where a name is ours in other letters."""
-    ours = {name.lower(): name for name in config.dataset.categories}
-    for name in others:
-        if name.lower() in ours:
+def _report_unexpected(unexpected: Sequence[str], config: Config) -> None:
+    """Warn of categories that are left out.
+
+    Raises:
+        ModelError: if one differs from a configured category only in upper and lower case.
+    """
+    categories = {name.lower(): name for name in config.dataset.categories}
+    for name in unexpected:
+        if category := categories.get(name.lower()):
             raise ModelError(
-                f"the detector answers '{name}', the data set's category is '{ours[name.lower()]}':"
-                f' set detector.options.rename = {{"{name}" = "{ours[name.lower()]}"}}, or '
+                f"the detector returns '{name}', but the data set's category is '{category}':"
+                f' set detector.options.rename = {{"{name}" = "{category}"}}, or '
                 "dataset.categories"
             )
         _warn_once(name, config.dataset.categories)
 
 
 @cache
-def _warn_once(name: str, ours: tuple[str, ...]) -> None:
-    """Once per process and name."""
+def _warn_once(name: str, categories: tuple[str, ...]) -> None:
+    """Log the warning once per process and name."""
     _log.warning(
-        "the detector answers '%s', none of the data set's categories (%s): such boxes are left "
-        "out; detector.options.rename of a recorded detector translates names",
+        "the detector returns '%s', which is not a category of the data set (%s): such boxes are "
+        "left out; detector.options.rename of a recorded detector translates names",
         name,
-        ", ".join(ours),
+        ", ".join(categories),
     )
 
 
 def detection_columns(found: Detections) -> dict[str, list[Any]]:
-    """Return number, category, score and box of each detection as the database names them."""
+    """Return k, category, score and box of n detections as columns of `prediction`."""
     return {
         "k": list(range(len(found))),
         "category": found.categories.tolist(),
@@ -110,45 +121,45 @@ def detection_columns(found: Detections) -> dict[str, list[Any]]:
 
 
 def as_detections(columns: Mapping[str, Sequence[Any]]) -> Detections:
-    """Return the detections behind the columns of `prediction`."""
+    """Return columns of `prediction` as detections."""
     names = ("category", "score", *BOX_COLUMNS, "iou")
     return Detections.from_rows(list(zip(*(columns[name] for name in names), strict=True)))
 
 
 def _or_none(numbers: np.ndarray) -> list[float | None]:
-    """Return the numbers as the database stores them: null, not NaN."""
+    """Return (n,) numbers as a list with None for NaN."""
     return [None if np.isnan(number) else number for number in numbers.tolist()]
 
 
 def settings(workspace: Workspace, _context: RoundContext) -> Settings:
-    """What predictions depend on beside the frames and the teacher."""
+    """Return what predictions depend on besides the frames and the teacher."""
     config = workspace.config
     return {
         "detector": config.detector.model_dump(mode="json", exclude={"path"}),
-        "files": named_files(config),
+        "files": option_files(config),
         "categories": config.dataset.categories,
     }
 
 
-def named_files(config: Config) -> dict[str, str]:
-    """The hashes of the files that the detector's options name beside its own path, by name."""
+def option_files(config: Config) -> dict[str, str]:
+    """Return the hashes of the files in the detector's options, by their paths in the options."""
     path = config.detector.path
     if path is None:
         return {}
-    found = {name: path.parent / name for name in _named_paths(config.detector.options)}
-    return {name: sha256(place) for name, place in found.items() if place.exists()}
+    files = {name: path.parent / name for name in _option_paths(config.detector.options)}
+    return {name: sha256(file) for name, file in files.items() if file.exists()}
 
 
-def _named_paths(options: object) -> Iterator[str]:
-    """Yield every text within options whose key says that it is a path."""
+def _option_paths(options: object) -> Iterator[str]:
+    """Yield the values of all keys `path` and `frame_list` in nested options."""
     if isinstance(options, Mapping):
         for key, value in options.items():
             if key in {"path", "frame_list"} and isinstance(value, str):
                 yield value
-            yield from _named_paths(value)
+            yield from _option_paths(value)
     elif isinstance(options, list | tuple):
         for each in options:
-            yield from _named_paths(each)
+            yield from _option_paths(each)
 
 
 def check(workspace: Workspace) -> None:
@@ -161,5 +172,5 @@ def check(workspace: Workspace) -> None:
 
 
 def function(workspace: Workspace, context: RoundContext) -> Predict:
-    """What predict does with a frame."""
+    """Return what predict does with a frame."""
     return Predict(workspace.config, context.teacher.path)

@@ -1,4 +1,4 @@
-"""pretrain: the first teacher w_0, from X_l alone; an external detector needs none."""
+"""pretrain: train the first teacher w_0 on X_l alone; not used with an external detector."""
 
 from pathlib import Path
 from typing import Any
@@ -19,24 +19,26 @@ from pipelines.stages.train_round import (
 )
 from pipelines.workspace.workspace import Workspace
 
-_OTHERS = {  # settings that only later trainings depend on
+_LATER_SETTINGS = {  # settings without effect on the first training
     "round_steps", "round_learning_rate", "unlabeled_batch_size", "threads", "start",
     "zero_weight", "teacher", "ema_decay", "command", "labels_format", "statistics_steps",
 }  # fmt: skip
 
 
 def settings(workspace: Workspace) -> Any:
-    """Return all that the first teacher depends on.
+    """Return everything that the first teacher depends on.
 
     Raises:
         WorkspaceError: if there are no labeled frames.
     """
     config, labeled = workspace.config, workspace.frames("labeled")
     if not labeled:
-        raise WorkspaceError("no labeled frames to learn from; `curate init --labeled` takes some")
+        raise WorkspaceError(
+            "no labeled frames to train from; choose some with `curate init --labeled`"
+        )
     trained = trained_detector(config)
     return [
-        config.train.model_dump(mode="json", exclude=_OTHERS) | {"preset": trained.preset},
+        config.train.model_dump(mode="json", exclude=_LATER_SETTINGS) | {"preset": trained.preset},
         sorted(labeled),
         config.run.seed,
         config.detector.device,
@@ -47,16 +49,16 @@ def settings(workspace: Workspace) -> Any:
 
 
 def file(workspace: Workspace) -> Path:
-    """Return the place of the first teacher's checkpoint."""
+    """Return the path of the first teacher's checkpoint."""
     suffix = trained_detector(workspace.config).detector.checkpoint_suffix
     return workspace.root / "checkpoints" / f"round-00{suffix}"
 
 
 def guard(workspace: Workspace) -> None:
-    """Check the leakage firewall, see `firewall`.
+    """Check the leakage firewall.
 
     Raises:
-        LeakageError: if ground truth would reach what it must not.
+        LeakageError: if ground truth of unlabeled or val frames would be trained on.
     """
     from pipelines.firewall.rules import enforce
 
@@ -64,7 +66,7 @@ def guard(workspace: Workspace) -> None:
 
 
 def run(workspace: Workspace, progress: Progress) -> Product:
-    """Train w_0."""
+    """Train the first teacher."""
     config, path, labels = workspace.config, file(workspace), _labels(workspace)
     write_label_file(workspace, labels, 0, "")
     report = train_with_progress(
@@ -93,5 +95,5 @@ def run(workspace: Workspace, progress: Progress) -> Product:
 
 
 def _labels(workspace: Workspace) -> Path:
-    """Return the label file that w_0 learns from."""
+    """Return the path of the label file that the first teacher is trained on."""
     return workspace.root / "exports" / "labeled.sqlite"

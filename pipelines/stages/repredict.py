@@ -1,4 +1,4 @@
-"""repredict: l' = A^-1 f(A(x); w), and how far it disagrees with l (the loss L of Eqs. 4 to 11)."""
+"""repredict: l' = A^-1 f(A(x); w), and its disagreement with l, the loss L of Eqs. 4 to 11."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ View = tuple[Similarity, Detections]
 
 
 class Repredict(Predict):
-    """Answers again for augmented copies of a frame."""
+    """Predicts augmented copies of a frame, and compares them with the frame's predictions."""
 
     def __init__(self, predict: Predict, seed: int, round_number: int) -> None:
         super().__init__(predict.config, predict.teacher)
@@ -33,7 +33,7 @@ class Repredict(Predict):
     def __call__(self, job: FrameJob) -> FrameRows:
         """Return the rows of `reprediction_view`, `reprediction` and `consistency`."""
         if job.predictions is None:
-            raise WorkspaceError(f"frame {job.frame} came without its predictions")
+            raise WorkspaceError(f"frame {job.frame}: the job has no predictions")
         views = self.views(job.frame)
         settings = consistency_settings(self.config)
         losses = [consistency(job.predictions, found, settings) for _, found in views]
@@ -44,7 +44,7 @@ class Repredict(Predict):
                 "rotation_rad": [a.rotation_rad for a, _ in views],
                 "scale": [a.scale for a, _ in views],
             },
-            "reprediction": _below(
+            "reprediction": _concatenate(
                 [
                     _reprediction_columns(view, found, loss)
                     for view, ((_, found), loss) in enumerate(zip(views, losses, strict=True))
@@ -54,26 +54,26 @@ class Repredict(Predict):
         }
 
     def views(self, frame_id: str) -> list[View]:
-        """Return each A with the detections mapped back into the frame."""
+        """Return each similarity A with its detections, mapped back to the frame by A^-1."""
         if isinstance(self.detector, RecordedViews):
-            answers = list(self.detector.views(frame_id))
+            views = list(self.detector.views(frame_id))
         else:
             frame = visible(self.dataset.read(frame_id), self.config)
             drawn = draw(self.seed, self.round_number, frame_id, self.config.repredict)
-            answers = [
+            views = [
                 (a, self.detector.predict(frame.with_points(a.apply_to_points(frame.points))))
                 for a in drawn
             ]
         return [
             (a, checked(replace(found, boxes=a.invert_boxes(found.boxes)), self.config))
-            for a, found in answers
+            for a, found in views
         ]
 
 
 def draw(
     seed: int, round_number: int, frame_id: str, section: RepredictSection
 ) -> list[Similarity]:
-    """Return the similarities of a frame; they depend on seed, round and frame alone."""
+    """Return the similarities A of a frame, drawn from seed, round and frame id alone."""
     digest = hashlib.sha256(frame_id.encode()).digest()
     generator = np.random.default_rng([seed, round_number, *digest])
     return [
@@ -88,19 +88,19 @@ def draw(
 
 
 def settings(workspace: Workspace, context: RoundContext) -> Settings:
-    """What repredictions depend on beside predictions and teacher."""
+    """Return what repredictions depend on besides predictions and teacher."""
     section = workspace.config.repredict.model_dump(mode="json")
     return {**section, "seed": context.seed, "round": context.number}
 
 
 def function(workspace: Workspace, context: RoundContext) -> Repredict:
-    """What repredict does with a frame."""
+    """Return what repredict does with a frame."""
     predict = Predict(workspace.config, context.teacher.path)
     return Repredict(predict, context.seed, context.number)
 
 
 def _reprediction_columns(view: int, found: Detections, loss: Consistency) -> dict[str, list[Any]]:
-    """Return the columns of one view, each reprediction with what it was matched with."""
+    """Return the columns of one view's repredictions, with their matched predictions."""
     matched: list[int | None] = [None] * len(found)
     for k, i in enumerate(loss.matched.tolist()):
         if i >= 0:
@@ -117,14 +117,14 @@ def _reprediction_columns(view: int, found: Detections, loss: Consistency) -> di
     }
 
 
-def _below(parts: Sequence[Mapping[str, list[Any]]]) -> dict[str, list[Any]]:
-    """Return the columns of several views below each other."""
+def _concatenate(parts: Sequence[Mapping[str, list[Any]]]) -> dict[str, list[Any]]:
+    """Return the concatenated columns of several views."""
     names = parts[0] if parts else ()
     return {name: [value for part in parts for value in part[name]] for name in names}
 
 
 def _consistency_columns(losses: Sequence[Consistency], count: int) -> dict[str, list[Any]]:
-    """Return the columns of the labels; without any view each says that there is no evidence."""
+    """Return the columns of `consistency`; without views, every loss is null (no evidence)."""
     loss: list[float | None] = [None] * count
     matched = [0] * count
     if losses:

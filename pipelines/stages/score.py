@@ -1,7 +1,8 @@
-"""score: evidence on every label; each source is a stage of its own.
+"""score: compute the evidence of every label. Each evidence source is a separate stage.
 
-What a source measures in a frame is stored beside what follows from it. Where only the formula has
-changed, its labels are rated again from what is stored, without a look at the frame.
+A source stores its measurements of a frame together with the trust that it computes from them. If
+only the formula changes, the trust is computed again from the stored measurements, without reading
+the frame.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,12 +42,12 @@ from pipelines.workspace.workspace import Workspace, open_dataset, sha256, stat_
 
 @dataclass
 class Score:
-    """Has one source look at a frame and judge its labels.
+    """Scores the labels of a frame with one source.
 
     Attributes:
-        config: all sections.
-        source: as the configuration names it.
-        thresholds: learned from X_l, for sources that name them.
+        config: the configuration.
+        source: name of the source in run.priors.
+        thresholds: points per category, learned from X_l, for sources with this argument.
     """
 
     config: Config
@@ -54,14 +55,14 @@ class Score:
     thresholds: Mapping[str, float]
 
     def open(self) -> None:
-        """Load the data set and what the source needs."""
+        """Open the data set, the source and its models."""
         self.dataset = open_dataset(self.config)
         self.prior = open_prior(self.config, self.source, self.thresholds)
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """Return the columns of the source's table."""
+        """Return the rows of the source's table."""
         if job.predictions is None:
-            raise WorkspaceError(f"frame {job.frame} came without its predictions")
+            raise WorkspaceError(f"frame {job.frame}: the job has no predictions")
         frame = self.dataset.read(
             job.frame, points=self.prior.needs_points, image=self.prior.needs_image
         )
@@ -74,43 +75,45 @@ class Score:
 
 
 class Rescore(Score):
-    """Rates the labels of a frame from what was measured before."""
+    """Scores the labels of a frame from stored measurements."""
 
     def open(self) -> None:
-        """Open the source alone: neither data set nor segmenter is needed."""
+        """Open the source alone, without data set and segmenter."""
         self.prior = open_prior(self.config, self.source, self.thresholds, measures=False)
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """Return the columns of the source's table."""
+        """Return the rows of the source's table."""
         if job.predictions is None or job.measured is None:
-            raise WorkspaceError(f"frame {job.frame} came without predictions and measurements")
+            raise WorkspaceError(
+                f"frame {job.frame}: the job has no predictions or no measurements"
+            )
         evidence = self.prior.rate(job.predictions, job.measured)
         return self.rows(evidence, len(job.predictions))
 
 
 @dataclass
 class ScoreSequence:
-    """Has one source look at a whole sequence.
+    """Scores the labels of a whole sequence with one source.
 
     Attributes:
-        config: all sections.
-        source: as the configuration names it.
+        config: the configuration.
+        source: name of the source in run.priors.
     """
 
     config: Config
     source: str
 
     def open(self) -> None:
-        """Load the data set and the source."""
+        """Open the data set and the source."""
         self.dataset = open_dataset(self.config)
         self.opened = open_sequence_source(self.config, self.source)
 
     def __call__(self, job: SequenceJob) -> Sequence[FrameRows]:
-        """Return the columns of the source's table, for each frame."""
+        """Return the rows of the source's table for each frame."""
         frames = []
         for each in job.frames:
             if each.predictions is None:
-                raise WorkspaceError(f"frame {each.frame} came without its predictions")
+                raise WorkspaceError(f"frame {each.frame}: the job has no predictions")
             read = partial(self.dataset.read, each.frame)
             frames.append(SequenceFrame(each.frame, each.predictions, read))
         found = self.opened.score_sequence(frames)
@@ -147,7 +150,7 @@ def stage(source: Source) -> FramesStage:
         writes=(source.table,),
         settings=partial(_settings, source),
         function=partial(_function, Score, name),
-        recall=ReusableMeasurements(
+        reusable=ReusableMeasurements(
             reads=("frame", "prediction"),
             settings=partial(_measured_settings, source),
             read=partial(_read_measured, source),
@@ -168,19 +171,18 @@ def stages(names: Sequence[str]) -> tuple[FramesStage, ...]:
 
 
 def _check(name: str, workspace: Workspace) -> None:
-    """Check that a source can be made with its options, and that its segmenter opens."""
     check_prior(workspace.config, name)
 
 
 def _declared(source: Source) -> Settings:
-    """Return the declaration of a source, as far as no migration of the schema fixes it."""
+    """Return the declaration of a source; nothing if its table is part of the schema."""
     if source.table in bulk.SCHEMA_TABLES:
         return {}
     return {"columns": repr(source.declaration)}
 
 
 def _settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:
-    """What rho depends on beside predictions, ground truth and measurements: the formula."""
+    """Return the settings of the formula, which rho depends on besides the measurements."""
     name = source.configured
     sections = {"thresholds": workspace.config.points, "settings": workspace.config.semantic}
     return {
@@ -191,13 +193,13 @@ def _settings(source: Source, workspace: Workspace, _context: RoundContext) -> S
 
 
 def _sequence_settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:
-    """What the evidence of a sequence depends on beside its predictions."""
+    """Return what the evidence of a sequence depends on besides its predictions."""
     options = workspace.config.run.prior_options.get(source.configured, {})
     return {"options": options, **_declared(source)}
 
 
 def _measured_settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:
-    """What measurements depend on beside frame and predictions."""
+    """Return what the measurements depend on besides frame and predictions."""
     config, name = workspace.config, source.configured
     options = {"options": config.run.prior_options.get(name, {}), **_declared(source)}
     if not PRIORS.takes(name, "segmenter"):
@@ -208,20 +210,20 @@ def _measured_settings(source: Source, workspace: Workspace, _context: RoundCont
 
 
 def _identity(path: Path | None) -> str:
-    """What tells a model, or a folder of saved maps, from another one in its place."""
+    """Return a fingerprint of a model file, or of a folder of saved maps."""
     if path is not None and path.is_dir():
         return stat_fingerprint(path)
     return sha256(path) if path is not None and path.is_file() else str(path)
 
 
 def _function(kind: type[Score], name: str, workspace: Workspace, _context: RoundContext) -> Score:
-    """What score does with a frame; X_l is read here, once."""
+    """Return what score does with a frame; X_l is read here, once for all workers."""
     thresholds = _learned(workspace) if PRIORS.takes(name, "thresholds") else {}
     return kind(workspace.config, name, thresholds)
 
 
 def _learned(workspace: Workspace) -> Mapping[str, float]:
-    """m_th of each category, from X_l."""
+    """Return m_th of each category, learned from X_l."""
     truth = workspace.ground_truth("labeled")
     return learn_thresholds(
         ((workspace.dataset.read(frame), annotations) for frame, annotations in truth.items()),
@@ -233,7 +235,7 @@ def _learned(workspace: Workspace) -> Mapping[str, float]:
 def _read_measured(
     source: Source, workspace: Workspace, context: RoundContext, frame_ids: Sequence[int]
 ) -> Mapping[int, Measured]:
-    """Return the measured columns of some frames, in the order of k."""
+    """Return the measured columns of some frames by frame key, each in the order of k."""
     table, names = bulk.table(source.table), source.measured_columns
     query = (
         select(table.c.frame_id, *(table.c[column] for column in names))
@@ -247,5 +249,5 @@ def _read_measured(
 
 
 def _array(values: Sequence[Any]) -> np.ndarray:
-    """Return a stored column; NaN for null."""
+    """Return a stored column as an array, with NaN for null."""
     return np.array(values, dtype=np.float64) if None in values else np.array(values)

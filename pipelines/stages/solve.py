@@ -1,4 +1,4 @@
-"""solve: the weight of every label under a policy, in closed form over the whole round."""
+"""solve: compute the weight of every label of a round under a policy, in closed form."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,11 +17,11 @@ from pipelines.labels.human_labels import refresh_matches
 from pipelines.labels.sources import report_unused
 from pipelines.workspace.workspace import Workspace
 
-TRUSTED = 0.5  # a label of a greater weight counts as trusted
+TRUSTED = 0.5  # labels with a greater weight count as trusted
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
-    """What weights depend on beside the evidence."""
+    """Return what the weights depend on besides the evidence."""
     section = workspace.config.solve
     return {
         "policy": policy,
@@ -37,7 +37,7 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
 
 
 def check(workspace: Workspace, policy: str) -> None:
-    """Check that the policy can be made with its settings.
+    """Check that the policy can be created with its settings.
 
     Raises:
         ConfigError: if it cannot.
@@ -46,31 +46,31 @@ def check(workspace: Workspace, policy: str) -> None:
 
 
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
-    """Return the policy's weights of the round."""
+    """Compute the policy's weights of the round."""
     report_unused(workspace)
     context, policy = job.context, job.policy
     opened = open_policy(workspace.config, policy)
-    looks_back = context.number > 1 and opened.remembers
+    needs_memory = context.number > 1 and opened.remembers
     keys, evidence = read_evidence(
         workspace,
         context.number,
         job.frames,
-        boxes=looks_back,
+        boxes=needs_memory,
         columns=opened.reads,
     )
-    if looks_back:
+    if needs_memory:
         evidence = replace(evidence, memory=read_memory(workspace, context.number - 1, policy))
     weights = opened.weigh(evidence, context.age)
     columns = _columns(keys, weights, evidence)
     counts = _counts(context.number, policy, keys, weights)
-    weight_index.prepare(workspace.database, policy)
+    weight_index.ensure_index(workspace.database, policy)
 
     def write(connection: Connection) -> None:
-        with weight_index.replacing(connection, policy, len(keys)):
+        with weight_index.rebuilding(connection, policy, len(keys)):
             _store(connection, context.number, policy, columns)
-        former = bulk.table("label_count").c
-        mine = (former.round == context.number, former.policy == policy)
-        connection.execute(former.policy.table.delete().where(*mine))
+        count = bulk.table("label_count")
+        former = (count.c.round == context.number, count.c.policy == policy)
+        connection.execute(count.delete().where(*former))
         bulk.insert_rows(connection, "label_count", counts)
         refresh_matches(connection, context.number)
         bulk.refresh_statistics(connection)
@@ -79,12 +79,12 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     summary = f"{len(keys)} labels, {trusted} with weight > 0, their weights sum to {total:.1f}"
     dropped = int(weights.dropped.sum())
     summary = f"{summary}, {dropped} dropped" if dropped else summary
-    # No other process changes predictions of a round that is being solved, see `db.claims`.
+    # The keys need no check: the claim keeps other processes from changing the predictions.
     return Product(summary, write, keys_known=True)
 
 
 def _memory_fingerprint(workspace: Workspace, context: RoundContext, policy: str) -> str | None:
-    """What a policy that remembers has stored of the round before."""
+    """Return the fingerprint of the weights that the policy reads from the round before."""
     if context.number == 1 or not open_policy(workspace.config, policy).remembers:
         return None
     return solved_fingerprint(workspace, context.number - 1, policy)
@@ -93,15 +93,16 @@ def _memory_fingerprint(workspace: Workspace, context: RoundContext, policy: str
 def _store(
     connection: Connection, round_number: int, policy: str, columns: Mapping[str, np.ndarray]
 ) -> None:
-    """Put the weights of a policy in the place of its former ones."""
-    weight, mine = bulk.table("weight"), {"round": round_number, "policy": policy}
-    connection.execute(weight.delete().where(*(weight.c[name] == at for name, at in mine.items())))
+    """Replace the stored weights of a policy."""
+    weight, key = bulk.table("weight"), {"round": round_number, "policy": policy}
+    former = (weight.c[name] == value for name, value in key.items())
+    connection.execute(weight.delete().where(*former))
     if len(columns["k"]):
-        bulk.insert(connection, "weight", {**mine, **columns})
+        bulk.insert(connection, "weight", {**key, **columns})
 
 
 def _columns(keys: LabelKeys, weights: Weights, evidence: Evidence) -> dict[str, np.ndarray]:
-    """Return the columns of `weight`, of the labels that are not dropped, by frame and k."""
+    """Return the columns of `weight` for the labels that are not dropped, by frame and k."""
     kept = ~weights.dropped if weights.dropped.any() else slice(None)
     return {
         "frame_id": keys.frame_id[kept],

@@ -1,4 +1,4 @@
-"""train-round: the student, from the exported labels and the teacher."""
+"""train-round: train the student from the exported labels and the teacher."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
-    """What a student depends on beside teacher and labels."""
+    """Return what a student depends on besides teacher and labels."""
     section = workspace.config.train
     if section.command is not None:
         return {"command": section.command, "labels_format": section.labels_format}
@@ -63,13 +63,13 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
-    """Return the checkpoint of the next teacher: the student, or the average of its weights.
+    """Return the path of the next teacher's checkpoint: the student, or its averaged weights.
 
-    It ends like the file that the user brings, so that the detector knows it by its name.
+    The suffix is that of the user's file, because a detector may choose the format by it.
     """
-    brought = workspace.config.detector.path
+    supplied = workspace.config.detector.path
     trainable = trainable_detector(workspace.config)
-    suffix = brought.suffix if brought else ""
+    suffix = supplied.suffix if supplied else ""
     if trainable:
         suffix = trainable.detector.checkpoint_suffix
     name = f"round-{context.number:02d}-{policy}{suffix}"
@@ -77,10 +77,10 @@ def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
 
 
 def check(workspace: Workspace, policy: str) -> None:
-    """Check the policy, and the settings of the trainer, curate's or the user's.
+    """Check the policy, and the settings of curate's trainer or of the user's.
 
     Raises:
-        ConfigError: if the policy or the label format cannot be used, or the trainer does not know
+        ConfigError: if the policy or the label format cannot be used, or the trainer does not have
             a setting.
     """
     config = workspace.config
@@ -93,11 +93,11 @@ def check(workspace: Workspace, policy: str) -> None:
 
 
 def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
-    """Train the student, or has it trained by the user's command.
+    """Train the student, by curate or by the user's command.
 
     Raises:
-        ConfigError: curate cannot train the configured detector, or the command is wrong.
-        TrainerFailed: if the command failed, or left no checkpoint.
+        ConfigError: if curate cannot train the configured detector, or the command is wrong.
+        TrainerFailed: if the command fails, or does not write a checkpoint.
     """
     path = file(workspace, job.context, job.policy)
     trainable = trainable_detector(workspace.config)
@@ -112,8 +112,8 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
         return Product(f"{workspace.relative(path)}, by your trainer", write)
     if trainable is None:
         raise ConfigError(
-            f"detector '{workspace.config.detector.name}' is not trained by curate; "
-            f"train it from {export.file(workspace, job.context, job.policy)}, or with --command"
+            f"detector '{workspace.config.detector.name}' cannot be trained by curate; train it "
+            f"yourself on {export.file(workspace, job.context, job.policy)}, or use --command"
         )
     section = workspace.config.train
     report = train_with_progress(
@@ -138,7 +138,7 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
 def store_statistics(
     connection: Connection, round_number: int, policy: str, statistics: "Sequence[Statistic]"
 ) -> None:
-    """Store the curves of a training in place of those of an earlier one; NaN becomes null."""
+    """Store the curves of a training; they replace earlier ones, and NaN becomes null."""
     table = bulk.table("training_statistics")
     connection.execute(
         table.delete().where(table.c.round == round_number, table.c.policy == policy)
@@ -165,13 +165,21 @@ def training_settings(
 ) -> "TrainingSettings":
     """Return the trainer's settings.
 
+    Args:
+        workspace: the workspace.
+        steps: number of optimiser steps.
+        learning_rate: peak learning rate.
+        round_number: number e of the round; 0 for the first teacher.
+        method: the method.
+
     Raises:
-        ConfigError: train.options holds what the trainer does not know, or cannot use.
+        ConfigError: if `train.options` has a setting that the trainer does not have, or a wrong
+            value.
     """
     from curate.training.settings import TrainingSettings
 
     section = workspace.config.train
-    known = {
+    values = {
         "preset": trained_detector(workspace.config).preset,
         "steps": steps,
         "batch_size": section.batch_size,
@@ -186,10 +194,10 @@ def training_settings(
         "device": device(workspace.config),
     }
     try:
-        return TrainingSettings(**{**known, **section.options})
+        return TrainingSettings(**{**values, **section.options})
     except TypeError as error:
-        names = [field.name for field in fields(TrainingSettings) if field.name not in known]
-        unknown = [name for name in section.options if name not in {*names, *known}]
+        names = [field.name for field in fields(TrainingSettings) if field.name not in values]
+        unknown = [name for name in section.options if name not in {*names, *values}]
         reason = f"unknown setting '{unknown[0]}'" if unknown else one_line(error)
         meant = did_you_mean(unknown[0], names) if unknown else ""
         raise ConfigError(
@@ -207,7 +215,7 @@ def train_with_progress(
     read: Callable[[str], Frame],
     progress: Progress,
 ) -> "TrainingReport":
-    """Train with a bar that counts steps and shows the loss."""
+    """Train a detector, and show the number of steps and the loss as progress."""
     from curate.training.trainer import train
 
     with progress.track(output.stem, settings.steps) as advance:

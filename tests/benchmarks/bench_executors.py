@@ -66,7 +66,7 @@ def bench_predict(benchmark, prepared, executor, workers):
 
         def predict(workspace):
             plan = open_plan(workspace, 1)
-            report = run_frames(plan, plan.graph.of_frames("predict"), work, Silent())
+            report = run_frames(plan, plan.graph.frames_stage("predict"), work, Silent())
             assert report.done + report.empty == FRAMES - 1, report.errors
 
         predict(prepared())  # starts the workers, which load their models

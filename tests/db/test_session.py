@@ -144,7 +144,7 @@ def test_a_server_without_pg_dump_is_migrated_with_a_warning(
     """The migration is one transaction."""
     monkeypatch.setenv("PATH", str(tmp_path))
     Database(older_server_database.url, tmp_path).close()
-    assert "without a copy" in caplog.text
+    assert "without a backup" in caplog.text
     assert list(tmp_path.iterdir()) == []
 
 
@@ -261,7 +261,7 @@ def test_a_dropped_table_is_reported(database: Database) -> None:
         drop_views(connection)
         connection.exec_driver_sql("DROP TABLE weight")
     database.close()
-    with pytest.raises(DatabaseError, match="has no table weight; restore a backup"):
+    with pytest.raises(DatabaseError, match="table weight is missing; restore a backup"):
         Database(database.url)
 
 
@@ -281,7 +281,7 @@ def test_a_database_of_two_schemas_is_rejected(tmp_path: Path) -> None:
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("INSERT INTO alembic_version VALUES ('0001')")
         connection.commit()
-    with pytest.raises(DatabaseError, match="names several schemas; restore a backup"):
+    with pytest.raises(DatabaseError, match="lists several schemas; restore a backup"):
         Database(f"sqlite:///{path}")
 
 
@@ -292,7 +292,9 @@ def test_a_database_of_another_program_is_not_changed(tmp_path: Path, table: str
     with closing(sqlite3.connect(path)) as connection:
         connection.execute(f"CREATE TABLE {table} (id, name)")
     before = path.read_bytes()
-    with pytest.raises(DatabaseError, match=f"has a table {table} but no schema of curate"):
+    with pytest.raises(
+        DatabaseError, match=f"has a table {table}, but table alembic_version has no schema"
+    ):
         Database(f"sqlite:///{path}")
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

@@ -43,7 +43,7 @@ def _indices(database: Database) -> set[str]:
 def test_every_policy_gets_one_index_for_any_name(database: Database) -> None:
     """Also for a user-supplied class; a second call changes nothing."""
     for policy in (*POLICIES, *POLICIES):
-        weight_index.prepare(database, policy)
+        weight_index.ensure_index(database, policy)
     expected = {str(weight_index.index_of(policy).name) for policy in POLICIES}
     assert len(expected) == len(POLICIES)
     assert {name.lower() for name in expected} == {name.lower() for name in _indices(database)}
@@ -53,7 +53,7 @@ def test_every_policy_gets_one_index_for_any_name(database: Database) -> None:
 def test_a_query_for_a_policy_uses_its_index(tmp_path: Path, policy: str) -> None:
     """Whether the policy is in the query or a parameter."""
     database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
-    weight_index.prepare(database, policy)
+    weight_index.ensure_index(database, policy)
     weight = bulk.table("weight").c
     query = select(weight.v).where(weight.round == 1, weight.policy == policy, weight.v > 0.5)
     name = weight_index.index_of(policy).name
@@ -73,9 +73,9 @@ def test_only_the_index_of_the_policy_is_rebuilt(
     monkeypatch.setattr(weight_index, "REBUILT_FROM", 1)
     database = Database(f"sqlite:///{tmp_path / 'curate.db'}")
     for policy in ("pspsl", "spsl"):
-        weight_index.prepare(database, policy)
+        weight_index.ensure_index(database, policy)
     with database.writing() as connection:
-        with weight_index.replacing(connection, "spsl", 20):
+        with weight_index.rebuilding(connection, "spsl", 20):
             within = {str(each["name"]) for each in inspect(connection).get_indexes("weight")}
         assert within == {"ix_weight_v_pspsl"}
     assert _indices(database) == {"ix_weight_v_pspsl", "ix_weight_v_spsl"}
@@ -83,7 +83,7 @@ def test_only_the_index_of_the_policy_is_rebuilt(
 
 def test_weights_of_an_older_schema_get_their_indices(database: Database) -> None:
     """The downgrade leaves the single index of that schema."""
-    weight_index.prepare(database, "pspsl")
+    weight_index.ensure_index(database, "pspsl")
     with database.writing() as connection:
         drop_views(connection)
         downgrade(connection, "0007")

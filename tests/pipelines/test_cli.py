@@ -176,7 +176,7 @@ def test_all_wrong_settings_are_reported_at_once(curate: Curate, made: Path) -> 
         ("seed = 0", "seed = -1", "run.seed"),
         ("seed = 0", "seed = 99999999999999999999", "run.seed"),
         ('method = "pspsl"', 'method = "nope"', "unknown policy 'nope'"),
-        ("[run]", '[run]\ndatabase = "nonsense"', "run.database: no URL of a database"),
+        ("[run]", '[run]\ndatabase = "nonsense"', "run.database: not the URL of a database"),
         ("[run]", '[run]\ndatabase = "oracle9://x"', "oracle9"),
     ],
 )
@@ -201,7 +201,7 @@ def test_a_policy_option_of_another_type_gives_a_one_line_error(curate: Curate, 
     curate("run")
     code, _, err = curate("solve", "--policy", "threshold")
     assert code == ConfigError.exit_code
-    assert "policy 'threshold' cannot be made" in err
+    assert "policy 'threshold' cannot be created" in err
     assert err.count("\n") == 1
 
 

@@ -134,7 +134,7 @@ def test_a_failing_detector_constructor_stops_the_first_stage(
     edit(workspace, ("support.toys:ToyDetector", "failing_detector:Mine"))
     code, out, err = curate(command, "-w", workspace.root)
     assert (code, out) == (ConfigError.exit_code, "")
-    assert "detector 'failing_detector:Mine' cannot be made: OSError: no licence" in err
+    assert "detector 'failing_detector:Mine' cannot be created: OSError: no licence" in err
     with workspace.database.reading() as connection:
         assert connection.execute(text("SELECT count(*) FROM task")).scalar_one() == 0
 

@@ -28,10 +28,10 @@ def run_stage(
     plan = open_plan(workspace, number)
     if isinstance(plan.graph.stage(name), RoundStage):
         return run_round(plan, name, policy, Silent())
-    return run_frames(plan, plan.graph.of_frames(name), SerialExecutor(), Silent())
+    return run_frames(plan, plan.graph.frames_stage(name), SerialExecutor(), Silent())
 
 
 def state_of(workspace: Workspace, name: str, policy: str = "pspsl", number: int = 1) -> str:
     """Return the state of a round stage."""
     plan = open_plan(workspace, number)
-    return plan.round_state(plan.graph.of_rounds(name), policy)
+    return plan.round_state(plan.graph.round_stage(name), policy)

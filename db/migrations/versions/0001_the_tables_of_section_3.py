@@ -1,11 +1,22 @@
-"""The tables of section 3."""
+"""The tables of the data model: frames, rounds, predictions, evidence and weights."""
 
 from typing import Any
 
 import sqlalchemy as sa
 from alembic import op
 
-from db.ddl import RADIANS, SHARE, box, integer, key, leaves_with, prediction_key, real, table, text
+from db.ddl import (
+    RADIANS,
+    SHARE,
+    box,
+    deleted_with,
+    integer,
+    key,
+    prediction_key,
+    real,
+    table,
+    text,
+)
 
 revision = "0001"
 down_revision = None
@@ -19,13 +30,13 @@ _TABLES = (
 
 
 def upgrade() -> None:
-    """Goes forward."""
+    """Upgrade the schema."""
     _frames()
     _rounds()
     _predictions()
     _evidence()
     if op.get_bind().dialect.name == "sqlite":
-        # The foreign key already refuses it; this holds for connections that switched keys off too.
+        # The foreign key rejects such a row too, but not on connections with foreign keys off.
         op.execute(
             """
             CREATE TRIGGER ground_truth_never_unlabeled BEFORE INSERT ON ground_truth
@@ -148,7 +159,7 @@ def _predictions() -> None:
         real("score_loss", "-ln of this score", nullable=True),
         real("box_loss", "sum of smooth L1, beta 1/9", nullable=True),
         *box(),
-        leaves_with("reprediction_view", "round", "frame_id", "view"),
+        deleted_with("reprediction_view", "round", "frame_id", "view"),
     )
 
 
@@ -185,12 +196,12 @@ def _evidence() -> None:
     }
     for name, columns in evidence.items():
         table(
-            name, *prediction_key(), *columns, leaves_with("prediction", "round", "frame_id", "k")
+            name, *prediction_key(), *columns, deleted_with("prediction", "round", "frame_id", "k")
         )
     op.create_index("ix_weight_policy_v", "weight", ["round", "policy", "v"])
 
 
 def downgrade() -> None:
-    """Goes back."""
+    """Downgrade the schema."""
     for name in reversed(_TABLES):
         op.drop_table(name)

@@ -23,7 +23,7 @@ _FIGURES = {
 
 
 def upgrade() -> None:
-    """Goes forward."""
+    """Upgrade the schema."""
     table("audit", *_audited(), *_judgement())
     table(
         "audit_bin",
@@ -79,7 +79,7 @@ def _source() -> sa.Column[Any]:
 
 
 def _audited() -> list[sa.Column[Any]]:
-    """The key of a row of an audit."""
+    """Return the key columns of the audit tables."""
     return [
         key("round", "of the teacher"),
         text("frames", "which: val, labeled, or e.g. 5 folds", primary_key=True),
@@ -90,7 +90,7 @@ def _audited() -> list[sa.Column[Any]]:
 
 
 def _judgement() -> list[sa.Column[Any]]:
-    """What is said of the labels of an audit."""
+    """Return the columns with the figures of an audit."""
     bound = "bound of its interval"
     return [
         integer("labels", "that are right or wrong"),
@@ -108,6 +108,6 @@ def _judgement() -> list[sa.Column[Any]]:
 
 
 def downgrade() -> None:
-    """Goes back."""
+    """Downgrade the schema."""
     for name in ("evaluation_object", "evaluation_ap", "audit_slice", "audit_bin", "audit"):
         op.drop_table(name)

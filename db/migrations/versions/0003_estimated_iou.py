@@ -1,4 +1,4 @@
-"""The detector's estimate of its IoU with the object."""
+"""The detector's estimate of a prediction's IoU with the object."""
 
 from alembic import op
 
@@ -11,11 +11,11 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Goes forward."""
+    """Upgrade the schema."""
     meaning = "the detector's estimate of its 3D IoU with the object; null = it makes none"
     op.add_column("prediction", real("iou", meaning, nullable=True))
 
 
 def downgrade() -> None:
-    """Goes back."""
+    """Downgrade the schema."""
     op.drop_column("prediction", "iou")

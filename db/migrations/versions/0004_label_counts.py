@@ -1,4 +1,4 @@
-"""Counts of weighed labels, and frames found by their name alone."""
+"""Counts of weighted labels, and an index of frames by name."""
 
 from alembic import op
 
@@ -11,7 +11,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Goes forward; what has been weighed before is counted."""
+    """Upgrade the schema and count the labels that already have weights."""
     table(
         "label_count",
         integer("round", primary_key=True, refers="round.number"),
@@ -35,6 +35,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Goes back."""
+    """Downgrade the schema."""
     op.drop_index("ix_frame_frame", "frame")
     op.drop_table("label_count")

@@ -1,4 +1,4 @@
-"""Reviews, what people decided in them, and the predictions that they speak for."""
+"""Reviews, the human labels from them, and the predictions that match human labels."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -8,9 +8,9 @@ from db.ddl import (
     RADIANS,
     SIDES,
     box,
+    deleted_with,
     integer,
     key,
-    leaves_with,
     prediction_key,
     real,
     table,
@@ -24,7 +24,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Goes forward."""
+    """Upgrade the schema."""
     op.create_table(
         "review",
         text("id", "hash of its manifest", primary_key=True),
@@ -66,14 +66,14 @@ def upgrade() -> None:
         integer("n", "human_label.n"),
         real("iou", "BEV IoU with its box, or the one seen"),
         integer("leads", "1 if the human label stands in weighted_labels under this k"),
-        leaves_with("prediction", "round", "frame_id", "k"),
-        leaves_with("human_label", "frame_id", "n"),
+        deleted_with("prediction", "round", "frame_id", "k"),
+        deleted_with("human_label", "frame_id", "n"),
     )
     op.create_index("ix_human_match_label", "human_match", ["frame_id", "n"])
 
 
 def downgrade() -> None:
-    """Goes back; the views, which name these tables, are made again by the next upgrade."""
+    """Downgrade the schema; the next upgrade recreates the view, which reads these tables."""
     op.execute("DROP VIEW IF EXISTS weighted_labels")
     for name in ("human_match", "human_label", "review"):
         op.drop_table(name)

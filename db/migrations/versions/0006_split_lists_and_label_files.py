@@ -1,4 +1,4 @@
-"""What the leakage firewall compares: lists of frames, and label files as they were written."""
+"""The tables of the leakage firewall: lists of frames, and hashes of exported label files."""
 
 import hashlib
 
@@ -14,7 +14,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Goes forward; the splits of an older workspace are taken as they are."""
+    """Upgrade the schema and record the splits of an older workspace."""
     lists = table(
         "split_list",
         text("source", "chosen | dataset (its own) | file (given to init)", primary_key=True),
@@ -43,6 +43,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Goes back."""
+    """Downgrade the schema."""
     op.drop_table("label_file")
     op.drop_table("split_list")

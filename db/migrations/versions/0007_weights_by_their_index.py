@@ -1,6 +1,6 @@
-"""The view weighted_labels gives weights bare, so that questions find them by their index.
+"""The view weighted_labels returns the stored weight itself, so that queries can use its index.
 
-Views are made anew after every migration; this revision only says that there is a newer one.
+Views are recreated after every migration; this revision only makes that happen.
 """
 
 revision = "0007"
@@ -10,8 +10,8 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Goes forward."""
+    """Upgrade the schema."""
 
 
 def downgrade() -> None:
-    """Goes back."""
+    """Downgrade the schema."""

@@ -1,4 +1,4 @@
-"""Each policy's weights have an index of their own by value."""
+"""One index per policy of its weights by value."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Goes forward."""
+    """Upgrade the schema."""
     op.drop_index("ix_weight_policy_v", "weight")
     connection = op.get_bind()
     for (policy,) in connection.execute(sa.text("SELECT DISTINCT policy FROM label_count")).all():
@@ -20,7 +20,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Goes back."""
+    """Downgrade the schema."""
     for index in sa.inspect(op.get_bind()).get_indexes("weight"):
         if str(index["name"]).startswith(PREFIX):
             op.drop_index(str(index["name"]), "weight")

@@ -1,4 +1,4 @@
-"""What evidence sources declare, and the definitions of the views."""
+"""The declarations of evidence sources, and the hashes of the views' definitions."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make both tables; the views are made after the migrations."""
+    """Upgrade the schema; the views are created after the migrations."""
     table(
         "evidence_source",
         text("name", "its table is prior_NAME", primary_key=True),
@@ -30,7 +30,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop both tables, and those of the sources."""
+    """Downgrade the schema and drop the tables of the evidence sources."""
     connection = op.get_bind()
     for (name,) in connection.execute(sa.text("SELECT name FROM evidence_source")).all():
         op.drop_table(f"prior_{name}")

@@ -1,4 +1,4 @@
-"""The curves of trainings: loss terms, learning rate and gradient norm of every few steps."""
+"""Training curves: loss terms, learning rate and gradient norm of every few steps."""
 
 from alembic import op
 
@@ -11,7 +11,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Adds the table."""
+    """Upgrade the schema."""
     table(
         "training_statistics",
         key("round", "as of the checkpoint"),
@@ -23,5 +23,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Removes the table."""
+    """Downgrade the schema."""
     op.drop_table("training_statistics")

@@ -1,4 +1,4 @@
-"""What every executor offers, and what happens to one frame wherever it is worked on."""
+"""The interface of executors, and the code that processes one job in any of them."""
 
 import logging
 import pickle
@@ -15,27 +15,28 @@ from curate.errors import CurateError, ModelError, one_line
 
 logger = logging.getLogger(__name__)
 
-# A frame whose worker died is tried so often in all; the next death may well be its own doing.
-TRIES = 2
-# Jobs in the hands of a worker: one that it works on, and one so that it need not wait while the
-# runner writes.
-IN_HAND = 2
-# So many more workers than there are may die in a row while they load their models.
+# A frame is tried again after its worker crashed, but it may have caused the crash: the second
+# crash makes it fail.
+MAX_TRIES = 2
+# Jobs that a worker holds: the one in progress, and the next one, so that the worker need not wait
+# while the runner writes.
+JOBS_PER_WORKER = 2
+# The run ends after (workers + SPARE_OPENINGS) crashes in a row during the loading of models.
 SPARE_OPENINGS = 2
 
 FrameRows = Mapping[str, Mapping[str, Sequence[Any]]]
-"""The rows of one frame: by table its columns of one length, without `round` and `frame_id`."""
+"""The rows of one frame: for each table its columns, without `round` and `frame_id`."""
 
 
 @dataclass(frozen=True)
 class FrameJob:
-    """One frame to work on, with what is known of it.
+    """One frame to process, with the stored data that the stage needs.
 
     Attributes:
-        frame_id: its key.
-        frame: its name.
-        predictions: what predict found, for stages that read it.
-        measured: what the stage itself once measured, where that still holds.
+        frame_id: key of the frame.
+        frame: name of the frame.
+        predictions: its predictions, for stages that read them.
+        measured: its stored measurements by column, if they are still valid.
     """
 
     frame_id: int
@@ -45,22 +46,22 @@ class FrameJob:
 
     @property
     def frames(self) -> "tuple[FrameJob, ...]":
-        """Itself."""
+        """The frames of the job: this one."""
         return (self,)
 
     @property
     def title(self) -> str:
-        """Its name in messages."""
+        """The name of the job in messages."""
         return f"frame {self.frame}"
 
 
 @dataclass(frozen=True)
 class SequenceJob:
-    """A sequence to work on: its frames in their order.
+    """One sequence to process.
 
     Attributes:
-        name: of the sequence.
-        frames: all its frames, each with its predictions.
+        name: name of the sequence.
+        frames: all its frames in order, each with its predictions.
     """
 
     name: str
@@ -68,7 +69,7 @@ class SequenceJob:
 
     @property
     def title(self) -> str:
-        """Its name in messages."""
+        """The name of the job in messages."""
         return f"sequence {self.name}"
 
 
@@ -76,26 +77,32 @@ Job = FrameJob | SequenceJob
 
 
 class FrameFunction(Protocol):
-    """What a stage does with one frame; travels to workers, so it is small until `open`."""
+    """What a stage does with one frame.
+
+    It is pickled and sent to the workers, so it loads nothing large before `open`.
+    """
 
     def open(self) -> None:
-        """Load the models and the data set; a failure here ends the run."""
+        """Load the models and the data set; an error here ends the run."""
         ...
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """Return the frame's rows; a failure here is the frame's alone."""
+        """Return the frame's rows; an error here fails only this frame."""
         ...
 
 
 class SequenceFunction(Protocol):
-    """What a stage does with one sequence; travels to workers, so it is small until `open`."""
+    """What a stage does with one sequence.
+
+    It is pickled and sent to the workers, so it loads nothing large before `open`.
+    """
 
     def open(self) -> None:
-        """Load the models and the data set; a failure here ends the run."""
+        """Load the models and the data set; an error here ends the run."""
         ...
 
     def __call__(self, job: SequenceJob) -> Sequence[FrameRows]:
-        """The rows of each of its frames in order; a failure here is the sequence's alone."""
+        """Return the rows of each frame in order; an error here fails only this sequence."""
         ...
 
 
@@ -104,13 +111,13 @@ JobFunction = FrameFunction | SequenceFunction
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job.
+    """The result of a job.
 
     Attributes:
-        job: what was worked on.
-        rows: of each of its frames, in their order; nothing where it failed.
-        error: in one line, where it failed.
-        seconds: that it took.
+        job: the job.
+        rows: rows of each of its frames, in order; empty if the job failed.
+        error: error message in one line; None if the job succeeded.
+        seconds: time that the job took.
     """
 
     job: Job
@@ -120,14 +127,14 @@ class Outcome:
 
 
 class Executor(Protocol):
-    """Maps a function over frames or sequences; yields outcomes in any order.
+    """Maps a function over frames or sequences, and yields their outcomes in any order.
 
-    It holds a bounded number of jobs.
-    A worker that dies costs the job in its hands one more try and no other job anything.
+    It takes a bounded number of jobs ahead. If a worker crashes, only the job in progress loses one
+    of its tries; the other jobs of the worker are requeued.
     """
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
-        """One outcome per job.
+        """Yield one outcome per job.
 
         Raises:
             CurateError: if the models cannot be loaded.
@@ -135,113 +142,113 @@ class Executor(Protocol):
         ...
 
     def close(self) -> None:
-        """End its workers."""
+        """End the workers."""
         ...
 
 
 class JobQueue:
-    """Jobs to hand out: first those that a dead worker has left, then the next of all."""
+    """The jobs that are still to be sent to workers: first requeued ones, then new ones."""
 
     def __init__(self, jobs: Iterable[Job], workers: int) -> None:
         self._openings = workers + SPARE_OPENINGS
         self._next = iter(jobs)
         self._again: deque[Job] = deque()
-        self._deaths: Counter[str] = Counter()
-        self._dead_openings = 0
+        self._crashes: Counter[str] = Counter()
+        self._failed_openings = 0
 
     def take(self) -> Job | None:
-        """Return the next job; None where there is none."""
+        """Return the next job; None if there is none."""
         return self._again.popleft() if self._again else next(self._next, None)
 
     def return_jobs(self, jobs: Iterable[Job]) -> None:
-        """Take jobs back that nobody has begun."""
+        """Requeue jobs that no worker has started."""
         self._again.extend(jobs)
 
-    def opened(self) -> None:
-        """A worker has loaded its models."""
-        self._dead_openings = 0
+    def record_opened(self) -> None:
+        """Record that a worker has loaded its models."""
+        self._failed_openings = 0
 
     def record_crash(
         self, in_flight: Sequence[Job], reason: str, *, opened: bool
     ) -> Iterator[Outcome]:
-        """Take back what a dead worker had in hand; a frame that was tried too often has failed.
+        """Requeue the jobs of a crashed worker; yield the job in progress if it has failed.
 
         Args:
-            in_flight: its jobs in their order; it had begun the first, if any.
-            reason: how it died.
-            opened: whether it had loaded its models.
+            in_flight: jobs of the worker, in order; it had started the first one.
+            reason: how the worker ended, for the message.
+            opened: whether the worker had loaded its models.
 
         Raises:
-            CurateError: workers die before they have loaded their models.
+            CurateError: if too many workers in a row crash before they have loaded their models.
         """
         if not opened:
-            self._dead_openings += 1
-            if self._dead_openings == self._openings:
+            self._failed_openings += 1
+            if self._failed_openings == self._openings:
                 raise CurateError(
                     f"{self._openings} workers in a row died while they loaded their models, the "
-                    f"last {reason}; run again with fewer workers, finished frames are kept"
+                    f"last {reason}; rerun with fewer workers, finished frames are kept"
                 )
             self.return_jobs(in_flight)
             return
-        begun, rest = in_flight[:1], in_flight[1:]
+        started, rest = in_flight[:1], in_flight[1:]
         self.return_jobs(rest)
-        for job in begun:
-            self._deaths[job.title] += 1
-            if self._deaths[job.title] < TRIES:
+        for job in started:
+            self._crashes[job.title] += 1
+            if self._crashes[job.title] < MAX_TRIES:
                 self._again.appendleft(job)
             else:
-                error = f"{job.title}: its worker died {TRIES} times, {reason}"
+                error = f"{job.title}: its worker died {MAX_TRIES} times, {reason}"
                 yield Outcome(job, (), error, 0.0)
 
 
 def open_function(function: JobFunction) -> None:
-    """Load what a function needs, and turns whatever goes wrong into one line.
+    """Load the models and the data set of a function.
 
     Raises:
-        CurateError: if it cannot be loaded.
+        CurateError: if they cannot be loaded; every error becomes one line.
     """
     try:
         function.open()
     except CurateError:
         raise
-    except Exception as fault:  # a user's model may raise anything
+    except Exception as error:  # a user's model may raise anything
         logger.debug("cannot load", exc_info=True)
         raise ModelError(
-            f"the models cannot be loaded: {type(fault).__name__}: {one_line(fault, 500)}"
-        ) from fault
+            f"the models cannot be loaded: {type(error).__name__}: {one_line(error, 500)}"
+        ) from error
 
 
-class RayWorker:
-    """What a worker on the other side of a pipe holds: the function at hand, with its models."""
+class FunctionHolder:
+    """The current function of a worker process or actor, with its loaded models."""
 
     def __init__(self) -> None:
         self.function: JobFunction | None = None
 
     def open(self, packed: bytes) -> CurateError | None:
-        """Load the models; the error where they cannot be loaded."""
-        self.function = None  # the one before, with its models, makes room first
+        """Load a pickled function and its models; return the error if they cannot be loaded."""
+        self.function = None  # first free the memory of the former function's models
         function = pickle.loads(packed)  # noqa: S301 - from the runner
         try:
             open_function(function)
-        except CurateError as fault:
-            return fault
+        except CurateError as error:
+            return error
         self.function = function
         return None
 
     def work(self, job: Job) -> tuple[Sequence[FrameRows], str | None, float]:
-        """Rows, error and seconds of a job.
+        """Return rows, error and seconds of a job, see `Outcome`.
 
         Raises:
-            CurateError: if it has no models.
+            CurateError: if no function is loaded.
         """
         if self.function is None:
-            raise CurateError("asked to work before the models were loaded")
+            raise CurateError("a worker got a job before it had loaded the models")
         outcome = attempt(self.function, job)
         return outcome.rows, outcome.error, outcome.seconds
 
 
 def attempt(function: Any, job: Job) -> Outcome:
-    """Work on one job and turns whatever goes wrong into its recorded failure."""
+    """Run a job and return its outcome; an exception makes the outcome a failed one."""
     start = time.perf_counter()
     rows: Sequence[FrameRows] = ()
     error = None
@@ -250,10 +257,10 @@ def attempt(function: Any, job: Job) -> Outcome:
         rows = (found,) if isinstance(job, FrameJob) else tuple(found)
         if len(rows) != len(job.frames):
             error, rows = f"{job.title}: {len(rows)} results for {len(job.frames)} frames", ()
-    except CurateError as fault:
-        error = str(fault)
-    except Exception as fault:
-        # A user's model may raise anything; it costs this job, never the run.
+    except CurateError as raised:
+        error = str(raised)
+    except Exception as raised:
+        # A user's model may raise anything; only this job fails, not the run.
         logger.debug("%s failed", job.title, exc_info=True)
-        error = f"{job.title}: {type(fault).__name__}: {one_line(fault, 500)}"
+        error = f"{job.title}: {type(raised).__name__}: {one_line(raised, 500)}"
     return Outcome(job, rows, error, time.perf_counter() - start)

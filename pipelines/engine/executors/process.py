@@ -1,7 +1,7 @@
-"""All cores of one machine: one process per worker, each with its own model.
+"""The executor for all cores of one machine: one process per worker, each with its own model.
 
-Every worker has a pipe of its own, so that it is known which frame was in the hands of a worker
-that the system has killed; `ProcessPoolExecutor` then gives up all that it holds.
+Every worker has its own pipe. If the system kills a worker, the frame that it was processing is
+known, and all other frames continue. `ProcessPoolExecutor` would fail all of them.
 """
 
 import contextlib
@@ -18,96 +18,96 @@ from typing import Any
 
 from curate.errors import CurateError
 from pipelines.engine.executors.base import (
-    IN_HAND,
+    JOBS_PER_WORKER,
+    FunctionHolder,
     Job,
     JobFunction,
     JobQueue,
     Outcome,
-    RayWorker,
 )
 
-# How often a look is taken at workers that say nothing: a process that a dead one has forked may
-# hold its pipe open.
-PULSE_S = 5.0
+# How often to check whether silent workers are alive: a crashed worker's pipe may be kept open by a
+# process that it has forked.
+POLL_S = 5.0
 
 
 class ProcessExecutor:
-    """Works on frames in `workers` spawned processes, which live until `close`."""
+    """Processes frames in `workers` spawned processes, which live until `close`."""
 
     def __init__(self, workers: int = 1) -> None:
         self.workers = workers
-        self._crew: list[_Worker] = []
+        self._workers: list[_Worker] = []
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
-        """One outcome per job, as they end.
+        """Yield one outcome per job, in the order in which they end.
 
         Raises:
-            CurateError: if the models cannot be loaded, or workers die while they load them.
+            CurateError: if the models cannot be loaded, or workers crash while they load them.
         """
         queue = JobQueue(jobs, self.workers)
         packed = pickle.dumps(function)
         try:
             while True:
                 self._dispatch(packed, queue)
-                busy = {worker.connection: worker for worker in self._crew if worker.in_flight}
+                busy = {worker.connection: worker for worker in self._workers if worker.in_flight}
                 if not busy:
                     return
-                speaking = wait(list(busy), PULSE_S)
+                readable = wait(list(busy), POLL_S)
                 for connection, worker in busy.items():
-                    if connection in speaking or not worker.process.is_alive():
+                    if connection in readable or not worker.process.is_alive():
                         yield from self._collect(worker, queue)
         finally:
-            for worker in [worker for worker in self._crew if worker.in_flight]:
+            for worker in [worker for worker in self._workers if worker.in_flight]:
                 self._dismiss(worker)
 
     def close(self) -> None:
         """End the workers."""
-        for worker in self._crew:
+        for worker in self._workers:
             worker.shut_down()
-        for worker in list(self._crew):
-            worker.process.join(PULSE_S)
+        for worker in list(self._workers):
+            worker.process.join(POLL_S)
             self._dismiss(worker)
 
     def _dispatch(self, packed: bytes, queue: JobQueue) -> None:
         while (job := queue.take()) is not None:
-            idle = min(self._crew, key=lambda worker: len(worker.in_flight), default=None)
-            if len(self._crew) < self.workers and (idle is None or idle.in_flight):
-                self._crew.append(idle := _Worker())
-            if idle is None or len(idle.in_flight) == IN_HAND:
+            idle = min(self._workers, key=lambda worker: len(worker.in_flight), default=None)
+            if len(self._workers) < self.workers and (idle is None or idle.in_flight):
+                self._workers.append(idle := _Worker())
+            if idle is None or len(idle.in_flight) == JOBS_PER_WORKER:
                 queue.return_jobs([job])
                 return
             idle.send(packed, job)
 
     def _collect(self, worker: "_Worker", queue: JobQueue) -> Iterator[Outcome]:
-        """What a worker answers; what it leaves behind if it is dead."""
+        """Yield the next outcome of a worker; if it has crashed, those of its failed jobs."""
         try:
-            answer = worker.connection.recv() if worker.connection.poll() else EOFError()
+            result = worker.connection.recv() if worker.connection.poll() else EOFError()
         except (EOFError, OSError) as end:
-            answer = end
-        if isinstance(answer, EOFError | OSError):
-            worker.process.join(PULSE_S)
+            result = end
+        if isinstance(result, EOFError | OSError):
+            worker.process.join(POLL_S)
             self._dismiss(worker)
             yield from queue.record_crash(
                 list(worker.in_flight), worker.end(), opened=worker.opened
             )
             return
-        if isinstance(answer, CurateError):
-            raise answer
-        if answer is None:
+        if isinstance(result, CurateError):
+            raise result
+        if result is None:
             worker.opened = True
-            queue.opened()
+            queue.record_opened()
         else:
-            yield Outcome(worker.in_flight.popleft(), *answer)
+            yield Outcome(worker.in_flight.popleft(), *result)
 
     def _dismiss(self, worker: "_Worker") -> None:
-        self._crew.remove(worker)
+        self._workers.remove(worker)
         worker.connection.close()
         worker.process.kill()
         worker.process.join()
 
 
 class _Worker:
-    """A process, and the jobs in its hands in the order in which it works on them."""
+    """A worker process, and the jobs sent to it in the order in which it processes them."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -120,21 +120,21 @@ class _Worker:
         self._packed = b""
 
     def send(self, packed: bytes, job: Job) -> None:
-        """Hand a job over, and before it the function, where that is another one."""
+        """Send a job, and before it the function if the worker does not have it yet."""
         self.in_flight.append(job)
-        with contextlib.suppress(OSError):  # it has died; its end of the pipe will tell
+        with contextlib.suppress(OSError):  # it has crashed; `_collect` will find that out
             if packed != self._packed:
                 self._packed, self.opened = packed, False
                 self.connection.send(packed)
             self.connection.send(job)
 
     def shut_down(self) -> None:
-        """Let it end by itself, which a model may need to put its things in order."""
+        """Ask the process to exit by itself, so that its models can release their resources."""
         with contextlib.suppress(OSError):
             self.connection.send(None)
 
     def end(self) -> str:
-        """How a dead worker died."""
+        """Return how the process ended, for a message."""
         code = self.process.exitcode or 0
         if code >= 0:
             return f"with exit code {code}"
@@ -143,11 +143,11 @@ class _Worker:
 
 
 def _serve(connection: Connection) -> None:
-    """What a worker does all its life."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends us
+    """Run a worker process: load functions and process jobs until the connection ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends the workers
     inbox: SimpleQueue[Any] = SimpleQueue()  # the packed function, jobs, None for the end
     Thread(target=_receive, args=(connection, inbox), daemon=True).start()
-    holder = RayWorker()
+    holder = FunctionHolder()
     while (message := inbox.get()) is not None:
         if isinstance(message, bytes):
             connection.send(holder.open(message))
@@ -156,9 +156,9 @@ def _serve(connection: Connection) -> None:
 
 
 def _receive(connection: Connection, inbox: "SimpleQueue[Any]") -> None:
-    """Empty the pipe, so that the parent never waits while it hands over.
+    """Move messages from the pipe to the inbox, so that the parent never blocks when it sends.
 
-    Where the parent has closed it, or was killed, nobody needs this process any more.
+    The process exits when the parent has closed the pipe or was killed.
     """
     try:
         while True:

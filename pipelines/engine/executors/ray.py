@@ -1,7 +1,7 @@
-"""Several machines: a pool of Ray actors, each of which holds its own model.
+"""The executor for several machines: a pool of Ray actors, each with its own model.
 
-The runner stays the only writer; what travels is a frame's name with what is known of it, and its
-rows. Every node needs the same curate, and the data set at the same path.
+The runner stays the only writer. Actors receive the name and the stored data of a frame, and return
+its rows. Every node needs the same version of curate, and the data set at the same path.
 """
 
 import os
@@ -14,33 +14,33 @@ from typing import Any
 
 from curate.errors import ConfigError, CurateError, one_line
 from pipelines.engine.executors.base import (
-    IN_HAND,
+    JOBS_PER_WORKER,
+    FunctionHolder,
     Job,
     JobFunction,
     JobQueue,
     Outcome,
-    RayWorker,
 )
 
-PULSE_S = 5.0
-# Frames and rows are small; by default Ray takes a third of the memory of a machine.
+POLL_S = 5.0
+# Jobs and rows are small; by default Ray reserves a third of a machine's memory.
 OBJECT_STORE_BYTES = 256 * 1024**2
 
 
 class RayExecutor:
-    """Works on frames in `workers` actors, which live until `close`.
+    """Processes frames in `workers` actors, which live until `close`.
 
     Args:
-        workers: how many actors; those for which the cluster has no room wait until it has.
-        address: of a running cluster, e.g. "auto" or "10.0.0.1:6379"; None joins the cluster that
-            RAY_ADDRESS names, or starts one on this machine.
-        num_cpus: that an actor takes.
-        num_gpus: that an actor takes; a fraction where several share one.
-        start_timeout_s: how long the cluster may take to place the first actor.
+        workers: number of actors; those that the cluster has no resources for wait.
+        address: address of a running cluster, e.g. "auto" or "10.0.0.1:6379"; None joins the
+            cluster in RAY_ADDRESS, or starts one on this machine.
+        num_cpus: CPUs per actor.
+        num_gpus: GPUs per actor; a fraction if several actors share one.
+        start_timeout_s: time limit for the cluster to place the first actor.
 
     Raises:
-        ConfigError: Ray is not installed.
-        CurateError: the cluster cannot be joined or started.
+        ConfigError: if Ray is not installed.
+        CurateError: if the cluster cannot be joined or started.
     """
 
     def __init__(
@@ -56,62 +56,67 @@ class RayExecutor:
         self.start_timeout_s = start_timeout_s
         self._ray = _import_ray()
         self._needs = {"num_cpus": num_cpus, "num_gpus": num_gpus}
-        self._own = not self._ray.is_initialized()
-        if self._own:
+        self._owns_cluster = not self._ray.is_initialized()
+        if self._owns_cluster:
             _join(self._ray, address, workers)
-        # A dead actor is replaced by another one, so that it is known which frame it had begun.
+        # Ray must not restart a crashed actor: the executor replaces it by a new one, and so knows
+        # which frame it was processing.
         options = {**self._needs, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
-        self._holder = self._ray.remote(**options)(ActorHolder)
-        self._crew: list[_Actor] = []
+        self._actor_class = self._ray.remote(**options)(RemoteHolder)
+        self._actors: list[_Actor] = []
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
-        """One outcome per job, as they end.
+        """Yield one outcome per job, in the order in which they end.
 
         Raises:
-            CurateError: if the models cannot be loaded, actors die while they load them, or the
-                cluster has no room for a single actor.
+            CurateError: if the models cannot be loaded, actors crash while they load them, or the
+                cluster has no resources for a single actor.
         """
         queue = JobQueue(jobs, self.workers)
         packed = pickle.dumps(function)
         placed_at = time.monotonic()
         try:
             while self._dispatch(packed, queue):
-                heads = {actor.head(): actor for actor in self._crew if actor.answers}
-                ready, _ = self._ray.wait(list(heads), num_returns=1, timeout=PULSE_S)
+                heads = {actor.head(): actor for actor in self._actors if actor.results}
+                ready, _ = self._ray.wait(list(heads), num_returns=1, timeout=POLL_S)
                 for ref in ready:
                     yield from self._collect(heads[ref], queue)
-                if any(actor.placed for actor in self._crew):
+                if any(actor.placed for actor in self._actors):
                     placed_at = time.monotonic()
                 self._check_placement_timeout(placed_at)
         finally:
-            for actor in [actor for actor in self._crew if actor.answers]:
+            for actor in [actor for actor in self._actors if actor.results]:
                 self._dismiss(actor)
 
     def close(self) -> None:
         """End the actors, and the cluster if it was started here."""
-        for actor in list(self._crew):
+        for actor in list(self._actors):
             self._dismiss(actor)
-        if self._own:
+        if self._owns_cluster:
             self._ray.shutdown()
 
     def _dispatch(self, packed: bytes, queue: JobQueue) -> bool:
-        """Return every actor that has loaded its models work; False where all is done."""
+        """Send jobs to the actors that have loaded their models; return whether any are left."""
         while (job := queue.take()) is not None:
-            while len(self._crew) < self.workers:
-                self._crew.append(_Actor(self._holder.remote(sys.path)))
-            for actor in self._crew:
+            while len(self._actors) < self.workers:
+                self._actors.append(_Actor(self._actor_class.remote(sys.path)))
+            for actor in self._actors:
                 actor.open(packed)
-            able = [actor for actor in self._crew if actor.opened and len(actor.jobs) < IN_HAND]
-            if not able:
+            free = [
+                actor
+                for actor in self._actors
+                if actor.opened and len(actor.jobs) < JOBS_PER_WORKER
+            ]
+            if not free:
                 queue.return_jobs([job])
                 return True
-            min(able, key=lambda actor: len(actor.jobs)).send(job)
-        return any(actor.jobs for actor in self._crew)
+            min(free, key=lambda actor: len(actor.jobs)).send(job)
+        return any(actor.jobs for actor in self._actors)
 
     def _collect(self, actor: "_Actor", queue: JobQueue) -> Iterator[Outcome]:
-        """Yield the oldest answer of an actor; what it leaves behind if it is dead."""
+        """Yield the oldest outcome of an actor; if it has crashed, those of its failed jobs."""
         try:
-            answer = self._ray.get(actor.head())
+            result = self._ray.get(actor.head())
         except self._ray.exceptions.RayTaskError as error:
             raise CurateError(f"a Ray actor failed: {_reason(error)}") from error
         except self._ray.exceptions.RayError as error:
@@ -119,19 +124,19 @@ class RayExecutor:
             self._dismiss(actor)
             yield from queue.record_crash(jobs, _reason(error), opened=opened)
             return
-        if isinstance(answer, CurateError):
-            raise answer
-        actor.answers.popleft()
+        if isinstance(result, CurateError):
+            raise result
+        actor.results.popleft()
         if actor.opened:
-            yield Outcome(actor.jobs.popleft(), *answer)
+            yield Outcome(actor.jobs.popleft(), *result)
         elif actor.placed:
             actor.opened = True
-            queue.opened()
+            queue.record_opened()
         else:
             actor.placed = True
 
     def _dismiss(self, actor: "_Actor") -> None:
-        self._crew.remove(actor)
+        self._actors.remove(actor)
         self._ray.kill(actor.handle)
 
     def _check_placement_timeout(self, placed_at: float) -> None:
@@ -139,48 +144,48 @@ class RayExecutor:
             offered = self._ray.cluster_resources()
             raise CurateError(
                 f"the Ray cluster has placed no actor in {self.start_timeout_s:.0f} s; each needs "
-                f"{self._needs}, all nodes together offer {offered.get('CPU', 0):g} CPUs and "
-                f"{offered.get('GPU', 0):g} GPUs: set run.executor_options.ray in curate.toml"
+                f"{self._needs}, and all nodes together have {offered.get('CPU', 0):g} CPUs and "
+                f"{offered.get('GPU', 0):g} GPUs; change run.executor_options.ray in curate.toml"
             )
 
 
-class ActorHolder(RayWorker):
-    """What runs in an actor."""
+class RemoteHolder(FunctionHolder):
+    """The class of the actors, which runs on the nodes of the cluster."""
 
     def __init__(self, search_path: Sequence[str]) -> None:
         super().__init__()
-        # A detector that the driver finds beside itself must be found on another node as well.
+        # The actor must find the same user modules as the driver.
         sys.path += [path for path in search_path if path not in sys.path]
 
     def place(self) -> None:
-        """Answers once the actor has found its place."""
+        """Do nothing; the call returns once the cluster has placed the actor."""
 
 
 class _Actor:
-    """An actor, and what it has been asked in the order in which it will answer."""
+    """The handle of an actor, with its calls in flight in the order in which they return."""
 
     def __init__(self, handle: Any) -> None:
         self.handle = handle
         self.jobs: deque[Job] = deque()
-        self.answers: deque[Any] = deque([handle.place.remote()])
+        self.results: deque[Any] = deque([handle.place.remote()])
         self.placed = False
         self.opened = False
         self._packed = b""
 
     def head(self) -> Any:
-        """Return the oldest answer that has not been read."""
-        return self.answers[0]
+        """Return the reference of the oldest result that has not been read."""
+        return self.results[0]
 
     def open(self, packed: bytes) -> None:
-        """Has it load its models, unless it holds them."""
+        """Make the actor load a function's models, unless it has loaded them."""
         if packed != self._packed:
             self._packed, self.opened = packed, False
-            self.answers.append(self.handle.open.remote(packed))
+            self.results.append(self.handle.open.remote(packed))
 
     def send(self, job: Job) -> None:
-        """Hand a job over."""
+        """Send a job."""
         self.jobs.append(job)
-        self.answers.append(self.handle.work.remote(job))
+        self.results.append(self.handle.work.remote(job))
 
 
 def _import_ray() -> Any:
@@ -196,29 +201,29 @@ def _import_ray() -> Any:
 
 
 def _join(ray: Any, address: str | None, workers: int) -> None:
-    """Join a cluster, or starts one with a CPU per worker at least."""
-    joins = address or os.environ.get("RAY_ADDRESS")
-    where: dict[str, Any] = (
-        {"address": joins}
-        if joins
+    """Join a cluster, or start one with at least one CPU per worker."""
+    address = address or os.environ.get("RAY_ADDRESS")
+    options: dict[str, Any] = (
+        {"address": address}
+        if address
         else {
-            "address": "local",  # not the one that somebody else has started on this machine
+            "address": "local",  # a new one, even if another one runs on this machine
             "num_cpus": max(workers, os.cpu_count() or 1),
             "object_store_memory": OBJECT_STORE_BYTES,
             "include_dashboard": False,
         }
     )
     try:
-        # Before an actor's class is looked up there; PYTHONPATH may hold other packages so named.
-        first = {"worker_process_setup_hook": "curate_command.claim_packages"}
-        ray.init(**where, runtime_env=first, logging_level="ERROR", log_to_driver=False)
-    except Exception as error:  # Ray raises many kinds, none of which says more than its words
-        done = f"joined at {joins}" if joins else "started on this machine"
-        raise CurateError(f"no Ray cluster could be {done}: {one_line(error, 200)}") from error
+        # Runs before Ray imports the actor's class: PYTHONPATH may have packages of the same name.
+        hook = {"worker_process_setup_hook": "curate_command.claim_packages"}
+        ray.init(**options, runtime_env=hook, logging_level="ERROR", log_to_driver=False)
+    except Exception as error:  # Ray raises exceptions of many types
+        failed = f"joined at {address}" if address else "started on this machine"
+        raise CurateError(f"no Ray cluster could be {failed}: {one_line(error, 200)}") from error
 
 
 def _reason(error: Any) -> str:
-    """What was raised in an actor, without Ray's account of how it got here."""
+    """Return the error that was raised in an actor in one line, without Ray's traceback."""
     cause = getattr(error, "cause", None)
-    found = cause if isinstance(cause, Exception) else error
-    return f"{type(found).__name__}: {one_line(found, 200)}"
+    raised = cause if isinstance(cause, Exception) else error
+    return f"{type(raised).__name__}: {one_line(raised, 200)}"

@@ -1,4 +1,4 @@
-"""The default executor: this process, one frame after the other."""
+"""The executor that processes one frame after the other in this process."""
 
 from collections.abc import Iterable, Iterator
 
@@ -6,10 +6,10 @@ from pipelines.engine.executors.base import Job, JobFunction, Outcome, attempt, 
 
 
 class SerialExecutor:
-    """Works on frames in their order."""
+    """Processes frames one by one, in order."""
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
-        """One outcome per job, in order.
+        """Yield one outcome per job, in order.
 
         Raises:
             CurateError: if the models cannot be loaded.
@@ -19,4 +19,4 @@ class SerialExecutor:
             yield attempt(function, job)
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing: there are no workers."""

@@ -85,7 +85,7 @@ def plan_with_lengths(workspace: Workspace, poisoned: Path) -> Plan:
 def run_lengths(workspace: Workspace, poisoned: Path, executor: Executor | None = None) -> Report:
     """Run the stage of sequences."""
     plan = plan_with_lengths(workspace, poisoned)
-    stage = plan.graph.of_frames("lengths")
+    stage = plan.graph.frames_stage("lengths")
     return run_frames(plan, stage, executor or SerialExecutor(), Silent())
 
 

@@ -179,9 +179,9 @@ def test_labels_are_exported_in_the_requested_format(curate: Curate, exported: W
     [
         ("import sys; sys.exit(3)", "ended with exit code 3"),
         ("import os; os.kill(os.getpid(), 9)", "ended with signal 9"),
-        ("pass", "was not written, though the trainer ended well"),
-        ("import os; open(os.environ['CURATE_OUTPUT'], 'w')", "is empty, though"),
-        ("import os; os.mkdir(os.environ['CURATE_OUTPUT'])", "is empty, though"),
+        ("pass", "was not written, although the trainer ended without an error"),
+        ("import os; open(os.environ['CURATE_OUTPUT'], 'w')", "is empty, although"),
+        ("import os; os.mkdir(os.environ['CURATE_OUTPUT'])", "is empty, although"),
     ],
 )
 def test_a_failing_trainer_gives_one_line_and_an_exit_code(
@@ -230,8 +230,8 @@ def test_labels_that_are_not_exported_are_rejected(
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("", "is empty; name a program"),
-        ("python 'train.py", "mend its quotes"),
+        ("", "is empty; write a program"),
+        ("python 'train.py", "fix its quotes"),
         ("no-such-program {labels}", "no-such-program cannot be started"),
     ],
 )

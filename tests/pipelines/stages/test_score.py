@@ -123,7 +123,7 @@ def test_a_changed_declaration_recreates_its_table(
     monkeypatch.setattr(ToyPrior, "columns", changed)
     source_of.cache_clear()
     assert run(own)[OWN] == 6
-    [line] = [each for each in caplog.messages if "is made anew" in each]
+    [line] = [each for each in caplog.messages if "is replaced" in each]
     assert "evidence source 'toy'" in line
     assert "prior_toy" in line
     source_of.cache_clear()
@@ -136,7 +136,7 @@ def test_a_source_removed_from_the_configuration_is_reported(
     run(workspace.with_settings("run", priors=("points", OWN)))
     caplog.clear()
     run(workspace)
-    lines = [each for each in caplog.messages if "not in run.priors any more" in each]
+    lines = [each for each in caplog.messages if "no longer in run.priors" in each]
     assert len(set(lines)) == 1
     assert "'toy'" in lines[0]
     assert "prior_toy" in lines[0]

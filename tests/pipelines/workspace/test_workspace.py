@@ -11,7 +11,6 @@ from pipelines.engine.rounds import (
     find_teacher,
     newest_checkpoint,
     open_round,
-    peek_round,
     register_checkpoint,
 )
 from pipelines.workspace.config import read_config
@@ -51,7 +50,7 @@ def test_a_checkpoint_replaced_by_a_pipe_counts_as_missing(workspace: Workspace)
         register_checkpoint(connection, workspace, 1, workspace.config.run.method, path)
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(WorkspaceError, match="the checkpoint is gone; run `curate train-round"):
+    with pytest.raises(WorkspaceError, match="the checkpoint is missing; run `curate train-round"):
         find_teacher(workspace, 2)
 
 
@@ -66,7 +65,7 @@ def test_a_replaced_checkpoint_is_not_used(workspace: Workspace) -> None:
     for call in (lambda: open_round(workspace, 2), lambda: newest_checkpoint(workspace)):
         with pytest.raises(WorkspaceError, match=r"has changed since .* run `curate train-round"):
             call()
-    assert peek_round(workspace, 2) is not None
+    assert stored_round(workspace, 2) is not None
     path.write_bytes(b"made")
     assert newest_checkpoint(workspace) == path
 
