@@ -256,7 +256,9 @@ def _api_entry(module: str, name: str, found: object) -> list[str]:
     """Return a heading, the signature, what it is, and the methods of a class."""
     heading = [f"### {name}", "", f"`{module}`", ""]
     if not callable(found):
-        return [*heading, f"```python\n{name} = {found!r}\n```"]
+        # ruff formats the code in Markdown, with double quotes.
+        value = repr(found).replace("'", '"')
+        return [*heading, f"```python\n{name} = {value}\n```"]
     called = isinstance(found, type) and not getattr(found, "_is_protocol", False)
     if called and not issubclass(found, Exception):
         heading += [f"```python\n{_signature(name, found, returns=False)}\n```", ""]
