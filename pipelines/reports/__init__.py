@@ -1,1 +1,1 @@
-"""What people look at: reports, explanations, status, pictures and recordings."""
+"""Reports, explanations, status tables, images and recordings of a workspace."""

@@ -1,4 +1,4 @@
-"""What became of a policy's labels from one round to another."""
+"""Compare a policy's labels of two rounds."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,24 +14,24 @@ COLUMNS = (
     "weight_before", "weight_after",
 )  # fmt: skip
 MOVED_BELOW = 0.7
-"""A label has moved where its boxes overlap by less than this, KITTI's bound for a car."""
+"""A label has moved if the IoU of its boxes is below this, KITTI's IoU threshold for cars."""
 CHANGED_BY = 0.05
-"""A weight counts as changed from this difference on."""
+"""A weight has changed if it differs by at least this."""
 
 
 @dataclass(frozen=True)
 class ChangedLabel:
-    """A label whose weight changed.
+    """A label with a changed weight.
 
     Attributes:
         change: gained, lost, moved or weight.
         frame: its frame.
         category: its category.
-        k_before: its number in the earlier round, None where it is gained.
-        k_after: its number in the later round, None where it is lost.
-        iou: BEV IoU of both boxes; None without both.
-        weight_before: 0 where it is gained.
-        weight_after: 0 where it is lost.
+        k_before: k in the earlier round; None for a gained label.
+        k_after: k in the later round; None for a lost label.
+        iou: BEV IoU of both boxes; None for a gained or lost label.
+        weight_before: weight in the earlier round; 0 for a gained label.
+        weight_after: weight in the later round; 0 for a lost label.
     """
 
     change: str
@@ -46,13 +46,13 @@ class ChangedLabel:
 
 @dataclass(frozen=True)
 class Difference:
-    """Two rounds compared.
+    """The difference between two rounds.
 
     Attributes:
-        rounds: both numbers.
-        policy: whose weights.
-        categories: a row of `COLUMNS` per category, then one for all of them.
-        labels: whose weight changed most, the largest change first.
+        rounds: numbers of the earlier and the later round.
+        policy: the policy that gave the weights.
+        categories: a row of `COLUMNS` per category, then a row of totals.
+        labels: the labels with the largest change of weight, the largest first.
     """
 
     rounds: tuple[int, int]
@@ -64,13 +64,13 @@ class Difference:
 def compare_rounds(
     workspace: Workspace, rounds: tuple[int, int], policy: str, listed: int
 ) -> Difference:
-    """Return the difference.
+    """Return the difference between two rounds.
 
     Args:
         workspace: see `Workspace`.
-        rounds: earlier and later.
-        policy: whose weights.
-        listed: how many changed labels to list.
+        rounds: numbers of the earlier and the later round.
+        policy: the policy that gave the weights.
+        listed: number of changed labels to list.
 
     Raises:
         WorkspaceError: if the policy has weighted nothing in one of the rounds.
@@ -83,12 +83,12 @@ def compare_rounds(
 
 @dataclass
 class Comparison:
-    """Two rounds compared a block of frames at a time.
+    """Compare two rounds block by block.
 
     Attributes:
-        listed: how many changed labels are kept.
-        sums: the numbers of `COLUMNS` of each category.
-        labels: those whose weight changed most so far, the largest change first.
+        listed: number of changed labels to keep.
+        sums: the numbers of `COLUMNS` by category.
+        labels: the labels with the largest change of weight so far, the largest first.
     """
 
     listed: int
@@ -96,7 +96,7 @@ class Comparison:
     labels: list[ChangedLabel] = field(default_factory=list)
 
     def add(self, before: LabelColumns, after: LabelColumns) -> None:
-        """The labels of the same frames in both rounds more."""
+        """Add a block with the labels of the same frames in both rounds."""
         changes = compare_labels(*as_rounds(before, after))
         names = tuple(dict.fromkeys((*before.category_names, *after.category_names)))
         for number, name in enumerate(names):
@@ -106,9 +106,9 @@ class Comparison:
         self.labels = found[: self.listed]
 
     def finish(self, rounds: tuple[int, int], policy: str) -> Difference:
-        """Return the difference, with the sums over all categories."""
-        everything = np.sum([*self.sums.values()], axis=0)
-        rows = tuple(_row(name, sums) for name, sums in (self.sums | {"all": everything}).items())
+        """Return the difference, with totals over all categories."""
+        total = np.sum([*self.sums.values()], axis=0)
+        rows = tuple(_row(name, sums) for name, sums in (self.sums | {"all": total}).items())
         return Difference(rounds, policy, rows, tuple(self.labels))
 
 
@@ -119,7 +119,7 @@ def _row(name: str, sums: np.ndarray) -> dict[str, Any]:
 
 
 def _sums(changes: LabelChanges, category: int) -> np.ndarray:
-    """(10,) float64 what `COLUMNS` say of a category."""
+    """Return (10,) float64 the numbers of `COLUMNS` for a category."""
     before, after = (side.categories == category for side in (changes.before, changes.after))
     paired = before[changes.pairs[:, 0]]
     change = changes.weight_change[paired]
@@ -136,7 +136,7 @@ def _sums(changes: LabelChanges, category: int) -> np.ndarray:
 def _listed(
     changes: LabelChanges, before: LabelColumns, after: LabelColumns, count: int
 ) -> list[ChangedLabel]:
-    """Return the most changed labels."""
+    """Return the labels with the largest change of weight."""
     found = []
     for old, new in changes.largest(count)[0].tolist():
         side, row = (after, new) if new >= 0 else (before, old)

@@ -1,4 +1,4 @@
-"""Every number behind one weight, and the weight recomputed from them."""
+"""Explain one weight: list the numbers that it depends on, and recompute it from them."""
 
 import json
 import math
@@ -29,7 +29,7 @@ from pipelines.workspace.workspace import Workspace
 
 @dataclass(frozen=True)
 class View:
-    """What one augmented copy said of a label."""
+    """The reprediction of a label in one augmented copy; scores and losses are None without one."""
 
     view: int
     flip_y: bool
@@ -43,16 +43,16 @@ class View:
 
 @dataclass(frozen=True)
 class AgeParameter:
-    """What Eq. 4 takes: lambda = (e/E) hardest + (1 - e/E) mean, never above the maximum.
+    """The terms of Eq. 4: lambda = (e/E) hardest + (1 - e/E) mean, at most the maximum.
 
     Attributes:
         round: e.
         rounds: E.
-        scope: whose losses: of the round, the label's category, or its frame.
-        matched: how many losses these are.
-        hardest: their maximum, or the configured quantile.
-        mean: of the losses.
-        lambda_u: recomputed from these.
+        scope: the labels that share this lambda: "round", "category" or "frame".
+        matched: number of their losses.
+        hardest: maximum of the losses, or their configured quantile.
+        mean: mean of the losses.
+        lambda_u: lambda, recomputed from these values.
     """
 
     round: int
@@ -66,11 +66,11 @@ class AgeParameter:
 
 @dataclass(frozen=True)
 class Recomputed:
-    """The numbers of a label, each worked out again from those before it.
+    """The values of a label, each recomputed from the values that it depends on.
 
     Attributes:
-        loss: L; None where nothing matched.
-        rho: trust by column of each prior; None where the prior has no evidence.
+        loss: L; None without a matched reprediction.
+        rho: trust by column of each prior; None if the prior has no evidence.
         rho_det: product of the priors.
     """
 
@@ -81,7 +81,7 @@ class Recomputed:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A row of `weighted_labels`, the views behind its loss, and the weight recomputed."""
+    """A row of `weighted_labels`, the views of its loss, the recomputed weight, and text lines."""
 
     label: dict[str, Any]
     views: tuple[View, ...]
@@ -91,17 +91,17 @@ class Explanation:
     lines: tuple[str, ...]
 
     def as_text(self) -> str:
-        """For a person."""
+        """Return the explanation as text."""
         return "\n".join(self.lines)
 
 
 def explain_label(
     workspace: Workspace, frame: str, k: int, round_number: int | None, policy: str
 ) -> Explanation:
-    """Why label k of a frame has its weight.
+    """Explain the weight of label k of a frame.
 
     Raises:
-        WorkspaceError: if the policy has not weighted such a label in that round.
+        WorkspaceError: if the policy has not weighted this label in the round.
         DataError: if a weight of the frame is not in [0, 1].
     """
     label = _label(workspace, frame, k, round_number, policy)
@@ -111,25 +111,25 @@ def explain_label(
 
 
 def _human(workspace: Workspace, label: dict[str, Any]) -> Explanation:
-    """What people decided; with the numbers behind the policy's own weight where they rejected."""
-    told = describe_decision(workspace, label)
-    if label["weight"] == 0 and told.policy_weight is not None:
-        alone = _computed(workspace, {**label, "weight": told.policy_weight})
-        return replace(alone, label=label, lines=(*alone.lines, told.lines[0]))
-    lines = (*_head(_numbers(label)), *told.lines)
-    nothing = Recomputed(None, {}, math.nan)
-    return Explanation(label, (), None, nothing, None, lines)
+    """Explain a person's decision; for a rejected label also the weight that the policy gave it."""
+    decision = describe_decision(workspace, label)
+    if label["weight"] == 0 and decision.policy_weight is not None:
+        computed = _computed(workspace, {**label, "weight": decision.policy_weight})
+        return replace(computed, label=label, lines=(*computed.lines, decision.lines[0]))
+    lines = (*_head(_numbers(label)), *decision.lines)
+    no_evidence = Recomputed(None, {}, math.nan)
+    return Explanation(label, (), None, no_evidence, None, lines)
 
 
 def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
-    """Return the numbers behind a policy's weight."""
+    """Explain a weight that a policy computed."""
     frame, k = label["frame"], label["k"]
     views = _views(workspace, label["round"], frame, k)
     config = _stored_config(workspace, label["round"])
     age = _age(workspace, config, label) if label["lambda_u"] is not None else None
     evidence = _evidence(config, label, views)
-    alone = not views and not _self_paced(config, label["policy"])
-    recomputed = _weight(label, evidence, age, alone=alone)
+    priors_only = not views and not _self_paced(config, label["policy"])
+    recomputed = _weight(label, evidence, age, priors_only=priors_only)
     lines = _lines(config, label, views, age, evidence, recomputed)
     return Explanation(label, views, age, evidence, recomputed, tuple(lines))
 
@@ -148,20 +148,20 @@ def _label(
         row = connection.execute(query).fetchone()
     if row is None:
         raise WorkspaceError(
-            f"round {round_number or 1} has no label {k} of frame {frame} weighted by {policy}, or "
-            "the policy dropped it; the view weighted_labels lists what there is, see "
-            "`curate query --help`"
+            f"round {round_number or 1}: {policy} gave no weight to label {k} of frame {frame}; "
+            "there is no such label, or the policy dropped it. The view weighted_labels lists all "
+            "weighted labels, see `curate query --help`"
         )
     return dict(row._mapping)  # noqa: SLF001 - its public name
 
 
 def _stored_config(workspace: Workspace, round_number: int) -> Config:
-    """The settings that the round was last worked on with; curate.toml may say others by now."""
+    """Return the settings that the round was last run with; curate.toml may have changed since."""
     table = bulk.table("round")
     query = select(table.c.config).where(table.c.number == round_number)
     with workspace.database.reading() as connection:
         stored = connection.execute(query).scalar_one()
-    return make_config(json.loads(stored), f"settings stored of round {round_number}")
+    return make_config(json.loads(stored), f"stored settings of round {round_number}")
 
 
 def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple[View, ...]:
@@ -180,7 +180,7 @@ def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple
 
 
 def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgeParameter | None:
-    """Eq. 4 over the losses that share the label's lambda; None without any."""
+    """Return the terms of Eq. 4 over the losses that share the label's lambda; None without any."""
     scope, quantile = _schedule(config, label["policy"])
     number = bulk.table("round")
     query = _losses(label, scope)
@@ -197,14 +197,17 @@ def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgePara
 
 
 def _lambda(losses: np.ndarray, age: Age, quantile: float | None) -> float:
-    """Eq. 4 of losses that share their lambda."""
+    """Return lambda by Eq. 4 for losses that share it."""
     zeros = np.zeros(len(losses))
     evidence = Evidence(zeros.astype(np.int64), zeros.astype(np.str_), score=zeros, loss=losses)
     return float(age_parameter(evidence, age, quantile=quantile)[0])
 
 
 def _losses(label: dict[str, Any], scope: str) -> Select[tuple[float]]:
-    """The losses that share a label's lambda; the policy saw those that people decided on too."""
+    """Return the query for the losses that share a label's lambda.
+
+    It includes labels that people decided on, because the policy used their losses too.
+    """
     weight, loss = bulk.table("weight"), bulk.table("consistency")
     frame, prediction = bulk.table("frame"), bulk.table("prediction")
     keys = ("round", "frame_id", "k")
@@ -220,14 +223,17 @@ def _losses(label: dict[str, Any], scope: str) -> Select[tuple[float]]:
 
 
 def _schedule(config: Config, policy: str) -> tuple[str, float | None]:
-    """Which labels share one lambda, and the quantile in place of the maximum, of a policy."""
+    """Return the scope of a policy's lambda, and the quantile that replaces the maximum, if any."""
     section = config.solve
     options = section.options.get(policy, {})
     return options.get("scope", section.scope), options.get("quantile", section.quantile)
 
 
 def _evidence(config: Config, label: dict[str, Any], views: tuple[View, ...]) -> Recomputed:
-    """L from the views; the priors from their counts, those of the user as they are stored."""
+    """Recompute L from the views and the priors from their counts.
+
+    The values of user-supplied priors are taken as stored.
+    """
     weights = config.repredict.score_weight, config.repredict.box_weight
     losses = [
         weights[0] * view.score_loss + weights[1] * view.box_loss
@@ -235,7 +241,7 @@ def _evidence(config: Config, label: dict[str, Any], views: tuple[View, ...]) ->
         if view.score_loss is not None and view.box_loss is not None
     ]
     rho = {
-        column: _rho_again(config, source, label)
+        column: _recomputed_rho(config, source, label)
         for source in sources_of(config.run.priors)
         for column in [source.declaration.rho_column]
         if column is not None
@@ -245,8 +251,8 @@ def _evidence(config: Config, label: dict[str, Any], views: tuple[View, ...]) ->
     return Recomputed(loss, rho, product)
 
 
-def _rho_again(config: Config, source: Source, label: dict[str, Any]) -> float | None:
-    """The trust of a prior rated again from what it measured; a user's own as it is stored."""
+def _recomputed_rho(config: Config, source: Source, label: dict[str, Any]) -> float | None:
+    """Return the trust of a prior, recomputed from its measurements; as stored for user priors."""
     column = str(source.declaration.rho_column)
     stored: float | None = label.get(column)
     if stored is None or source.configured not in PRIORS.classes or source.of_sequences:
@@ -259,7 +265,7 @@ def _rho_again(config: Config, source: Source, label: dict[str, Any]) -> float |
 
 
 def _opened(config: Config, source: Source, label: dict[str, Any]) -> EvidenceSource:
-    """Return a source that rates one label, with the threshold that is stored with it."""
+    """Return the source for rating one label, with the threshold that is stored with the label."""
     thresholds = {label["category"]: label["points_threshold"] or 1.0}
     return open_prior(config, source.configured, thresholds, measures=False)
 
@@ -271,24 +277,24 @@ def _detections(label: dict[str, Any]) -> Detections:
 
 
 def _self_paced(config: Config, policy: str) -> bool:
-    """Return whether the policy weighs by the consistency loss."""
+    """Return whether the policy uses the consistency loss."""
     section = config.solve
-    own = section.options.get(policy, {}).get("self_paced", section.self_paced)
-    return policy != "pspsl" or bool(own)
+    self_paced = section.options.get(policy, {}).get("self_paced", section.self_paced)
+    return policy != "pspsl" or bool(self_paced)
 
 
 def _weight(
-    label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None, *, alone: bool
+    label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None, *, priors_only: bool
 ) -> float | None:
     """Return the weight by Eqs. 7 and 11; None for policies that do not use them.
 
-    A label that matched has a lambda unless the policy was told to do without: it weighs rho_det,
-    as do all where the priors are `alone`, without a second pass.
+    The weight is rho_det if the policy does not use lambda (solve.self_paced = false), or if there
+    is no second pass (`priors_only`).
     """
     if label["policy"] not in {"spsl", "pspsl"}:
         return None
     if evidence.loss is None:
-        return evidence.rho_det if alone else 0.0
+        return evidence.rho_det if priors_only else 0.0
     if age is None:
         return evidence.rho_det
     v = float(easiness(np.array([evidence.loss]), np.array([age.lambda_u]))[0])
@@ -315,8 +321,8 @@ def _lines(
     )
     for source in sources_of(config.run.priors):
         if any(label.get(column.name) is not None for column in source.declaration.columns):
-            told = _described(config, source, label, number)
-            lines.append(f"  {source.declaration.name:<14} {told}")
+            description = _described(config, source, label, number)
+            lines.append(f"  {source.declaration.name:<14} {description}")
     factors = [f"{name} {value:.4f}" for name, value in evidence.rho.items() if value is not None]
     lines.append(f"  priors         rho_det = {' * '.join(factors) or '1'} = {number['rho_det']}")
     lines.append(_age_line(config, label["policy"], age, str(number["lambda_u"])))
@@ -329,28 +335,31 @@ def _lines(
     if recomputed is not None:
         lines.append(f"  recomputed     {_working(label, evidence, age)}{recomputed:.4f}")
         if not math.isclose(recomputed, label["weight"], abs_tol=1e-6):
-            lines.append("  they differ: settings have changed since; `curate solve` weighs again")
+            lines.append(
+                "  they differ: the settings have changed since; rerun `curate solve` to update "
+                "the weights"
+            )
     return lines
 
 
 def _described(
     config: Config, source: Source, label: dict[str, Any], number: Mapping[str, Any]
 ) -> str:
-    """What a source says of the label's columns."""
+    """Return a source's description of the label's columns."""
     if source.of_sequences:
         return open_sequence_source(config, source.configured).describe(number)
     return _opened(config, source, label).describe(number)
 
 
 def _meaning(config: Config, label: dict[str, Any]) -> str:
-    """What labels of weight 0 are to the student; empty for other weights."""
+    """Return the meaning of weight 0 for the student; empty for other weights."""
     if label["weight"] > 0:
         return ""
     return f" ({ZERO_WEIGHT_WORDS[zero_weight_of(config, label['policy'])]})"
 
 
 def _numbers(label: dict[str, Any]) -> dict[str, Any]:
-    """Return the columns of a label as they are printed."""
+    """Return the columns of a label as printable values."""
     return {
         name: "none" if value is None else f"{value:.4f}" if isinstance(value, float) else value
         for name, value in label.items()
@@ -358,7 +367,7 @@ def _numbers(label: dict[str, Any]) -> dict[str, Any]:
 
 
 def _head(number: dict[str, Any]) -> list[str]:
-    """Which label it is, and where."""
+    """Return the lines that identify the label and its box."""
     return [
         "round {round}, frame {frame}, label {k}: {category}, score {score}".format(**number),
         "  box            x {x}  y {y}  z {z}  l {length}  w {width}  h {height}  yaw {yaw}".format(
@@ -368,7 +377,7 @@ def _head(number: dict[str, Any]) -> list[str]:
 
 
 def _age_line(config: Config, policy: str, age: AgeParameter | None, stored: str) -> str:
-    """Eq. 4 with its numbers."""
+    """Return the line with Eq. 4 and its values."""
     if age is None:
         return f"  age, Eq. 4     lambda = {stored}"
     _, quantile = _schedule(config, policy)
@@ -381,7 +390,7 @@ def _age_line(config: Config, policy: str, age: AgeParameter | None, stored: str
 
 
 def _working(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> str:
-    """The equation of the weight with its numbers; empty where nothing is to be worked out."""
+    """Return the equation of the weight with its values; empty if nothing is to be computed."""
     if age is None or evidence.loss is None:
         return ""
     if evidence.loss >= age.lambda_u > 0:
@@ -391,13 +400,13 @@ def _working(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | No
 
 
 def _view_line(view: View) -> str:
-    how = (
+    augmentation = (
         f"view {view.view}: {'flipped, ' if view.flip_y else ''}"
         f"rotated {view.rotation_rad:+.3f} rad, scaled {view.scale:.3f}"
     )
     if view.score is None:
-        return f"{how}: no match"
+        return f"{augmentation}: no match"
     return (
-        f"{how}: matched with BEV IoU {view.iou:.3f}, s' {view.score:.4f}, -ln s' "
+        f"{augmentation}: matched with BEV IoU {view.iou:.3f}, s' {view.score:.4f}, -ln s' "
         f"{view.score_loss:.4f}, box loss {view.box_loss:.4f}"
     )

@@ -1,4 +1,4 @@
-"""The figures of a report: what a round's losses, priors and weights are, all labels together."""
+"""The sections of a report with tables and charts of losses, priors and weights of a round."""
 
 from collections.abc import Iterator
 
@@ -23,7 +23,7 @@ def is_repredicted(workspace: Workspace, number: int) -> bool:
 def summary(
     workspace: Workspace, totals: RoundTotals, number: int, policy: str, *, repredicted: bool
 ) -> Section:
-    """Return the round in a few numbers."""
+    """Return the section with the key figures of the round."""
     n, kept, trusted = totals.everything.labels, totals.everything.kept, totals.trusted
     facts = [
         ("labels", f"{n:,}"),
@@ -32,7 +32,7 @@ def summary(
         ("weight above 0.5", f"{trusted:,} ({trusted / n:.1%})"),
         ("sum of weights", f"{totals.everything.weight:,.1f}"),
         (
-            "matched again",
+            "matched by a reprediction",
             f"{totals.matched:,} ({totals.matched / n:.1%})" if repredicted else "no second pass",
         ),
     ]
@@ -48,14 +48,14 @@ def summary(
 
 
 def distributions(totals: RoundTotals) -> Section:
-    """Histograms of losses, priors and weights."""
+    """Return the section with histograms of losses, priors and weights."""
     n, loss = totals.everything.labels, totals.histograms["loss"]
     marks = [Mark(float(value), f"λ {value:.3g}") for value in totals.ages[:SHOWN_AGES]]
     figures = []
     if totals.matched:
         unmatched = (
-            f"the loss of {totals.matched:,} labels; {n - totals.matched:,} without a matched "
-            "reprediction left out"
+            f"the loss of {totals.matched:,} labels; {n - totals.matched:,} labels without a "
+            "matched reprediction are not included"
         )
         chart = histogram("loss", loss.counts, loss.edges, "consistency loss L", marks)
         figures.append(Figure.of_chart(chart, unmatched))
@@ -63,24 +63,24 @@ def distributions(totals: RoundTotals) -> Section:
         found = totals.histograms[name]
         if not found.above:
             continue
-        # Most weights are 0: in the same chart they would flatten all others.
-        left_out = f"; {found.zeros:,} labels with 0 left out" if found.zeros else ""
+        # Most weights are 0; a bar for them would make all other bars too small.
+        omitted = f"; {found.zeros:,} labels with 0 are not included" if found.zeros else ""
         chart = histogram(name, found.counts, found.edges, name)
-        figures.append(Figure.of_chart(chart, f"{meaning}; {found.above:,} labels{left_out}"))
+        figures.append(Figure.of_chart(chart, f"{meaning}; {found.above:,} labels{omitted}"))
     return Section("Losses, priors and weights", figures=figures)
 
 
 def by_category(totals: RoundTotals, categories: tuple[str, ...]) -> Section:
-    """Return a row per category and distance, and the sums.
+    """Return the section with a row per category and distance, and totals.
 
     Args:
         totals: see `RoundTotals`.
-        categories: those that come first.
+        categories: the categories to list first.
     """
     rows = []
     for category in dict.fromkeys((*categories, *(name for name, _ in totals.cells))):
-        own = {band: totals.cells.get((category, band)) for band in range(len(BANDS) - 1)}
-        found = {band: sums for band, sums in own.items() if sums is not None}
+        bands = {band: totals.cells.get((category, band)) for band in range(len(BANDS) - 1)}
+        found = {band: sums for band, sums in bands.items() if sums is not None}
         if found:
             rows.append((category, ALL, *_cells(_together(list(found.values())))))
         rows += [(category, _place(band), *_cells(sums)) for band, sums in found.items()]
@@ -93,7 +93,7 @@ def by_category(totals: RoundTotals, categories: tuple[str, ...]) -> Section:
 
 
 def beside_others(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:
-    """Yield the policies that weighted the same labels, where there are several."""
+    """Yield the section that compares policies, if several have weighted the same labels."""
     weight, frame = bulk.table("weight"), bulk.table("frame")
     above = [func.sum(case((weight.c.v > least, 1), else_=0)) for least in (0, 0.5)]
     query = (
@@ -109,8 +109,8 @@ def beside_others(workspace: Workspace, number: int, policy: str) -> Iterator[Se
     ]
     if len(rows) > 1:
         columns = ("policy", "labels", "weight > 0", "weight > 0.5", "sum of weights", "mean")
-        note = "The same labels under every policy that has weighted them in this round."
-        yield Section("Beside other policies", note, columns, rows)
+        note = "The same labels with the weights of every policy that was run in this round."
+        yield Section("Comparison with other policies", note, columns, rows)
 
 
 def _together(parts: list[Sums]) -> Sums:
@@ -128,13 +128,13 @@ def _place(band: int) -> str:
 
 
 def _cells(sums: Sums) -> tuple[int, int, float, float, float, float]:
-    """Labels, kept ones, their share, and the sum and means of weight and score."""
+    """Return the cells: labels, kept labels, their share, sum and means of weight and score."""
     n = sums.labels
     return n, sums.kept, sums.kept / n, sums.weight, sums.weight / n, sums.score / n
 
 
 def _age(workspace: Workspace, number: int) -> str:
-    """Return the round and of how many it is, as it was made."""
+    """Return e/E: the round, and the number of rounds when it was made."""
     table = bulk.table("round")
     query = select(table.c.rounds).where(table.c.number == number)
     rows = workspace.database.rows(query)

@@ -1,4 +1,4 @@
-"""Pictures of a frame's weighted labels."""
+"""Draw the weighted labels of a frame into image files."""
 
 from pathlib import Path
 
@@ -22,12 +22,12 @@ from pipelines.workspace.workspace import Workspace
 
 
 def draw_example_frame(workspace: Workspace, round_number: int) -> list[Path]:
-    """Draw a bird's eye view and an image overlay of the frame that `find_example_frame` finds."""
+    """Draw the bird's eye view and the image overlay of the example frame; return their paths."""
     return draw_labels(workspace, round_number, find_example_frame(workspace, round_number))
 
 
 def find_example_frame(workspace: Workspace, round_number: int) -> str:
-    """Return the name of the frame with most of both trusted and mistrusted labels."""
+    """Return the name of the frame with the most labels of both high and low weight."""
     policy = workspace.config.run.method
     found = read_columns(workspace, round_number, policy)
     return str(found.frame_names[_most_varied(found)])
@@ -43,19 +43,19 @@ def draw_view(
     kind: ImageFormat = "png",
     style: Style = DARK,
 ) -> Path:
-    """Draw image and bird's eye view of any frame into one file; return its path.
+    """Draw camera image and bird's eye view of any frame into one file; return its path.
 
     Args:
         workspace: see `Workspace`.
-        name: of the frame.
-        round_number: None for the last that has predictions.
-        policy: whose weights; None for the configured one.
-        output: None for a file in the folder `pictures`.
+        name: name of the frame.
+        round_number: the round; None for the last round with predictions.
+        policy: the policy that gave the weights; None for the configured one.
+        output: path of the file; None for a file in the folder `pictures`.
         kind: format of the file.
         style: colours.
 
     Raises:
-        ConfigError: if no frame has that name, or a picture cannot be written to `output`.
+        ConfigError: if no frame has this name, or `output` cannot be written.
         WorkspaceError: if the round has no predictions.
     """
     number = chosen_round(workspace, round_number)
@@ -63,22 +63,22 @@ def draw_view(
     content = _painted(workspace, name, (number, policy), kind, style).content(kind)
     path = output or workspace.root / "pictures" / f"round-{number:02d}-{name}-{policy}.{kind}"
     if path.is_dir() or not path.parent.is_dir():
-        raise ConfigError(f"--output {path}: name a file in a folder that exists")
+        raise ConfigError(f"--output {path}: must be a file in an existing folder")
     replace_file(path, content)
     return path
 
 
 def frame_picture(workspace: Workspace, name: str, round_number: int, policy: str) -> np.ndarray:
-    """Return image and bird's eye view of any frame as (height, width, 3) uint8 RGB.
+    """Return camera image and bird's eye view of any frame as (height, width, 3) uint8 RGB.
 
     Raises:
-        ConfigError: if no frame has that name.
+        ConfigError: if no frame has this name.
     """
     return _painted(workspace, name, (round_number, policy), "png", DARK).finish()
 
 
 def shown_labels(workspace: Workspace, frame: Frame, found: FrameBoxes, policy: str) -> ShownLabels:
-    """Return the labels of a frame as pictures show them."""
+    """Return the labels of a frame for drawing, with their points counted."""
     labels = found.labels
     return ShownLabels(
         labels.boxes,
@@ -92,7 +92,7 @@ def shown_labels(workspace: Workspace, frame: Frame, found: FrameBoxes, policy: 
 
 
 def draw_labels(workspace: Workspace, round_number: int, name: str) -> list[Path]:
-    """Draw a frame's image and its bird's eye view into two files in the folder `pictures`."""
+    """Draw image overlay and bird's eye view into two files in `pictures`; return their paths."""
     policy = workspace.config.run.method
     frame = workspace.dataset.read(name, image=True)
     if frame.image is None:
@@ -114,7 +114,7 @@ def draw_labels(workspace: Workspace, round_number: int, name: str) -> list[Path
 def _painted(
     workspace: Workspace, name: str, weighted: tuple[int, str], kind: ImageFormat, style: Style
 ) -> Canvas:
-    """Draw a frame in a round under a policy."""
+    """Draw a frame with the labels of a round and a policy."""
     number, policy = weighted
     found = read_frame(workspace, name, number, policy)
     frame = workspace.dataset.read(name, image=True)
@@ -130,8 +130,8 @@ def _painted(
 
 
 def _most_varied(found: LabelColumns) -> int:
-    """Return the frame with most of both trusted and mistrusted labels, the nearer the better."""
+    """Return the frame with the most near labels of both high and low weight."""
     near, count = found.boxes[:, 0] < 40, len(found.frame_names)
-    trusted = np.bincount(found.frames[near & (found.weights > 0.3)], minlength=count)
-    mistrusted = np.bincount(found.frames[near & (found.weights < 0.1)], minlength=count)
-    return int(np.argmax(np.minimum(trusted, mistrusted) + 0.01 * trusted))
+    high = np.bincount(found.frames[near & (found.weights > 0.3)], minlength=count)
+    low = np.bincount(found.frames[near & (found.weights < 0.1)], minlength=count)
+    return int(np.argmax(np.minimum(high, low) + 0.01 * high))

@@ -1,4 +1,4 @@
-"""A 3D recording of frames of a round, with what is stored of each label."""
+"""Write a 3D recording of frames of a round, with the stored evidence of each label."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,21 +19,21 @@ from pipelines.workspace.workspace import Workspace
 def record_frames(
     workspace: Workspace, names: Sequence[str], round_number: int, policy: str, output: Path
 ) -> Path:
-    """Write the recording; says where it is.
+    """Write the recording and return its path.
 
     Args:
         workspace: see `Workspace`.
-        names: of the frames, in the order of the time line.
-        round_number: whose predictions.
-        policy: whose weights.
-        output: the .rrd file.
+        names: names of the frames, in the order of the timeline.
+        round_number: the round with the predictions.
+        policy: the policy that gave the weights.
+        output: path of the .rrd file.
 
     Raises:
-        ConfigError: rerun is not installed, a frame is unknown, or the file cannot be written.
+        ConfigError: if rerun is not installed, a frame is unknown, or the file cannot be written.
     """
     load_rerun()
     if output.suffix != ".rrd" or output.is_dir() or not output.parent.is_dir():
-        raise ConfigError(f"--rerun {output}: name an .rrd file in a folder that exists")
+        raise ConfigError(f"--rerun {output}: must be an .rrd file in an existing folder")
     write_recording(output, _recorded(workspace, names, round_number, policy))
     return output
 
@@ -41,7 +41,7 @@ def record_frames(
 def _recorded(
     workspace: Workspace, names: Sequence[str], round_number: int, policy: str
 ) -> Iterator[RecordedFrame]:
-    """Yield the frames, one at a time: their points do not fit into memory together."""
+    """Yield the frames one at a time, because their points may not fit into memory together."""
     for name in names:
         found = read_frame(workspace, name, round_number, policy)
         frame = workspace.dataset.read(name, image=True)
@@ -64,7 +64,7 @@ def _recorded(
 def evidence_of_labels(
     workspace: Workspace, name: str, round_number: int, policy: str, numbers: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """(n,) of each kind of evidence, for the labels with these n values of k; NaN for none."""
+    """Return (n,) values of each evidence column for n labels given by k; NaN if missing."""
     with workspace.database.reading() as connection:
         labels = weighted_labels(connection).c
         columns = [each for each in numeric_columns(connection) if each not in ("score", "weight")]
@@ -74,6 +74,6 @@ def evidence_of_labels(
         table = np.full((len(numbers), len(columns)), np.nan)
         rows = {k: row for row, k in enumerate(numbers.tolist())}
         for k, *values in bulk.select(connection, query):
-            if k in rows:  # others are objects that people added
+            if k in rows:  # the others are objects that people added
                 table[rows[k]] = values
     return dict(zip(columns, table.T, strict=True))

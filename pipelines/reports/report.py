@@ -1,4 +1,4 @@
-"""The report of a round: one HTML file with figures, changes and the labels worth a look."""
+"""The report of a round: one HTML file with figures, changes and close-ups of notable labels."""
 
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
@@ -38,16 +38,17 @@ def write_report(
     policy: str | None,
     kind: ImageFormat | None = None,
 ) -> tuple[Path, list[Path]]:
-    """Write the report into the folder `reports`; return its path and those of its charts.
+    """Write the report into the folder `reports`; return its path and the paths of its charts.
 
     Args:
         workspace: see `Workspace`.
-        round_number: None for the last that the policy weighted.
-        policy: whose weights; None for the configured one.
-        kind: also write each chart as a file of this format, into a folder beside the report.
+        round_number: the round; None for the last round that the policy weighted.
+        policy: the policy that gave the weights; None for the configured one.
+        kind: format of chart files, which are written to a folder next to the report; None for no
+            chart files.
 
     Raises:
-        WorkspaceError: if the policy has weighted nothing in that round.
+        WorkspaceError: if the policy has no weights in the round.
     """
     policy = policy or workspace.config.run.method
     number = chosen_round(workspace, round_number or weighted_round(workspace, policy))
@@ -57,12 +58,12 @@ def write_report(
     comparison = Comparison(_PICTURES)
     before = _round_before(workspace, number, policy)
     rounds = (number,) if before is None else (number, before)
-    for labels, *former in read_blocks(workspace, rounds, policy):
+    for labels, *previous in read_blocks(workspace, rounds, policy):
         score = labels.numbers["score"]
         totals.add(labels)
         doubted.add(labels, score - labels.weights)
         kept.add(labels, np.where(score < 0.5, labels.weights, 0.0))
-        for each in former:
+        for each in previous:
             comparison.add(each, labels)
     rejected = _rejected(workspace, number, policy, doubted)
     priors = [name for name in totals.shares if name not in ("weight", "score", "rho_det")]
@@ -79,8 +80,8 @@ def write_report(
         *(
             _shown(workspace, heading, ranking, rejected, priors, repredicted=repredicted)
             for heading, ranking in (
-                ("Most doubted: high score, low weight", doubted),
-                ("Kept against a low score: below 0.5, greatest weight", kept),
+                ("High score, low weight", doubted),
+                ("Low score (below 0.5), high weight", kept),
             )
         ),
         *_reliability(workspace, number, policy),
@@ -89,8 +90,8 @@ def write_report(
     note = f"workspace {workspace.root.name}, data set {workspace.config.dataset.kind}"
     decided = counts(workspace, number)
     if decided:
-        told = ", ".join(f"{count:,} {name}" for name, count in decided.items())
-        note += f". People decided on some labels, whatever the policy says: {told}."
+        summary_of_decisions = ", ".join(f"{count:,} {name}" for name, count in decided.items())
+        note += f". Decisions by people, which override the policy: {summary_of_decisions}."
     path = workspace.root / "reports" / f"round-{number:02d}-{policy}.html"
     replace_file(path, render_page(title, note, sections).encode("utf-8"))
     charts = [each.chart for section in sections for each in section.figures if each.chart]
@@ -106,14 +107,14 @@ def _save(charts: Sequence[Chart], folder: Path, kind: ImageFormat) -> list[Path
 
 
 def _round_before(workspace: Workspace, number: int, policy: str) -> int | None:
-    """Return the round before, where the policy weighted that."""
+    """Return the previous round, or None if the policy has no weights in it."""
     weight = bulk.table("weight")
     query = select(weight.c.k).where(weight.c.round == number - 1, weight.c.policy == policy)
     return number - 1 if workspace.database.rows(query.limit(1)) else None
 
 
 def _changes(workspace: Workspace, found: Difference) -> Iterator[Section]:
-    """What changed since the round before."""
+    """Yield the section with the changes since the previous round."""
     note = (
         "Matched one to one by BEV IoU; moved: an IoU below 0.7; heavier, lighter: by 0.05 or more."
     )
@@ -124,7 +125,7 @@ def _changes(workspace: Workspace, found: Difference) -> Iterator[Section]:
 
 
 def _changed(workspace: Workspace, found: Difference, each: ChangedLabel) -> Figure:
-    """One of the most changed labels, with its former box in dashes."""
+    """Return a close-up of a changed label, with its previous box dashed."""
     boxes = [
         _box(workspace, number, found.policy, each.frame, k)
         for number, k in zip(found.rounds, (each.k_before, each.k_after), strict=True)
@@ -141,7 +142,7 @@ def _changed(workspace: Workspace, found: Difference, each: ChangedLabel) -> Fig
 def _rejected(
     workspace: Workspace, number: int, policy: str, ranking: Ranking
 ) -> AbstractSet[tuple[str, int]]:
-    """Frames and numbers of the labels that people rejected, in the frames of a ranking."""
+    """Return frame and k of the labels that people rejected, in the frames of a ranking."""
     labels = WEIGHTED_LABELS.c
     query = select(labels.frame, labels.k).where(
         labels.round == number,
@@ -162,7 +163,7 @@ def _shown(
     *,
     repredicted: bool,
 ) -> Section:
-    """Pictures of the labels of a ranking."""
+    """Return the section with close-ups of the labels of a ranking."""
     figures = [
         _close_up(
             workspace,
@@ -177,26 +178,26 @@ def _shown(
         )
         for each in ranking.labels
     ]
-    return Section(title, "" if figures else "There is none.", figures=figures)
+    return Section(title, "" if figures else "There are no such labels.", figures=figures)
 
 
 def _describe_label(
     label: RankedLabel, priors: Sequence[str], *, rejected: bool, repredicted: bool
 ) -> str:
-    """What a label is, its numbers, and what took its weight away."""
-    own = label.numbers
+    """Return the caption of a label: its numbers, and the reasons for a weight of 0."""
+    values = label.numbers
     numbers = ", ".join(
-        f"{name} {_figure(value)}" for name, value in own.items() if not np.isnan(value)
+        f"{name} {_figure(value)}" for name, value in values.items() if not np.isnan(value)
     )
     reasons = {
-        "no reprediction matched it": repredicted and np.isnan(own["loss"]),
-        "its loss is above lambda": own["loss"] >= own["lambda_u"],
+        "no reprediction matched it": repredicted and np.isnan(values["loss"]),
+        "its loss is above lambda": values["loss"] >= values["lambda_u"],
     }
-    # A trust of 0 takes the whole weight away.
-    reasons |= {f"{name} is 0": own[name] == 0 for name in priors}
+    # The trusts are factors of the weight: one trust of 0 is enough.
+    reasons |= {f"{name} is 0": values[name] == 0 for name in priors}
     if rejected:
         reasons = {"a person rejected it": True}
-    found = [reason for reason, holds in reasons.items() if holds and own["weight"] <= 0]
+    found = [reason for reason, holds in reasons.items() if holds and values["weight"] <= 0]
     return f"{label.category} {label.k} in frame {label.frame}: {numbers}" + "".join(
         f"; {reason}" for reason in found
     )
@@ -207,7 +208,7 @@ def _figure(value: float) -> str:
 
 
 def _reliability(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:
-    """Yield a chart per stored audit of the round."""
+    """Yield the section with a chart for each stored audit of the round."""
     bins = bulk.table("audit_bin")
     names = ("frames", "overlap", "mean_weight", "precision", "labels")
     query = (
@@ -228,8 +229,8 @@ def _reliability(workspace: Workspace, number: int, policy: str) -> Iterator[Sec
     ]
     if figures:
         note = (
-            "Share of correct labels over their mean weight, with 95 % Wilson intervals; on the "
-            "diagonal the weight is that share. Hollow dots stand for fewer than 10 labels."
+            "Share of correct labels over their mean weight, with 95 % Wilson intervals. The "
+            "diagonal is perfect calibration. Hollow dots have fewer than 10 labels."
         )
         yield Section("Reliability", note, figures=figures)
 
@@ -241,7 +242,7 @@ def _chart(name: str, rows: Sequence[Sequence[float]]) -> Chart:
 
 
 def _box(workspace: Workspace, number: int, policy: str, frame: str, k: int) -> np.ndarray:
-    """(7,) box of a label."""
+    """Return the (7,) box of a label."""
     labels = read_frame_columns(workspace, number, policy, frame)
     box: np.ndarray = labels.boxes[labels.k == k][0]
     return box

@@ -1,4 +1,4 @@
-"""How far a workspace is: a row per round and stage."""
+"""The progress of a workspace: a row per round and stage."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -17,13 +17,13 @@ COLUMNS = ("round", "stage", "split", "policy", "state", "done", "empty", "faile
 
 
 def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]]:
-    """Column names, and a row per round and stage; nothing is written."""
+    """Return the column names, and a row per round and stage; nothing is written."""
     table = bulk.table("round")
     numbers = [
         row[0] for row in workspace.database.rows(select(table.c.number).order_by(table.c.number))
     ]
-    # A detector that the user brings needs no pretraining, and has students only by a command:
-    # nothing would ever come of these rows.
+    # An external detector is not pretrained and has students only by an explicit command: these
+    # rows would wait forever.
     trained = is_student_trained(workspace)
     graph = graph_of(workspace)
     rows = [_first_row(workspace, first) for first in graph.first_stages]
@@ -42,7 +42,7 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
 
 
 def failed_frames(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]]:
-    """Column names, and every failed frame with its error."""
+    """Return the column names, and a row for every failed frame with its error."""
     columns = ("round", "stage", "frame", "split", "error")
     query = text(f"SELECT {', '.join(columns)} FROM failed_frames ORDER BY 1, 2, 3")  # noqa: S608
     with workspace.database.reading() as connection:

@@ -1,8 +1,8 @@
-"""How tables, lines, reports and JSON are printed, in a terminal and in a pipe.
+"""Print tables, lines, reports and JSON, to a terminal or a pipe.
 
-In a terminal no line is longer than the terminal is wide, and no number or identifier is cut: text
-wraps at spaces, and a table that is still too wide becomes one block per row. In a pipe or a file
-each row is one line, however long. Nothing is coloured.
+In a terminal, lines are at most as long as the terminal is wide, and numbers and identifiers are
+never split: text wraps at spaces, and a table that is still too wide is printed as one block per
+row. In a pipe or a file, each row is one line of any length. The output has no colours.
 """
 
 import json
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
     from pipelines.engine.runner import Report
 
 NARROWEST = 20
-"""A terminal that reports fewer columns than this is treated as this wide."""
-_TEXT_WIDTH = 16  # text is not wrapped to a narrower column than this
-_PAIR_GAP = 3  # columns between two name-value pairs of a block
+"""The smallest width of a terminal; a smaller reported width is ignored."""
+_TEXT_WIDTH = 16  # smallest width of a column with wrapped text
+_PAIR_GAP = 3  # gap between two name-value pairs of a block
 
 Cells = Sequence[Sequence[str]]
 
 
 def print_json(value: Any) -> None:
-    """Print a value, a dataclass or a list of them as JSON; NaN and infinity as null."""
+    """Print a value, a dataclass or a list of them as JSON; NaN and infinity are null."""
     typer.echo(json.dumps(_plain(value), indent=1, default=str, allow_nan=False))
 
 
 def print_json_rows(rows: Iterable[Any]) -> None:
-    """Print values as the list that `print_json` would print, each as it comes."""
+    """Print values as a JSON list like `print_json`, each as soon as it is available."""
     before = "["
     for row in rows:
         text = json.dumps(_plain(row), indent=1, default=str, allow_nan=False)
@@ -58,13 +58,13 @@ def _plain(value: Any) -> Any:
 def print_table(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], title: str = "", *, page: bool = False
 ) -> None:
-    """Print rows as a table with numbers to the right, and an empty line behind it.
+    """Print rows as a table with right-aligned numbers, followed by an empty line.
 
     Args:
-        columns: their names.
-        rows: a value per column; fractions are rounded to four digits.
-        title: printed above the table.
-        page: whether a table that is longer than the terminal goes through a pager.
+        columns: names of the columns.
+        rows: rows with a value per column; floats are rounded to four digits.
+        title: text above the table.
+        page: whether to use a pager for a table that is longer than the terminal.
     """
     print_tables([(title, columns, rows)], page=page)
 
@@ -72,10 +72,10 @@ def print_table(
 def print_tables(
     tables: Iterable[tuple[str, Sequence[str], Iterable[Sequence[Any]]]], *, page: bool = False
 ) -> None:
-    """Print several tables as `print_table` does, in one run of the pager.
+    """Print several tables like `print_table`, with a single pager.
 
     Args:
-        tables: title, columns and rows of each.
+        tables: title, columns and rows of each table.
         page: see `print_table`.
     """
     parts = []
@@ -87,24 +87,24 @@ def print_tables(
 
 
 def print_line(text: str, indent: int = 0) -> None:
-    """Print text that wraps at spaces in a terminal.
+    """Print text; in a terminal it wraps at spaces.
 
     Args:
         text: one or more lines.
-        indent: spaces before what is continued on a further line.
+        indent: number of spaces at the start of continuation lines.
     """
     typer.echo(_wrapped(text, indent))
 
 
 def terminal_width() -> int | None:
-    """Return the columns of the terminal that standard output is; None for a pipe or file."""
+    """Return the width of the terminal; None if standard output is a pipe or a file."""
     if not sys.stdout.isatty():
         return None
     return max(_terminal_size().columns, NARROWEST)
 
 
 def _terminal_size() -> os.terminal_size:
-    """Return COLUMNS and LINES where they are set, else what the terminal reports, else 80 x 24."""
+    """Return COLUMNS and LINES if they are set, else the size of the terminal, else 80 x 24."""
     try:
         reported = os.get_terminal_size(sys.stdout.fileno())
     except (OSError, ValueError):
@@ -113,12 +113,12 @@ def _terminal_size() -> os.terminal_size:
 
 
 def _write(text: str, *, page: bool) -> None:
-    """Print text, through the pager where it is asked for and both ends are a terminal."""
+    """Print text, with a pager if it is requested, useful, and input and output are a terminal."""
     size = _terminal_size()
     if page and sys.stdin.isatty() and sys.stdout.isatty() and text.count("\n") >= size.lines:
         import pydoc
 
-        os.environ.setdefault("LESS", "FRX")  # leaves the text on the screen
+        os.environ.setdefault("LESS", "FRX")  # X keeps the text on the screen
         pydoc.pager(text)
     else:
         typer.echo(text, nl=False)
@@ -136,7 +136,7 @@ def _wrapped(text: str, indent: int = 0) -> str:
 
 
 def _laid_out(columns: Sequence[str], cells: Cells, width: int | None) -> str:
-    """Return a table, or blocks where a table would be wider than `width`."""
+    """Return a table, or blocks if a table would be wider than `width`."""
     for gap in (2, 1):
         room = None if width is None else width - gap * (len(columns) - 1)
         widths = _column_widths(columns, cells, room)
@@ -148,37 +148,37 @@ def _laid_out(columns: Sequence[str], cells: Cells, width: int | None) -> str:
 
 
 def _column_widths(columns: Sequence[str], cells: Cells, room: int | None) -> list[int] | None:
-    """Return the width of each column, together at most `room`; None where they do not fit.
+    """Return the width of each column, in total at most `room`; None if they do not fit.
 
-    Each column gets at least what its numbers and words need. The rest goes to the narrowest
-    columns first, so that only long text wraps.
+    Each column gets at least the width of its longest number or word. The remaining width goes to
+    the narrowest columns first, so that only long text wraps.
     """
     from rich.cells import cell_len
 
     by_column = [[row[i] for row in cells] for i in range(len(columns))]
-    wanted, least = [], []
+    natural, least = [], []
     for name, values in zip(columns, by_column, strict=True):
         lines = [line for value in (name, *values) for line in value.splitlines() or [""]]
-        wanted.append(max(map(cell_len, lines)))
+        natural.append(max(map(cell_len, lines)))
         unbroken = max(cell_len(part) for text in (*name.split(), *values) for part in _parts(text))
         text = any(_is_text(value) for value in values)
-        least.append(max(unbroken, min(wanted[-1], _TEXT_WIDTH)) if text else unbroken)
-    if room is None or sum(wanted) <= room:
-        return wanted
+        least.append(max(unbroken, min(natural[-1], _TEXT_WIDTH)) if text else unbroken)
+    if room is None or sum(natural) <= room:
+        return natural
     for most in range(room, 0, -1):
-        widths = [max(low, min(high, most)) for low, high in zip(least, wanted, strict=True)]
+        widths = [max(low, min(high, most)) for low, high in zip(least, natural, strict=True)]
         if sum(widths) <= room:
             return widths
     return None
 
 
 def _parts(value: str) -> Sequence[str]:
-    """Return what must not be broken in a value: words of text, the whole of anything else."""
+    """Return the unbreakable parts of a value: the words of a text, else its whole lines."""
     return value.split() if _is_text(value) else value.splitlines() or [""]
 
 
 def _is_text(value: str) -> bool:
-    """Return whether a value may be wrapped at its spaces, unlike 0.1 - 0.2."""
+    """Return whether a value may be wrapped at spaces; "0.1 - 0.2" may not."""
     return " " in value and any(map(str.isalpha, value))
 
 
@@ -187,7 +187,7 @@ def _as_table(columns: Sequence[str], cells: Cells, widths: Sequence[int], gap: 
     from rich.table import Table
     from rich.text import Text
 
-    # The box itself leaves one column between two columns of the table.
+    # The box style already puts one space between two columns.
     table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, gap - 1, 0, 0))
     for i, (name, width) in enumerate(zip(columns, widths, strict=True)):
         numeric = bool(cells) and all(_is_number(row[i]) for row in cells)
@@ -198,7 +198,7 @@ def _as_table(columns: Sequence[str], cells: Cells, widths: Sequence[int], gap: 
 
 
 def _as_blocks(columns: Sequence[str], cells: Cells, width: int) -> str:
-    """Return a block per row: as many pairs of name and value side by side as fit."""
+    """Return one block per row, with as many name-value pairs per line as fit."""
     from rich.cells import cell_len
     from rich.rule import Rule
     from rich.table import Table
@@ -225,10 +225,10 @@ def _as_blocks(columns: Sequence[str], cells: Cells, width: int) -> str:
 def _pairs_per_line(
     names: Sequence[int], values: Sequence[int], width: int
 ) -> tuple[int, list[tuple[int, int]]]:
-    """Return how many pairs stand side by side, and the widths of name and value of each.
+    """Return the number of pairs per line, and the widths of name and value of each.
 
-    The pairs fill the lines from left to right, so that pair i stands at place i modulo the count.
-    A single pair to a line may be narrower than its value, which then wraps.
+    Lines are filled from left to right: pair i is in column i modulo the number. With one pair per
+    line, the width may be smaller than a value, which then wraps.
     """
     for count in range(len(names), 1, -1):
         widths = [(max(names[j::count]), max(values[j::count])) for j in range(count)]
@@ -238,18 +238,18 @@ def _pairs_per_line(
     return 1, [(name, width - name - 2)]
 
 
-def _rendered(what: "RenderableType", width: int) -> str:
-    """Return plain text, without spaces at the ends of lines."""
+def _rendered(renderable: "RenderableType", width: int) -> str:
+    """Return plain text without trailing spaces."""
     from rich.console import Console
 
     console = Console(color_system=None, width=width)
     with console.capture() as captured:
-        console.print(what)
+        console.print(renderable)
     return "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines())
 
 
 def print_report(report: "Report") -> None:
-    """One line on what a stage did, and the first errors of its failed frames."""
+    """Print one line about a stage, and the first errors of its failed frames."""
     line = f"round {report.round}  {report.stage:<11} "
     if report.summary:
         line += report.summary
@@ -262,11 +262,11 @@ def print_report(report: "Report") -> None:
     for frame, error in report.errors[:5]:
         typer.echo(f"  failed {frame}: {error}", err=True)
     if len(report.errors) > 5:
-        typer.echo("  ... all of them: curate status --failed", err=True)
+        typer.echo("  ... for all errors: curate status --failed", err=True)
 
 
 def _cell(value: Any) -> str:
-    """Return a value as text; what would steer the terminal is spelled out."""
+    """Return a value as text, with control characters escaped."""
     if value is None:
         return ""
     if isinstance(value, float):
@@ -275,7 +275,7 @@ def _cell(value: Any) -> str:
 
 
 def _is_number(text: str) -> bool:
-    """Return whether a value is right-aligned; 000012 is a frame id."""
+    """Return whether a value is a number, to be right-aligned; 000012 is a frame id."""
     if text[:1] == "0" and text[1:2].isdigit():
         return False
     try:

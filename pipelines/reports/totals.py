@@ -1,4 +1,4 @@
-"""What the labels of a round amount to, and which rank highest, found block by block."""
+"""Totals, histograms and rankings of the labels of a round, computed block by block."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,21 +14,21 @@ from pipelines.labels.columns import LabelColumns
 from pipelines.workspace.workspace import Workspace
 
 BANDS = (0.0, 20.0, 40.0, 60.0, np.inf)
-"""Edges of the distances from the LiDAR, metres."""
+"""Edges of the ranges of distance from the LiDAR, in metres."""
 SHOWN_AGES = 4
 LOSS_BINS, SHARE_BINS = 40, 25
 
 
 @dataclass
 class Histogram:
-    """Counts of the values above 0, or from 0 on.
+    """A histogram of values above 0, or of values from 0.
 
     Attributes:
-        edges: (bins + 1,) rising; a value beyond the last counts in no bar.
-        counts: (bins,).
-        above: how many values are above 0.
-        zeros: how many are 0; the others are NaN.
-        with_zeros: whether zeros count in the bars too.
+        edges: (bins + 1,) edges of the bins, ascending; values above the last are not counted.
+        counts: (bins,) number of values in each bin.
+        above: number of values above 0.
+        zeros: number of values that are 0; the remaining values are NaN.
+        with_zeros: whether the bins include zeros.
     """
 
     edges: np.ndarray
@@ -41,7 +41,7 @@ class Histogram:
         self.counts = np.zeros(len(self.edges) - 1, dtype=np.int64)
 
     def add(self, values: np.ndarray) -> None:
-        """(n,) values more."""
+        """Add (n,) values."""
         above, zeros = values > 0, values == 0
         counted = above | zeros if self.with_zeros else above
         self.counts += np.histogram(values[counted], self.edges)[0]
@@ -51,7 +51,7 @@ class Histogram:
 
 @dataclass
 class Sums:
-    """What some labels amount to."""
+    """Sums over labels: their number, the number with a weight above 0, weights and scores."""
 
     labels: int = 0
     kept: int = 0
@@ -59,7 +59,7 @@ class Sums:
     score: float = 0.0
 
     def add(self, weights: np.ndarray, scores: np.ndarray) -> None:
-        """The labels with these (n,) weights and scores more."""
+        """Add n labels with these (n,) weights and scores."""
         self.labels += len(weights)
         self.kept += int((weights > 0).sum())
         self.weight += float(weights.sum())
@@ -71,14 +71,14 @@ class RoundTotals:
     """Sums over the labels of a round.
 
     Attributes:
-        extent: the greatest loss and the least lambda; NaN where there is none.
-        shares: columns of numbers from 0 to 1, with their meanings; a histogram is kept of each.
-        frames: with labels.
-        trusted: labels with a weight above 0.5.
-        ages: the `SHOWN_AGES` least values of lambda and the greatest.
+        extent: the greatest loss and the least lambda; NaN if there is none.
+        shares: the columns with values from 0 to 1, with their meanings; each has a histogram.
+        frames: number of frames with labels.
+        trusted: number of labels with a weight above 0.5.
+        ages: the `SHOWN_AGES` smallest values of lambda, and the greatest.
         everything: sums over all labels.
-        cells: sums by category and place in `BANDS`.
-        histograms: of the loss and of each of `shares`, by name.
+        cells: sums by category and index in `BANDS`.
+        histograms: histograms of the loss and of each column in `shares`, by name.
     """
 
     extent: tuple[float, float]
@@ -98,12 +98,12 @@ class RoundTotals:
 
     @property
     def matched(self) -> int:
-        """Labels with a loss."""
+        """The number of labels with a loss."""
         loss = self.histograms["loss"]
         return loss.above + loss.zeros
 
     def add(self, labels: LabelColumns) -> None:
-        """The labels of a block of frames more."""
+        """Add the labels of a block of frames."""
         weights, scores = labels.weights, labels.numbers["score"]
         self.frames += len(labels.frame_names)
         self.trusted += int((weights > 0.5).sum())
@@ -117,15 +117,16 @@ class RoundTotals:
         cell = labels.categories * len(BANDS) + np.digitize(distance, BANDS[1:])
         for number in np.unique(cell).tolist():
             category, band = divmod(number, len(BANDS))
-            own = cell == number
+            in_cell = cell == number
             sums = self.cells.setdefault((labels.category_names[category], band), Sums())
-            sums.add(weights[own], scores[own])
+            sums.add(weights[in_cell], scores[in_cell])
 
 
 def read_shares(workspace: Workspace) -> dict[str, str]:
-    """Return the columns with numbers from 0 to 1, with their meanings.
+    """Return the columns with values from 0 to 1, and their meanings.
 
-    They are weight, score, the trust of every prior that has stored evidence, and their product.
+    These are the weight, the score, the trust of every prior with stored evidence, and the product
+    of the trusts.
     """
     with workspace.database.reading() as connection:
         columns = {each.name: each.meaning for each in weighted_label_columns(connection)}
@@ -136,7 +137,7 @@ def read_shares(workspace: Workspace) -> dict[str, str]:
 
 
 def extent(workspace: Workspace, round_number: int, policy: str) -> tuple[float, float]:
-    """Return the greatest loss and the least lambda of a round; NaN where there is none."""
+    """Return the greatest loss and the least lambda of a round; NaN if there is none."""
     loss, weight = bulk.table("consistency").c, bulk.table("weight").c
     queries = (
         select(func.max(loss.loss)).where(loss.round == round_number),
@@ -155,12 +156,12 @@ class RankedLabel:
     """A label and its rank.
 
     Attributes:
-        rank: above 0.
+        rank: rank above 0; higher is first.
         frame: its frame.
-        k: its number there.
+        k: its k in the frame.
         category: its category.
         box: (7,) in the LiDAR frame.
-        numbers: of `weighted_labels` by name; NaN for null.
+        numbers: numeric columns of `weighted_labels` by name; NaN for null.
     """
 
     rank: float
@@ -176,15 +177,15 @@ class Ranking:
     """The labels with the highest rank above 0 so far.
 
     Attributes:
-        count: how many are kept.
-        labels: the highest first; of equals the one that came first.
+        count: number of labels to keep.
+        labels: the labels, highest rank first; labels of equal rank in the order of their arrival.
     """
 
     count: int
     labels: list[RankedLabel] = field(default_factory=list)
 
     def add(self, labels: LabelColumns, rank: np.ndarray) -> None:
-        """A block of labels with their (n,) ranks more."""
+        """Add a block of labels with their (n,) ranks."""
         first = np.argsort(-rank, kind="stable")[: self.count]
         found = [
             RankedLabel(

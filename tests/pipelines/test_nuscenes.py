@@ -169,5 +169,5 @@ def test_folds_do_not_cut_scenes(root: Path, tmp_path: Path, curate: Curate) -> 
     assert sorted(map(len, folds)) == [STEPS] * 3
     for scene in SCENES:
         assert all(tokens(scene) & fold in (set(), tokens(scene)) for fold in folds)
-    with pytest.raises(ConfigError, match="the labeled frames are of 3 sequences"):
+    with pytest.raises(ConfigError, match="the labeled frames are from only 3 sequences"):
         list(open_folds(workspace, 4))

@@ -56,7 +56,7 @@ def test_a_report_shows_a_round_its_changes_and_its_audit(
     assert first == root / "reports" / "round-01-pspsl.html"
     headings, text = read(first)
     assert [heading.split()[0] for heading in headings] == [
-        "The", "Losses,", "Labels", "Most", "Kept"
+        "The", "Losses,", "Labels", "High", "Low"
     ]  # fmt: skip
     assert "18 labels in 6 unlabeled frames" in text
     assert "λ" in text
@@ -65,7 +65,7 @@ def test_a_report_shows_a_round_its_changes_and_its_audit(
     second = Path(json.loads(curate("report", "--json", "-w", root)[1])["report"])
     headings, text = read(second)
     assert "Since round 1" in headings
-    assert "Beside other policies" in headings
+    assert "Comparison with other policies" in headings
     assert text.count("(this page)") == 1
     assert "Reliability" in headings
     code, out, _ = curate("report", "--format", "png", "--json", "-w", root)
