@@ -71,9 +71,9 @@ def test_the_tables_are_printed(curate: Curate, two_rounds: Workspace) -> None:
     disturb(two_rounds, "UPDATE weight SET v = v / 2 WHERE round = 2")
     code, out, _ = curate("diff", 1, 2, "--limit", 1, "-w", two_rounds.root)
     assert code == 0
-    assert "the most changed labels" in out
-    assert len(out.split("most changed labels")[1].strip().splitlines()) == 3
-    assert "most changed" not in curate("diff", 1, 1, "-w", two_rounds.root)[1]
+    assert "labels with the largest changes" in out
+    assert len(out.split("labels with the largest changes")[1].strip().splitlines()) == 3
+    assert "largest changes" not in curate("diff", 1, 1, "-w", two_rounds.root)[1]
 
 
 def test_a_round_without_weights_is_reported(curate: Curate, two_rounds: Workspace) -> None:

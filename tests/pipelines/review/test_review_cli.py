@@ -327,7 +327,7 @@ def test_human_labels_are_marked_in_every_output(
 INVALID_SELECTIONS = (
     (("--frames", "{labeled}"), 5, "is not unlabeled"),
     (("--frames", "{val}"), 5, "is not unlabeled"),
-    (("--frames", "999999"), 2, "no frame is named '999999'"),
+    (("--frames", "999999"), 2, "frame '999999' is not in this workspace"),
     (("--category", "Tram"), 2, "--category Tram"),
     (("--by", "luck"), 2, "--by luck"),
     (("--format", "paint"), 2, "unknown editor 'paint'"),
