@@ -121,8 +121,8 @@ def _named(name: str, policy: str | None, round_number: int | None, url: "URL") 
     known = (*POLICIES.classes, *AUDITED)
     if policy is not None and policy not in known and ":" not in policy:
         raise ConfigError(
-            f"--policy {policy}: unknown policy{did_you_mean(policy, known)}; "
-            f"use one of {', '.join(known)}, or module:Class"
+            f"--policy {policy}: unknown policy: use one of "
+            f"{', '.join(known)}, or module:Class{did_you_mean(policy, known)}"
         )
     postgresql = url.get_backend_name() == "postgresql"
     return found.selecting(policy, round_number, postgresql=postgresql)
@@ -197,6 +197,8 @@ def _print(
     else:
         shown = list(islice(rows, limit))
         print_table(columns, shown, page=True)
+        if not shown:
+            typer.echo("no rows", err=True)
         if len(shown) == limit and next(rows, None) is not None:
             print_line(f"the first {limit} rows; more with --limit, all with --format csv or json")
 

@@ -130,6 +130,16 @@ def test_the_list_names_every_query(curate: Curate) -> None:
     assert json.loads(curate("query", "--list", "--json")[1])[0]["name"] == rows[0]["name"]
 
 
+@pytest.mark.parametrize(("limit", "words"), [(0, "no rows\n"), (1, "")])
+def test_an_empty_table_says_that_it_is_empty(
+    curate: Curate, workspace: Workspace, limit: int, words: str
+) -> None:
+    """On standard error, so that a pipe gets the table alone."""
+    code, out, err = curate("query", f"SELECT frame FROM frame LIMIT {limit}", "-w", workspace.root)
+    assert (code, err) == (0, words)
+    assert out.startswith("frame")
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
