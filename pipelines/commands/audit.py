@@ -143,7 +143,7 @@ def _print(figures: "Audit", title: str) -> None:
         title="the weight as a judge, and what of it lies on right labels",
     )
     print_table(
-        ("labels", "right", "of", "objects", *by_policy),
+        ("part", "right", "labels", "objects", *by_policy),
         _parts(figures),
         title="AUROC by category, distance and points in the label",
     )
