@@ -303,7 +303,12 @@ def check_prior(config: Config, name: str) -> None:
         CurateError: if it cannot be imported or created, or its segmenter cannot be opened.
     """
     with _error_prefix("run.priors"):
-        if hasattr(registry.PRIORS.load(name), "score_sequence"):
+        whole_sequences = hasattr(registry.PRIORS.load(name), "score_sequence")
+        reads_pixels = registry.PRIORS.takes(name, "segmenter")
+    if reads_pixels:
+        check_segmenter(config)
+    with _error_prefix("run.priors"):
+        if whole_sequences:
             open_sequence_source(config, name)
         else:
             open_prior(config, name, dict.fromkeys(config.dataset.categories, 1.0))

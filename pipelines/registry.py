@@ -58,7 +58,8 @@ class Registry:
         try:
             module = importer(module_name)
         except (ImportError, AttributeError, ConfigError) as error:
-            raise ConfigError(f"{self.kind} '{name}' cannot be imported: {error}") from error
+            hint = _import_hint(error, module_name)
+            raise ConfigError(f"{self.kind} '{name}' cannot be imported: {error}{hint}") from error
         except (Exception, SystemExit) as error:  # a user's module may raise anything
             raise ConfigError(
                 f"{self.kind} '{name}' cannot be imported: its module raises "
@@ -264,6 +265,14 @@ def trainable(name: str) -> "type[TrainableDetector] | None":
 def trainable_names() -> list[str]:
     """Return the names of the registered detectors that curate can train."""
     return [name for name in DETECTORS.classes if trainable(name)]
+
+
+def _import_hint(error: Exception, module: str) -> str:
+    """Return what to do if it is the named module itself that Python does not find, else ""."""
+    missing = error.name if isinstance(error, ModuleNotFoundError) else None
+    if missing is None or not f"{module}.".startswith(f"{missing}."):
+        return ""
+    return "; install it, or add its folder to PYTHONPATH"
 
 
 def _members(protocol: str) -> list[str]:

@@ -146,7 +146,12 @@ def paint_overlay(
     anchors = image_rectangles(labels.boxes, calibration, size) * factor
     bounds = np.array([0, 0, width * factor, height * factor])
     draw_tags(within, labels, anchors, bounds, style)
-    draw_title(canvas, shown.title, "camera image, k: number of a label", style)
+    draw_title(
+        canvas,
+        shown.title,
+        "camera image; a label: k, weight, category, score, LiDAR points",
+        style,
+    )
 
 
 def _enlargement(image: np.ndarray) -> int:

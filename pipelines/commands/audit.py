@@ -143,7 +143,7 @@ def _print(figures: "Audit", title: str) -> None:
         title="ranking of labels by weight, and share of the weight on correct labels",
     )
     print_table(
-        ("slice", "correct", "of labels", "objects", *by_policy),
+        ("part", "correct", "labels", "objects", *by_policy),
         _parts(figures),
         title="AUROC by category, distance and points in the label",
     )

@@ -84,16 +84,16 @@ def evaluate(
 
         _, truth, detections = read_folders(labels, results, _read_ids(frames) if frames else None)
         found = _compare(truth, detections)
+        notes = f"{results} on {len(truth)} frames"
     else:
         if round_number is not None and checkpoint is not None:
             raise ConfigError("evaluate: give --round or --checkpoint, not both")
         opened = open_workspace(workspace, executor, workers)
         found, notes = _evaluate_val(opened, round_number, checkpoint, store=store)
-        if not as_json:
-            print_line(notes)
     if as_json:
         print_json(found.as_dict())
     else:
+        print_line(notes)
         _print(found.as_dict())
 
 

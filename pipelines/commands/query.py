@@ -123,8 +123,8 @@ def _named(name: str, policy: str | None, round_number: int | None, url: "URL") 
     valid = (*POLICIES.classes, *AUDITED)
     if policy is not None and policy not in valid and ":" not in policy:
         raise ConfigError(
-            f"--policy {policy}: unknown policy{did_you_mean(policy, valid)}; "
-            f"use one of {', '.join(valid)}, or module:Class"
+            f"--policy {policy}: unvalid policy: use one of "
+            f"{', '.join(valid)}, or module:Class{did_you_mean(policy, valid)}"
         )
     postgresql = url.get_backend_name() == "postgresql"
     return found.filtered(policy, round_number, postgresql=postgresql)
@@ -199,5 +199,7 @@ def _print(
     else:
         shown = list(islice(rows, limit))
         print_table(columns, shown, page=True)
+        if not shown:
+            typer.echo("no rows", err=True)
         if len(shown) == limit and next(rows, None) is not None:
             print_line(f"the first {limit} rows; more with --limit, all with --format csv or json")

@@ -84,7 +84,10 @@ class Pace:
 
     def __str__(self) -> str:
         rate, left = self.rate, self.seconds_left
-        return "" if rate is None or left is None else f"{rate:.3g}/s, {duration(left)} left"
+        if rate is None or left is None:
+            return ""
+        shown = f"{rate:.3g}" if rate < 100 else f"{rate:.0f}"  # 17300, not 1.73e+04
+        return f"{shown}/s, {duration(left)} left"
 
 
 def duration(seconds: float) -> str:

@@ -107,8 +107,8 @@ def find_query(name: str) -> NamedQuery:
     queries = named_queries()
     if name not in queries:
         raise ConfigError(
-            f"--named {name}: unknown query{did_you_mean(name, queries)}; "
-            f"use one of {', '.join(queries)}"
+            f"no query is named '{name}': "
+            f"use one of {', '.join(queries)}{did_you_mean(name, queries)}"
         )
     return queries[name]
 

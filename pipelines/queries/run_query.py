@@ -268,4 +268,9 @@ def _explain(message: str) -> str:
         return "query: only SELECT is allowed, the connection is read-only"
     if "one statement" in message or "multiple commands" in message:
         return "query: only one statement is allowed"
+    if "unable to open database file" in message:
+        return (
+            f"query: {message}; SQLite must be able to write in its folder: copy the workspace, or "
+            "query an exported file with --file"
+        )
     return f"query: {message}"

@@ -168,8 +168,8 @@ def find_relation(schema: Iterable[Relation], name: str) -> Relation:
     by_name = {relation.name: relation for relation in schema}
     if name not in by_name:
         raise ConfigError(
-            f"query --schema: unknown table or view '{name}'{did_you_mean(name, by_name)}; "
-            f"use one of {', '.join(by_name)}"
+            f"query --schema: no table or view is named '{name}': "
+            f"use one of {', '.join(by_name)}{did_you_mean(name, by_name)}"
         )
     return by_name[name]
 

@@ -61,6 +61,7 @@ class Anything(Mine):
     ("name", "options", "words"),
     [
         ("pilars", {}, "unknown detector 'pilars': use one of .*; did you mean 'pillars'\\?$"),
+        ("no_such_package.a:B", {}, "No module named .*; install it, or add its folder to PYTHON"),
         ("{}:Mien", {}, "cannot be imported: {} has no 'Mien'; did you mean 'Mine'\\?$"),
         (
             "{}:Mine",

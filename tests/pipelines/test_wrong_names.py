@@ -80,7 +80,7 @@ UNUSABLE = [
     (
         ("score", "run"),
         ("support.toys:ToySegmenter", "support.toys:NoSegmenter"),
-        "run.priors: segmenter 'support.toys:NoSegmenter' cannot be imported",
+        "error: segmenter.name: segmenter 'support.toys:NoSegmenter' cannot be imported",
     ),
     (
         ("score", "run"),

@@ -74,6 +74,8 @@ def test_it_shows_r40_and_r11_side_by_side(curate: Curate, folders: tuple[Path, 
     """And the recall; a detected car is exactly 100."""
     code, out, _ = evaluate(curate, folders)
     assert code == 0
+    count = len(list(folders[1].glob("*.txt")))
+    assert out.startswith(f"{folders[1]} on {count} frames\n")
     lines = {tuple(line.split()[:2]): line.split()[2:] for line in out.splitlines() if line.strip()}
     assert lines[("Car", "3d")] == ["100.00"] * 6
     assert lines[("Car", "aos")] == ["100.00"] * 6

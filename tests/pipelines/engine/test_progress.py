@@ -66,6 +66,18 @@ def test_steps_of_an_earlier_run_do_not_count(clock: Callable[[float], None]) ->
     assert pace.seconds_left == pytest.approx(40.0)
 
 
+@pytest.mark.parametrize(("done", "words"), [(1, "1/s"), (17_300, "17300/s")])
+def test_a_high_rate_is_a_plain_number(
+    clock: Callable[[float], None], done: int, words: str
+) -> None:
+    """A rate is never shown with an exponent."""
+    pace = progress.Pace(done + 1)
+    pace.advance(1)
+    clock(1.0)
+    pace.advance(done)
+    assert str(pace) == f"{words}, 0.0 s left"
+
+
 @pytest.mark.parametrize(
     ("seconds", "words"),
     [

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import sqlite3
 from pathlib import Path
 
 import pytest
@@ -131,6 +132,29 @@ def test_the_list_contains_every_query(curate: Curate) -> None:
     rows = list(csv.DictReader(io.StringIO(curate("query", "--list", "--format", "csv")[1])))
     assert [row["name"] for row in rows] == list(QUERIES)
     assert json.loads(curate("query", "--list", "--json")[1])[0]["name"] == rows[0]["name"]
+
+
+def test_a_folder_that_cannot_be_written_names_the_remedy(curate: Curate, tmp_path: Path) -> None:
+    """SQLite needs a file beside the database, which a folder in its place prevents."""
+    path = tmp_path / "copy.db"
+    connection = sqlite3.connect(path)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("CREATE TABLE frame (frame TEXT)")
+    connection.close()
+    (tmp_path / "copy.db-wal").mkdir()
+    code, out, err = curate("query", "SELECT frame FROM frame", "--file", path)
+    assert (code, out) == (ConfigError.exit_code, "")
+    assert "must be able to write in its folder" in err
+
+
+@pytest.mark.parametrize(("limit", "words"), [(0, "no rows\n"), (1, "")])
+def test_an_empty_table_says_that_it_is_empty(
+    curate: Curate, workspace: Workspace, limit: int, words: str
+) -> None:
+    """On standard error, so that a pipe gets the table alone."""
+    code, out, err = curate("query", f"SELECT frame FROM frame LIMIT {limit}", "-w", workspace.root)
+    assert (code, err) == (0, words)
+    assert out.startswith("frame")
 
 
 @pytest.mark.parametrize(

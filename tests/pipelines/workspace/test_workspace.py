@@ -12,6 +12,7 @@ from pipelines.engine.rounds import (
     newest_checkpoint,
     open_round,
     register_checkpoint,
+    stored_round,
 )
 from pipelines.workspace.config import read_config
 from pipelines.workspace.workspace import Workspace, sha256
