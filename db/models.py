@@ -637,7 +637,6 @@ class Task(Base):
             "frame_id",
             unique=True,
             sqlite_where=text("frame_id IS NOT NULL"),
-            postgresql_where=text("frame_id IS NOT NULL"),
         ),
         Index(
             "uq_task_round",
@@ -646,7 +645,6 @@ class Task(Base):
             "variant",
             unique=True,
             sqlite_where=text("frame_id IS NULL"),
-            postgresql_where=text("frame_id IS NULL"),
         ),
     )
 
