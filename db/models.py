@@ -759,7 +759,6 @@ class Task(Base):
             "frame_id",
             unique=True,
             sqlite_where=text("frame_id IS NOT NULL"),
-            postgresql_where=text("frame_id IS NOT NULL"),
         ),
         Index(
             "uq_task_round",
@@ -768,7 +767,6 @@ class Task(Base):
             "variant",
             unique=True,
             sqlite_where=text("frame_id IS NULL"),
-            postgresql_where=text("frame_id IS NULL"),
         ),
     )
 

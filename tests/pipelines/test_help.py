@@ -19,12 +19,12 @@ from pipelines.workspace.workspace import Workspace
 # Not needed by commands that only read rows.
 HEAVY = {
     "torch", "numba", "scipy", "open3d", "cv2", "onnx", "onnxruntime", "alembic", "sklearn",
-    "matplotlib", "pandas", "safetensors",
+    "matplotlib", "pandas", "safetensors", "sqlalchemy.dialects.postgresql",
 }  # fmt: skip
 
 
 def loaded(*arguments: object) -> set[str]:
-    """Return the packages that are loaded once a command has ended, in a new process."""
+    """Return the modules that are loaded once a command has ended, in a new process."""
     code = (
         f"import sys; sys.argv = {['curate', *map(str, arguments)]!r}\n"
         "from pipelines.cli import main\n"
@@ -32,8 +32,13 @@ def loaded(*arguments: object) -> set[str]:
         "try: main()\n"
         "except SystemExit as end: code = end.code\n"
         "assert not code, code\n"
-        "print('loaded:', *{name.partition('.')[0] for name in sys.modules})"
+        "print('loaded:', *sys.modules)"
     )
+    return set(printed(code).rpartition("loaded:")[2].split())
+
+
+def printed(code: str) -> str:
+    """What Python prints, in a process of its own."""
     ended = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
@@ -41,7 +46,7 @@ def loaded(*arguments: object) -> set[str]:
         check=True,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (ROOT, TESTS)))},
     )
-    return set(ended.stdout.rpartition("loaded:")[2].split())
+    return ended.stdout
 
 
 @pytest.mark.parametrize("command", ["--help", "init --help", "solve --help", "--version"])
@@ -58,6 +63,22 @@ def test_reading_rows_needs_no_heavy_imports(workspace: Workspace) -> None:
         found = loaded(*command, "-w", workspace.root)
         assert "sqlalchemy" in found
         assert not found & HEAVY, command
+
+
+def test_a_command_rarely_looks_for_garbage(workspace: Workspace) -> None:
+    """Python's own setting makes over a hundred collections of a status, and one more at exit."""
+    code = (
+        "import atexit, gc, sys\n"
+        "collections = []\n"
+        "gc.callbacks.append(lambda phase, _: collections.append(phase))\n"
+        "atexit.register(lambda: print('counts:', len(collections) // 2, gc.get_freeze_count()))\n"
+        f"sys.argv = ['curate', 'status', '-w', {str(workspace.root)!r}]\n"
+        "import curate_command\n"
+        "curate_command.main()"
+    )
+    collections, frozen = map(int, printed(code).rpartition("counts:")[2].split())
+    assert collections < 50
+    assert frozen > 10_000
 
 
 def test_the_help_lists_every_command_under_a_heading_with_a_whole_sentence(
