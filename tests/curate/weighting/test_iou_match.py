@@ -42,7 +42,7 @@ def test_categories_can_have_their_own_thresholds():
 
 def test_a_detector_without_estimates_is_refused_in_one_line():
     """It says how many labels lack one, and what to do."""
-    with pytest.raises(ConfigError, match=r"3dioumatch: 1 of 2 labels have no IoU estimate") as info:
+    with pytest.raises(ConfigError, match="3dioumatch: 1 of 2 labels have no IoU estimate") as info:
         IoUMatch().weigh(labels(("Car", 0.9, 0.9), ("Car", 0.9, np.nan)), Age(1, 1))
     assert "\n" not in str(info.value)
 
