@@ -73,5 +73,5 @@ def test_a_checkpoint_that_was_exchanged_does_not_answer(workspace: Workspace) -
 
 def test_a_zero_byte_in_the_address_of_a_database() -> None:
     """Drivers raise errors of their own for it."""
-    with pytest.raises(ConfigError, match=r"run\.database: no URL"):
+    with pytest.raises(ConfigError, match=r"run\.database: not the URL"):
         parse_url("sqlite:////tmp/a\0b")
