@@ -73,5 +73,5 @@ def test_a_replaced_checkpoint_is_not_used(workspace: Workspace) -> None:
 
 def test_a_null_character_in_a_database_url_is_rejected() -> None:
     """Drivers raise their own errors for it."""
-    with pytest.raises(ConfigError, match=r"run\.database: no URL"):
+    with pytest.raises(ConfigError, match=r"run\.database: not the URL"):
         parse_url("sqlite:////tmp/a\0b")
