@@ -52,7 +52,7 @@ class KnownMap:
 
     def __init__(self, path):
         classes = np.arange(IMAGE_SIZE[0] * IMAGE_SIZE[1]).reshape(IMAGE_SIZE[::-1]) // 97 % 4
-        known = {name: frozenset({i + 1}) for i, name in enumerate(CATEGORIES)}
+        known = {name: (i + 1,) for i, name in enumerate(CATEGORIES)}
         self.answer = SemanticMap(classes.astype(np.uint8), known)
 
     def segment(self, frame):
