@@ -52,7 +52,7 @@ class KnownMap:
 
     def __init__(self, path):
         classes = np.arange(IMAGE_SIZE[0] * IMAGE_SIZE[1]).reshape(IMAGE_SIZE[::-1]) // 97 % 4
-        class_ids = {name: frozenset({i + 1}) for i, name in enumerate(CATEGORIES)}
+        class_ids = {name: (i + 1,) for i, name in enumerate(CATEGORIES)}
         self.answer = SemanticMap(classes.astype(np.uint8), class_ids)
 
     def segment(self, frame):

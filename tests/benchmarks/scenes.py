@@ -65,6 +65,7 @@ def kitti_frames(
     """
     if examples is None:
         labels, results = (list(map(to_objects, side)) for side in random_frames(generator, 250))
+        labels = [replace(each, scores=np.full(len(each), np.nan)) for each in labels]
     else:
         names = sorted(path.name for path in (examples / "label_2").glob("*.txt"))
         labels = [read_objects(examples / "label_2" / name) for name in names]
