@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 MIRROR = os.environ.get("BARE_MIRROR", "http://deb.debian.org/debian")
 TESTS = os.environ.get(
     "BARE_TESTS",
-    "tests/test_architecture.py tests/curate/simulation/test_open3d_loader.py "
+    "tests/test_house.py tests/curate/simulation/test_open3d_loader.py "
     "tests/curate/geometry tests/curate/priors tests/pipelines/test_cli.py",
 )
 HOME = "/srv/curate"

@@ -240,7 +240,7 @@ def python_api_page() -> str:
         "shape; a letter stands for the same size wherever it occurs in one call. Boxes are",
         "(x, y, z, length, width, height, yaw) in metres and radians, at the box centre in the",
         "LiDAR frame: x forward, y left, z up, yaw counter-clockwise from x. The docstrings list",
-        "units, errors and sources: `help(curate.bev_iou)`. The [examples](../examples/README.md)",
+        "units, errors and sources: `help(curate.bev_iou)`. The scripts in `examples/`",
         "use these names.",
         "",
     ]

@@ -179,7 +179,10 @@ def _print_query(workspace: Workspace) -> None:
 
 def _print_quality(workspace: Workspace) -> None:
     rows = label_quality(workspace, 1, EVALUATED)
-    print_table(("policy", "labels", "weight > 0", "weighted precision", "recall", "AUROC"), rows)
+    print_table(
+        ("policy", "labels", "weight > 0", "weighted precision %", "weighted recall %", "AUROC"),
+        rows,
+    )
 
 
 def _print_detectors(workspace: Workspace) -> None:

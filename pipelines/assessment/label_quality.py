@@ -46,12 +46,13 @@ def label_quality(
         weights = _weights(workspace, round_number, policy)
         counted = [label for label in weights if label in correct]
         v = np.array([weights[label] for label in counted])
+        above_zero = sum(weight > 0 for weight in weights.values())
         is_correct = np.array([correct[label] for label in counted], dtype=bool)
         rows.append(
             (
                 policy,
                 len(weights),
-                int((v > 0).sum()),
+                above_zero,
                 100 * weighted_precision(v, is_correct),
                 100 * weighted_recall(v, is_correct, objects),
                 auroc(v, is_correct),

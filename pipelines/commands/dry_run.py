@@ -2,9 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-import typer
-
-from pipelines.reports.terminal import print_json
+from pipelines.reports.terminal import print_json, print_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -24,15 +22,15 @@ def print_preview(planned: "Iterable[PlannedStage]", *, as_json: bool) -> None:
         print_json({"stages": stages, "seconds": total, "stages_without_a_rate": unknown})
         return
     for stage in stages:
-        typer.echo(_line(stage))
+        print_line(_line(stage), indent=4)
     if not any(stage.reasons for stage in stages):
-        typer.echo("Everything is up to date.")
+        print_line("Everything is up to date.")
         return
     costs = [f"about {duration(total)}"] if any(stage.seconds for stage in stages) else []
     if unknown:
         names = ", ".join(dict.fromkeys(unknown))
         costs.append(f"an unknown time for {names}, which no earlier run has measured")
-    typer.echo(f"Total: {', and '.join(costs)}. Nothing was done.")
+    print_line(f"Total: {', and '.join(costs)}. Nothing was done.")
 
 
 def _line(stage: "PlannedStage") -> str:

@@ -8,7 +8,7 @@ import typer
 from curate.segmenters.classes import CLASS_MAPS
 from pipelines.commands.options import JsonOption, complete, one_of, registered
 from pipelines.registry import DATASETS, DETECTORS, SEGMENTERS
-from pipelines.reports.terminal import print_json
+from pipelines.reports.terminal import print_json, print_line
 
 
 def init(
@@ -127,7 +127,7 @@ def init(
     if as_json:
         print_json({"workspace": str(workspace.root), "frames": counts})
         return
-    typer.echo(
+    print_line(
         f"{workspace.root}: {counts['labeled']} labeled, {counts['unlabeled']} unlabeled and "
         f"{counts['val']} val frames; settings in curate.toml"
     )

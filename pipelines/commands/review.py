@@ -15,7 +15,7 @@ from pipelines.commands.options import (
     open_workspace,
 )
 from pipelines.registry import EDITORS
-from pipelines.reports.terminal import print_json, print_table
+from pipelines.reports.terminal import print_json, print_line, print_table
 
 if TYPE_CHECKING:
     from pipelines.review.importing import ReviewImport
@@ -88,7 +88,7 @@ def export_review(
             }
         )
         return
-    typer.echo(
+    print_line(
         f"review {sheet.id}: {sheet.asked} of {sheet.boxes} boxes in {len(sheet.frames)} frames of "
         f"round {sheet.round}, weights by {sheet.policy}, in {directory}; see its README.txt"
     )
@@ -144,7 +144,7 @@ def import_review(
     if as_json:
         print_json(found)
     else:
-        typer.echo(_describe_import(found))
+        print_line(_describe_import(found))
 
 
 @group.command("list")

@@ -111,6 +111,12 @@ def draw_labels(workspace: Workspace, round_number: int, name: str) -> list[Path
     return [folder / file for file in pictures]
 
 
+def picture_title(name: str, found: FrameBoxes, round_number: int, policy: str) -> str:
+    """Return the title of a frame's picture; a frame without predictions does not look empty."""
+    content = f"weights by {policy}" if len(found.labels) else "no predictions stored"
+    return f"frame {name} ({found.split}), round {round_number}, {content}"
+
+
 def _painted(
     workspace: Workspace, name: str, weighted: tuple[int, str], kind: ImageFormat, style: Style
 ) -> Canvas:
@@ -123,7 +129,7 @@ def _painted(
         found.truth_boxes,
         found.repredictions,
         found.human_boxes,
-        f"frame {name} ({found.split}), round {number}, weights by {policy}",
+        picture_title(name, found, number, policy),
         style,
     )
     return paint_frame(frame, shown, kind)

@@ -55,7 +55,7 @@ def test_class_names_in_lower_case_fail_every_frame_with_a_fix(
     work = tmp_path / "w"
     code, _, err = begin(curate, work, toy_kitti, results)
     assert code == FramesFailed.exit_code
-    assert "answers 'car', the data set's category is 'Car'" in err
+    assert "returns 'car', but the data set's category is 'Car'" in err
     setting = re.search(r"detector\.options\.(rename = )\{", err)
     assert setting is not None
     toml = work / "curate.toml"
@@ -180,7 +180,10 @@ def test_a_report_needs_no_network(curate: Curate, workspace: Workspace, tmp_pat
     [
         ({"name": "onnx", "path": None}, "segmenter 'onnx' needs a path"),
         ({"name": "onnx", "path": "gone.onnx", "classes": "voc"}, "gone.onnx"),
-        ({"name": "onnx", "path": SHIPPED_SEGMENTER, "classes": None}, "class numbers mean"),
+        (
+            {"name": "onnx", "path": SHIPPED_SEGMENTER, "classes": None},
+            "class numbers is not configured",
+        ),
         ({"name": "saved", "path": "gone", "classes": "voc"}, "no such folder of semantic maps"),
     ],
 )

@@ -274,7 +274,7 @@ def test_a_workspace_with_a_killed_init_is_reported(curate: Curate, made: Path) 
         path.unlink()
     code, out, err = curate("run")
     assert (code, out) == (WorkspaceError.exit_code, "")
-    assert "run `curate init` again" in err
+    assert "rerun `curate init`" in err
     assert not (made / "exports" / "labels.sqlite").exists()
 
 

@@ -109,7 +109,7 @@ def test_the_schema_is_printed_in_every_format(curate: Curate, workspace: Worksp
     """One text table per table, one list in JSON and CSV."""
     _, out, _ = curate("query", "--schema", "-w", workspace.root)
     assert "weighted_labels (view): Every label" in out
-    assert "ground_truth (table): What annotators wrote" in out
+    assert "ground_truth (table): The annotated objects of labeled and val frames" in out
     rows = json.loads(curate("query", "--schema", "--json", "-w", workspace.root)[1])
     table = list(csv.DictReader(io.StringIO(curate("query", "--schema", "--csv")[1])))
     assert [row["column"] for row in table] == [row["column"] for row in rows]

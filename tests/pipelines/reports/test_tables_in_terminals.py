@@ -91,6 +91,20 @@ def test_nothing_is_truncated(
     assert sorted(_NUMBER.findall(shown)) == sorted(_NUMBER.findall(whole))
 
 
+@pytest.mark.parametrize("width", [60, 80])
+def test_a_dry_run_wraps_at_spaces(
+    monkeypatch: pytest.MonkeyPatch, workspace: Path, width: int
+) -> None:
+    """The reasons of a stage continue on an indented line."""
+    arguments = ("predict", "--round", "3", "--dry-run")
+    wide = run(monkeypatch, WIDE, arguments, workspace)
+    narrow = run(monkeypatch, width, arguments, workspace)
+    assert "frames (" in wide.text
+    assert max(map(len, narrow.lines)) <= width < max(map(len, wide.lines))
+    assert narrow.text.split() == wide.text.split()
+    assert any(line.startswith("    ") for line in narrow.lines)
+
+
 @pytest.mark.parametrize("width", [60, 80, 120])
 def test_a_process_in_a_terminal(workspace: Path, width: int) -> None:
     """With NO_COLOR and a terminal that reports its size, not COLUMNS."""

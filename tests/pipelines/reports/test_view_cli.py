@@ -10,7 +10,7 @@ from support.pipelines_cli import Curate
 
 from curate.errors import ConfigError, WorkspaceError
 from pipelines.labels.of_one_frame import read_frame
-from pipelines.reports.pictures import draw_example_frame
+from pipelines.reports.pictures import draw_example_frame, picture_title
 from pipelines.reports.recording import evidence_of_labels
 from pipelines.workspace.workspace import Workspace
 
@@ -47,6 +47,10 @@ def test_a_frame_of_every_split_is_drawn(curate: Curate, weighted: Workspace) ->
         assert (found.truth_boxes is None) == (split == "unlabeled")
         assert len(found.labels) == {"labeled": 0, "unlabeled": 3, "val": 3}[split]
         assert np.isnan(found.weights).all() == (split != "unlabeled")
+        content = "no predictions stored" if split == "labeled" else "weights by pspsl"
+        assert (
+            picture_title(name, found, 1, "pspsl") == f"frame {name} ({split}), round 1, {content}"
+        )
 
 
 def test_repredictions_have_the_weight_of_their_label(weighted: Workspace) -> None:

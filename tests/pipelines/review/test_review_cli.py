@@ -363,7 +363,7 @@ def spoil_both(folder: Path, frame: str) -> None:
 
 INVALID_EDITS = (
     (lambda folder, frame: (folder / "review.json").unlink(), (), "review.json: no such file"),
-    (spoil_text, (), "fields, but a label line"),
+    (spoil_text, (), "fields, but label lines"),
     (spoil_both, (), "cannot overlap: reject one of box 1 ("),
     (lambda folder, frame: decide(folder, frame, 1, "perhaps"), (), "decision 'perhaps'"),
     (lambda folder, frame: None, ("--answer", "nowhere"), "nowhere: no such folder"),
