@@ -280,7 +280,7 @@ _REMEDIES = {
         "locked": "; another process is writing, wait for it or stop it",
         "readonly": "; give yourself write permission on the file and its folder",
         "unable to open": "; check that the folder exists and can be written",
-        "disk I/O error": "; check the free space, the disk and its mount, finished frames are kept",
+        "disk I/O error": "; check free space, disk and mount, finished frames are kept",
         "full": "; free space on the disk and rerun the command, finished frames are kept",
     },
     "postgresql": {

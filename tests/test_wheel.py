@@ -92,6 +92,7 @@ def test_the_modules_are_those_of_the_wheel(installed: Path, tmp_path: Path) -> 
 def test_the_demo_runs_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
     """With its migrations, queries, templates and the model of the segmenter."""
     small = ("--frames", 12, "--val", 4, "--labeled", 0.25, "--steps", 20)
+    assert run(tmp_path, installed / "curate", "--version").split()[-1] == curate.__version__
     printed = run(tmp_path, installed / "curate", "demo", "work", *small)
     assert "Evaluate the detectors" in printed
     query = ("query", "-w", "work", "--csv", "SELECT split, count(*) FROM frame GROUP BY split")
@@ -104,7 +105,10 @@ def test_the_demo_runs_outside_the_checkout(installed: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "example", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.name
+    "example",
+    # The export of a segmenter needs torchvision or a model file.
+    sorted(set((ROOT / "examples").glob("*.py")) - {ROOT / "examples" / "export_segmenter.py"}),
+    ids=lambda path: path.name,
 )
 def test_an_example_runs_outside_the_checkout(
     installed: Path, tmp_path: Path, example: Path
