@@ -46,8 +46,9 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(folder: Path, *command: object) -> str:
-    """Return the output of a command, run in a folder without PYTHONPATH."""
+    """Return the output of a command in an activated environment, without PYTHONPATH."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    environment["PATH"] = f"{Path(str(command[0])).parent}{os.pathsep}{environment['PATH']}"
     ended = subprocess.run(
         [str(word) for word in command],
         cwd=folder,
