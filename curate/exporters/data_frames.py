@@ -17,6 +17,7 @@ from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from curate.exporters.columns import WEIGHTED_LABELS
 from curate.exporters.label_file import read_label_rows
 from curate.exporters.parquet import FORMAT
+from curate.files.batches import batched
 from curate.files.parquet import load_parquet
 from curate.files.paths import StrPath
 
@@ -204,6 +205,6 @@ def _polars_types() -> Mapping[Kind, Any]:
 
 def _blocks(rows: Iterator[Row]) -> Iterator[list[Row]]:
     """Yield the rows in blocks; a single empty block if there are no rows."""
-    yield list(islice(rows, BLOCK_ROWS))
-    while block := list(islice(rows, BLOCK_ROWS)):
-        yield block
+    blocks = batched(rows, BLOCK_ROWS)
+    yield next(blocks, [])
+    yield from blocks

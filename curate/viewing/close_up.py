@@ -11,7 +11,7 @@ from curate.viewing.bird_eye import Region
 from curate.viewing.canvas import Canvas
 from curate.viewing.legend import REPREDICTION_DASHES
 from curate.viewing.overlay import box_strokes
-from curate.viewing.palette import BACKGROUND, PANEL, TEXT, height_shades, weight_colours
+from curate.viewing.palette import DARK, height_shades, weight_colours
 
 _SIDE, _WIDE = 260, 390
 _REACH_METRES = 8.0
@@ -36,7 +36,7 @@ class CloseUpLabel:
 
 def draw_close_up(frame: Frame, label: CloseUpLabel) -> np.ndarray:
     """Return (260, 650, 3) uint8 RGB; the left part is empty if the label is outside the image."""
-    canvas = Canvas(_WIDE + _SIDE, _SIDE, BACKGROUND)
+    canvas = Canvas(_WIDE + _SIDE, _SIDE, DARK.background)
     red, green, blue = weight_colours(np.array([label.weight]))[0].tolist()
     colour = (red, green, blue)
     boxes = label.box[None] if label.former is None else np.stack([label.box, label.former])
@@ -65,17 +65,17 @@ def _draw_above(
     front = (outlines[0, 0] + outlines[0, 3]) / 2
     canvas.lines(np.stack([outlines[0].mean(axis=0), front]), colour, 1.5)
     for side in sides[1:]:
-        canvas.dashes(side, TEXT, 1.2, REPREDICTION_DASHES)
+        canvas.dashes(side, DARK.text, 1.2, REPREDICTION_DASHES)
 
 
 def _draw_image(
     canvas: Canvas, frame: Frame, boxes: np.ndarray, colour: tuple[int, int, int]
 ) -> None:
     """Draw the left part: the camera image around the label."""
-    canvas.box(0, 0, _WIDE, _SIDE, PANEL)
+    canvas.box(0, 0, _WIDE, _SIDE, DARK.panel)
     rectangle = image_rectangles(boxes[:1], frame.calibration, frame.image_size)[0]
     if frame.image is None or np.isnan(rectangle).any():
-        canvas.text(20, _SIDE / 2, "outside the image", TEXT)
+        canvas.text(20, _SIDE / 2, "outside the image", DARK.text)
         return
     window = _window(rectangle, frame.image_size)
     left, top, right, bottom = window
@@ -89,9 +89,9 @@ def _draw_image(
         places = (box_lines - np.array([left, top])) * factor + corner
         inside = places[((places >= low) & (places <= high)).all(axis=(1, 2))]
         if index:
-            canvas.dashes(inside, TEXT, 1.2, REPREDICTION_DASHES)
+            canvas.dashes(inside, DARK.text, 1.2, REPREDICTION_DASHES)
         elif len(inside):
-            canvas.lines(inside, BACKGROUND, 3.2)
+            canvas.lines(inside, DARK.background, 3.2)
             canvas.lines(inside, colour, 1.8)
 
 

@@ -78,9 +78,6 @@ PAPER = Style(
 )  # fmt: skip
 STYLES = {"dark": DARK, "paper": PAPER}
 
-BACKGROUND, PANEL, GRID, TEXT = DARK.background, DARK.panel, DARK.grid, DARK.text
-GROUND_TRUTH, ZERO_WEIGHT, UNWEIGHTED = DARK.ground_truth, DARK.zero_weight, DARK.unweighted
-
 
 def find_style(name: str) -> Style:
     """Return the style with this name.

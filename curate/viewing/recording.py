@@ -15,7 +15,7 @@ import numpy as np
 
 from curate.errors import ConfigError, one_line
 from curate.frames import Calibration, Frame
-from curate.viewing.palette import GROUND_TRUTH, height_shades, weight_colours
+from curate.viewing.palette import DARK, height_shades, weight_colours
 from curate.viewing.tags import ShownLabels, ShownRepredictions
 
 POINTS = "world/points"
@@ -165,7 +165,7 @@ def _log_frame(rerun: ModuleType, stream: Any, recorded: RecordedFrame) -> None:
     truth = np.zeros((0, 7)) if recorded.truth_boxes is None else recorded.truth_boxes
     seen = ~np.isnan(truth).any(axis=1)
     names = [] if recorded.truth_categories is None else recorded.truth_categories[seen].tolist()
-    white = np.tile(np.array(GROUND_TRUTH, dtype=np.uint8), (int(seen.sum()), 1))
+    white = np.tile(np.array(DARK.ground_truth, dtype=np.uint8), (int(seen.sum()), 1))
     stream.log(TRUTH, _boxes(rerun, TRUTH, truth[seen], white, names))
 
 

@@ -213,11 +213,8 @@ class Preview:
             task.c.stage == stage.name,
             task.c.frame_id.is_not(None),
         )
-        with self._workspace.database.reading() as connection:
-            return {
-                key: (state, fingerprint)
-                for key, state, fingerprint in bulk.select(connection, query)
-            }
+        rows = self._workspace.database.rows(query)
+        return {key: (state, fingerprint) for key, state, fingerprint in rows}
 
     def _whole_sequences(
         self, names: Mapping[str, int], found: Mapping[str, _Reason]
@@ -297,8 +294,7 @@ class Preview:
             .join(table, table.c.teacher_id == checkpoint.c.id)
             .where(table.c.number == self._number)
         )
-        with self._workspace.database.reading() as connection:
-            found = bulk.select(connection, query)
+        found = self._workspace.database.rows(query)
         return found[0][0] if found else None
 
 
@@ -342,8 +338,7 @@ def _seconds(
         .order_by(task.c.id.desc())
         .limit(MEASURED_TASKS)
     )
-    with workspace.database.reading() as connection:
-        rows = bulk.select(connection, query)
+    rows = workspace.database.rows(query)
     if not rows:
         return None
     if isinstance(stage, FirstStage | RoundStage):

@@ -1,6 +1,5 @@
 """Names in the configuration that stand for registered or user-supplied classes."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +10,28 @@ from curate.errors import ConfigError
 from pipelines.registry import Registry
 
 
+class _CheckedText:
+    """Marks a text that a subclass checks; its ConfigError becomes an error of the setting."""
+
+    def check(self, name: str) -> None:
+        """Raise ConfigError if the name is not valid."""
+        raise NotImplementedError
+
+    def __get_pydantic_core_schema__(
+        self, source: type[Any], handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def _checked(self, name: str) -> str:
+        try:
+            self.check(name)
+        except ConfigError as error:  # pydantic collects ValueError
+            raise ValueError(str(error)) from error
+        return name
+
+
 @dataclass(frozen=True)
-class KnownName:
+class KnownName(_CheckedText):
     """Marks a text as the name of an extension, or as `module:Class`.
 
     A class is imported, and thereby checked, only by commands that use it.
@@ -30,23 +49,19 @@ class KnownName:
         """The valid names."""
         return (*self.registry.classes, *self.others)
 
-    def __get_pydantic_core_schema__(
-        self, source: type[Any], handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        return core_schema.no_info_after_validator_function(self._checked, handler(source))
-
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         choices = [{"enum": list(self.names)}, {"pattern": "^[^:]+:.+$"}]
         return {**handler(schema), "anyOf": choices}
 
-    def _checked(self, name: str) -> str:
-        return _as_value_error(lambda: self.registry.check_name(name, *self.others), name)
+    def check(self, name: str) -> None:
+        """Raise ConfigError if the name is not valid."""
+        self.registry.check_name(name, *self.others)
 
 
 @dataclass(frozen=True)
-class KnownClassSet:
+class KnownClassSet(_CheckedText):
     """Marks a text as the name of a class set of segmenters."""
 
     @property
@@ -56,26 +71,13 @@ class KnownClassSet:
 
         return tuple(CLASS_MAPS)
 
-    def __get_pydantic_core_schema__(
-        self, source: type[Any], handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        return core_schema.no_info_after_validator_function(self._checked, handler(source))
-
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         return {**handler(schema), "enum": list(self.names)}
 
-    def _checked(self, name: str) -> str:
+    def check(self, name: str) -> None:
+        """Raise ConfigError if the name is not valid."""
         from curate.segmenters.classes import class_map
 
-        return _as_value_error(lambda: class_map(name), name)
-
-
-def _as_value_error(check: Callable[[], object], name: str) -> str:
-    """Return the name, or raise ValueError, which pydantic collects, if the check fails."""
-    try:
-        check()
-    except ConfigError as error:
-        raise ValueError(str(error)) from error
-    return name
+        class_map(name)

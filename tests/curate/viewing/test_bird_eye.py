@@ -6,7 +6,7 @@ from support.shown_labels import labels
 
 from curate.viewing.bird_eye import Region, draw_bird_eye, region_around
 from curate.viewing.legend import TITLE_HEIGHT
-from curate.viewing.palette import GROUND_TRUTH, PAPER, weight_colours
+from curate.viewing.palette import DARK, PAPER, weight_colours
 from curate.viewing.tags import ShownLabels
 
 REGION = Region(0, 40, -20, 20, 10)
@@ -42,8 +42,8 @@ def test_ground_truth_is_white_and_can_be_nan():
     truth = np.array([[30.0, 0, 0, 4, 2, 1.5, 0], [np.nan] * 7])
     with_truth = draw_bird_eye(np.zeros((0, 4)), labels([], []), truth, region=REGION)
     without = draw_bird_eye(np.zeros((0, 4)), labels([], []), region=REGION)
-    assert near(with_truth, (32, 1), np.array(GROUND_TRUTH))
-    assert not near(without, (32, 1), np.array(GROUND_TRUTH))
+    assert near(with_truth, (32, 1), np.array(DARK.ground_truth))
+    assert not near(without, (32, 1), np.array(DARK.ground_truth))
 
 
 def test_points_are_drawn():

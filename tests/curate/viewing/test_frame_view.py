@@ -8,7 +8,7 @@ from curate.errors import DataError
 from curate.frames import Frame
 from curate.viewing.canvas import Canvas, jpeg
 from curate.viewing.frame_view import draw_frame
-from curate.viewing.palette import UNWEIGHTED, weight_colours
+from curate.viewing.palette import DARK, weight_colours
 from curate.viewing.tags import ShownLabels, ShownRepredictions
 
 BOX = np.array([[15.0, 1, 0, 4, 2, 1.5, 0.3]])
@@ -49,9 +49,9 @@ def test_image_and_bird_eye_view_are_one_image():
 
 def test_a_label_without_weight_has_its_own_colour():
     """NaN is neither ignored nor trusted."""
-    assert has(draw_frame(frame(), shown(np.nan)), UNWEIGHTED)
-    assert not has(draw_frame(frame(), shown(0.9)), UNWEIGHTED)
-    assert weight_colours(np.array([np.nan]))[0].tolist() == list(UNWEIGHTED)
+    assert has(draw_frame(frame(), shown(np.nan)), DARK.unweighted)
+    assert not has(draw_frame(frame(), shown(0.9)), DARK.unweighted)
+    assert weight_colours(np.array([np.nan]))[0].tolist() == list(DARK.unweighted)
 
 
 def test_a_frame_without_image_is_rejected():

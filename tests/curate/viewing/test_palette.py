@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 
 from curate.errors import ConfigError
-from curate.viewing.palette import (
-    BACKGROUND,
-    DARK,
-    PAPER,
-    ZERO_WEIGHT,
-    find_style,
-    height_shades,
-    weight_colours,
-)
+from curate.viewing.palette import DARK, PAPER, find_style, height_shades, weight_colours
 
 
 def lightness(colours):
@@ -34,14 +26,14 @@ def test_a_higher_weight_is_a_lighter_colour():
 def test_every_weight_is_distinct_from_the_background():
     """The lowest weight is still far lighter than the background."""
     lowest = lightness(weight_colours(np.array([0.001])).astype(float))
-    assert lowest - lightness(np.array([BACKGROUND], dtype=float)) > 25
+    assert lowest - lightness(np.array([DARK.background], dtype=float)) > 25
 
 
 def test_weight_0_is_not_on_the_scale():
     """Ignored labels are grey; tiny weights are not."""
     colours = weight_colours(np.array([0.0, 1e-9, 1.0]))
-    assert tuple(colours[0]) == ZERO_WEIGHT
-    assert tuple(colours[1]) != ZERO_WEIGHT
+    assert tuple(colours[0]) == DARK.zero_weight
+    assert tuple(colours[1]) != DARK.zero_weight
     assert np.ptp(colours[1].astype(int)) > 60
     assert weight_colours(np.zeros(0)).shape == (0, 3)
 

@@ -9,7 +9,7 @@ import pytest
 from curate.errors import ConfigError
 from curate.frames import Calibration, Frame
 from curate.viewing import recording
-from curate.viewing.palette import GROUND_TRUTH, weight_colours
+from curate.viewing.palette import DARK, weight_colours
 from curate.viewing.recording import (
     CAMERA,
     POINTS,
@@ -99,7 +99,7 @@ def test_a_recording_contains_points_boxes_weights_and_evidence(
     assert found[REPREDICTIONS][0]["colors"] == as_rgba(weight_colours(np.array([0.63])))
     [truth] = found[TRUTH]
     assert truth["labels"] == ["Car"]
-    assert truth["colors"] == as_rgba(np.array([GROUND_TRUTH], dtype=np.uint8))
+    assert truth["colors"] == as_rgba(np.array([DARK.ground_truth], dtype=np.uint8))
 
 
 def as_rgba(colours: np.ndarray) -> list[int]:
