@@ -2,9 +2,9 @@
 
 Usage, as root, with debootstrap installed: prove_bare.py SUITE...
 
-For each suite debootstrap makes a system with python3, python3-venv and make, and nothing else that
-was asked for. A copy of the checkout is put into it, and the commands of `STEPS` run there. Mounts
-live in a namespace of their own and end with it. The settings of pip on this machine are passed in
+For each suite debootstrap makes a minimal system, to which only python3, python3-venv and make are
+added. The commands of `STEPS` run there in a copy of the checkout. Mounts are made in a separate
+namespace and end with it. The settings of pip on this machine are passed in
 the environment; local folders and files that they name are mounted at the same place.
 
 Environment: BARE_FOLDER (default: a temporary folder, removed at the end), BARE_MIRROR, BARE_TESTS.

@@ -27,7 +27,7 @@ def as_categories(names: Sequence[str] | np.ndarray) -> Shaped[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class Columns:
-    """Base of data classes whose fields are arrays with one row per object."""
+    """Base of data classes with arrays as fields, one row per object."""
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))

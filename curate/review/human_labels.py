@@ -15,14 +15,14 @@ from curate.geometry.overlap import bev_iou
 ACCEPTED, REJECTED, MOVED, ADDED = DECISIONS = ("accepted", "rejected", "moved", "added")
 
 SAME_OBJECT_IOU = 0.1
-"""A prediction of any category whose BEV IoU with a human label's box is above this is the same
-object and is replaced by it. The consistency match and `curate diff` use the same threshold."""
+"""A prediction of any category with a BEV IoU above this to the box of a human label is the same
+object and is replaced by the label. The consistency match and `curate diff` use this value too."""
 REJECTED_IOU = 0.3
-"""A prediction of the same category whose BEV IoU with a rejected box is above this is rejected as
+"""A prediction of the same category with a BEV IoU above this to a rejected box is rejected as
 well. Predictions that overlap less, or have another category, stay undecided: a detector may
 predict the same box with two categories, and the person rejects only the wrong one."""
 SAME_DECISION_IOU = 0.5
-"""A later decision replaces an earlier one whose box overlaps it by more than this."""
+"""A later decision replaces an earlier one if their boxes overlap by more than this BEV IoU."""
 
 
 @dataclass(frozen=True)

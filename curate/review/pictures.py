@@ -16,10 +16,10 @@ class NumberedLabels(ShownLabels):
     """Labels with their number as the first part of their caption.
 
     Attributes:
-        asked: (n,) bool, labels for which a decision is requested; they are highlighted.
+        requested: (n,) bool, labels for which a decision is requested; they are highlighted.
     """
 
-    asked: np.ndarray | None = None
+    requested: np.ndarray | None = None
 
     @property
     def emphasis(self) -> np.ndarray:
@@ -38,7 +38,7 @@ class NumberedLabels(ShownLabels):
 
     @property
     def _is_requested(self) -> np.ndarray:
-        return np.zeros(len(self), dtype=bool) if self.asked is None else self.asked
+        return np.zeros(len(self), dtype=bool) if self.requested is None else self.requested
 
 
 def draw_review(frame: Frame, shown: ShownFrame, *, title: str = "") -> np.ndarray:
@@ -53,6 +53,6 @@ def draw_review(frame: Frame, shown: ShownFrame, *, title: str = "") -> np.ndarr
         as_categories([box.category for box in shown.boxes]),
         np.array([box.score for box in shown.boxes], dtype=np.float64),
         np.array([box.weight for box in shown.boxes], dtype=np.float64),
-        asked=np.array([box.asked for box in shown.boxes], dtype=bool),
+        requested=np.array([box.asked for box in shown.boxes], dtype=bool),
     )
     return draw_frame(frame, labels, human_boxes=shown.array[human], title=title)
