@@ -100,7 +100,7 @@ def draw_labels(workspace: Workspace, round_number: int, name: str) -> list[Path
     found = read_frame(workspace, name, round_number, policy)
     labels = shown_labels(workspace, frame, found, policy)
     title = f"frame {name}, round {round_number}, weights by {policy}"
-    stem = f"round-{round_number:02d}-{name}"
+    stem = f"round-{round_number:02d}-{name}-{policy}"
     pictures = {
         f"{stem}-bird-eye.png": draw_bird_eye(frame.points, labels, title=title),
         f"{stem}-image.png": draw_overlay(frame.image, frame.calibration, labels, title=title),
