@@ -5,14 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from sqlalchemy import func, select
 
-from curate.detections import Annotations, Detections
+from curate.detections import Annotations, Detections, as_categories
 from curate.errors import ConfigError, WorkspaceError
-from curate.review.human_labels import REJECTED
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.labels.by_frame import check_weights, not_weighted_error
-from pipelines.labels.human_labels import human_boxes
+from pipelines.labels.human_labels import DecidedLabels, decided_labels
 from pipelines.workspace.workspace import Workspace
 
 
@@ -22,22 +21,24 @@ class FrameBoxes:
 
     Attributes:
         split: split of the frame.
-        labels: the n predictions, without those that a human label replaces.
+        labels: the n labels by k: predictions, and in place of those that a human label replaces,
+            the objects that people accepted, moved or added, with score 1.
         numbers: (n,) k of each label.
-        weights: (n,) weights of one policy; 0 for labels that it dropped or a person rejected, NaN
-            if it has weighted none of the frame's labels.
+        weights: (n,) weights of one policy; 0 for labels that it dropped or a person rejected, 1
+            for objects of people, NaN if it has weighted none of the frame's labels.
+        decisions: (n,) str, what a person decided about each label: accepted, moved, added,
+            rejected, or "".
         repredictions: the repredictions of all views, each with the weight of its matched label.
         truth: ground truth, with NaN boxes for DontCare; None for frames of X_u.
-        human_boxes: (h, 7) boxes of the human labels, in the LiDAR frame.
     """
 
     split: str
     labels: Detections
     numbers: np.ndarray
     weights: np.ndarray
+    decisions: np.ndarray
     repredictions: ShownRepredictions
     truth: Annotations | None
-    human_boxes: np.ndarray
 
     @property
     def truth_boxes(self) -> np.ndarray | None:
@@ -100,17 +101,26 @@ def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) 
     labels = workspace.predictions(round_number, [key])[key]
     weights = _weights(workspace, round_number, (key, name), policy, len(labels))
     truth = None if split == "unlabeled" else workspace.ground_truth(split)[name]
-    rejected, replaced = _decided(workspace, round_number, key, len(labels))
-    weights[rejected] = 0.0
-    return FrameBoxes(
-        split,
-        labels.select(~replaced),
-        np.flatnonzero(~replaced),
-        weights[~replaced],
-        _repredictions(workspace, round_number, key, weights),
-        truth,
-        human_boxes(workspace, round_number, key),
+    decided = decided_labels(workspace, round_number, key)
+    weights[list(decided.rejected)] = 0.0
+    repredictions = _repredictions(workspace, round_number, key, weights)
+    return FrameBoxes(split, *_with_decisions(labels, weights, decided), repredictions, truth)
+
+
+def _with_decisions(
+    labels: Detections, weights: np.ndarray, decided: DecidedLabels
+) -> tuple[Detections, np.ndarray, np.ndarray, np.ndarray]:
+    """Return labels, k, weights and decisions, with the objects of people among the predictions."""
+    kept = np.array([k for k in range(len(labels)) if k not in decided.replaced], dtype=np.int64)
+    objects = Detections.from_rows(
+        [(each.category, 1.0, *each.box, None) for each in decided.objects]
     )
+    every = labels.select(kept).joined(objects)
+    numbers = np.array([*kept.tolist(), *(each.k for each in decided.objects)], dtype=np.int64)
+    weights = np.concatenate([weights[kept], np.ones(len(objects))])
+    decisions = as_categories([decided.by_k.get(k, "") for k in numbers.tolist()])
+    order = np.argsort(numbers, kind="stable")
+    return every.select(order), numbers[order], weights[order], decisions[order]
 
 
 def _find(workspace: Workspace, name: str) -> tuple[str, int]:
@@ -136,21 +146,6 @@ def _weights(
     for k, v in found:
         weights[k] = v
     return weights
-
-
-def _decided(
-    workspace: Workspace, round_number: int, key: int, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return two (count,) bool by k: rejected by a person, and replaced by a human label."""
-    match, label = bulk.table("human_match"), bulk.table("human_label")
-    same = (label.c.frame_id == match.c.frame_id, label.c.n == match.c.n)
-    query = select(match.c.k, label.c.decision).where(
-        *same, match.c.round == round_number, match.c.frame_id == key
-    )
-    rejected, replaced = np.zeros((2, count), dtype=bool)
-    for k, decision in workspace.database.rows(query):
-        (rejected if decision == REJECTED else replaced)[k] = True
-    return rejected, replaced
 
 
 def _repredictions(

@@ -88,6 +88,7 @@ def shown_labels(workspace: Workspace, frame: Frame, found: FrameBoxes, policy: 
         count_points_in_boxes(frame.points, labels.boxes),
         zero_weight_of(workspace.config, policy),
         found.numbers,
+        found.decisions,
     )
 
 
@@ -128,7 +129,6 @@ def _painted(
         shown_labels(workspace, frame, found, policy),
         found.truth_boxes,
         found.repredictions,
-        found.human_boxes,
         picture_title(name, found, number, policy),
         style,
     )

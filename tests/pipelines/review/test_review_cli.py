@@ -310,9 +310,9 @@ def test_human_labels_are_marked_in_every_output(
     untouched = curate("explain", other, 0, "-w", workspace.root)[1]
     assert "differ" not in untouched
     found = read_frame(workspace, frame, 1, "pspsl")
-    assert (len(found.labels), found.weights.tolist()) == (1, [0.0])
-    assert found.human_boxes.shape == (3, 7)
-    assert np.isfinite(found.human_boxes).all()
+    assert found.numbers.tolist() == [0, 1, 2, 1_000_003]
+    assert found.weights.tolist() == [1, 0, 1, 1]
+    assert found.decisions.tolist() == ["accepted", "rejected", "moved", "added"]
     assert curate("report", "-w", workspace.root)[0] == 0
     page = next((workspace.root / "reports").glob("*.html")).read_text()
     assert "1 accepted, 1 added, 1 moved, 1 rejected" in page
