@@ -129,10 +129,10 @@ def paint_bird_eye(canvas: Canvas, points: np.ndarray, shown: FrameContent, regi
     for index in np.argsort(labels.emphasis, kind="stable").tolist():
         colour = labels.colour(index, style)
         _draw_label(canvas, footprints[index], colour, labels.emphasis[index])
-        if labels.is_rejected[index]:
-            draw_cross(canvas, footprints[index], style)
     if shown.repredictions is not None:
         _draw_repredictions(canvas, region, shown.repredictions, style)
+    for footprint in footprints[labels.is_rejected]:
+        draw_cross(canvas, footprint, style)
     human = labels.boxes[labels.is_human]
     canvas.dashes(_sides(human, region), style.human, 2.0, HUMAN_DASHES)
     canvas.dashes(_sides(shown.valid_truth, region), style.ground_truth, 1.5, TRUTH_DOTS)

@@ -137,10 +137,13 @@ def paint_overlay(
         dash(shown.repredictions.boxes, colours, 1.3, REPREDICTION_DASHES)
     strokes_of = box_strokes(labels.boxes, calibration, size)
     for index in np.argsort(-np.linalg.norm(labels.boxes[:, :2], axis=1), kind="stable").tolist():
-        weight, strokes = float(labels.emphasis[index]), strokes_of[index] * factor
-        _draw_strokes(within, strokes, labels.colour(index, style), weight, style)
-        if labels.is_rejected[index] and len(strokes) == len(_STARTS):
-            draw_cross(within, strokes[:_FRONT_EDGES, 0], style)
+        weight = float(labels.emphasis[index])
+        _draw_strokes(
+            within, strokes_of[index] * factor, labels.colour(index, style), weight, style
+        )
+    for index in np.flatnonzero(labels.is_rejected):
+        if len(strokes_of[index]) == len(_STARTS):
+            draw_cross(within, strokes_of[index][:_FRONT_EDGES, 0] * factor, style)
     human = labels.boxes[labels.is_human]
     dash(human, [style.human] * len(human), 2.0, HUMAN_DASHES)
     anchors = image_rectangles(labels.boxes, calibration, size) * factor

@@ -157,6 +157,13 @@ def counts(workspace: Workspace, round_number: int) -> dict[str, int]:
     return {name: found.count(name) for name in sorted(set(found))}
 
 
+def decided_frames(workspace: Workspace, round_number: int) -> int:
+    """Return the number of frames with human labels that are valid in a round."""
+    table = bulk.table("human_label")
+    query = select(table.c.frame_id).where(table.c.from_round <= round_number).distinct()
+    return len(workspace.database.rows(query))
+
+
 def decided_labels(workspace: Workspace, round_number: int, frame_id: int) -> DecidedLabels:
     """Return what people decided about a frame, as far as it is valid in a round.
 

@@ -1,17 +1,20 @@
 """The stored boxes of one frame in a round: labels, repredictions, ground truth outside X_u."""
 
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 
 import numpy as np
 from sqlalchemy import func, select
 
 from curate.detections import Annotations, Detections, as_categories
 from curate.errors import ConfigError, WorkspaceError
+from curate.spelling import did_you_mean
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.labels.by_frame import check_weights, not_weighted_error
 from pipelines.labels.human_labels import DecidedLabels, decided_labels
+from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace
 
 
@@ -90,6 +93,11 @@ def weighted_frame_names(
     return names
 
 
+def decided_in_frame(workspace: Workspace, name: str, round_number: int) -> DecidedLabels:
+    """Return what people decided about a frame, as far as it is valid in a round."""
+    return decided_labels(workspace, round_number, _find(workspace, name)[1])
+
+
 def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) -> FrameBoxes:
     """Return the stored boxes of a frame, with the weights of a policy.
 
@@ -123,12 +131,31 @@ def _with_decisions(
     return every.select(order), numbers[order], weights[order], decisions[order]
 
 
+def find_frame(workspace: Workspace, name: str) -> str:
+    """Return the id of a frame that is named by its id, its number, or the name of a file of it.
+
+    Raises:
+        ConfigError: if no frame has that name, or several could have it.
+    """
+    frames = workspace.frames(*SPLITS)
+    if name in frames:
+        return name
+    stem = PurePosixPath(name.replace("\\", "/")).stem
+    fitting = [each for each in frames if each == stem or each.lstrip("0") == stem.lstrip("0")]
+    if len(fitting) > 1:
+        raise ConfigError(
+            f"'{name}' could be frame {' or '.join(fitting[:2])}; write the whole frame id"
+        )
+    if not fitting:
+        hint = did_you_mean(stem, frames) or "; the table frame lists all frames"
+        raise ConfigError(f"no frame is named '{name}'{hint}")
+    return fitting[0]
+
+
 def _find(workspace: Workspace, name: str) -> tuple[str, int]:
     table = bulk.table("frame")
-    query = select(table.c.split, table.c.id).where(table.c.frame == name)
+    query = select(table.c.split, table.c.id).where(table.c.frame == find_frame(workspace, name))
     found = workspace.database.rows(query)
-    if not found:
-        raise ConfigError(f"no frame is named '{name}'; the table frame lists all frames")
     return found[0][0], found[0][1]
 
 
