@@ -9,7 +9,8 @@ height, width, and the yaw about the camera's y axis. `bbox_label_3d` is the num
 For a label of weight 0 it is -1: mmdetection3d skips such instances, so a trainer that does not
 read the additional keys treats them as background. The additional keys are `weight` (v; 1 for
 ground truth), `category` and `ignored` (True if a label of weight 0 is a region to ignore, False if
-it is background). `zero_weight` in `metainfo` gives the meaning of weight 0.
+it is background), `k` and `provenance` (detector, human if a person decided, or ground_truth).
+`zero_weight` in `metainfo` gives the meaning of weight 0.
 
 KITTI's categories have the numbers of `KittiDataset`; other categories follow. R0_rect is the
 identity, and Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera.
@@ -146,6 +147,8 @@ def _instances(
                 "weight": weight,
                 "ignored": bool(objects.ignored[k]),
                 "category": category,
+                "k": int(objects.numbers[k]),
+                "provenance": str(objects.provenance[k]),
             }
         )
     return instances

@@ -7,8 +7,9 @@ Source: OpenPCDet's KITTI data set (github.com/open-mmlab/OpenPCDet). DIRECTORY 
     kitti_dbinfos_train.pkl  the objects of X_l by category, for OpenPCDet's GT sampling
     gt_database/*.bin        the points of these objects, relative to the box centre
 
-`annos` has additional arrays: `weight` (v; 1 for ground truth), `category`, and `ignored` (True for
-labels of weight 0 that are regions to ignore, False for those that are background). The `name` of
+`annos` has additional arrays: `weight` (v; 1 for ground truth), `category`, `k`, `provenance`
+(detector, human if a person decided, or ground_truth), and `ignored` (True for labels of weight 0
+that are regions to ignore, False for those that are background). The `name` of
 a label of weight 0 is DontCare, which OpenPCDet skips: a trainer that does not read the weights
 treats all these labels as background, never as objects. `zero_weight` of export.json gives the
 meaning of weight 0.
@@ -97,6 +98,8 @@ def _annos(objects: FrameObjects, in_camera: KittiObjects) -> Info:
     return {
         "name": names,
         "category": found.categories,
+        "k": objects.numbers,
+        "provenance": objects.provenance,
         "weight": objects.weights,
         "ignored": objects.ignored,
         "truncated": objects.truncated,

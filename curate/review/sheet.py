@@ -1,4 +1,4 @@
-"""The manifest of a review, review.json: its frames with numbered boxes.
+"""The manifest of a review, review.json: its frames with their boxes, numbered by k.
 
 The manifest stores every box as it was shown, so that the edits can be read even after the round
 was computed again. Its id is a hash of its content, so that a changed manifest is detected.
@@ -45,7 +45,7 @@ class ShownBox:
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """The boxes of a frame; the person sees box i - 1 as number i."""
+    """The boxes of a frame, by k."""
 
     frame: str
     boxes: tuple[ShownBox, ...]

@@ -1,4 +1,7 @@
-"""review.csv: one row per box, in which a person may write a decision.
+"""review.csv: one row per label, in which a person may write a decision.
+
+A label has the number k that it has everywhere else: in pictures, `curate explain` and queries. In
+tables of curate 0.1 the column `box` counts the labels of a frame from 1; they are read, too.
 
 The column `decision` takes `accept` or `reject`. `accept` in the row `all` of a frame accepts every
 unchanged box of the frame that has no decision of its own. An unchanged box without a decision
@@ -16,8 +19,9 @@ from curate.review.human_labels import ACCEPTED, REJECTED
 from curate.review.sheet import Sheet
 
 TABLE = "review.csv"
-COLUMNS = ("frame", "box", "asked", "category", "score", "weight", "decision")
+COLUMNS = ("frame", "k", "asked", "category", "score", "weight", "decision")
 ALL = "all"
+_OLD_NUMBER = "box"
 _WORDS = {"accept": ACCEPTED, "accepted": ACCEPTED, "reject": REJECTED, "rejected": REJECTED}
 
 
@@ -26,7 +30,7 @@ class ExplicitDecisions:
     """The decisions written in the table for one frame.
 
     Attributes:
-        boxes: accepted or rejected, by box number.
+        boxes: accepted or rejected, by k.
         accept_rest: whether all other unchanged boxes are accepted.
     """
 
@@ -41,10 +45,10 @@ def write_table(folder: Path, sheet: Sheet) -> None:
     writer.writerow(COLUMNS)
     for frame in sheet.frames:
         writer.writerow((frame.frame, ALL, "", "", "", "", ""))
-        for number, box in enumerate(frame.boxes, start=1):
+        for box in frame.boxes:
             asked = "yes" if box.asked else "human" if box.human else ""
             numbers = (f"{box.score:.3f}", f"{box.weight:.3f}")
-            writer.writerow((frame.frame, number, asked, box.category, *numbers, ""))
+            writer.writerow((frame.frame, box.k, asked, box.category, *numbers, ""))
     replace_file(folder / TABLE, text.getvalue().encode())
 
 
@@ -65,8 +69,9 @@ def read_table(folder: Path, sheet: Sheet) -> dict[str, ExplicitDecisions]:
     # In some languages spreadsheets save CSV with semicolons.
     delimiter = ";" if ";" in text.partition("\n")[0] else ","
     rows = csv.DictReader(io.StringIO(text), delimiter=delimiter)
-    if not {"frame", "box", "decision"} <= set(rows.fieldnames or ()):
-        raise DataError(f"{path}:1: the columns frame, box and decision are required")
+    names = set(rows.fieldnames or ())
+    if not {"frame", "decision"} <= names or names.isdisjoint({"k", _OLD_NUMBER}):
+        raise DataError(f"{path}:1: the columns frame, k and decision are required")
     found: dict[str, ExplicitDecisions] = {}
     for row in rows:
         word = (row["decision"] or "").strip().lower()
@@ -82,16 +87,23 @@ def _add_decision(
         raise DataError(f"{place}: invalid decision {word!r}; write accept, reject or nothing")
     name = _frame(row["frame"], place, sheet)
     words = found.setdefault(name, ExplicitDecisions())
-    if (row["box"] or "").strip().lower() == ALL:
+    name_of_number = "k" if "k" in row else _OLD_NUMBER
+    number = (row[name_of_number] or "").strip().lower()
+    if number == ALL:
         if _WORDS[word] == REJECTED:
             raise DataError(f"{place}: a whole frame cannot be rejected; reject its boxes")
         words.accept_rest = True
         return
-    count = len(next(frame for frame in sheet.frames if frame.frame == name).boxes)
-    number = int(row["box"]) if (row["box"] or "").strip().isdigit() else 0
-    if not 1 <= number <= count:
-        raise DataError(f"{place}: frame {name} has boxes 1 to {count}, not {row['box']!r}")
-    words.boxes[number] = _WORDS[word]
+    boxes = next(frame for frame in sheet.frames if frame.frame == name).boxes
+    shown = {str(box.k): box.k for box in boxes}
+    if name_of_number == _OLD_NUMBER:
+        shown = {str(place): box.k for place, box in enumerate(boxes, start=1)}
+    if number not in shown:
+        raise DataError(
+            f"{place}: {name_of_number} {number!r} is not in frame {name} of this review; it has "
+            f"{', '.join(shown) or 'no labels'}"
+        )
+    words.boxes[shown[number]] = _WORDS[word]
 
 
 def _frame(name: str, place: str, sheet: Sheet) -> str:

@@ -20,7 +20,6 @@ def draw_frame(
     truth_boxes: np.ndarray | None = None,
     repredictions: ShownRepredictions | None = None,
     *,
-    human_boxes: np.ndarray | None = None,
     title: str = "",
 ) -> np.ndarray:
     """Return the drawn frame in the dark style, (height, width, 3) uint8 RGB.
@@ -30,13 +29,12 @@ def draw_frame(
         labels: labels, coloured by weight.
         truth_boxes: (m, 7) ground truth in the LiDAR frame; None if unknown.
         repredictions: repredictions; None to draw none.
-        human_boxes: (h, 7) boxes that people decided on; None for none.
         title: text at the top.
 
     Raises:
         DataError: if the frame has no image.
     """
-    shown = FrameContent(labels, truth_boxes, repredictions, human_boxes, title)
+    shown = FrameContent(labels, truth_boxes, repredictions, title)
     return paint_frame(frame, shown).finish()
 
 
@@ -54,9 +52,7 @@ def paint_frame(frame: Frame, shown: FrameContent, kind: ImageFormat = "png") ->
     if frame.image is None:
         raise DataError(f"frame {frame.frame_id}: the data set has no image")
     width, above = overlay_size(frame.image)
-    boxes = [shown.labels.boxes, shown.valid_truth]
-    boxes += [] if shown.human_boxes is None else [shown.human_boxes]
-    region = region_around(boxes, width)
+    region = region_around([shown.labels.boxes, shown.valid_truth], width)
     below = bird_eye_size(region)[1]
     kind_of_canvas = Canvas if kind == "png" else VectorCanvas
     canvas = kind_of_canvas(width, above + below, shown.style.background)

@@ -35,6 +35,7 @@ def draw_legend(
     repredictions: bool = False,
     unweighted: bool = False,
     human: bool = False,
+    rejected: bool = False,
     style: Style = DARK,
 ) -> None:
     """Draw the strip at the bottom: the weight scale, and the line styles that are used."""
@@ -48,13 +49,22 @@ def draw_legend(
         (repredictions, "prediction", style.text, None),
         (repredictions, "reprediction", style.text, REPREDICTION_DASHES),
         (human, "human", style.human, HUMAN_DASHES),
+        (rejected, "rejected by a person", style.zero_weight, None),
         (truth, "ground truth", style.ground_truth, TRUTH_DOTS),
     ]
     for shown, name, colour, pattern in entries:
         if shown:
-            _swatch(canvas, (left, baseline), colour, pattern)
+            outline = _swatch(canvas, (left, baseline), colour, pattern)
+            if name.startswith("rejected"):
+                draw_cross(canvas, outline, style)
             canvas.text(left + 28, baseline, name, style.text)
             left += 28 + canvas.text_width(name) + _GAP
+
+
+def draw_cross(canvas: Canvas, corners: np.ndarray, style: Style = DARK) -> None:
+    """Draw both diagonals of a (4, 2) quadrilateral: a person rejected this label."""
+    canvas.lines(corners[[0, 2]], style.human, 1.5)
+    canvas.lines(corners[[1, 3]], style.human, 1.5)
 
 
 def _weight_bar(canvas: Canvas, left: float, top: float, baseline: float, style: Style) -> float:
@@ -75,7 +85,8 @@ def _swatch(
     place: tuple[float, float],
     colour: Colour,
     pattern: tuple[float, float] | None,
-) -> None:
+) -> np.ndarray:
+    """Draw an outline and return its (4, 2) corners."""
     corners = np.array([[0, -10], [20, -10], [20, 1], [0, 1]])
     outline = corners + np.array(place)
     if pattern is None:
@@ -83,3 +94,4 @@ def _swatch(
     else:
         sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
         canvas.dashes(sides, colour, 1.5, pattern)
+    return outline

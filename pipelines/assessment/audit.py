@@ -156,8 +156,14 @@ def describe_audit(found: AuditedRound) -> list[str]:
 def picture_path(workspace: Workspace, found: AuditedRound, suffix: str = "png") -> Path:
     """Return the path of the reliability diagram."""
     frames = found.request.frames.replace(" ", "-")
-    name = f"audit-round-{found.context.number:02d}-{frames}-{found.request.overlap}.{suffix}"
-    return workspace.root / "reports" / name
+    names = found.request.names
+    parts = (
+        f"audit-round-{found.context.number:02d}",
+        frames,
+        found.request.overlap,
+        *(() if names == AuditRequest.names else names),
+    )
+    return workspace.root / "reports" / f"{'-'.join(parts)}.{suffix}"
 
 
 def _check(workspace: Workspace, request: AuditRequest) -> None:

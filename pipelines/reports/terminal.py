@@ -248,6 +248,18 @@ def _rendered(renderable: "RenderableType", width: int) -> str:
     return "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines())
 
 
+def print_missing(frames: Sequence[str]) -> None:
+    """Print one line about the failed frames that are not in an export; nothing without any."""
+    from curate.exporters.base import named
+
+    if frames:
+        print_line(
+            f"failed frames that are missing from the export: {len(frames)} ({named(frames)}); "
+            "see `curate status --failed`",
+            indent=4,
+        )
+
+
 def print_report(report: "Report") -> None:
     """Print one line about a stage, and the first errors of its failed frames."""
     line = f"round {report.round}  {report.stage:<11} "
@@ -259,6 +271,7 @@ def print_report(report: "Report") -> None:
         line += "".join(f", {n} {state}" for state, n in states.items() if n)
         line += f", {report.kept} already done" if report.kept else ""
     print_line(f"{line}  ({report.seconds:.1f} s)", indent=4)
+    print_missing(report.missing)
     for frame, error in report.errors[:5]:
         typer.echo(f"  failed {frame}: {error}", err=True)
     if len(report.errors) > 5:

@@ -1,6 +1,6 @@
 """KITTI's text format: one line per box, for any tool that writes KITTI labels.
 
-DIRECTORY/label_2/FRAME.txt has a line of 15 fields per box; line i is box i of the image.
+DIRECTORY/label_2/FRAME.txt has a line of 15 fields per box, in the order of review.csv.
 DIRECTORY/calib/FRAME.txt is the calibration that its camera coordinates refer to. Lines with a
 16th field, a score, are accepted too; DontCare regions are skipped.
 """
