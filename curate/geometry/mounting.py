@@ -61,6 +61,14 @@ class Mounting:
         )
 
 
+def defines_headings(calibration: Calibration) -> bool:
+    """Return whether an angle about the camera's y axis is a heading in the LiDAR frame.
+
+    It is not if that axis is about horizontal: the camera lies on its side, or looks up or down.
+    """
+    return bool(abs(calibration.lidar_to_camera[1, 2]) >= np.sin(_LEAST_UPRIGHT_RAD))
+
+
 def check_rotation_y(value: str, setting: str = "dataset.options.rotation_y") -> None:
     """Raise ConfigError if the value of a setting is not a meaning of rotation_y."""
     names = get_args(RotationY)
@@ -152,7 +160,7 @@ def _heading(calibration: Calibration, meaning: RotationY) -> tuple[float, int]:
     if meaning != "calibration":
         return 0.0, 1
     down = -float(calibration.lidar_to_camera[1, 2])
-    if abs(down) < np.sin(_LEAST_UPRIGHT_RAD):
+    if not defines_headings(calibration):
         raise DataError(
             f"the camera's y axis is {np.rad2deg(np.arcsin(abs(down))):.1f} degrees from the "
             "horizontal plane of the LiDAR frame: rotation_y, an angle about this axis, is not a "
