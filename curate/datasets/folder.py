@@ -34,12 +34,13 @@ from curate.datasets.kitti.dataset import (
     read_frame_lists,
     visible_files,
 )
-from curate.datasets.kitti.labels import read_objects, to_annotations
+from curate.datasets.kitti.labels import read_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
 from curate.files.toml_text import parse_toml
 from curate.frames import Calibration, Frame, FrameFiles
+from curate.geometry.mounting import RotationY, check_lidar_to_camera, check_rotation_y
 
 DESCRIPTION = "dataset.toml"
 _FOLDERS = ("points", "images", "labels", "splits")
@@ -53,8 +54,10 @@ class FolderDataset:
     Args:
         root: the folder with dataset.toml.
         follow_links: whether links and paths in dataset.toml may lead out of the folder.
+        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
     Raises:
+        ConfigError: if `rotation_y` is unknown.
         DataError: if dataset.toml is missing or malformed, or specifies neither images nor their
             size. The size is necessary: the camera's field of view decides which points are passed
             to a detector, and it clips every 2D box.
@@ -62,8 +65,16 @@ class FolderDataset:
 
     name = "folder"
 
-    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
+    def __init__(
+        self,
+        root: StrPath,
+        *,
+        follow_links: bool = False,
+        rotation_y: RotationY = "calibration",
+    ) -> None:
+        check_rotation_y(rotation_y)
         self.root = Path(root)
+        self._rotation_y = rotation_y
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._path = self.root / DESCRIPTION
         self._boundary.check(self._path)
@@ -178,7 +189,9 @@ class FolderDataset:
                     "to the folder of label files"
                 )
             raise DataError(f"{expected}: no such label file")
-        return to_annotations(read_objects(label, categories=None), self._calibration)
+        return read_annotations(
+            label, self._calibration, categories=None, rotation_y=self._rotation_y
+        )
 
     @cached_property
     def _calibration(self) -> Calibration:
@@ -189,8 +202,7 @@ class FolderDataset:
         extrinsic = np.eye(4)
         rows = _matrix(self._path, calibration, "lidar_to_camera", ((3, 4), (4, 4)))
         extrinsic[: len(rows)] = rows
-        if abs(np.linalg.det(extrinsic)) < 1e-6:
-            raise DataError(f"{self._path}: calibration.lidar_to_camera cannot be inverted")
+        check_lidar_to_camera(extrinsic, f"{self._path}: calibration.lidar_to_camera")
         return Calibration(projection, extrinsic)
 
     def _label(self, frame_id: str) -> Path | None:

@@ -19,12 +19,13 @@ import numpy as np
 
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.images import read_sized_image
-from curate.datasets.kitti.labels import read_objects, to_annotations
+from curate.datasets.kitti.labels import read_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles
+from curate.geometry.mounting import RotationY, check_lidar_to_camera, check_rotation_y
 from curate.shapes import Float, Float32
 
 _log = logging.getLogger(__name__)
@@ -47,15 +48,25 @@ class KittiDataset:
     Args:
         root: the folder that contains training/velodyne or velodyne.
         follow_links: whether links may lead out of the root.
+        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
     Raises:
         DataError: if the root contains neither.
+        ConfigError: if `rotation_y` is unknown.
     """
 
     name = "kitti"
 
-    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
+    def __init__(
+        self,
+        root: StrPath,
+        *,
+        follow_links: bool = False,
+        rotation_y: RotationY = "calibration",
+    ) -> None:
+        check_rotation_y(rotation_y)
         self.root = Path(root)
+        self._rotation_y = rotation_y
         self._boundary = Boundary(self.root, follow_links=follow_links)
         homes = [self.root / "training", self.root]
         home = next((home for home in homes if (home / "velodyne").is_dir()), None)
@@ -150,7 +161,8 @@ class KittiDataset:
         files = self.files(frame_id)
         if files.label is None:
             raise DataError(f"{self._home / 'label_2' / frame_id}.txt: no such label file")
-        return to_annotations(read_objects(files.label), read_calibration(files.calibration))
+        calibration = read_calibration(files.calibration)
+        return read_annotations(files.label, calibration, rotation_y=self._rotation_y)
 
 
 def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:
@@ -201,7 +213,8 @@ def read_calibration(path: Path) -> Calibration:
 
     Raises:
         DataError: if the file or one of the three matrices is missing, or a matrix has a wrong
-            number of entries, entries that are not finite, or no inverse.
+            number of entries or entries that are not finite, or the transform from LiDAR to camera
+            is not a rotation and a translation.
     """
     matrices: dict[str, np.ndarray] = {}
     text = read_bytes(path, "calibration").decode("utf-8", errors="replace")
@@ -216,8 +229,7 @@ def read_calibration(path: Path) -> Calibration:
     rectify[:3, :3] = matrices["R0_rect"]
     extrinsic[:3] = matrices["Tr_velo_to_cam"]
     lidar_to_camera = rectify @ extrinsic
-    if abs(np.linalg.det(lidar_to_camera)) < 1e-6:
-        raise DataError(f"{path}: the product of R0_rect and Tr_velo_to_cam cannot be inverted")
+    check_lidar_to_camera(lidar_to_camera, str(path))
     return Calibration(matrices["P2"], lidar_to_camera)
 
 

@@ -21,11 +21,12 @@ from curate.datasets.kitti.dataset import (
     read_points,
     visible_files,
 )
-from curate.datasets.kitti.labels import read_objects, to_annotations
+from curate.datasets.kitti.labels import read_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles
+from curate.geometry.mounting import RotationY, check_lidar_to_camera, check_rotation_y
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
 _TO_CAMERA, _CAMERAS = "calib_velo_to_cam.txt", "calib_cam_to_cam.txt"
@@ -39,15 +40,25 @@ class KittiRawDataset:
     Args:
         root: a date folder with drives, or a folder of date folders.
         follow_links: whether links may lead out of the root.
+        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
     Raises:
         DataError: if there is no drive.
+        ConfigError: if `rotation_y` is unknown.
     """
 
     name = "kitti-raw"
 
-    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
+    def __init__(
+        self,
+        root: StrPath,
+        *,
+        follow_links: bool = False,
+        rotation_y: RotationY = "calibration",
+    ) -> None:
+        check_rotation_y(rotation_y)
         self.root = Path(root)
+        self._rotation_y = rotation_y
         self._boundary = Boundary(self.root, follow_links=follow_links)
         drives = (
             path.parent.parent
@@ -127,7 +138,7 @@ class KittiRawDataset:
             drive, number = self._frames[frame_id]
             raise DataError(f"{drive / 'label_2' / number}.txt: no such label file")
         calibration = read_raw_calibration(files.calibration.parent)
-        return to_annotations(read_objects(files.label), calibration)
+        return read_annotations(files.label, calibration, rotation_y=self._rotation_y)
 
 
 def read_raw_calibration(folder: Path) -> Calibration:
@@ -137,12 +148,14 @@ def read_raw_calibration(folder: Path) -> Calibration:
         folder: the date folder.
 
     Raises:
-        DataError: if a file or an entry is missing or malformed.
+        DataError: if a file or an entry is missing or malformed, or the transform from LiDAR to
+            camera is not a rotation and a translation.
     """
     extrinsic, rectify = np.eye(4), np.eye(4)
     extrinsic[:3, :3] = _entry(folder / _TO_CAMERA, "R", (3, 3))
     extrinsic[:3, 3:] = _entry(folder / _TO_CAMERA, "T", (3, 1))
     rectify[:3, :3] = _entry(folder / _CAMERAS, "R_rect_00", (3, 3))
+    check_lidar_to_camera(rectify @ extrinsic, str(folder / _TO_CAMERA))
     return Calibration(_entry(folder / _CAMERAS, "P_rect_02", (3, 4)), rectify @ extrinsic)
 
 

@@ -24,9 +24,9 @@ from curate.datasets.nuscenes.tables import (
 from curate.detections import Annotations, as_categories
 from curate.errors import DataError
 from curate.frames import Calibration
+from curate.geometry.mounting import observation_angles
 from curate.geometry.poses import boxes_in_frame
 from curate.geometry.projection import image_rectangles
-from curate.geometry.similarity import wrap_angle
 
 # KITTI's occlusion level for nuScenes' visibility token (up to 40, 60, 80, 100 percent visible).
 _OCCLUSION = {"1": 2, "2": 1, "3": 1, "4": 0}
@@ -76,7 +76,7 @@ class AnnotationTable:
             categories,
             _truncation(boxes, rectangles, calibration, image_size),
             np.array(levels, dtype=np.int64),
-            _observation_angles(boxes, calibration),
+            observation_angles(boxes, calibration),
             rectangles,
         )
         return objects.select(~np.isnan(rectangles).any(axis=1))
@@ -166,15 +166,3 @@ def _areas(rectangles: np.ndarray) -> np.ndarray:
     """Return (n,) areas in pixels of left, top, right, bottom."""
     areas: np.ndarray = np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)
     return areas
-
-
-def _observation_angles(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """Return (n,) KITTI's alpha in radians: rotation_y minus the angle of the ray to the centre."""
-    to_camera = calibration.lidar_to_camera
-    centres = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
-    zeros = np.zeros(len(boxes))
-    headings = np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), zeros])
-    headings = headings @ to_camera[:3, :3].T
-    rotation_y = np.arctan2(-headings[:, 2], headings[:, 0])
-    angles: np.ndarray = wrap_angle(rotation_y - np.arctan2(centres[:, 0], centres[:, 2]))
-    return angles

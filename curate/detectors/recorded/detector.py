@@ -24,6 +24,7 @@ from curate.detectors.recorded.table import TableRecord
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame
+from curate.geometry.mounting import RotationY, check_rotation_y
 from curate.geometry.similarity import Similarity
 
 _log = logging.getLogger(__name__)
@@ -84,6 +85,8 @@ class RecordedDetector:
             other names stay unchanged.
         axes: axes of boxes in the LiDAR frame: "forward-left" (x forward, y left), or
             "right-forward" as in nuScenes' LiDAR frame.
+        rotation_y: who computed rotation_y of KITTI result files; see
+            `curate.geometry.mounting.RotationY`.
         frame_ids: the frames of the data set; recorded frames outside it are reported.
         calibration: returns the calibration of a frame id; needed for views in the formats of
             KITTI and nuScenes.
@@ -105,6 +108,7 @@ class RecordedDetector:
         frame_list: str | None = None,
         rename: Mapping[str, str] | None = None,
         axes: str = "forward-left",
+        rotation_y: RotationY = "calibration",
         frame_ids: Sequence[str] = (),
         calibration: Callable[[str], Calibration] | None = None,
         wants_views: bool = True,
@@ -112,6 +116,8 @@ class RecordedDetector:
         check_kind(kind)
         if axes not in _AXES:
             raise ConfigError(f"detector.options.axes '{axes}': use one of {', '.join(_AXES)}")
+        check_rotation_y(rotation_y, "detector.options.rotation_y")
+        self._rotation_y = rotation_y
         self.path = Path(path)
         self.minimum_score = minimum_score
         self.rename = dict(rename or {})
@@ -180,8 +186,11 @@ class RecordedDetector:
         """Return a result in the LiDAR frame of reference."""
         if not isinstance(result, KittiObjects):
             return result.in_lidar(calibration)
-        found = to_detections(result, calibration)
         place = f"{self.path}: frame {frame_id}"
+        try:
+            found = to_detections(result, calibration, self._rotation_y)
+        except DataError as error:
+            raise DataError(f"{place}: {error}") from None
         return as_detections(place, found.boxes, found.scores, found.categories)
 
     def _report_unmatched(self, frame_ids: Sequence[str]) -> None:
