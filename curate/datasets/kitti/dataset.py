@@ -150,7 +150,9 @@ class KittiDataset:
         files = self.files(frame_id)
         if files.label is None:
             raise DataError(f"{self._home / 'label_2' / frame_id}.txt: no such label file")
-        return to_annotations(read_objects(files.label), read_calibration(files.calibration))
+        return to_annotations(
+            read_objects(files.label, categories=None), read_calibration(files.calibration)
+        )
 
 
 def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:

@@ -127,7 +127,7 @@ class KittiRawDataset:
             drive, number = self._frames[frame_id]
             raise DataError(f"{drive / 'label_2' / number}.txt: no such label file")
         calibration = read_raw_calibration(files.calibration.parent)
-        return to_annotations(read_objects(files.label), calibration)
+        return to_annotations(read_objects(files.label, categories=None), calibration)
 
 
 def read_raw_calibration(folder: Path) -> Calibration:
