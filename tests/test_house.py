@@ -21,13 +21,13 @@ MAY_IMPORT = {
 LAYERS = {
     "curate": (
         "shapes", "errors", "spelling", "files", "frames", "geometry", "detections", "consistency",
-        "datasets", "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters",
-        "detectors", "firewall", "viewing", "review", "training", "__main__",
+        "datasets", "names", "simulation", "segmenters", "priors", "weighting", "evaluation",
+        "exporters", "detectors", "firewall", "viewing", "review", "training", "__main__",
     ),
     "pipelines": (
-        "user_modules", "registry", "workspace", "assembly", "engine", "labels", "firewall",
-        "review", "stages", "round", "assessment", "queries", "reports", "serving", "bench", "demo",
-        "commands", "cli", "__main__",
+        "user_modules", "registry", "workspace", "assembly", "category_names", "engine", "labels",
+        "firewall", "review", "stages", "round", "assessment", "queries", "reports", "serving",
+        "bench", "demo", "commands", "cli", "__main__",
     ),
 }  # fmt: skip
 MODULES = sorted(path for folder in MAY_IMPORT for path in (ROOT / folder).rglob("*.py"))

@@ -85,6 +85,10 @@ class OnnxDetector:
             self._input, self._shape = self._find_input(points)
         self._names = {} if self._postprocess else self._find_outputs(outputs or {})
 
+    def category_names(self) -> tuple[str, ...]:
+        """See `curate.detectors.base.NamesCategories`."""
+        return self.classes
+
     def predict(self, frame: Frame) -> Detections:
         """See `curate.detectors.base.Detector`; a sweep without points has no boxes.
 

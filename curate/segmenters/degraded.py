@@ -95,6 +95,7 @@ class DegradedSegmenter:
             )
         self.errors = ErrorModel(**rates)
         self._truth = SavedSegmenter(directory, class_map("simulated"))
+        self.classes = self._truth.classes
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's degraded map; it depends on the seed and the frame id only.

@@ -13,7 +13,9 @@ from curate.evaluation.examination import (
     examine_labels,
 )
 from curate.frames import Frame
+from curate.names import NameFinding, renamed
 from pipelines.assembly import open_detector, open_segmenter, wants_views
+from pipelines.category_names import detector_differences, find_differences
 from pipelines.engine.rounds import newest_checkpoint
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
@@ -43,7 +45,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
         frame = workspace.dataset.read(name, image=semantic)
     except CurateError as error:
         return name, [Finding("data set", "wrong", str(error))]
-    findings = examine_frame(frame)
+    findings = [*_names(find_differences(workspace)), *examine_frame(frame)]
     findings += _guarded("labels", lambda: _labels(workspace, frame))
     findings += _guarded("detector", lambda: _detector(workspace, frame))
     if semantic:
@@ -75,9 +77,12 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     config = workspace.config
     detector = open_detector(config, newest_checkpoint(workspace))
     seen = visible(frame, config)
-    found = detector.predict(seen)
-    findings = examine_detections(seen, found, config.dataset.categories)
-    checked(found, config)
+    found = renamed(detector.predict(seen), config.detector.rename)
+    findings = [
+        *_names(detector_differences(config, detector)),
+        *examine_detections(seen, found, config.dataset.categories),
+    ]
+    checked(found, config, detector)
     if isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
         findings.append(
@@ -93,6 +98,13 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
                 if finding.check == "boxes" and finding.state == "wrong"
             ]
     return findings
+
+
+def _names(differences: Sequence[NameFinding]) -> list[Finding]:
+    """Return differences between category names as findings."""
+    return [
+        Finding("names", "wrong" if each.wrong else "suspect", each.message) for each in differences
+    ]
 
 
 def _no_views(config: Config) -> Finding:

@@ -16,7 +16,7 @@ from curate.evaluation.reliability import (
 )
 from curate.geometry.projection import image_rectangles
 from db import bulk
-from pipelines.workspace.workspace import Workspace
+from pipelines.workspace.workspace import Workspace, read_truth
 
 
 def label_quality(
@@ -36,7 +36,9 @@ def label_quality(
         frame = workspace.dataset.read(name, points=False)
         rectangles = image_rectangles(found[key].boxes, frame.calibration, frame.image_size)
         matches = match_to_ground_truth(
-            found[key], workspace.dataset.annotations(name), rectangles=rectangles
+            found[key],
+            read_truth(workspace.config, workspace.dataset, name),
+            rectangles=rectangles,
         )
         objects += sum(matches.ground_truths.values())
         for k in np.flatnonzero(matches.counted):

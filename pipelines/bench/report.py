@@ -21,7 +21,7 @@ from pipelines.bench.results import OVERLAPS, JobResult, read_results
 from pipelines.bench.settings import SYNTHETIC, Bench
 from pipelines.bench.tables import Entry, Finished, Table, Value, all_tables, signed
 from pipelines.stages.methods import METHODS
-from pipelines.workspace.workspace import open_dataset
+from pipelines.workspace.workspace import open_dataset, read_truth
 
 MARKDOWN, NUMBERS = "results.md", "results.json"
 
@@ -179,7 +179,7 @@ class BenchReport:
         names = dataset.splits()["val"]
         frames = [
             from_annotations(
-                dataset.annotations(name), dataset.read(name, points=False).calibration
+                read_truth(config, dataset, name), dataset.read(name, points=False).calibration
             )
             for name in names
         ]

@@ -78,6 +78,7 @@ def audit(
     from curate.viewing.charts import audit_chart
     from pipelines.assessment.audit import AuditRequest, describe_audit, picture_path, run_audit
     from pipelines.assessment.store import store_audit
+    from pipelines.category_names import check_names
     from pipelines.engine.progress import Bar
 
     kind = check_format(image_format or "png")
@@ -93,6 +94,7 @@ def audit(
         **options,
     )
     opened = open_workspace(workspace, executor, workers, threads)
+    check_names(opened)
     found = run_audit(opened, request, Bar(), (lambda _: None) if as_json else print_report)
     store_audit(opened, found)
     picture = picture_path(opened, found, kind)

@@ -86,9 +86,12 @@ def evaluate(
         found = _compare(truth, detections)
         notes = f"{results} on {len(truth)} frames"
     else:
+        from pipelines.category_names import check_names
+
         if round_number is not None and checkpoint is not None:
             raise ConfigError("evaluate: give --round or --checkpoint, not both")
         opened = open_workspace(workspace, executor, workers)
+        check_names(opened)
         found, notes = _evaluate_val(opened, round_number, checkpoint, store=store)
     if as_json:
         print_json(found.as_dict())

@@ -27,6 +27,7 @@ def run_frame_command(
     """Run frame stages on a split; None for the stages of the configured priors."""
     from curate.errors import ConfigError
     from pipelines.assembly import check_executor
+    from pipelines.category_names import check_names
     from pipelines.engine.plan import Plan
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
@@ -44,6 +45,7 @@ def run_frame_command(
     if unknown:
         raise ConfigError(f"--prior {unknown[0]}: not in run.priors {list(priors)}")
     check_executor(workspace.config)
+    check_names(workspace)
     graph = graph_of(workspace)
     selected = [graph.frames_stage(name) for name in names]
     for stage in selected:
@@ -86,6 +88,7 @@ def run_round_command(
         dry_run: whether to print only what would run.
         missing: failed frames that the export lacks, also if it is up to date.
     """
+    from pipelines.category_names import check_names
     from pipelines.engine.plan import Plan
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
@@ -98,6 +101,7 @@ def run_round_command(
     stage = graph.round_stage(name)
     if stage.check:
         stage.check(workspace, chosen)
+    check_names(workspace)
     if dry_run:
         context = preview_round(workspace, round_number)
         plan = Plan(workspace, context, graph)

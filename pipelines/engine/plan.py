@@ -121,9 +121,15 @@ class Plan:
         """The fingerprints of the inputs that no stage of the round writes."""
         return {
             "frame": self.workspace.config.dataset.kind,
-            "ground_truth": digest(sorted(self.workspace.frames("labeled"))),
+            "ground_truth": digest([*sorted(self.workspace.frames("labeled")), *self._renamed]),
             "teacher": self.context.teacher.sha256,
         }
+
+    @property
+    def _renamed(self) -> Sequence[Any]:
+        """The setting `dataset.rename`, if it has a value."""
+        rename = self.workspace.config.dataset.rename
+        return [rename] if rename else []
 
     @cached_property
     def _of_frames(self) -> dict[str, str]:

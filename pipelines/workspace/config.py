@@ -22,6 +22,7 @@ from pydantic import (
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, one_line
 from curate.files.toml_text import parse_toml
+from curate.names import check_rename
 from pipelines import registry
 from pipelines.workspace.config_errors import describe_errors
 from pipelines.workspace.names import KnownClassSet, KnownName
@@ -65,6 +66,30 @@ def _rising(limits: tuple[float, float]) -> tuple[float, float]:
     return limits
 
 
+def _final_names(rename: dict[str, str] | None) -> dict[str, str] | None:
+    try:
+        check_rename(rename or {})
+    except ConfigError as error:  # pydantic collects ValueError
+        raise ValueError(str(error)) from error
+    return rename
+
+
+Rename = Annotated[dict[str, str] | None, AfterValidator(_final_names)]
+
+
+def _own_rename(section: Any, key: str, name: str) -> Any:
+    """Move `options.rename`, as 0.1 had it for one class, to the setting of all classes."""
+    if not isinstance(section, Mapping) or section.get(key) != name:
+        return section
+    options = section.get("options")
+    if not isinstance(options, Mapping) or "rename" not in options:
+        return section
+    if section.get("rename") is not None:
+        raise ValueError("both rename and options.rename are set; remove options.rename")
+    kept = {each: value for each, value in options.items() if each != "rename"}
+    return {**section, "options": kept, "rename": options["rename"]}
+
+
 class Section(BaseModel):
     """A table of settings; unknown keys are rejected."""
 
@@ -82,6 +107,11 @@ class DatasetSection(Section):
         default=CATEGORIES,
         description="Categories to detect. Labels of all others are not used.",
     )
+    rename: Rename = Field(
+        default=None,
+        description="Category for names in the label files; other names stay as they are.",
+        examples=[{"car": "Car"}],
+    )
     split_by: Literal["sequence", "frame"] = Field(
         default="sequence",
         description="Unit of the split: whole sequences or single frames. With 'frame', "
@@ -93,6 +123,11 @@ class DatasetSection(Section):
     options: Options = Field(
         default={}, description="Further arguments of the data set's class; see docs/datasets.md."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _move_rename(cls, section: Any) -> Any:
+        return _own_rename(section, "kind", "nuscenes")
 
 
 class DetectorSection(Section):
@@ -121,9 +156,19 @@ class DetectorSection(Section):
         default=True,
         description="Whether the detector gets only the points that the camera sees.",
     )
+    rename: Rename = Field(
+        default=None,
+        description="Category for names that the detector returns; other names stay as they are.",
+        examples=[{"car": "Car"}],
+    )
     options: Options = Field(
         default={}, description="Further arguments of the detector's class; see docs/detectors.md."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _move_rename(cls, section: Any) -> Any:
+        return _own_rename(section, "name", "recorded")
 
 
 class SegmenterSection(Section):
@@ -144,6 +189,12 @@ class SegmenterSection(Section):
         description="Class set that gives the segmenter's class ids their meaning; see "
         "docs/segmenters.md.",
         examples=["cityscapes"],
+    )
+    rename: Rename = Field(
+        default=None,
+        description="Category for names in the segmenter's table of classes; other names stay as "
+        "they are.",
+        examples=[{"car": "Car"}],
     )
     options: Options = Field(
         default={},

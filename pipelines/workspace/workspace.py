@@ -11,8 +11,10 @@ import numpy as np
 from sqlalchemy import select
 
 from curate.datasets.base import Dataset
+from curate.datasets.kitti.labels import DONT_CARE
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError, WorkspaceError
+from curate.names import renamed
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from db.session import Database
@@ -129,10 +131,28 @@ def open_dataset(config: Config) -> Dataset:
     dataset: Dataset = registry.DATASETS.build(
         section.kind,
         section.root,
-        offered={"follow_links": lambda: section.follow_links},
+        offered={
+            "follow_links": lambda: section.follow_links,
+            # Names are renamed after reading. A class with a mapping of its own must not use it.
+            **({} if section.rename is None else {"rename": dict}),
+        },
         options=section.options,
     )
     return dataset
+
+
+def read_truth(config: Config, dataset: Dataset, frame: str) -> Annotations:
+    """Return the ground truth of a frame with the names of `dataset.rename`."""
+    return with_final_names(config, dataset.annotations(frame))
+
+
+def with_final_names(config: Config, truth: Annotations) -> Annotations:
+    """Return ground truth with the names of `dataset.rename`; DontCare regions lose their box."""
+    found = renamed(truth, config.dataset.rename)
+    if found is truth:
+        return truth
+    region = (found.categories == DONT_CARE)[:, None]
+    return replace(found, boxes=np.where(region, np.nan, found.boxes))
 
 
 def sha256(path: Path) -> str:

@@ -162,7 +162,9 @@ class KittiDataset:
         if files.label is None:
             raise DataError(f"{self._home / 'label_2' / frame_id}.txt: no such label file")
         calibration = read_calibration(files.calibration)
-        return read_annotations(files.label, calibration, rotation_y=self._rotation_y)
+        return read_annotations(
+            files.label, calibration, categories=None, rotation_y=self._rotation_y
+        )
 
 
 def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:

@@ -138,7 +138,9 @@ class KittiRawDataset:
             drive, number = self._frames[frame_id]
             raise DataError(f"{drive / 'label_2' / number}.txt: no such label file")
         calibration = read_raw_calibration(files.calibration.parent)
-        return read_annotations(files.label, calibration, rotation_y=self._rotation_y)
+        return read_annotations(
+            files.label, calibration, categories=None, rotation_y=self._rotation_y
+        )
 
 
 def read_raw_calibration(folder: Path) -> Calibration:

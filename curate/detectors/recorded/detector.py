@@ -1,7 +1,7 @@
 """Detector that returns stored predictions."""
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -51,6 +51,10 @@ class Record(Protocol):
 
     def frame_ids(self) -> Iterable[str]:
         """Return the recorded frames, in sorted order."""
+        ...
+
+    def category_names(self) -> Collection[str]:
+        """Return the category names of all boxes."""
         ...
 
     def result(self, frame_id: str) -> RecordedResult:
@@ -132,6 +136,15 @@ class RecordedDetector:
     def frame_ids(self) -> tuple[str, ...]:
         """Return the recorded frames, in sorted order."""
         return tuple(self._record.frame_ids())
+
+    def category_names(self) -> frozenset[str]:
+        """Return the category names of all recorded boxes, after `rename`.
+
+        Raises:
+            DataError: if a file cannot be read.
+        """
+        names = self._record.category_names()
+        return frozenset(self.rename.get(name, name) for name in names)
 
     def predict(self, frame: Frame) -> Detections:
         """Return the stored result of the original frame; `frame.points` is not used.

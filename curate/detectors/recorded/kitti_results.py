@@ -1,9 +1,11 @@
 """KITTI benchmark results: a folder with one FRAME.txt per frame, sixteen fields per line."""
 
+import codecs
+import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from curate.datasets.kitti.labels import KittiObjects, read_objects
+from curate.datasets.kitti.labels import DONT_CARE, KittiObjects, read_objects
 from curate.errors import DataError
 
 
@@ -36,6 +38,18 @@ class KittiResults(Mapping[str, KittiObjects]):
             DataError: if its file is malformed.
         """
         return read_objects(self._paths[frame_id], scored=True, categories=None)
+
+    def category_names(self) -> set[str]:
+        """Return the category names of all objects: the first word of every line.
+
+        A file that cannot be read is left out: it affects only its frame.
+        """
+        names: set[bytes] = set()
+        for path in self._paths.values():
+            with contextlib.suppress(OSError):
+                lines = path.read_bytes().removeprefix(codecs.BOM_UTF8).splitlines()
+                names.update(line.split(None, 1)[0] for line in lines if line.strip())
+        return {name.decode(errors="replace") for name in names} - {DONT_CARE}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._paths)

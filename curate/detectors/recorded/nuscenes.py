@@ -51,6 +51,11 @@ class MapBoxes:
     numbers: np.ndarray
     names: Sequence[str]
 
+    @property
+    def categories(self) -> np.ndarray:
+        """(n,) category names of the project."""
+        return as_categories([CATEGORIES.get(name, name) for name in self.names])
+
     def in_lidar(self, calibration: Calibration) -> Detections:
         """Return the boxes in the LiDAR frame, with the category names of the project.
 
@@ -75,8 +80,7 @@ class MapBoxes:
                 f"must be in the map frame: {hint}"
             )
         boxes = boxes_in_frame(centres, sizes[:, [1, 0, 2]], rotations, pose)
-        names = [CATEGORIES.get(name, name) for name in self.names]
-        return as_detections(self.place, boxes, self.numbers[:, 10], as_categories(names))
+        return as_detections(self.place, boxes, self.numbers[:, 10], self.categories)
 
 
 def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str, MapBoxes]:

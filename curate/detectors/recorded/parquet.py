@@ -10,6 +10,7 @@ frame is requested, a row group at a time, and an invalid row affects only its f
 claims more rows than its bytes can hold is rejected.
 """
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -76,6 +77,17 @@ class ParquetRecord:
     def frame_ids(self) -> tuple[str, ...]:
         """Return the recorded frames, in sorted order."""
         return tuple(sorted(self.runs))
+
+    def category_names(self) -> frozenset[str]:
+        """Return the category names of all boxes; reads only the column of categories.
+
+        A damaged row group is left out: it affects only its frames.
+        """
+        file, names = _open(self.path), set[str]()
+        for number in range(file.num_row_groups):
+            with contextlib.suppress(DataError):
+                names.update(_read(self.path, file, number, ["category"])["category"])
+        return frozenset(names)
 
     def result(self, frame_id: str) -> Detections:
         """Return the detections of the original frame.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from curate.detectors.recorded.formats import read_results
+from curate.detectors.recorded.formats import category_names, read_results
 from curate.detectors.recorded.results import ReadOptions, RecordedResult, ResultsByFrame
 from curate.errors import ConfigError, DataError
 from curate.geometry.similarity import Similarity
@@ -61,6 +61,11 @@ class PassesRecord:
     def frame_ids(self) -> tuple[str, ...]:
         """Return the frames of the first pass, in sorted order."""
         return tuple(sorted(self.plain))
+
+    def category_names(self) -> set[str]:
+        """Return the category names of all boxes, of all passes."""
+        passes = (self.plain, *(results for _, _, results in self.augmented))
+        return {name for results in passes for name in category_names(results)}
 
     def result(self, frame_id: str) -> RecordedResult:
         """Return the result of the first pass.

@@ -20,6 +20,11 @@ LARGEST = 1e6
 class ForeignBoxes(Protocol):
     """Boxes in another frame of reference; their conversion needs the calibration of the frame."""
 
+    @property
+    def categories(self) -> np.ndarray:
+        """(n,) category names of the boxes."""
+        ...
+
     def in_lidar(self, calibration: Calibration) -> Detections:
         """Return the boxes in the LiDAR frame of reference.
 

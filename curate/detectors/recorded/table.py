@@ -46,12 +46,14 @@ class TableRecord:
         order: index of each of `_COLUMNS` in a row.
         names: (n,) the frame of each run of consecutive rows, as UTF-8, sorted.
         places: (n, 3) first byte, end byte and first line of each run.
+        categories: the category names of all rows.
     """
 
     path: Path
     order: tuple[int, ...]
     names: np.ndarray
     places: np.ndarray
+    categories: frozenset[str]
 
     @classmethod
     def read(cls, path: Path) -> "TableRecord":
@@ -65,7 +67,11 @@ class TableRecord:
             with path.open("rb") as file:
                 rows = _Rows(path, file)
                 order = rows.header()
-                runs = [_check_block(path, block) for block in rows.blocks(order)]
+                categories: set[str] = set()
+                runs = []
+                for block in rows.blocks(order):
+                    runs.append(_check_block(path, block))
+                    categories.update(row[1] for row in block.rows)
         except FileNotFoundError:
             raise DataError(f"{path}: no such file of recorded detections") from None
         except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -73,7 +79,7 @@ class TableRecord:
         names = np.concatenate([names for names, _ in runs] or [np.empty(0, dtype="S1")])
         places = np.concatenate([places for _, places in runs] or [np.empty((0, 3), np.int64)])
         sort = np.argsort(names, kind="stable")
-        return cls(path, order, names[sort], places[sort])
+        return cls(path, order, names[sort], places[sort], frozenset(categories))
 
     @property
     def has_views(self) -> bool:
@@ -83,6 +89,10 @@ class TableRecord:
     def frame_ids(self) -> Iterator[str]:
         """Return the recorded frames, in sorted order."""
         return (name.decode() for name in np.unique(self.names))
+
+    def category_names(self) -> frozenset[str]:
+        """Return the category names of all boxes."""
+        return self.categories
 
     def result(self, frame_id: str) -> Detections:
         """Return the detections of the original frame.

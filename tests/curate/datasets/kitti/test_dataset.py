@@ -155,9 +155,16 @@ def test_annotations_are_in_the_lidar_frame(toy_kitti):
 def test_an_invalid_label_line_is_reported(toy_kitti):
     """`annotations` raises with file and line."""
     path = toy_kitti / "training" / "label_2" / "000002.txt"
-    path.write_text("Unicorn" + path.read_text()[3:])
-    with pytest.raises(DataError, match=r"000002\.txt:1: unknown category 'Unicorn'"):
+    path.write_text(path.read_text().replace("Car ", "Car one ", 1))
+    with pytest.raises(DataError, match=r"000002\.txt:1: "):
         KittiDataset(toy_kitti).annotations("000002")
+
+
+def test_any_category_is_read(toy_kitti):
+    """Names are compared with the declared categories when a workspace is created."""
+    path = toy_kitti / "training" / "label_2" / "000002.txt"
+    path.write_text("Unicorn" + path.read_text()[3:])
+    assert KittiDataset(toy_kitti).annotations("000002").categories[0] == "Unicorn"
 
 
 def test_an_empty_sweep_is_valid(tmp_path):
