@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.toys import toy_calibration
 
-from curate.datasets.kitti.dataset import KittiDataset, read_calibration
+from curate.datasets.kitti.calibration import read_calibration
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.datasets.kitti.labels import (
     KittiObjects,
     from_annotations,
