@@ -8,10 +8,13 @@ images = "camera"             # folder of FRAME.png or .jpg; if there are no ima
 labels = "label_2"            # optional: folder of KITTI label files of the labeled frames
 splits = "lists"              # optional: folder of train.txt, val.txt
 sequence_separator = "_"      # optional: frames are named SEQUENCE_NUMBER; the last one separates
-columns = 4                   # columns of .bin and .npy files
+columns = 4                   # number of columns of .bin and .npy files
+column_names = ["x", "y", "z", "intensity", "ring"]   # optional: their names, in any order
+intensity_field = "intensity" # optional: the column of the intensity, where several may be it
 intensity_scale = 255.0       # the value of full intensity in the files
 
-[calibration]                 # or calibration = "calib.txt", a file in KITTI's format
+[calibration]                 # or calibration = "calib.txt", a file in KITTI's format,
+                              # or calibration = "calib", a folder of such files FRAME.txt
 projection = [[...], [...], [...]]             # 3 x 4, camera (z forward) to pixels
 lidar_to_camera = [[...], [...], [...]]        # 3 x 4 or 4 x 4, LiDAR (x forward) to camera
 """
@@ -24,28 +27,30 @@ from typing import Any
 
 import numpy as np
 
+from curate.datasets.formats.binary import read_bytes
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES, read_cloud
 from curate.datasets.formats.containment import Boundary, check_frame_id
+from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder
 from curate.datasets.formats.images import read_sized_image
-from curate.datasets.kitti.dataset import (
-    IMAGE_SUFFIXES,
-    read_bytes,
-    read_calibration,
-    read_frame_lists,
-    visible_files,
-)
+from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
+from curate.datasets.kitti.calibration import read_calibration
+from curate.datasets.kitti.dataset import checked_frames, read_frame_lists
 from curate.datasets.kitti.labels import read_annotations
+from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
-from curate.errors import DataError
+from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.files.toml_text import parse_toml
 from curate.frames import Calibration, Frame, FrameFiles
-from curate.geometry.mounting import RotationY, check_lidar_to_camera, check_rotation_y
+from curate.geometry.mounting import RotationY, check_rotation_y
+from curate.spelling import did_you_mean
 
 DESCRIPTION = "dataset.toml"
 _FOLDERS = ("points", "images", "labels", "splits")
 _TEXTS = (*_FOLDERS, "sequence_separator")
-_KEYS = (*_TEXTS, "image_size", "columns", "intensity_scale", "calibration")
+# The keys that describe the point files; the settings in [dataset] have the same names.
+_LAYOUT = ("columns", "column_names", "intensity_field", "intensity_scale")
+_KEYS = (*_TEXTS, *_LAYOUT, "image_size", "calibration")
 
 
 class FolderDataset:
@@ -53,6 +58,7 @@ class FolderDataset:
 
     Args:
         root: the folder with dataset.toml.
+        layout: the declared layout of the point files, in place of the keys of dataset.toml.
         follow_links: whether links and paths in dataset.toml may lead out of the folder.
         rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
@@ -61,6 +67,7 @@ class FolderDataset:
         DataError: if dataset.toml is missing or malformed, or specifies neither images nor their
             size. The size is necessary: the camera's field of view decides which points are passed
             to a detector, and it clips every 2D box.
+        ConfigError: if the layout and dataset.toml contradict each other.
     """
 
     name = "folder"
@@ -69,30 +76,46 @@ class FolderDataset:
         self,
         root: StrPath,
         *,
+        layout: PointLayout = UNDECLARED,
         follow_links: bool = False,
         rotation_y: RotationY = "calibration",
     ) -> None:
         check_rotation_y(rotation_y)
-        self.root = Path(root)
         self._rotation_y = rotation_y
+        self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._path = self.root / DESCRIPTION
         self._boundary.check(self._path)
+        if not self._path.exists():
+            raise DataError(
+                f"{self._path}: no such description file{layout_hint(self.root, self.name)}"
+            )
         self._description = _read_description(self._path)
+        self._layout = _merged(_described_layout(self._path, self._description), layout, self._path)
         keys = (*_FOLDERS, "calibration")
         paths = [self._description[key] for key in keys if key in self._description]
         self._boundary.check(*(self.root / path for path in paths if isinstance(path, str)))
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return the ids of all frames with a point file, sorted."""
-        return tuple(self._points)
+        """Return the ids of all frames with a point file, sorted.
+
+        Raises:
+            DataError: if there are none, or a frame has two point files or two images.
+        """
+        return self._frame_ids
 
     @cached_property
-    def _points(self) -> Mapping[str, Path]:
-        """The path of the point file of each frame."""
-        files = visible_files(self.root / self._description["points"], "*")
-        paths = sorted(path for path in files if path.suffix.lower() in CLOUD_SUFFIXES)
-        return {path.stem: path for path in paths}
+    def _frame_ids(self) -> tuple[str, ...]:
+        return checked_frames(self._points, self._images, self.root, self.name)
+
+    @cached_property
+    def _points(self) -> FrameFolder:
+        return FrameFolder(self.root / self._description["points"], CLOUD_SUFFIXES, "point")
+
+    @cached_property
+    def _images(self) -> FrameFolder:
+        folder = self.root / self._description.get("images", "images")
+        return FrameFolder(folder, IMAGE_SUFFIXES, "image")
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in the folder `splits`, by file name without suffix.
@@ -112,25 +135,22 @@ class FolderDataset:
         return lists
 
     def files(self, frame_id: str) -> FrameFiles:
-        """Return the paths of the frame's files; all frames share the calibration.
+        """Return the paths of the frame's files.
 
-        The image path is returned even if there is no such file.
+        The paths of image and calibration are returned even if there are no such files.
 
         Raises:
-            DataError: if there is no such frame.
+            DataError: if there is no such frame, or it has two point files or two images.
         """
         check_frame_id(frame_id)
+        points = self._points.path(frame_id)
         if frame_id not in self._points:
-            folder = self.root / self._description["points"]
-            raise DataError(f"{folder}: no point file for frame {frame_id}")
-        folder = self.root / self._description.get("images", "images")
-        images = [folder / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
-        calibration = self._description["calibration"]
+            raise DataError(f"{self._points.folder}: no point file for frame {frame_id}")
         label = self._label(frame_id)
         files = FrameFiles(
-            points=self._points[frame_id],
-            image=next((image for image in images if image.exists()), images[0]),
-            calibration=self.root / calibration if isinstance(calibration, str) else self._path,
+            points=points,
+            image=self._images.path(frame_id),
+            calibration=self._calibration_path(frame_id),
             label=label if label is not None and label.exists() else None,
         )
         self._boundary.check(*files.paths())
@@ -152,10 +172,9 @@ class FolderDataset:
         files = self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            scale = float(self._description.get("intensity_scale", 1.0))
-            sweep = read_cloud(files.points, int(self._description.get("columns", 4)), scale)
+            sweep = read_cloud(files.points, self._layout)
         size, pixels = self._size_and_pixels(files.image, pixels=image)
-        return Frame(frame_id, sweep, self._calibration, size, pixels)
+        return Frame(frame_id, sweep, self._calibration(files.calibration), size, pixels)
 
     def _size_and_pixels(
         self, image: Path, *, pixels: bool
@@ -180,8 +199,8 @@ class FolderDataset:
         Raises:
             DataError: if there is no label file, or it is malformed.
         """
-        label = self.files(frame_id).label
-        if label is None:
+        files = self.files(frame_id)
+        if files.label is None:
             expected = self._label(frame_id)
             if expected is None:
                 raise DataError(
@@ -190,11 +209,32 @@ class FolderDataset:
                 )
             raise DataError(f"{expected}: no such label file")
         return read_annotations(
-            label, self._calibration, categories=None, rotation_y=self._rotation_y
+            files.label,
+            self._calibration(files.calibration),
+            categories=None,
+            rotation_y=self._rotation_y,
         )
 
+    def _calibration_path(self, frame_id: str) -> Path:
+        """Return the file with the calibration of a frame."""
+        calibration = self._description["calibration"]
+        if not isinstance(calibration, str):
+            return self._path
+        path = self.root / calibration
+        return path / f"{frame_id}.txt" if self._calibrated_by_frame else path
+
     @cached_property
-    def _calibration(self) -> Calibration:
+    def _calibrated_by_frame(self) -> bool:
+        """Whether the calibration is a folder with a file for each frame."""
+        calibration = self._description["calibration"]
+        return isinstance(calibration, str) and (self.root / calibration).is_dir()
+
+    def _calibration(self, path: Path) -> Calibration:
+        """Return the calibration in a file, which is read once if all frames share it."""
+        return read_calibration(path) if self._calibrated_by_frame else self._shared_calibration
+
+    @cached_property
+    def _shared_calibration(self) -> Calibration:
         calibration = self._description["calibration"]
         if isinstance(calibration, str):
             return read_calibration(self.root / calibration)
@@ -202,7 +242,8 @@ class FolderDataset:
         extrinsic = np.eye(4)
         rows = _matrix(self._path, calibration, "lidar_to_camera", ((3, 4), (4, 4)))
         extrinsic[: len(rows)] = rows
-        check_lidar_to_camera(extrinsic, f"{self._path}: calibration.lidar_to_camera")
+        if abs(np.linalg.det(extrinsic)) < 1e-6:
+            raise DataError(f"{self._path}: calibration.lidar_to_camera cannot be inverted")
         return Calibration(projection, extrinsic)
 
     def _label(self, frame_id: str) -> Path | None:
@@ -223,7 +264,10 @@ def _read_description(path: Path) -> Mapping[str, Any]:
         raise DataError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
     unknown = sorted(set(content) - set(_KEYS))
     if unknown:
-        raise DataError(f"{path}: unknown key {unknown[0]}; use one of {', '.join(_KEYS)}")
+        raise DataError(
+            f"{path}: unknown key {unknown[0]}; use one of {', '.join(_KEYS)}"
+            f"{did_you_mean(unknown[0], _KEYS)}"
+        )
     for key in ("points", "calibration"):
         if key not in content:
             raise DataError(f"{path}: no key {key}")
@@ -240,17 +284,68 @@ def _read_description(path: Path) -> Mapping[str, Any]:
         )
     invalid = [key for key in _TEXTS if not isinstance(content.get(key, ""), str)]
     invalid += [] if _is_size(content.get("image_size", [1, 1])) else ["image_size"]
-    invalid += [key for key in ("columns", "intensity_scale") if not _positive(content.get(key, 1))]
-    if (
-        invalid
-        or not isinstance(content["calibration"], str | dict)
-        or content.get("columns", 4) < 3
-    ):
+    if not isinstance(content["calibration"], str | dict):
+        invalid.append("calibration")
+    if invalid:
         raise DataError(
-            f"{path}: invalid value of {(invalid or ['calibration or columns'])[0]}; folders and "
-            "separators are strings, sizes and scales positive numbers, columns at least 3"
+            f"{path}: invalid value of {invalid[0]}; folders and separators are strings, sizes "
+            "positive numbers, and calibration is a table, a file or a folder"
         )
     return content
+
+
+def _described_layout(path: Path, description: Mapping[str, Any]) -> PointLayout:
+    """Return the layout of the point files in dataset.toml.
+
+    Raises:
+        DataError: if a value is invalid, or two of them contradict each other.
+    """
+    values = {key: description[key] for key in _LAYOUT if key in description}
+    names = values.get("column_names", ())
+    valid = {
+        "columns": _is_integer(values.get("columns", 4)),
+        "column_names": isinstance(names, list | tuple) and all(isinstance(n, str) for n in names),
+        "intensity_field": isinstance(values.get("intensity_field", ""), str),
+        "intensity_scale": _positive(values.get("intensity_scale", 1)),
+    }
+    invalid = [key for key, is_valid in valid.items() if not is_valid]
+    if invalid:
+        raise DataError(
+            f"{path}: invalid value of {invalid[0]}; columns is an integer from 3, column_names a "
+            "list of strings, intensity_field a string, and intensity_scale a positive number"
+        )
+    if names:
+        values["column_names"] = tuple(names)
+    try:
+        return PointLayout(**values)
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def _merged(described: PointLayout, declared: PointLayout, path: Path) -> PointLayout:
+    """Return the layout of dataset.toml with the settings of the workspace.
+
+    Raises:
+        ConfigError: if they contradict each other.
+    """
+    for key in _LAYOUT:
+        one, other = getattr(described, key), getattr(declared, key)
+        if None not in (one, other) and one != other:
+            raise ConfigError(
+                f"dataset.{key} is {other!r}, but {path} has {key} = {one!r}; remove one of them"
+            )
+    values = {
+        key: getattr(described if getattr(declared, key) is None else declared, key)
+        for key in _LAYOUT
+    }
+    try:
+        return PointLayout(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{error} (settings in [dataset] and {path})") from None
+
+
+def _is_integer(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _is_size(value: object) -> bool:

@@ -117,6 +117,33 @@ class DatasetSection(Section):
         description="Unit of the split: whole sequences or single frames. With 'frame', "
         "near-duplicate frames of a sequence end up in several splits.",
     )
+    columns: Annotated[int, Field(ge=3, le=64)] | None = Field(
+        default=None,
+        description="Number of float32 columns of point files without a header (.bin, .npy). "
+        "Without it, the number of the data set's format; a file that looks like another number "
+        "is rejected.",
+        json_schema_extra=_unit("columns"),
+        examples=[5],
+    )
+    column_names: Annotated[tuple[str, ...], Field(min_length=3)] | None = Field(
+        default=None,
+        description="Names of these columns, in the order of the file. x, y and z are needed, an "
+        "intensity is not. Without it, x, y, z, intensity and columns that are not read.",
+        examples=[["x", "y", "z", "intensity", "ring"]],
+    )
+    intensity_field: str | None = Field(
+        default=None,
+        description="Column or field of the intensity. It is only needed where several may be it, "
+        "such as intensity and reflectivity in one file.",
+        examples=["reflectivity"],
+    )
+    intensity_scale: Positive | None = Field(
+        default=None,
+        description="Value of full intensity in the point files. Without it, that of the data "
+        "set's format (1; nuScenes 255). Files with larger values are rejected.",
+        json_schema_extra=_unit("1"),
+        examples=[255.0],
+    )
     follow_links: bool = Field(
         default=False, description="Whether links in the data set may lead out of its folder."
     )

@@ -25,6 +25,7 @@ from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
 from pipelines.workspace.config import Config
+from pipelines.workspace.samples import check_samples
 from pipelines.workspace.split_record import split_rows
 from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace, open_dataset, with_final_names
@@ -75,6 +76,7 @@ def initialise(
     check_files(config)
     dataset = open_dataset(config)
     split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
+    check_samples(dataset, sorted((*split.labeled, *split.unlabeled, *split.val)))
     truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
     if compare:
         _compare_names(config, dataset, truth)
@@ -188,7 +190,7 @@ def choose_split(
     lists = dataset.splits()
     frames = lists.get("train") or dataset.frame_ids()
     if not frames:
-        raise DataError("the data set has no frames; --root must contain velodyne/ or training/")
+        raise DataError("the data set has no frames; check --root, and --dataset for its layout")
     all_sequences = sequences_of(dataset, {*frames, *lists.get("val", ())})
     sequences = all_sequences if split_by == "sequence" else {}
     if all_sequences and not sequences:

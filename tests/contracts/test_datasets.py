@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from contracts.samples import assert_one_line, assert_same, sample_of
-from support.dataset_layouts import write_toy_folder, write_toy_raw
+from support.dataset_layouts import write_toy_folder, write_toy_raw, write_toy_tracking
 from support.nuscenes_scenes import write_nuscenes
 from support.toys import write_toy_kitti
 
@@ -18,6 +18,7 @@ from pipelines.registry import DATASETS
 SAMPLES: Mapping[str, Callable[[Path], None]] = {
     "kitti": lambda root: write_toy_kitti(root, frames=4, val=1),
     "kitti-raw": write_toy_raw,
+    "kitti-tracking": write_toy_tracking,
     "folder": write_toy_folder,
     "nuscenes": write_nuscenes,
 }

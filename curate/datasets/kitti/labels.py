@@ -96,24 +96,54 @@ def read_objects(
             field that is not a finite number, an unknown category, or a negative dimension (unless
             it is a DontCare region).
     """
-    fields = RESULT_FIELDS if scored else LABEL_FIELDS
     path = Path(path)
-    lines = _read_lines(path)
-    rows = [row for row in map(str.split, lines) if row]
+    return parse_rows(path, read_rows(path), scored=scored, categories=categories)
+
+
+def read_rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Return line number and fields of each line of a label or result file that is not empty.
+
+    Raises:
+        DataError: if the file is missing or not text.
+    """
+    lines = enumerate(_read_lines(path), start=1)
+    return [(number, row) for number, line in lines if (row := line.split())]
+
+
+def parse_rows(
+    path: Path,
+    numbered: Sequence[tuple[int, Sequence[str]]],
+    *,
+    scored: bool = False,
+    categories: Collection[str] | None = KITTI_CATEGORIES,
+) -> KittiObjects:
+    """Return the objects of lines in KITTI's format, which are split into fields.
+
+    Args:
+        path: the file, for error messages.
+        numbered: line number and fields of each object.
+        scored: see `read_objects`.
+        categories: see `read_objects`.
+
+    Raises:
+        DataError: as `read_objects`.
+    """
+    fields = RESULT_FIELDS if scored else LABEL_FIELDS
+    rows = [row for _, row in numbered]
     names = [row[0] for row in rows]
     # All lines are parsed and checked at once for speed; the bad line is searched only on failure.
     try:
         values = np.array([float(field) for row in rows for field in row[1:]])
         values = values.reshape(len(rows), fields - 1)
     except ValueError:  # a field that is not a number, or a wrong number of fields
-        raise _first_error(path, lines, fields, categories) from None
+        raise _first_error(path, numbered, fields, categories) from None
     if (
         any(len(row) != fields for row in rows)
         or not (np.abs(values) <= _MAX_VALUE).all()
         or (categories is not None and not frozenset(categories).issuperset(names))
         or _has_negative_dimension(names, values[:, 7:10])
     ):
-        raise _first_error(path, lines, fields, categories)
+        raise _first_error(path, numbered, fields, categories)
     return KittiObjects(as_categories(names), *_columns(values))
 
 
@@ -332,11 +362,13 @@ def _has_negative_dimension(categories: Sequence[str], dimensions: np.ndarray) -
 
 
 def _first_error(
-    path: Path, lines: Sequence[str], fields: int, categories: Collection[str] | None
+    path: Path,
+    rows: Sequence[tuple[int, Sequence[str]]],
+    fields: int,
+    categories: Collection[str] | None,
 ) -> DataError:
     """Return the error for the first invalid line of a file with at least one."""
-    rows = [(number, line.split()) for number, line in enumerate(lines, start=1)]
-    problems = ((number, _line_problem(row, fields, categories)) for number, row in rows if row)
+    problems = ((number, _line_problem(row, fields, categories)) for number, row in rows)
     number, problem = next((number, problem) for number, problem in problems if problem)
     return DataError(f"{path}:{number}: {problem}")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.image_truth import seen_objects
 from curate.datasets.nuscenes.names import category_of
 from curate.datasets.nuscenes.tables import (
     Record,
@@ -24,16 +25,11 @@ from curate.datasets.nuscenes.tables import (
 from curate.detections import Annotations, as_categories
 from curate.errors import DataError
 from curate.frames import Calibration
-from curate.geometry.mounting import observation_angles
 from curate.geometry.poses import boxes_in_frame
-from curate.geometry.projection import image_rectangles
 
 # KITTI's occlusion level for nuScenes' visibility token (up to 40, 60, 80, 100 percent visible).
 _OCCLUSION = {"1": 2, "2": 1, "3": 1, "4": 0}
 _UNKNOWN = 3
-# Margin around the image for truncation, in image widths and heights. It bounds the 2D box of an
-# object that is partly behind the camera.
-_MARGIN = 10
 _SAMPLE = re.compile(rb'"sample_token"\s*:\s*"([^"]*)"')
 
 
@@ -70,16 +66,9 @@ class AnnotationTable:
         categories = as_categories([self._category(record) for record in records])
         visibilities = [str(record.get("visibility_token")) for record in records]
         levels = [_OCCLUSION.get(visibility, _UNKNOWN) for visibility in visibilities]
-        rectangles = image_rectangles(boxes, calibration, image_size)
-        objects = Annotations(
-            boxes,
-            categories,
-            _truncation(boxes, rectangles, calibration, image_size),
-            np.array(levels, dtype=np.int64),
-            observation_angles(boxes, calibration),
-            rectangles,
+        return seen_objects(
+            boxes, categories, np.array(levels, dtype=np.int64), calibration, image_size
         )
-        return objects.select(~np.isnan(rectangles).any(axis=1))
 
     def _records(self, token: str) -> list[Record]:
         with self.path.open("rb") as file:
@@ -135,34 +124,3 @@ class AnnotationTable:
             for token, record in read_table(path).items()
         }
         return {token: names[of] for token, of in categories.items() if of in names}
-
-
-def _truncation(
-    boxes: np.ndarray, rectangles: np.ndarray, calibration: Calibration, size: tuple[int, int]
-) -> np.ndarray:
-    """Return (n,) the fraction of each projected box outside the image; 1 if nothing is inside.
-
-    The full 2D box is the projection into a larger image, with a margin on all sides. For example,
-    a 2D box of 100 x 50 pixels of which 40 x 50 lie in the image has truncation 0.6.
-
-    Args:
-        boxes: (n, 7) in the LiDAR frame.
-        rectangles: (n, 4) projected boxes, clipped to the image.
-        calibration: calibration of the frame.
-        size: (width, height) of the image in pixels.
-    """
-    margin = np.array(size) * _MARGIN
-    shift = np.eye(3)
-    shift[:2, 2] = margin
-    wider = Calibration(shift @ calibration.projection, calibration.lidar_to_camera)
-    width, height = (np.array(size) + 2 * margin).tolist()
-    full = image_rectangles(boxes, wider, (width, height))
-    inside = _areas(rectangles) / np.maximum(_areas(full), 1e-9)
-    outside: np.ndarray = np.clip(1 - np.nan_to_num(inside), 0, 1)
-    return outside
-
-
-def _areas(rectangles: np.ndarray) -> np.ndarray:
-    """Return (n,) areas in pixels of left, top, right, bottom."""
-    areas: np.ndarray = np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)
-    return areas

@@ -16,10 +16,12 @@ import numpy as np
 from curate.datasets.formats.clouds import read_cloud
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.images import read_image
+from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.nuscenes.annotations import AnnotationTable
 from curate.datasets.nuscenes.keyframes import TO_SENSOR_AXES, Keyframe, read_keyframes
 from curate.datasets.nuscenes.names import CATEGORIES
 from curate.datasets.nuscenes.scenes import validation_scenes
+from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
@@ -35,6 +37,7 @@ class NuScenesDataset:
 
     Args:
         root: the folder with samples/ and v1.0-*/.
+        layout: the layout of the point files, if it differs from nuScenes' own.
         version: name of the folder of tables; only needed if there are several.
         camera: channel of the camera.
         rename: the category for each class of the detection task, in place of `names.CATEGORIES`.
@@ -52,6 +55,7 @@ class NuScenesDataset:
         self,
         root: StrPath,
         *,
+        layout: PointLayout = UNDECLARED,
         version: str | None = None,
         camera: str = "CAM_FRONT",
         rename: Mapping[str, str] | None = None,
@@ -60,6 +64,7 @@ class NuScenesDataset:
     ) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
+        self._layout = layout.with_defaults(_COLUMNS, _FULL_INTENSITY)
         self.version = _version(self.root, version)
         self.camera = camera
         self._tables = self.root / self.version
@@ -98,7 +103,7 @@ class NuScenesDataset:
                     f"{self.root}: {missing} are missing, such as {first}; set the root to the "
                     "folder with samples/"
                 )
-            _log.info("%s: %s are missing; these frames are skipped", self.root, missing)
+            _log.warning("%s: %s are missing; these frames are skipped", self.root, missing)
         return present
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
@@ -145,7 +150,7 @@ class NuScenesDataset:
         frame, files = self._frame(frame_id), self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            sweep = read_cloud(files.points, _COLUMNS, _FULL_INTENSITY)
+            sweep = read_cloud(files.points, self._layout)
             # For row vectors, p @ R applies the inverse of R: from the sensor's axes to ours.
             sweep[:, :3] = sweep[:, :3] @ TO_SENSOR_AXES[:3, :3].astype(np.float32)
         pixels = read_image(files.image) if image else None
@@ -182,7 +187,7 @@ def _version(root: Path, version: str | None) -> str:
     if not versions:
         raise DataError(
             f"{root}: contains no v1.0-*/sample_data.json; set the root to the folder with "
-            "samples/ and v1.0-*/"
+            f"samples/ and v1.0-*/{layout_hint(root, NuScenesDataset.name)}"
         )
     if version is None and len(versions) == 1:
         return versions[0]

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.calibration import write_calibration
 from curate.datasets.kitti.labels import (
     DONT_CARE,
     RESULT_FIELDS,

@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 from support.toys import toy_calibration, write_toy_kitti
 
-from curate.datasets.kitti.dataset import (
-    KittiDataset,
-    read_calibration,
-    read_points,
-    write_calibration,
-)
+from curate.datasets.kitti.calibration import read_calibration, write_calibration
+from curate.datasets.kitti.dataset import KittiDataset, read_points
 from curate.errors import DataError
 from curate.frames import Calibration
 from curate.geometry.projection import project_points
@@ -117,7 +113,7 @@ def test_a_missing_frame_in_a_list_fails_when_read(toy_kitti):
     """The error contains the missing file."""
     with pytest.raises(DataError) as caught:
         KittiDataset(toy_kitti).read("000777")
-    assert one_line(caught).endswith("velodyne/000777.bin: no such velodyne file")
+    assert one_line(caught).endswith("velodyne/000777.bin: no such point file")
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../000001", "a/b", "/etc/passwd", "a\\b", "a\0b"])

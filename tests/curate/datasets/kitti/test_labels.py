@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from support.rigs import TILTED, Rig, rigs
 from support.toys import toy_calibration
 
-from curate.datasets.kitti.dataset import KittiDataset, read_calibration
+from curate.datasets.kitti.calibration import read_calibration
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.datasets.kitti.labels import (
     KittiObjects,
     from_annotations,
