@@ -104,15 +104,23 @@ class FrameNames(Sequence[str]):
             return _only(name, self._numbered.get(int(last), ()))
         return None
 
-    def require(self, name: str) -> str:
+    def require(self, name: str, place: object = None) -> str:
         """Return the frame with a name.
+
+        Args:
+            name: the name.
+            place: file and line, for messages.
 
         Raises:
             DataError: if no frame has it, or several have.
         """
-        found = self.find(name)
+        prefix = "" if place is None else f"{place}: "
+        try:
+            found = self.find(name)
+        except DataError as error:
+            raise DataError(f"{prefix}{error}") from None
         if found is None:
-            raise DataError(f"there is no frame {name[:200]!r}{self.nearest(name)}")
+            raise DataError(f"{prefix}there is no frame {name[:200]!r}{self.nearest(name)}")
         return found
 
     def match(self, names: Iterable[str], place: object) -> tuple[dict[str, str], list[str]]:
@@ -198,26 +206,27 @@ def match_frames(
     return found
 
 
-def match_files(
-    paths: Iterable[Path], frame_ids: Iterable[str], place: object
-) -> Mapping[str, Path]:
-    """Return the file of each frame; files of other frames are left out.
+def files_by_frame(folder: Path, pattern: str, frame_ids: Sequence[str]) -> Mapping[str, Path]:
+    """Return the file of each frame in a folder; files of other frames are left out.
 
     Args:
-        paths: files that are named like their frame.
-        frame_ids: the ids of all frames, or `FrameNames`.
-        place: the folder, for messages.
+        folder: the folder; if no file in it matches the pattern, its subfolders are searched.
+        pattern: of the file names, such as "*.png".
+        frame_ids: the ids of all frames; if empty, no file is matched.
 
     Raises:
         DataError: if no file is of a frame of the data set, a file could be of several, or two
             files are of one frame.
     """
+    if not len(frame_ids):
+        return {}
+    paths = list(folder.glob(pattern)) or list(folder.rglob(pattern))
+    by_name = {path.relative_to(folder).as_posix(): path for path in paths if path.name[0] != "."}
     frames = FrameNames.of(frame_ids)
-    by_name = {str(path.relative_to(str(place))): path for path in sorted(paths)}
-    found, unmatched = frames.match(by_name, place)
+    found, unmatched = frames.match(by_name, folder)
     if unmatched and not found:
         raise DataError(
-            f"{place}: no file is of a frame of the data set, such as {unmatched[0][:200]!r}"
+            f"{folder}: no file is of a frame of the data set, such as {unmatched[0][:200]!r}"
             f"{frames.nearest(unmatched[0])}"
         )
     return {frame: by_name[name] for name, frame in found.items()}
