@@ -13,10 +13,12 @@ import io
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from curate.datasets.frame_names import FrameNames
 from curate.errors import DataError
 from curate.files.atomic import replace_file
+from curate.files.csv_text import column_names, read_csv
 from curate.review.human_labels import ACCEPTED, REJECTED
-from curate.review.sheet import Sheet
+from curate.review.sheet import Sheet, ShownFrame
 
 TABLE = "review.csv"
 COLUMNS = ("frame", "k", "asked", "category", "score", "weight", "decision")
@@ -62,56 +64,37 @@ def read_table(folder: Path, sheet: Sheet) -> dict[str, ExplicitDecisions]:
     path = folder / TABLE
     if not path.is_file():
         return {}
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a UTF-8 text file (byte {error.start})") from None
-    # In some languages spreadsheets save CSV with semicolons.
-    delimiter = ";" if ";" in text.partition("\n")[0] else ","
-    rows = csv.DictReader(io.StringIO(text), delimiter=delimiter)
-    names = set(rows.fieldnames or ())
-    if not {"frame", "decision"} <= names or names.isdisjoint({"k", _OLD_NUMBER}):
-        raise DataError(f"{path}:1: the columns frame, k and decision are required")
+    shown = {frame.frame: frame for frame in sheet.frames}
+    frames = FrameNames(shown)
+    column = _OLD_NUMBER if _OLD_NUMBER in column_names(path) else "k"
     found: dict[str, ExplicitDecisions] = {}
-    for row in rows:
-        word = (row["decision"] or "").strip().lower()
-        if word:
-            _add_decision(row, word, f"{path}:{rows.line_num}", sheet, found)
+    for line, (name, label, decision) in read_csv(path, ("frame", column, "decision")):
+        if decision:
+            place = f"{path}:{line}"
+            frame = frames.require(name, place)
+            words = found.setdefault(frame, ExplicitDecisions())
+            _add_decision(shown[frame], (column, label.lower()), decision.lower(), place, words)
     return found
 
 
 def _add_decision(
-    row: dict[str, str], word: str, place: str, sheet: Sheet, found: dict[str, ExplicitDecisions]
+    shown: ShownFrame, label: tuple[str, str], word: str, place: str, words: ExplicitDecisions
 ) -> None:
+    """Add the decision of a row; `label` is the name of its column of numbers, and the number."""
+    column, number = label
     if word not in _WORDS:
         raise DataError(f"{place}: invalid decision {word!r}; write accept, reject or nothing")
-    name = _frame(row["frame"], place, sheet)
-    words = found.setdefault(name, ExplicitDecisions())
-    name_of_number = "k" if "k" in row else _OLD_NUMBER
-    number = (row[name_of_number] or "").strip().lower()
     if number == ALL:
         if _WORDS[word] == REJECTED:
             raise DataError(f"{place}: a whole frame cannot be rejected; reject its boxes")
         words.accept_rest = True
         return
-    boxes = next(frame for frame in sheet.frames if frame.frame == name).boxes
-    shown = {str(box.k): box.k for box in boxes}
-    if name_of_number == _OLD_NUMBER:
-        shown = {str(place): box.k for place, box in enumerate(boxes, start=1)}
-    if number not in shown:
+    known = {str(each.k): each.k for each in shown.boxes}
+    if column == _OLD_NUMBER:
+        known = {str(place): each.k for place, each in enumerate(shown.boxes, start=1)}
+    if number not in known:
         raise DataError(
-            f"{place}: {name_of_number} {number!r} is not in frame {name} of this review; it has "
-            f"{', '.join(shown) or 'no labels'}"
+            f"{place}: {column} {number!r} is not in frame {shown.frame} of this review; it has "
+            f"{', '.join(known) or 'no labels'}"
         )
-    words.boxes[shown[number]] = _WORDS[word]
-
-
-def _frame(name: str, place: str, sheet: Sheet) -> str:
-    """Return the frame of a row; spreadsheets remove leading zeros."""
-    names = [frame.frame for frame in sheet.frames]
-    matches = [each for each in names if each.lstrip("0") == name.strip().lstrip("0")]
-    if name in names:
-        return name
-    if len(matches) != 1:
-        raise DataError(f"{place}: frame '{name}' is not in this review")
-    return matches[0]
+    words.boxes[known[number]] = _WORDS[word]
