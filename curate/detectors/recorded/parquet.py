@@ -11,6 +11,7 @@ claims more rows than its bytes can hold is rejected.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,6 +23,7 @@ from curate.detections import Detections
 from curate.detectors.recorded.results import as_detections
 from curate.errors import DataError, one_line
 from curate.exporters.base import BOX_COLUMNS
+from curate.files.child_process import require_survival
 from curate.files.parquet import load_parquet
 from curate.geometry.similarity import Similarity
 
@@ -62,6 +64,11 @@ class ParquetRecord:
             DataError: if the file is missing, damaged or not a Parquet file, or a column is missing
                 or of a wrong type.
         """
+        require_survival(path, "pyarrow", _read_all)
+        return cls._index(path)
+
+    @classmethod
+    def _index(cls, path: Path) -> "ParquetRecord":
         file = _open(path)
         names = file.schema_arrow.names
         has_views = any(name in names for name in VIEW_COLUMNS)
@@ -94,6 +101,12 @@ class ParquetRecord:
         """
         return [view for number, view in sorted(self._views(frame_id).items()) if number]
 
+    def read_groups(self) -> None:
+        """Read every row group, without looking at its values."""
+        for number in range(_open(self.path).num_row_groups):
+            with suppress(DataError):  # the next group may be readable
+                self._groups(number)
+
     @cached_property
     def _groups(self) -> Any:
         """Function that reads a row group; it caches the last ones."""
@@ -125,6 +138,11 @@ class ParquetRecord:
 
     def _part(self, group: int, start: int, stop: int) -> Mapping[str, np.ndarray]:
         return {name: column[start:stop] for name, column in self._groups(group).items()}
+
+
+def _read_all(path: Path) -> None:
+    """Read everything in a file that this module ever reads of it."""
+    ParquetRecord._index(path).read_groups()
 
 
 def _open(path: Path) -> Any:
@@ -195,6 +213,7 @@ def _read(path: Path, file: Any, number: int, columns: Sequence[str]) -> Mapping
     arrow, _ = load_parquet()
     try:
         table = file.read_row_group(number, columns=list(columns), use_threads=False)
+        table.validate(full=True)  # e.g. indices beyond the distinct texts
         return {name: _values(path, number, arrow, name, table.column(name)) for name in columns}
     except (arrow.ArrowException, OSError, UnicodeError) as error:
         raise DataError(f"{path}: row group {number} is damaged: {one_line(error)}") from None
