@@ -25,11 +25,11 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from threading import Lock
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 from curate.errors import CurateError, DataError
 
-_MIN_SECONDS = 120.0
+_MIN_SECONDS = 600.0
 _MIN_BYTES_PER_SECOND = 1 << 20
 _DONE = b"\0curate: survived\0"
 _KEPT_OUTPUT_BYTES = 4096
@@ -105,15 +105,11 @@ class _Child:
     def attempt(self, read: Callable[[], object], seconds: float) -> str | None:
         """Return None if the child survives reading a file, else what happened to it."""
         with self._lock:
-            process = self._process = self._process or _start()
-            assert process.stdin is not None
-            assert process.stdout is not None
+            if self._process is None or self._process.poll() is not None:
+                self._end()
+                self._process = _start()
             try:
-                process.stdin.write(pickle.dumps(read))
-                process.stdin.flush()
-                output = _output(process.stdout, seconds)
-            except BrokenPipeError:
-                output = b""
+                output = _request(self._process, pickle.dumps(read), seconds)
             except BaseException:
                 self._end()
                 raise
@@ -126,16 +122,17 @@ class _Child:
 
     def close(self) -> None:
         """End the child."""
-        if self._process is not None:
-            self._end()
+        self._end()
 
     def forget(self) -> None:
         """Leave the child to the process that this one was forked from."""
         self._process, self._lock = None, Lock()
 
     def _end(self, *, wait: bool = False) -> int:
+        """Return the exit code of the child, which may be about to end by itself."""
         process, self._process = self._process, None
-        assert process is not None
+        if process is None:
+            return 0
         if wait:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(5)
@@ -145,9 +142,9 @@ class _Child:
         return process.returncode
 
 
-def _start() -> subprocess.Popen[bytes]:
-    search_path = json.dumps([os.path.abspath(entry) for entry in sys.path])
-    return subprocess.Popen(
+def _start() -> "subprocess.Popen[bytes]":
+    search_path = json.dumps([str(Path(entry).absolute()) for entry in sys.path])
+    return subprocess.Popen(  # noqa: S603 - this program
         [sys.executable, "-c", _START + _SERVE, search_path],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -156,7 +153,20 @@ def _start() -> subprocess.Popen[bytes]:
     )
 
 
-def _output(pipe: BinaryIO | Any, seconds: float) -> bytes | None:
+def _request(process: "subprocess.Popen[bytes]", request: bytes, seconds: float) -> bytes | None:
+    """Send a request and return what `_output` returns."""
+    pipes = (process.stdin, process.stdout)
+    if pipes[0] is None or pipes[1] is None:
+        return b""
+    try:
+        pipes[0].write(request)
+        pipes[0].flush()
+    except BrokenPipeError:  # the child has just ended
+        return b""
+    return _output(pipes[1], seconds)
+
+
+def _output(pipe: IO[bytes], seconds: float) -> bytes | None:
     """Return what the child wrote until it was done or ended; None if it takes too long."""
     output, deadline = b"", time.monotonic() + seconds
     while not output.endswith(_DONE):
@@ -186,7 +196,7 @@ def _fingerprint(path: Path, library: str, read: Callable[..., object]) -> str:
     except PackageNotFoundError:
         installed = ""
     identity = (
-        os.path.abspath(path), state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns,
+        str(path.absolute()), state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns,
         read.__module__, read.__qualname__, library, installed,
     )  # fmt: skip
     return hashlib.sha256(repr(identity).encode()).hexdigest()

@@ -10,8 +10,8 @@ frame is requested, a row group at a time, and an invalid row affects only its f
 claims more rows than its bytes can hold is rejected.
 """
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -65,19 +65,21 @@ class ParquetRecord:
                 or of a wrong type.
         """
         require_survival(path, "pyarrow", _read_all)
-        return cls._index(path)
+        return cls.index(path)
 
     @classmethod
-    def _index(cls, path: Path) -> "ParquetRecord":
+    def index(cls, path: Path) -> "ParquetRecord":
+        """Return the record in a file that does not end the process; errors are those of `read`."""
         file = _open(path)
-        names = file.schema_arrow.names
+        with _errors_as_data_error(f"{path}: not a readable Parquet file"):
+            names = file.schema_arrow.names
+            _check_expansion(path, file.metadata)
         has_views = any(name in names for name in VIEW_COLUMNS)
         required = (*_REQUIRED, *(VIEW_COLUMNS if has_views else ()))
         missing = [name for name in required if name not in names]
         if missing:
             raise DataError(f"{path}: no column {', '.join(missing)}; it has {', '.join(names)}")
         _check_types(path, file.schema_arrow, required)
-        _check_expansion(path, file.metadata)
         return cls(path, has_views, _runs(path, file))
 
     def frame_ids(self) -> tuple[str, ...]:
@@ -142,17 +144,28 @@ class ParquetRecord:
 
 def _read_all(path: Path) -> None:
     """Read everything in a file that this module ever reads of it."""
-    ParquetRecord._index(path).read_groups()
+    ParquetRecord.index(path).read_groups()
+
+
+@contextmanager
+def _errors_as_data_error(problem: str) -> Iterator[None]:
+    """Convert the errors that pyarrow raises for a damaged file."""
+    arrow, _ = load_parquet()
+    try:
+        yield
+    except (arrow.ArrowException, LookupError, OSError, OverflowError, UnicodeError) as error:
+        raise DataError(f"{problem}: {one_line(error)}") from None
 
 
 def _open(path: Path) -> Any:
-    arrow, parquet = load_parquet()
-    try:
-        return parquet.ParquetFile(path, read_dictionary=sorted(_TEXT_COLUMNS))
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file of recorded detections") from None
-    except (arrow.ArrowException, OSError, UnicodeError) as error:
-        raise DataError(f"{path}: not a readable Parquet file: {one_line(error)}") from None
+    """Return an open `pyarrow.parquet.ParquetFile` that reads texts as dictionaries."""
+    _, parquet = load_parquet()
+    if not path.exists():
+        raise DataError(f"{path}: no such file of recorded detections")
+    with _errors_as_data_error(f"{path}: not a readable Parquet file"):
+        metadata = parquet.read_metadata(path)
+        texts = sorted(_TEXT_COLUMNS & set(metadata.schema.names))
+        return parquet.ParquetFile(path, metadata=metadata, read_dictionary=texts)
 
 
 def _check_types(path: Path, schema: Any, names: Sequence[str]) -> None:
@@ -211,12 +224,10 @@ def _group(path: Path, number: int, columns: Sequence[str]) -> Mapping[str, np.n
 def _read(path: Path, file: Any, number: int, columns: Sequence[str]) -> Mapping[str, np.ndarray]:
     """Return columns of a row group: text as objects, numbers as float64."""
     arrow, _ = load_parquet()
-    try:
+    with _errors_as_data_error(f"{path}: row group {number} is damaged"):
         table = file.read_row_group(number, columns=list(columns), use_threads=False)
         table.validate(full=True)  # e.g. indices beyond the distinct texts
         return {name: _values(path, number, arrow, name, table.column(name)) for name in columns}
-    except (arrow.ArrowException, OSError, UnicodeError) as error:
-        raise DataError(f"{path}: row group {number} is damaged: {one_line(error)}") from None
 
 
 def _values(path: Path, number: int, arrow: Any, name: str, column: Any) -> np.ndarray:
