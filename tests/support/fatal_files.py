@@ -49,6 +49,18 @@ def count(path: Path) -> None:
         calls.write("x")
 
 
+def write_aborting_parquet(path: Path) -> None:
+    """Write a record for which pyarrow 25 aborts: column y is neither required nor optional."""
+    from fuzzing.foreign_formats import write_parquet
+
+    write_parquet(path)
+    content = path.read_bytes()
+    optional, damaged = b"\x25\x02\x18\x01y", b"\x25\x03\x18\x01y"
+    if content.count(optional) != 1:
+        raise AssertionError("pyarrow writes another header")
+    path.write_bytes(content.replace(optional, damaged))
+
+
 def write_overflowing_model(path: Path, *, early: bool = False) -> None:
     """Write a model of points with an integer division that the processor answers with SIGFPE.
 
