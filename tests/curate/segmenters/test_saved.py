@@ -40,7 +40,7 @@ def test_it_reads_the_map_of_a_frame(tmp_path):
         (np.zeros((5, 11), np.uint8), "the map is 11 x 5 pixels, the image of the frame is 12 x 5"),
         (
             np.zeros((5, 12, 3), np.uint8),
-            "a map in colours; if .* colours to one of camvid, cityscapes.* or to a table, if one",
+            "a map in colours; if .*colours to one of camvid, cityscapes.* or to a table, if one",
         ),
         (
             np.zeros((5, 12), np.uint16),
