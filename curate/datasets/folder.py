@@ -27,10 +27,9 @@ import numpy as np
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES, read_cloud
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.images import read_sized_image
+from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.dataset import (
     IMAGE_SUFFIXES,
-    read_bytes,
-    read_calibration,
     read_frame_lists,
     visible_files,
 )
@@ -38,6 +37,7 @@ from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
+from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
 from curate.frames import Calibration, Frame, FrameFiles
 
@@ -93,7 +93,7 @@ class FolderDataset:
         if "splits" not in self._description:
             return {}
         folder = self.root / self._description["splits"]
-        lists = read_frame_lists(folder, self._boundary)
+        lists = read_frame_lists(folder, self._boundary, self.frame_ids())
         if not lists:
             raise DataError(
                 f"{self._path}: splits: {folder} contains no frame list such as train.txt"
@@ -206,7 +206,7 @@ def _read_description(path: Path) -> Mapping[str, Any]:
         DataError: if the file is missing or not TOML, or a key is missing, unknown or invalid.
     """
     try:
-        content = parse_toml(read_bytes(path, "description").decode("utf-8"))
+        content = parse_toml(read_text(path, "description"))
     except (RecursionError, ValueError) as error:  # ValueError also for very long integers
         raise DataError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
     unknown = sorted(set(content) - set(_KEYS))

@@ -9,7 +9,7 @@ and ROOT/ImageSets/*.txt are optional.
 import io
 import logging
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -19,12 +19,14 @@ import numpy as np
 
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.images import read_sized_image
+from curate.datasets.frame_names import FrameNames, match_frame_list
+from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
-from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
-from curate.frames import Calibration, Frame, FrameFiles
+from curate.files.text import read_lines, read_text
+from curate.frames import Frame, FrameFiles
 from curate.shapes import Float, Float32
 
 _log = logging.getLogger(__name__)
@@ -36,9 +38,6 @@ MAX_RANGE_METRES = 2000.0
 # The folder of KITTI's development kit that says which drive each frame of training/ is from.
 _MAPPINGS = ("mapping", "devkit_object/mapping", "devkit/mapping")
 _MAPPING_FILES = ("train_mapping.txt", "train_rand.txt")
-# Focal lengths are thousands of pixels; the last column of P2 is at most a million.
-_MAX_ENTRY = 1e9
-CALIBRATION_SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
 class KittiDataset:
@@ -84,13 +83,10 @@ class KittiDataset:
         Raises:
             DataError: if a list contains an invalid frame id.
         """
-        lists = {
-            path.stem: path for path in sorted(visible_files(self.root / "ImageSets", "*.txt"))
-        }
-        if self._home != self.root and "test" in lists:
-            _log.info("%s: skipped, it lists frames of testing/", lists.pop("test"))
-        self._boundary.check(*lists.values())
-        return {name: read_frame_list(path) for name, path in lists.items()}
+        lists = dict(read_frame_lists(self.root / "ImageSets", self._boundary, self.frame_ids()))
+        if self._home != self.root and lists.pop("test", None) is not None:
+            _log.info("%s/ImageSets/test.txt: skipped, it lists frames of testing/", self.root)
+        return lists
 
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; `label` is None if there is no label file.
@@ -196,72 +192,6 @@ def check_point_range(path: Path, points: Float[np.ndarray, "n _"]) -> None:
         )
 
 
-def read_calibration(path: Path) -> Calibration:
-    """Return the calibration of the left colour camera (P2, R0_rect, Tr_velo_to_cam).
-
-    Raises:
-        DataError: if the file or one of the three matrices is missing, or a matrix has a wrong
-            number of entries, entries that are not finite, or no inverse.
-    """
-    matrices: dict[str, np.ndarray] = {}
-    text = read_bytes(path, "calibration").decode("utf-8", errors="replace")
-    for number, line in enumerate(text.splitlines(), start=1):
-        key, _, entries = line.partition(":")
-        if key in CALIBRATION_SHAPES:
-            matrices[key] = parse_matrix(entries, CALIBRATION_SHAPES[key], f"{path}:{number}")
-    missing = [key for key in CALIBRATION_SHAPES if key not in matrices]
-    if missing:
-        raise DataError(f"{path}: no line {' and no line '.join(f'{key}:' for key in missing)}")
-    rectify, extrinsic = np.eye(4), np.eye(4)
-    rectify[:3, :3] = matrices["R0_rect"]
-    extrinsic[:3] = matrices["Tr_velo_to_cam"]
-    lidar_to_camera = rectify @ extrinsic
-    if abs(np.linalg.det(lidar_to_camera)) < 1e-6:
-        raise DataError(f"{path}: the product of R0_rect and Tr_velo_to_cam cannot be inverted")
-    return Calibration(matrices["P2"], lidar_to_camera)
-
-
-def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration file that `read_calibration` reads back exactly.
-
-    Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera, and R0_rect is
-    the identity. P0, P1 and P3 repeat P2, for readers that expect P2 on the third line.
-    """
-    matrices = dict.fromkeys(("P0", "P1", "P2", "P3"), calibration.projection)
-    matrices["R0_rect"] = np.eye(3)
-    matrices["Tr_velo_to_cam"] = calibration.lidar_to_camera[:3]
-    matrices["Tr_imu_to_velo"] = np.eye(4)[:3]
-    lines = [
-        f"{key}: {' '.join(f'{entry:.16e}' for entry in matrix.ravel())}\n"
-        for key, matrix in matrices.items()
-    ]
-    replace_file(path, "".join(lines).encode())
-
-
-def parse_matrix(entries: str, shape: tuple[int, int], location: str) -> np.ndarray:
-    """Parse the numbers of a calibration line as a matrix.
-
-    Args:
-        entries: the part of the line after the key.
-        shape: rows and columns of the matrix.
-        location: file and line, for error messages.
-
-    Raises:
-        DataError: if an entry is not a finite number of sane size, or their count is wrong.
-    """
-    try:
-        numbers = np.array([float(entry) for entry in entries.split()])
-    except ValueError as error:
-        raise DataError(f"{location}: {error}; a calibration line holds only numbers") from None
-    if len(numbers) != shape[0] * shape[1]:
-        raise DataError(f"{location}: {len(numbers)} numbers, expected {shape[0]} x {shape[1]}")
-    if not np.isfinite(numbers).all():
-        raise DataError(f"{location}: contains NaN or infinite numbers")
-    if np.abs(numbers).max() > _MAX_ENTRY:
-        raise DataError(f"{location}: contains numbers beyond {_MAX_ENTRY:g}")
-    return numbers.reshape(shape)
-
-
 def read_drives(folder: Path) -> Mapping[str, str]:
     """Return the drive of each frame of KITTI's training/.
 
@@ -273,10 +203,10 @@ def read_drives(folder: Path) -> Mapping[str, str]:
         DataError: if a file is missing or malformed.
     """
     mapping, path = (folder / name for name in _MAPPING_FILES)
-    lines = read_bytes(mapping, "mapping").decode("utf-8", "replace")
-    drives = [line.split()[1] for line in lines.splitlines() if len(line.split()) == 3]
+    lines = map(str.split, read_lines(mapping, "mapping"))
+    drives = [line[1] for line in lines if len(line) == 3]
+    text = read_text(path, "mapping")
     try:
-        text = read_bytes(path, "mapping").decode("utf-8", "replace")
         numbers = [int(number) for number in text.replace(",", " ").split()]
     except ValueError as error:
         raise DataError(f"{path}: {error}; the file must contain only line numbers") from None
@@ -295,40 +225,25 @@ def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
                 yield folder / entry.name
 
 
-def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str, ...]]:
+def read_frame_lists(
+    folder: Path, boundary: Boundary, frame_ids: Sequence[str] = ()
+) -> Mapping[str, tuple[str, ...]]:
     """Return the frame lists of a folder by file name; empty if the folder does not exist.
+
+    The lists may contain frames without files; their names stay as they are.
 
     Args:
         folder: the folder of the lists.
         boundary: the boundary of the data set.
+        frame_ids: the frames of the data set.
 
     Raises:
         DataError: if a list contains an invalid frame id, or is a link out of the data set.
     """
     paths = sorted(visible_files(folder, "*.txt"))
     boundary.check(*paths)
-    return {path.stem: read_frame_list(path) for path in paths}
-
-
-def read_frame_list(path: Path) -> tuple[str, ...]:
-    """Return the frame ids of a text file, one per line.
-
-    Raises:
-        DataError: if the file is missing or not text, or a line is not a valid frame id.
-    """
-    names: list[str] = []
-    try:
-        text = read_bytes(path, "frame list").decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from None
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.strip():
-            try:
-                check_frame_id(line.strip())
-            except DataError as error:
-                raise DataError(f"{path}:{number}: {error}") from None
-            names.append(line.strip())
-    return tuple(names)
+    frames = FrameNames.of(frame_ids)
+    return {path.stem: match_frame_list(path, frames, allow_missing=True) for path in paths}
 
 
 def read_bytes(path: Path, kind: str) -> bytes:

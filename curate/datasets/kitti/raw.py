@@ -14,21 +14,19 @@ import numpy as np
 
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.images import read_sized_image
-from curate.datasets.kitti.dataset import (
-    parse_matrix,
-    read_bytes,
-    read_frame_lists,
-    read_points,
-    visible_files,
+from curate.datasets.kitti.calibration import (
+    RAW_CAMERAS,
+    RAW_TO_CAMERA,
+    read_raw_calibration,
 )
+from curate.datasets.kitti.dataset import read_frame_lists, read_points, visible_files
 from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
-from curate.frames import Calibration, Frame, FrameFiles
+from curate.frames import Frame, FrameFiles
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
-_TO_CAMERA, _CAMERAS = "calib_velo_to_cam.txt", "calib_cam_to_cam.txt"
 # The root is a date folder with drives, or a folder of date folders.
 _DRIVES = ("*", "*/*")
 
@@ -58,7 +56,7 @@ class KittiRawDataset:
         if not self._drives:
             raise DataError(
                 f"{self.root}: contains no DRIVE/{_POINTS}; set the root to the date folder, which "
-                f"also contains {_TO_CAMERA}, or to the folder of all dates"
+                f"also contains {RAW_TO_CAMERA}, or to the folder of all dates"
             )
 
     def frame_ids(self) -> tuple[str, ...]:
@@ -78,7 +76,7 @@ class KittiRawDataset:
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in ROOT/ImageSets by file name."""
-        return read_frame_lists(self.root / "ImageSets", self._boundary)
+        return read_frame_lists(self.root / "ImageSets", self._boundary, self.frame_ids())
 
     def sequence_of(self, frame_id: str) -> str | None:
         """Return the drive of a frame, or None if there is no such frame."""
@@ -98,10 +96,10 @@ class KittiRawDataset:
         files = FrameFiles(
             points=drive / _POINTS / f"{number}.bin",
             image=drive / _IMAGES / f"{number}.png",
-            calibration=drive.parent / _TO_CAMERA,
+            calibration=drive.parent / RAW_TO_CAMERA,
             label=label if label.exists() else None,
         )
-        self._boundary.check(*files.paths(), drive.parent / _CAMERAS)
+        self._boundary.check(*files.paths(), drive.parent / RAW_CAMERAS)
         return files
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
@@ -128,28 +126,3 @@ class KittiRawDataset:
             raise DataError(f"{drive / 'label_2' / number}.txt: no such label file")
         calibration = read_raw_calibration(files.calibration.parent)
         return to_annotations(read_objects(files.label), calibration)
-
-
-def read_raw_calibration(folder: Path) -> Calibration:
-    """Return the calibration of the left colour camera (P_rect_02, R_rect_00, R and T).
-
-    Args:
-        folder: the date folder.
-
-    Raises:
-        DataError: if a file or an entry is missing or malformed.
-    """
-    extrinsic, rectify = np.eye(4), np.eye(4)
-    extrinsic[:3, :3] = _entry(folder / _TO_CAMERA, "R", (3, 3))
-    extrinsic[:3, 3:] = _entry(folder / _TO_CAMERA, "T", (3, 1))
-    rectify[:3, :3] = _entry(folder / _CAMERAS, "R_rect_00", (3, 3))
-    return Calibration(_entry(folder / _CAMERAS, "P_rect_02", (3, 4)), rectify @ extrinsic)
-
-
-def _entry(path: Path, key: str, shape: tuple[int, int]) -> np.ndarray:
-    text = read_bytes(path, "calibration").decode("utf-8", errors="replace")
-    for number, line in enumerate(text.splitlines(), start=1):
-        name, _, entries = line.partition(":")
-        if name == key:
-            return parse_matrix(entries, shape, f"{path}:{number}")
-    raise DataError(f"{path}: no line {key}:")

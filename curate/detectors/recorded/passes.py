@@ -6,7 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from curate.detectors.recorded.formats import read_results
-from curate.detectors.recorded.results import ReadOptions, RecordedResult, ResultsByFrame
+from curate.detectors.recorded.results import (
+    ReadOptions,
+    RecordedResult,
+    ResultsByFrame,
+    check_scores,
+)
 from curate.errors import ConfigError, DataError
 from curate.geometry.similarity import Similarity
 
@@ -51,7 +56,10 @@ class PassesRecord:
             if not place.exists():
                 raise DataError(f"{place}: no such file or folder; see detector.options.passes")
             augmented.append((place, similarity, read_results(place, kind, options)))
-        return cls(path, read_results(path, kind, options), augmented)
+        plain = read_results(path, kind, options)
+        for place, results in ((path, plain), *((place, found) for place, _, found in augmented)):
+            check_scores(place, results, sigmoid=options.sigmoid)
+        return cls(path, plain, augmented)
 
     @property
     def has_views(self) -> bool:

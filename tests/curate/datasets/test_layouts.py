@@ -10,7 +10,8 @@ from support.toys import write_toy_kitti
 
 from curate.datasets.folder import FolderDataset
 from curate.datasets.formats.clouds import read_cloud
-from curate.datasets.kitti.dataset import KittiDataset, read_calibration
+from curate.datasets.kitti.calibration import read_calibration
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.datasets.kitti.raw import KittiRawDataset, read_raw_calibration
 from curate.errors import DataError
 

@@ -10,7 +10,7 @@ import pytest
 from support.pipelines_cli import Curate
 from support.toys import toy_calibration, toy_document
 
-from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.calibration import write_calibration
 from curate.errors import ConfigError, DataError, WorkspaceError
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise

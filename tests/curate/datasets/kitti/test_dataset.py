@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 from support.toys import toy_calibration, write_toy_kitti
 
-from curate.datasets.kitti.dataset import (
-    KittiDataset,
-    read_calibration,
-    read_points,
-    write_calibration,
-)
+from curate.datasets.kitti.calibration import read_calibration, write_calibration
+from curate.datasets.kitti.dataset import KittiDataset, read_points
 from curate.errors import DataError
 from curate.frames import Calibration
 from curate.geometry.projection import project_points
@@ -139,7 +135,7 @@ def test_a_list_must_be_text(toy_kitti):
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"\xef\xbb\xbf000001\n")
     assert KittiDataset(toy_kitti).splits()["train"] == ("000001",)
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"000001\n\xff\xfe\n")
-    with pytest.raises(DataError, match=r"train\.txt: not UTF-8 text"):
+    with pytest.raises(DataError, match=r"train\.txt:2: not UTF-8 text"):
         KittiDataset(toy_kitti).splits()
 
 

@@ -222,14 +222,14 @@ def test_results_for_unknown_frames_are_reported(written, caplog):
     with caplog.at_level(logging.WARNING):
         RecordedDetector(path, frame_ids=("000001", "000007"), **options)
     assert "1 of 2 results are for frames that the data set does not have (000002)" in caplog.text
-    with pytest.raises(DataError, match=r"frames that do not exist .*named like 1"):
-        RecordedDetector(path, frame_ids=("1", "2"), **options)
+    message = r"frames that do not exist \(000001, 000002\); the nearest are '00000[78]' and '00000"
+    with pytest.raises(DataError, match=message):
+        RecordedDetector(path, frame_ids=("000007", "000008"), **options)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"score": np.array([12.0, -3.0])}, "box 0: the score is not in"),
         ({"boxes_lidar": BOXES * [1, 1, 1, 1, -1, 1, 1]}, "box 0: length, width or height"),
         ({"boxes_lidar": BOXES * np.nan}, "box 0: a number is NaN"),
         ({"boxes_lidar": BOXES[:, :5]}, r"boxes \[2, 5\]"),
@@ -301,13 +301,20 @@ def test_the_format_can_be_specified(tmp_path):
         RecordedDetector(tmp_path / "empty")
 
 
-def test_an_invalid_result_file_fails_only_its_frame(tmp_path):
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("Car 0 0", "3 fields"),
+        ("Car 0 0 0 1 1 9 9 0 0 0 0 0 0 0 0.5", "no 3D box: height, width and length of the Car"),
+        ("Car 0 0 0 1 1 9 9 1.5 0 4 0 0 0 0 0.5", "are 1.5 0 4, but must be positive"),
+    ],
+)
+def test_an_invalid_result_file_is_found_when_the_results_are_opened(tmp_path, line, message):
+    """Before any frame is worked on, as in all other formats."""
     folder = write_kitti(tmp_path / "results")
-    (folder / "000003.txt").write_text("Car 0 0\n")
-    record = RecordedDetector(folder)
-    with pytest.raises(DataError, match=r"000003\.txt:1: 3 fields"):
-        record.predict(frame("000003"))
-    assert len(record.predict(frame("000001"))) == 2
+    (folder / "000003.txt").write_text(f"{line}\n")
+    with pytest.raises(DataError, match=rf"000003\.txt:1: {message}"):
+        RecordedDetector(folder)
 
 
 def written_results(tmp_path, boxes):
