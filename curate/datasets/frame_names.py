@@ -206,12 +206,14 @@ def match_frames(
     return found
 
 
-def files_by_frame(folder: Path, pattern: str, frame_ids: Sequence[str]) -> Mapping[str, Path]:
+def files_by_frame(
+    folder: Path, suffixes: Sequence[str], frame_ids: Sequence[str]
+) -> Mapping[str, Path]:
     """Return the file of each frame in a folder; files of other frames are left out.
 
     Args:
-        folder: the folder; if no file in it matches the pattern, its subfolders are searched.
-        pattern: of the file names, such as "*.png".
+        folder: the folder; if no file in it has one of the suffixes, its subfolders are searched.
+        suffixes: of the files, such as ".png".
         frame_ids: the ids of all frames; if empty, no file is matched.
 
     Raises:
@@ -220,7 +222,8 @@ def files_by_frame(folder: Path, pattern: str, frame_ids: Sequence[str]) -> Mapp
     """
     if not len(frame_ids):
         return {}
-    paths = list(folder.glob(pattern)) or list(folder.rglob(pattern))
+    paths = [path for path in folder.iterdir() if path.suffix in suffixes]
+    paths = paths or [path for path in folder.rglob("*") if path.suffix in suffixes]
     by_name = {path.relative_to(folder).as_posix(): path for path in paths if path.name[0] != "."}
     frames = FrameNames.of(frame_ids)
     found, unmatched = frames.match(by_name, folder)

@@ -56,7 +56,7 @@ class InstanceSegmenter:
         self.minimum_score = minimum_score
         self._files = self._frames = None
         if self.path.is_dir():
-            self._files = files_by_frame(self.path, "*.json", frame_ids)
+            self._files = files_by_frame(self.path, (".json",), frame_ids)
         else:
             self._frames = _by_frame(self.path, FrameNames.of(frame_ids))
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.exported import BOXES, CATEGORIES, SCORES, toy_labels
+from support.fatal_files import write_aborting_parquet
 from support.toys import empty_frame
 
 from curate.detectors.recorded import RecordedDetector
@@ -186,3 +187,20 @@ def test_only_a_few_row_groups_are_in_memory(tmp_path, monkeypatch):
     cached = 30 - len(read)
     assert cached <= 2
     assert read == list(reversed(range(30 - cached)))
+
+
+def test_a_file_that_makes_pyarrow_abort_is_rejected(tmp_path):
+    """Case 24: it ended the process with SIGABRT."""
+    write_aborting_parquet(tmp_path / "a.parquet")
+    with pytest.raises(
+        DataError, match=r"pyarrow ends the process \(SIGABRT: Definition"
+    ) as caught:
+        RecordedDetector(tmp_path / "a.parquet")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_without_the_column_of_frames_is_rejected(tmp_path):
+    """Also if another column of text is missing."""
+    path = write(tmp_path / "a.parquet", frame=None, category=None)
+    with pytest.raises(DataError, match="no column frame, category; it has score"):
+        RecordedDetector(path)
