@@ -17,7 +17,6 @@ from pipelines.commands.options import (
     end,
     open_workspace,
 )
-from pipelines.reports.count_table import print_counts
 from pipelines.reports.terminal import print_json, print_line, print_report, print_table
 
 if TYPE_CHECKING:
@@ -132,6 +131,8 @@ def _title(found: "AuditedRound") -> str:
 
 def _print(figures: "Audit", title: str, overlaps: "Mapping[str, float]") -> None:
     """Print all policies, their AUROC by slice, and the weight bins of the first one."""
+    from pipelines.reports.count_table import print_counts
+
     by_policy = figures.whole()
     thresholds = ", ".join(f"{name} {overlap:g}" for name, overlap in overlaps.items())
     print_line(

@@ -13,12 +13,12 @@ from pipelines.commands.options import (
     WorkspaceOption,
     open_workspace,
 )
-from pipelines.reports.evaluation_report import EvaluationReport, print_evaluation
 
 if TYPE_CHECKING:
     from curate.evaluation.kitti_ap import KittiEvaluation
     from curate.evaluation.kitti_folders import SensorFolders
     from pipelines.assessment.evaluation import ValObjects
+    from pipelines.reports.evaluation_report import EvaluationReport
     from pipelines.workspace.workspace import Workspace
 
 OUTCOMES = {"tp": "detected", "fn": "missed", "ignored": "ignored"}
@@ -131,6 +131,7 @@ def evaluate(
     Example: curate evaluate --labels data/label_2 --results out/results --json
     """
     from curate.errors import ConfigError
+    from pipelines.reports.evaluation_report import print_evaluation
 
     of_folders = {
         "--frames": frames,
@@ -235,13 +236,14 @@ def _evaluate_folders(
     categories: tuple[str, ...],
     rules: Mapping[str, Any],
     sensors: "SensorFolders",
-) -> EvaluationReport:
+) -> "EvaluationReport":
     """Return the evaluation of two folders."""
     from curate.errors import ConfigError
     from curate.evaluation.difficulties import open_difficulty
     from curate.evaluation.kitti_folders import load_folders
     from curate.evaluation.kitti_rules import overlaps_of
     from pipelines.assessment.evaluation import ValObjects, projection_notes
+    from pipelines.reports.evaluation_report import EvaluationReport
 
     try:
         overlaps = overlaps_of(categories, rules.get("overlaps"))
@@ -276,13 +278,14 @@ def _read_ids(path: Path) -> list[str]:
 
 def _evaluate_val(
     workspace: "Workspace", round_number: int | None, checkpoint: Path | None, *, store: bool
-) -> EvaluationReport:
+) -> "EvaluationReport":
     """Return the evaluation on the val frames."""
     from curate.errors import WorkspaceError
     from pipelines.assessment.evaluation import detect_val, stored_val, val_objects
     from pipelines.assessment.store import store_evaluation
     from pipelines.engine.progress import Bar
     from pipelines.engine.rounds import newest_checkpoint
+    from pipelines.reports.evaluation_report import EvaluationReport
 
     if round_number is not None:
         source = f"round {round_number}"

@@ -283,38 +283,6 @@ class SolveSection(Section):
         return section
 
 
-class EvaluationSection(Section):
-    """When a detection or label counts as correct, and which objects count, in evaluate and audit.
-
-    The settings change no label and no weight.
-    """
-
-    overlaps: Overlaps = Field(
-        default={},
-        description="IoU that a detection or label must exceed to be correct, by category, such as "
-        "{Bus = 0.7}. Without an entry: 0.7 for Car, 0.5 for all others.",
-    )
-    difficulty: Literal["kitti", "points", "distance"] = Field(
-        default="kitti",
-        description="Levels of difficulty of curate evaluate: KITTI's easy, moderate and hard, "
-        "which need 2D boxes; levels by LiDAR points in the object; or ranges of distance.",
-    )
-    minimum_points: Annotated[
-        tuple[AtLeastOne, ...], Field(min_length=1), AfterValidator(_falling)
-    ] = Field(
-        default=(6, 1),
-        description="LiDAR points that an object of each level has at least, the largest first, "
-        "for difficulty = 'points'. Each level includes those before it.",
-        json_schema_extra=_unit("points"),
-    )
-    distance_limits: Annotated[tuple[Positive, ...], AfterValidator(_strictly_rising)] = Field(
-        default=(30.0, 50.0),
-        description="Distances between two ranges, the smallest first, for difficulty = "
-        "'distance'.",
-        json_schema_extra=_unit("m"),
-    )
-
-
 class TrainSection(Section):
     """How the detector is trained."""
 
@@ -438,6 +406,38 @@ class RunSection(Section):
     )
 
 
+class EvaluationSection(Section):
+    """When a detection or label counts as correct, and which objects count, in evaluate and audit.
+
+    The settings change no label and no weight.
+    """
+
+    overlaps: Overlaps = Field(
+        default={},
+        description="IoU that a detection or label must exceed to be correct, by category, such as "
+        "{Bus = 0.7}. Without an entry: 0.7 for Car, 0.5 for all others.",
+    )
+    difficulty: Literal["kitti", "points", "distance"] = Field(
+        default="kitti",
+        description="Levels of difficulty of curate evaluate: KITTI's easy, moderate and hard, "
+        "which need 2D boxes; levels by LiDAR points in the object; or ranges of distance.",
+    )
+    minimum_points: Annotated[
+        tuple[AtLeastOne, ...], Field(min_length=1), AfterValidator(_falling)
+    ] = Field(
+        default=(6, 1),
+        description="LiDAR points that an object of each level has at least, the largest first, "
+        "for difficulty = 'points'. Each level includes those before it.",
+        json_schema_extra=_unit("points"),
+    )
+    distance_limits: Annotated[tuple[Positive, ...], AfterValidator(_strictly_rising)] = Field(
+        default=(30.0, 50.0),
+        description="Distances between two ranges, the smallest first, for difficulty = "
+        "'distance'.",
+        json_schema_extra=_unit("m"),
+    )
+
+
 class Config(Section):
     """The settings of a workspace."""
 
@@ -448,9 +448,9 @@ class Config(Section):
     points: PointsSection = PointsSection()
     semantic: SemanticSection = SemanticSection()
     solve: SolveSection = SolveSection()
-    evaluation: EvaluationSection = EvaluationSection()
     train: TrainSection = TrainSection()
     run: RunSection = RunSection()
+    evaluation: EvaluationSection = EvaluationSection()
 
 
 def read_config(path: Path) -> Config:

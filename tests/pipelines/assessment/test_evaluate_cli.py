@@ -250,9 +250,11 @@ def test_missed_objects_can_be_queried(curate: Curate, workspace: Workspace) -> 
     assert missed
     assert objects
     assert all(row["iou"] <= 0.7 for row in missed)
-    sql = "SELECT ap_r40 FROM evaluation_ap WHERE figure = '3d' AND category = 'Cyclist'"
-    stored = [row["ap_r40"] for row in query_rows(curate, workspace, sql)]
-    assert sorted(stored) == pytest.approx(sorted(figures["AP_R40"]["Cyclist"]["3d"]))
+    sql = "SELECT * FROM evaluation_ap WHERE figure = '3d' AND category = 'Cyclist'"
+    rows = {row["difficulty"]: row for row in query_rows(curate, workspace, sql)}
+    stored = [rows[level]["ap_r40"] for level in figures["difficulties"]]
+    assert stored == figures["AP_R40"]["Cyclist"]["3d"]
+    assert [value is None for value in stored] == [n == 0 for n in figures["objects"]["Cyclist"]]
 
 
 def test_outcomes_contain_their_boxes(curate: Curate, workspace: Workspace) -> None:
