@@ -19,7 +19,7 @@ from pipelines.category_names import detector_differences, find_differences
 from pipelines.engine.rounds import newest_checkpoint
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
-from pipelines.workspace.workspace import Workspace
+from pipelines.workspace.workspace import Workspace, read_truth
 
 # Labeled frames whose labels are checked together.
 _LABELED_FRAMES = 5
@@ -70,7 +70,8 @@ def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     frames += [dataset.read(name) for name in others[: _LABELED_FRAMES - len(frames)]]
     if not frames:
         return []
-    return examine_labels([(each, dataset.annotations(each.frame_id)) for each in frames])
+    truth = (read_truth(workspace.config, dataset, each.frame_id) for each in frames)
+    return examine_labels(list(zip(frames, truth, strict=True)))
 
 
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:

@@ -12,7 +12,7 @@ import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
-from math import isfinite
+from math import isfinite, isnan
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -279,16 +279,20 @@ def print_report(report: "Report") -> None:
 
 
 def _cell(value: Any) -> str:
-    """Return a value as text, with control characters escaped."""
+    """Return a value as text, with control characters escaped; "-" for NaN."""
     if value is None:
         return ""
     if isinstance(value, float):
+        if isnan(value):
+            return "-"
         return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in str(value))
 
 
 def _is_number(text: str) -> bool:
-    """Return whether a value is a number, to be right-aligned; 000012 is a frame id."""
+    """Return whether a value is a number or "-", to be right-aligned; 000012 is a frame id."""
+    if text == "-":
+        return True
     if text[:1] == "0" and text[1:2].isdigit():
         return False
     try:

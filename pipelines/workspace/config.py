@@ -7,6 +7,7 @@ from the fields of these classes.
 import math
 import tomllib
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,6 +22,7 @@ from pydantic import (
 
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, one_line
+from curate.evaluation.kitti_rules import overlaps_of
 from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
 from curate.names import check_rename
@@ -32,6 +34,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Scale = Annotated[float, Field(gt=0, le=100)]
+Overlaps = dict[str, Annotated[float, Field(gt=0, lt=1)]]
 AtLeastOne = Annotated[int, Field(ge=1)]
 Count = Annotated[int, Field(ge=0)]
 PointCount = Annotated[float, Field(ge=1, allow_inf_nan=False)]
@@ -89,6 +92,18 @@ def _own_rename(section: Any, key: str, name: str) -> Any:
         raise ValueError("both rename and options.rename are set; remove options.rename")
     kept = {each: value for each, value in options.items() if each != "rename"}
     return {**section, "options": kept, "rename": options["rename"]}
+
+
+def _falling(numbers: tuple[int, ...]) -> tuple[int, ...]:
+    if any(a <= b for a, b in pairwise(numbers)):
+        raise ValueError("the largest number must come first, each only once")
+    return numbers
+
+
+def _strictly_rising(limits: tuple[float, ...]) -> tuple[float, ...]:
+    if any(a >= b for a, b in pairwise(limits)):
+        raise ValueError("the smallest distance must come first, each only once")
+    return limits
 
 
 class Section(BaseModel):
@@ -470,6 +485,38 @@ class RunSection(Section):
     )
 
 
+class EvaluationSection(Section):
+    """When a detection or label counts as correct, and which objects count, in evaluate and audit.
+
+    The settings change no label and no weight.
+    """
+
+    overlaps: Overlaps = Field(
+        default={},
+        description="IoU that a detection or label must exceed to be correct, by category, such as "
+        "{Bus = 0.7}. Without an entry: 0.7 for Car, 0.5 for all others.",
+    )
+    difficulty: Literal["kitti", "points", "distance"] = Field(
+        default="kitti",
+        description="Levels of difficulty of curate evaluate: KITTI's easy, moderate and hard, "
+        "which need 2D boxes; levels by LiDAR points in the object; or ranges of distance.",
+    )
+    minimum_points: Annotated[
+        tuple[AtLeastOne, ...], Field(min_length=1), AfterValidator(_falling)
+    ] = Field(
+        default=(6, 1),
+        description="LiDAR points that an object of each level has at least, the largest first, "
+        "for difficulty = 'points'. Each level includes those before it.",
+        json_schema_extra=_unit("points"),
+    )
+    distance_limits: Annotated[tuple[Positive, ...], AfterValidator(_strictly_rising)] = Field(
+        default=(30.0, 50.0),
+        description="Distances between two ranges, the smallest first, for difficulty = "
+        "'distance'.",
+        json_schema_extra=_unit("m"),
+    )
+
+
 class Config(Section):
     """The settings of a workspace."""
 
@@ -482,6 +529,7 @@ class Config(Section):
     solve: SolveSection = SolveSection()
     train: TrainSection = TrainSection()
     run: RunSection = RunSection()
+    evaluation: EvaluationSection = EvaluationSection()
 
 
 def read_config(path: Path) -> Config:
@@ -509,9 +557,14 @@ def make_config(document: Mapping[str, Any], source: str) -> Config:
         ConfigError: if settings are invalid; the message lists all of them, after the source.
     """
     try:
-        return Config.model_validate(document)
+        config = Config.model_validate(document)
     except ValidationError as error:
         raise ConfigError(f"{source}: {describe_errors(error, Config)}") from error
+    try:
+        overlaps_of(config.dataset.categories, config.evaluation.overlaps)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: evaluation.overlaps: {error}") from error
+    return config
 
 
 def change_setting(document: dict[str, Any], setting: str) -> None:

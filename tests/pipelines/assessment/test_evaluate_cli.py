@@ -164,18 +164,27 @@ def test_a_missing_result_file_is_not_treated_as_empty(
 
 
 @pytest.mark.parametrize("empty", [(0,), (1,), (0, 1)])
-def test_without_detections_or_ground_truth_every_value_is_zero(
+def test_without_ground_truth_there_is_no_value_and_without_detections_it_is_zero(
     curate: Curate, folders: tuple[Path, Path], empty: tuple[int, ...]
 ) -> None:
-    """On either side or on both: 0, never NaN, and the number of objects."""
+    """Nothing can be computed without an object: null and "-", not 0; a missed object gives 0."""
     for side in empty:
         (folders[side] / "000001.txt").write_text("")
-    code, out, _ = evaluate(curate, folders, "--json")
+    code, out, err = evaluate(curate, folders, "--json")
     assert code == 0
     found = json.loads(out, parse_constant=pytest.fail)
-    assert found["AP_R40"]["Car"]["3d"] == found["AP_R11"]["Car"]["image"] == [0, 0, 0]
+    expected = [None if 0 in empty else 0] * 3
+    assert found["AP_R40"]["Car"]["3d"] == found["AP_R11"]["Car"]["image"] == expected
+    assert found["recall_3d"]["Car"]["0.7"] == expected
     assert found["objects"]["Car"] == [1 - (0 in empty)] * 3
-    assert evaluate(curate, folders)[0] == 0
+    warned = [("objects", 0), ("results", 1)]
+    for side, number in warned:
+        sentence = f"There are no {side} of Car, Pedestrian, Cyclist"
+        assert (sentence in found["notes"]) == (number in empty)
+        assert (f"warning: {sentence}\n" in err) == (number in empty)
+    _, out, _ = evaluate(curate, folders)
+    row = next(line.split() for line in out.splitlines() if line.startswith("Car         3d"))
+    assert row[2:] == (["-"] if 0 in empty else ["0.00"]) * 6
 
 
 def test_detections_with_equal_scores_are_counted_together(
@@ -232,6 +241,7 @@ def test_missed_objects_can_be_queried(curate: Curate, workspace: Workspace) -> 
     missed = query_rows(curate, workspace, MISSED)
     found = query_rows(curate, workspace, "SELECT * FROM evaluation WHERE outcome = 'tp'")
     objects = [row for row in found if row["side"] == "object"]
+    assert not any("2D box" in note for note in figures["notes"])
     for category, overlap in (("Car", "0.7"), ("Pedestrian", "0.5"), ("Cyclist", "0.5")):
         tp = sum(row["category"] == category for row in objects)
         fn = sum(row["category"] == category for row in missed)
@@ -240,9 +250,11 @@ def test_missed_objects_can_be_queried(curate: Curate, workspace: Workspace) -> 
     assert missed
     assert objects
     assert all(row["iou"] <= 0.7 for row in missed)
-    sql = "SELECT ap_r40 FROM evaluation_ap WHERE figure = '3d' AND category = 'Cyclist'"
-    stored = [row["ap_r40"] for row in query_rows(curate, workspace, sql)]
-    assert sorted(stored) == pytest.approx(sorted(figures["AP_R40"]["Cyclist"]["3d"]))
+    sql = "SELECT * FROM evaluation_ap WHERE figure = '3d' AND category = 'Cyclist'"
+    rows = {row["difficulty"]: row for row in query_rows(curate, workspace, sql)}
+    stored = [rows[level]["ap_r40"] for level in figures["difficulties"]]
+    assert stored == figures["AP_R40"]["Cyclist"]["3d"]
+    assert [value is None for value in stored] == [n == 0 for n in figures["objects"]["Cyclist"]]
 
 
 def test_outcomes_contain_their_boxes(curate: Curate, workspace: Workspace) -> None:
