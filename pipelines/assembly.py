@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.consistency import ConsistencySettings
+from curate.datasets.frame_names import FrameNames
 from curate.detectors.base import Detector, TrainableDetector, choose_preset
 from curate.errors import ConfigError, CurateError
 from curate.frames import Calibration
@@ -68,7 +69,7 @@ def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:
         "device": lambda: device(config),
         "categories": lambda: config.dataset.categories,
         "threads": lambda: 1,
-        "frame_ids": lambda: open_dataset(config).frame_ids(),
+        "frame_ids": lambda: FrameNames.of_dataset(open_dataset(config)),
         "calibration": lambda: _calibrations(config),
         "wants_views": lambda: wants_views(config),
     }
@@ -157,7 +158,11 @@ def open_segmenter(config: Config) -> Segmenter:
     segmenter: Segmenter = registry.SEGMENTERS.build(
         name,
         path,
-        offered={"classes": lambda: _class_map(name, classes), "seed": lambda: config.run.seed},
+        offered={
+            "classes": lambda: _class_map(name, classes),
+            "seed": lambda: config.run.seed,
+            "frame_ids": lambda: FrameNames.of_dataset(open_dataset(config)),
+        },
         options=section.options,
     )
     return segmenter
@@ -175,7 +180,7 @@ def check_segmenter(config: Config) -> None:
             registry.SEGMENTERS.check(
                 name,
                 segmenter_path(config),
-                offered=("classes", "seed"),
+                offered=("classes", "seed", "frame_ids"),
                 options=config.segmenter.options,
             )
 

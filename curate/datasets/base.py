@@ -46,6 +46,15 @@ class Sequenced(Protocol):
         ...
 
 
+@runtime_checkable
+class FileNamed(Protocol):
+    """A data set whose files are not named like their frames."""
+
+    def file_names(self) -> Mapping[str, str]:
+        """Return the frame of each name of a file without suffix."""
+        ...
+
+
 def sequences_of(dataset: Dataset, frames: Iterable[str]) -> Mapping[str, str]:
     """Return the sequence of each frame, without frames of unknown sequence."""
     if not isinstance(dataset, Sequenced):

@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 
-from curate.datasets.formats.binary import read_bytes
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES, read_cloud
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder
@@ -40,6 +39,7 @@ from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
+from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
 from curate.frames import Calibration, Frame, FrameFiles
 from curate.spelling import did_you_mean
@@ -121,7 +121,7 @@ class FolderDataset:
         if "splits" not in self._description:
             return {}
         folder = self.root / self._description["splits"]
-        lists = read_frame_lists(folder, self._boundary)
+        lists = read_frame_lists(folder, self._boundary, self.frame_ids())
         if not lists:
             raise DataError(
                 f"{self._path}: splits: {folder} contains no frame list such as train.txt"
@@ -249,7 +249,7 @@ def _read_description(path: Path) -> Mapping[str, Any]:
         DataError: if the file is missing or not TOML, or a key is missing, unknown or invalid.
     """
     try:
-        content = parse_toml(read_bytes(path, "description").decode("utf-8"))
+        content = parse_toml(read_text(path, "description"))
     except (RecursionError, ValueError) as error:  # ValueError also for very long integers
         raise DataError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
     unknown = sorted(set(content) - set(_KEYS))

@@ -15,6 +15,7 @@ import numpy as np
 
 from curate.detections import Detections, as_categories
 from curate.detectors.conventions import BoxConvention
+from curate.detectors.scores import describe_invalid_scores, to_probabilities
 from curate.errors import ConfigError, ModelError, first_line
 from curate.files.onnx_session import is_numeric_array, open_session, runtime_errors
 from curate.files.paths import StrPath
@@ -147,8 +148,7 @@ class OnnxDetector:
                 "scores [n] and labels [n], or scores [n, classes]"
             )
         scores = scores.astype(np.float64)
-        if self.sigmoid:
-            scores = 0.5 * (1 + np.tanh(scores / 2))  # does not overflow
+        scores = to_probabilities(scores, sigmoid=self.sigmoid)
         self._check_values(scores, labels)
         boxes = self.convention.to_boxes(boxes)
         index = labels.astype(np.int64) - self.first_label
@@ -158,11 +158,8 @@ class OnnxDetector:
         """Raise ModelError if a score is not in [0, 1] or a label is not a configured class."""
         if len(scores) == 0:
             return
-        if not (scores.min() >= 0 and scores.max() <= 1):
-            raise ModelError(
-                f"{self.model}: scores from {scores.min():.3g} to {scores.max():.3g} are not in "
-                "[0, 1]; set detector.options.sigmoid = true if they are logits"
-            )
+        if problem := describe_invalid_scores(scores.min(), scores.max()):
+            raise ModelError(f"{self.model}: {problem}")
         last = self.first_label + len(self.classes) - 1
         within = labels.min() >= self.first_label and labels.max() <= last
         if not within or (labels != np.floor(labels)).any():

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from curate.datasets.formats.images import decode_image
+from curate.datasets.frame_names import files_by_frame
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Frame
@@ -20,13 +21,15 @@ class SavedSegmenter:
     """A `Segmenter` that reads DIRECTORY/FRAME.png with a single channel: a class id per pixel.
 
     Args:
-        directory: the folder of the maps.
+        directory: the folder of the maps; if none is in it, they are in its subfolders.
         classes: the class ids that count for each category.
         divisor: for 16-bit maps of class * divisor + instance number: 1000 for Cityscapes'
             instanceIds, 256 for KITTI's. A value below the divisor is a class id without instance.
+        frame_ids: the frames of the data set, with which the names of the maps are matched in the
+            spellings of `curate.datasets.frame_names`; without them, names are frame ids.
 
     Raises:
-        DataError: if the folder does not exist.
+        DataError: if the folder does not exist, or no map is of a frame of the data set.
         ConfigError: if a class id or the divisor is out of range.
     """
 
@@ -39,6 +42,7 @@ class SavedSegmenter:
         classes: Mapping[str, Sequence[int]],
         *,
         divisor: int | None = None,
+        frame_ids: Sequence[str] = (),
     ) -> None:
         if divisor is not None and not (isinstance(divisor, int) and divisor > 1):
             raise ConfigError(f"segmenter divisor {divisor!r}: expected an integer above 1")
@@ -47,6 +51,7 @@ class SavedSegmenter:
         self.divisor = divisor
         if not self.directory.is_dir():
             raise DataError(f"{self.directory}: no such folder of semantic maps")
+        self._maps = files_by_frame(self.directory, "*.png", frame_ids)
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's saved map.
@@ -55,7 +60,7 @@ class SavedSegmenter:
             DataError: if the map is missing, has another size than the frame's image, or contains
                 ids that its class set does not have.
         """
-        path = self.directory / f"{frame.frame_id}.png"
+        path = self._maps.get(frame.frame_id, self.directory / f"{frame.frame_id}.png")
         class_ids = self._class_ids(path, decode_image(path, cv2.IMREAD_UNCHANGED))
         width, height = frame.image_size
         if class_ids.shape != (height, width):

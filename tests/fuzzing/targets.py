@@ -17,12 +17,13 @@ from curate.datasets.folder import FolderDataset
 from curate.datasets.formats.clouds import read_cloud
 from curate.datasets.formats.containment import check_frame_id
 from curate.datasets.formats.images import read_image, read_image_size
+from curate.datasets.frame_names import read_frame_list
 from curate.datasets.kitti.calibration import (
     read_calibration,
     read_raw_calibration,
     write_calibration,
 )
-from curate.datasets.kitti.dataset import read_drives, read_frame_list, read_points
+from curate.datasets.kitti.dataset import read_drives, read_points
 from curate.datasets.kitti.labels import read_objects, to_annotations, to_detections
 from curate.detectors.recorded.formats import read_results
 from curate.detectors.recorded.results import ReadOptions

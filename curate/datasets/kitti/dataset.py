@@ -9,7 +9,7 @@ with image_0 to image_4, label_0 to label_4 or label_all, and a Tr_velo_to_cam_N
 
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -21,12 +21,14 @@ from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder, visible_files
 from curate.datasets.formats.images import read_sized_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
+from curate.datasets.frame_names import FrameNames, match_frame_list
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
+from curate.files.text import read_lines, read_text
 from curate.frames import Frame, FrameFiles
 from curate.shapes import Float32
 
@@ -116,13 +118,10 @@ class KittiDataset:
         Raises:
             DataError: if a list contains an invalid frame id.
         """
-        lists = {
-            path.stem: path for path in sorted(visible_files(self.root / "ImageSets", "*.txt"))
-        }
-        if self._home != self.root and "test" in lists:
-            _log.info("%s: skipped, it lists frames of testing/", lists.pop("test"))
-        self._boundary.check(*lists.values())
-        return {name: read_frame_list(path) for name, path in lists.items()}
+        lists = dict(read_frame_lists(self.root / "ImageSets", self._boundary, self.frame_ids()))
+        if self._home != self.root and lists.pop("test", None) is not None:
+            _log.info("%s/ImageSets/test.txt: skipped, it lists frames of testing/", self.root)
+        return lists
 
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; `label` is None if there is no label file.
@@ -302,10 +301,10 @@ def read_drives(folder: Path) -> Mapping[str, str]:
         DataError: if a file is missing or malformed.
     """
     mapping, path = (folder / name for name in _MAPPING_FILES)
-    lines = read_bytes(mapping, "mapping").decode("utf-8", "replace")
-    drives = [line.split()[1] for line in lines.splitlines() if len(line.split()) == 3]
+    lines = map(str.split, read_lines(mapping, "mapping"))
+    drives = [line[1] for line in lines if len(line) == 3]
+    text = read_text(path, "mapping")
     try:
-        text = read_bytes(path, "mapping").decode("utf-8", "replace")
         numbers = [int(number) for number in text.replace(",", " ").split()]
     except ValueError as error:
         raise DataError(f"{path}: {error}; the file must contain only line numbers") from None
@@ -314,37 +313,22 @@ def read_drives(folder: Path) -> Mapping[str, str]:
     return {f"{i:06d}": drives[number - 1] for i, number in enumerate(numbers)}
 
 
-def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str, ...]]:
+def read_frame_lists(
+    folder: Path, boundary: Boundary, frame_ids: Sequence[str] = ()
+) -> Mapping[str, tuple[str, ...]]:
     """Return the frame lists of a folder by file name; empty if the folder does not exist.
+
+    The lists may contain frames without files; their names stay as they are.
 
     Args:
         folder: the folder of the lists.
         boundary: the boundary of the data set.
+        frame_ids: the frames of the data set.
 
     Raises:
         DataError: if a list contains an invalid frame id, or is a link out of the data set.
     """
     paths = sorted(visible_files(folder, "*.txt"))
     boundary.check(*paths)
-    return {path.stem: read_frame_list(path) for path in paths}
-
-
-def read_frame_list(path: Path) -> tuple[str, ...]:
-    """Return the frame ids of a text file, one per line.
-
-    Raises:
-        DataError: if the file is missing or not text, or a line is not a valid frame id.
-    """
-    names: list[str] = []
-    try:
-        text = read_bytes(path, "frame list").decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from None
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.strip():
-            try:
-                check_frame_id(line.strip())
-            except DataError as error:
-                raise DataError(f"{path}:{number}: {error}") from None
-            names.append(line.strip())
-    return tuple(names)
+    frames = FrameNames.of(frame_ids)
+    return {path.stem: match_frame_list(path, frames, allow_missing=True) for path in paths}

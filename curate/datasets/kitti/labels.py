@@ -13,7 +13,7 @@ drives away from the camera, has rotation_y = -pi/2. Its centre is (2, 0.95, 20)
 frame, about (20, -2, -0.95) in the frame of a LiDAR at the camera, and its yaw is 0.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -24,6 +24,7 @@ from curate.detections import Annotations, Columns, Detections, as_categories
 from curate.errors import DataError
 from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
+from curate.files.text import read_lines
 from curate.frames import Calibration
 from curate.geometry.projection import image_rectangles
 from curate.geometry.similarity import wrap_angle
@@ -77,8 +78,9 @@ def read_objects(
 ) -> KittiObjects:
     """Return the objects of a KITTI label file, or of a result file if `scored`.
 
-    Label files have 15 fields per line, result files 16. Empty lines are skipped. An empty file
-    contains no objects.
+    Every reader of KITTI's format uses this function. Label files have 15 fields per line; a 16th,
+    which some converters write, is left out. Result files have 16. Empty lines are skipped. An
+    empty file contains no objects.
 
     Args:
         path: the text file.
@@ -87,21 +89,11 @@ def read_objects(
 
     Raises:
         DataError: if the file is missing or not text, or if a line has a wrong number of fields, a
-            field that is not a finite number, an unknown category, or a negative dimension (unless
-            it is a DontCare region).
+            field that is not a finite number, an unknown category, or a size that is not positive
+            (unless it is a DontCare region).
     """
     path = Path(path)
     return parse_rows(path, read_rows(path), scored=scored, categories=categories)
-
-
-def read_rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Return line number and fields of each line of a label or result file that is not empty.
-
-    Raises:
-        DataError: if the file is missing or not text.
-    """
-    lines = enumerate(_read_lines(path), start=1)
-    return [(number, row) for number, line in lines if (row := line.split())]
 
 
 def parse_rows(
@@ -123,22 +115,32 @@ def parse_rows(
         DataError: as `read_objects`.
     """
     fields = RESULT_FIELDS if scored else LABEL_FIELDS
-    rows = [row for _, row in numbered]
+    rows = [row[:fields] for _, row in numbered]
     names = [row[0] for row in rows]
     # All lines are parsed and checked at once for speed; the bad line is searched only on failure.
     try:
         values = np.array([float(field) for row in rows for field in row[1:]])
         values = values.reshape(len(rows), fields - 1)
     except ValueError:  # a field that is not a number, or a wrong number of fields
-        raise _first_error(path, numbered, fields, categories) from None
+        raise _first_error(path, numbered, categories, scored=scored) from None
     if (
-        any(len(row) != fields for row in rows)
+        any(not fields <= len(row) <= RESULT_FIELDS for _, row in numbered)
         or not (np.abs(values) <= _MAX_VALUE).all()
         or (categories is not None and not frozenset(categories).issuperset(names))
-        or _has_negative_dimension(names, values[:, 7:10])
+        or _has_no_size(names, values[:, 7:10])
     ):
-        raise _first_error(path, numbered, fields, categories)
+        raise _first_error(path, numbered, categories, scored=scored)
     return KittiObjects(as_categories(names), *_columns(values))
+
+
+def read_rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Return line number and fields of each line of a label or result file that is not empty.
+
+    Raises:
+        DataError: if the file is missing or not text.
+    """
+    lines = enumerate(read_lines(path, "label"), start=1)
+    return [(number, row) for number, line in lines if (row := line.split())]
 
 
 def write_objects(path: StrPath, objects: KittiObjects) -> None:
@@ -291,52 +293,55 @@ def _format(objects: KittiObjects, index: int) -> str:
     )
 
 
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return path.read_bytes().decode("utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such label file") from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a text file (byte {error.start})") from error
-
-
-def _has_negative_dimension(categories: Sequence[str], dimensions: np.ndarray) -> bool:
-    """Return whether an object other than a DontCare region has a negative dimension."""
-    if dimensions.min(initial=0) >= 0:
+def _has_no_size(categories: Sequence[str], dimensions: np.ndarray) -> bool:
+    """Return whether an object other than a DontCare region has a size that is not positive."""
+    if dimensions.min(initial=1) > 0:
         return False
-    rows = np.flatnonzero((dimensions < 0).any(axis=1)).tolist()
+    rows = np.flatnonzero((dimensions <= 0).any(axis=1)).tolist()
     return any(categories[row] != DONT_CARE for row in rows)
 
 
 def _first_error(
     path: Path,
-    rows: Sequence[tuple[int, Sequence[str]]],
-    fields: int,
+    rows: Iterable[tuple[int, Sequence[str]]],
     categories: Collection[str] | None,
+    *,
+    scored: bool,
 ) -> DataError:
     """Return the error for the first invalid line of a file with at least one."""
-    problems = ((number, _line_problem(row, fields, categories)) for number, row in rows)
+    problems = ((number, _line_problem(row, categories, scored=scored)) for number, row in rows)
     number, problem = next((number, problem) for number, problem in problems if problem)
     return DataError(f"{path}:{number}: {problem}")
 
 
 def _line_problem(
-    row: Sequence[str], fields: int, categories: Collection[str] | None
+    row: Sequence[str], categories: Collection[str] | None, *, scored: bool
 ) -> str | None:
     """Return what is wrong with one line, or None."""
-    if len(row) != fields:
-        kind = "result lines (which end with a score)" if fields == RESULT_FIELDS else "label lines"
-        return f"{len(row)} fields, but {kind} have {fields}"
+    if len(row) == LABEL_FIELDS and scored:
+        return "15 fields: the score is missing; result lines end with it as the 16th field"
+    if not LABEL_FIELDS <= len(row) <= RESULT_FIELDS:
+        expected = "result lines have 16" if scored else "label lines have 15, or 16 with a score"
+        return f"{len(row)} fields, but {expected}"
     if categories is not None and row[0] not in categories:
         return f"unknown category {row[0][:40]!r}; use one of {', '.join(sorted(categories))}"
-    problem = next(filter(None, map(_number_problem, row[1:])), None)
-    if problem:
-        return problem
-    if row[0] != DONT_CARE and min(map(float, row[8:11])) < 0:
-        return f"negative height, width or length ({' '.join(row[8:11])}) of a {row[0]}"
-    return None
+    fields = RESULT_FIELDS if scored else LABEL_FIELDS
+    problem = next(filter(None, map(_number_problem, row[1:fields])), None)
+    return problem or _size_problem(row)
+
+
+def _size_problem(row: Sequence[str]) -> str | None:
+    """Return what is wrong with the size of the 3D box of a line, or None."""
+    sizes = [float(field) for field in row[8:11]]
+    if row[0] == DONT_CARE or min(sizes) > 0:
+        return None
+    shown = f"height, width and length of the {row[0]} are {' '.join(row[8:11])}"
+    if max(sizes) <= 0:
+        return (
+            f"no 3D box: {shown}; delete the line, or set its category to {DONT_CARE} to keep its "
+            "2D box as a region that is neither object nor background"
+        )
+    return f"{shown}, but must be positive"
 
 
 def _number_problem(field: str) -> str | None:

@@ -122,7 +122,7 @@ class KittiRawDataset:
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in ROOT/ImageSets by file name."""
-        return read_frame_lists(self.root / "ImageSets", self._boundary)
+        return read_frame_lists(self.root / "ImageSets", self._boundary, self.frame_ids())
 
     def sequence_of(self, frame_id: str) -> str | None:
         """Return the drive of a frame, or None if there is no such frame."""

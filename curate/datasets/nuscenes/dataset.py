@@ -124,6 +124,15 @@ class NuScenesDataset:
         """Return the scene of a frame, 20 seconds of a drive, or None for an unknown frame."""
         return self._keyframes[frame_id].scene if frame_id in self._keyframes else None
 
+    def file_names(self) -> Mapping[str, str]:
+        """Return the sample token of each name of a sweep or image without suffix."""
+        files = ((file, token) for token in self._present for file in self._names(token))
+        return {Path(file).name.partition(".")[0]: token for file, token in files}
+
+    def _names(self, token: str) -> tuple[str, str]:
+        frame = self._keyframes[token]
+        return frame.points, frame.image
+
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; calibration and labels are tables of all frames.
 

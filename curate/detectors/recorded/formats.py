@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from curate.detectors.recorded.json_files import holds_object, read_json, stream_results
+from curate.detectors.recorded.json_files import holds_object, stream_results
 from curate.detectors.recorded.kitti_results import KittiResults
 from curate.detectors.recorded.mmdetection3d import holds_boxes, read_mmdetection3d
 from curate.detectors.recorded.nuscenes import read_nuscenes
@@ -12,6 +12,7 @@ from curate.detectors.recorded.openpcdet import read_openpcdet
 from curate.detectors.recorded.plain_pickle import read_plain_pickle
 from curate.detectors.recorded.results import ReadOptions, ResultsByFrame
 from curate.errors import ConfigError, DataError
+from curate.files.json_text import read_json
 
 # Readers of formats with one list entry per frame.
 _LISTS: Mapping[str, Callable[[Path, Sequence[Any], ReadOptions], ResultsByFrame]] = {

@@ -10,7 +10,7 @@ frame is requested, a row group at a time, and an invalid row affects only its f
 claims more rows than its bytes can hold is rejected.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -76,6 +76,9 @@ class ParquetRecord:
     def frame_ids(self) -> tuple[str, ...]:
         """Return the recorded frames, in sorted order."""
         return tuple(sorted(self.runs))
+
+    def check(self, frame_ids: Iterable[str]) -> None:
+        """Do nothing: rows are checked when their frame is requested."""
 
     def result(self, frame_id: str) -> Detections:
         """Return the detections of the original frame.

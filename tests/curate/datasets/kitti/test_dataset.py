@@ -135,7 +135,7 @@ def test_a_list_must_be_text(toy_kitti):
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"\xef\xbb\xbf000001\n")
     assert KittiDataset(toy_kitti).splits()["train"] == ("000001",)
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"000001\n\xff\xfe\n")
-    with pytest.raises(DataError, match=r"train\.txt: not UTF-8 text"):
+    with pytest.raises(DataError, match=r"train\.txt:2: not UTF-8 text"):
         KittiDataset(toy_kitti).splits()
 
 

@@ -123,16 +123,17 @@ def test_an_empty_file_has_no_objects(tmp_path, text):
     ("line", "scored", "message"),
     [
         (CAR.rsplit(" ", 1)[0], False, "14 fields, but label lines have 15"),
-        (f"{CAR} 0.5", False, "16 fields, but label lines have 15"),
-        (CAR, True, "15 fields, but result lines (which end with a score) have 16"),
-        (f"{CAR} 0.5 0.5", True, "17 fields, but result lines"),
+        (f"{CAR} 0.5 0.5", False, "17 fields, but label lines have 15, or 16 with a score"),
+        (CAR, True, "15 fields: the score is missing; result lines end with it"),
+        (f"{CAR} 0.5 0.5", True, "17 fields, but result lines have 16"),
         ("Car", False, "1 fields"),
         (CAR.replace("Car", "car"), False, "unknown category 'car'; use one of Car, Cyclist,"),
         (CAR.replace("14.44", "far"), False, "'far' is not a number"),
         (CAR.replace("14.44", "nan"), False, "'nan' is not a finite number"),
         (f"{CAR} NaN", True, "'NaN' is not a finite number"),
         (f"{CAR} -inf", True, "'-inf' is not a finite number"),
-        (CAR.replace("1.60 3.66", "-1.60 3.66"), False, "negative height, width or length"),
+        (CAR.replace("1.60 3.66", "-1.60 3.66"), False, "are 1.47 -1.60 3.66, but must be pos"),
+        (CAR.replace("1.60 3.66", "0 3.66"), False, "of the Car are 1.47 0 3.66, but must be"),
     ],
 )
 def test_an_invalid_line_gives_one_line_with_its_position(tmp_path, line, scored, message):
@@ -170,7 +171,7 @@ def test_a_missing_or_binary_file_is_rejected(tmp_path, scored):
     with pytest.raises(DataError, match="cannot be read"):
         read_objects(tmp_path, scored=scored)
     (tmp_path / "binary.txt").write_bytes(b"Car \xff\xfe")
-    with pytest.raises(DataError, match=r"binary\.txt: not a text file \(byte 4\)"):
+    with pytest.raises(DataError, match=r"binary\.txt:1: not UTF-8 text \(byte 0xff\)"):
         read_objects(tmp_path / "binary.txt", scored=scored)
 
 

@@ -113,7 +113,7 @@ VIEWS = {"view": [0, 1, 1], "flip_y": [0, 1, 1], "rotation_rad": [0, 0, 0], "sca
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"score": [0.9, 1.5, 0.5]}, "frame a: box 1: the score is not in"),
+        ({"score": [0.9, 1.5, 0.5]}, "frame a: scores from 0 to 1.5 are not in"),
         ({"length": [0.0, 1.0, 4.0]}, "frame a: box 0: length, width or height is not positive"),
         ({"z": [np.nan, 1.0, 4.0]}, "frame a: box 0: a number is NaN"),
         ({"z": [None, 1.0, 4.0]}, "row group 0: 1 rows have no z"),
