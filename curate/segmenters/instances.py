@@ -14,7 +14,7 @@ import numpy as np
 from curate.errors import ConfigError, DataError, one_line
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import SemanticMap, image_size_of
 from curate.segmenters.classes import background_id, checked_classes
 from curate.segmenters.masks import decode_mask
 
@@ -27,7 +27,8 @@ class InstanceSegmenter:
     Args:
         path: a file with `images` and `annotations`; a file with a list of results, where
             `image_id` is the frame's name or number; or a folder with a file FRAME.json per frame,
-            which contains such a list or `{annotations: [...]}`.
+            which contains such a list or `{annotations: [...]}`. With several cameras, the names
+            are CAMERA/FRAME.
         classes: the COCO category ids that count for each category.
         minimum_score: masks below it are dropped; a mask without a score counts as score 1.
 
@@ -54,18 +55,18 @@ class InstanceSegmenter:
         Raises:
             DataError: if the frame has no masks, or a mask is malformed or of another size.
         """
-        width, height = frame.image_size
+        size = width, height = image_size_of(frame)
         used_ids = {class_id for ids in self.classes.values() for class_id in ids}
         background = background_id(self.classes)
         class_ids = np.full((height, width), background, dtype=np.uint8)
-        source, objects = self._objects(frame.frame_id)
+        source, objects = self._objects(frame.frame_id, frame.camera)
         scored = [(_score(source, number, entry), number) for number, entry in enumerate(objects)]
         for score, number in sorted(scored, key=lambda pair: pair[0]):
             if score < self.minimum_score:
                 continue
             entry = objects[number]
             try:
-                mask = decode_mask(entry["segmentation"], frame.image_size)
+                mask = decode_mask(entry["segmentation"], size)
                 category = entry["category_id"]
             except KeyError as error:
                 raise DataError(f"{source}: object {number} has no {error.args[0]}") from None
@@ -76,18 +77,19 @@ class InstanceSegmenter:
             class_ids[mask] = category if category in used_ids else background
         return SemanticMap(class_ids, self.classes)
 
-    def _objects(self, frame_id: str) -> tuple[str, Objects]:
+    def _objects(self, frame_id: str, camera: str) -> tuple[str, Objects]:
         """Return the place of a frame's objects, for error messages, and the objects."""
         if self._frames is None:
-            path = self.path / f"{frame_id}.json"
+            path = self.path / camera / f"{frame_id}.json"
             return str(path), _object_list(path, _read(path))
-        number = int(frame_id) if frame_id.isdecimal() else None
-        for key in (frame_id, number):
+        name = f"{camera}/{frame_id}" if camera else frame_id
+        number = int(frame_id) if frame_id.isdecimal() and not camera else None
+        for key in (name, number):
             if key in self._frames:
-                return f"{self.path}: frame {frame_id}", self._frames[key]
+                return f"{self.path}: frame {name}", self._frames[key]
         raise DataError(
-            f"{self.path}: no masks for frame {frame_id}; list a frame without objects in "
-            '`images`: {"images": [{"id": 1, "file_name": "FRAME.png"}], "annotations": [...]}'
+            f"{self.path}: no masks for frame {name}; list a frame without objects in `images`: "
+            f'{{"images": [{{"id": 1, "file_name": "{name}.png"}}], "annotations": [...]}}'
         )
 
 
@@ -96,17 +98,25 @@ def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
     document = _read(path)
     images = document.get("images", ()) if isinstance(document, dict) else ()
     try:
-        names = {image["id"]: Path(image["file_name"]).stem for image in images}
-        frames: dict[str | int, list[Mapping[str, Any]]] = {name: [] for name in names.values()}
+        names = {image["id"]: Path(image["file_name"]) for image in images}
+        frames: dict[str | int, list[Mapping[str, Any]]] = {
+            key: [] for name in names.values() for key in _keys(name)
+        }
         for entry in _object_list(path, document):
-            key = entry["image_id"]
-            frames.setdefault(names[key] if names else key, []).append(entry)
+            for key in _keys(names[entry["image_id"]]) if names else (entry["image_id"],):
+                frames.setdefault(key, []).append(entry)
     except (KeyError, TypeError) as error:
         words = f"no {error.args[0]!s:.80}" if isinstance(error, KeyError) else str(error)
         raise DataError(
             f"{path}: not COCO's format of images and masks: {' '.join(words.split())}"
         ) from None
     return frames
+
+
+def _keys(file: Path) -> tuple[str, ...]:
+    """Return the names of an image file: FRAME, and for one of several cameras CAMERA/FRAME."""
+    folder = file.parent.name
+    return (file.stem, f"{folder}/{file.stem}") if folder else (file.stem,)
 
 
 def _object_list(path: Path, document: Any) -> list[Mapping[str, Any]]:

@@ -10,7 +10,7 @@ from curate.datasets.formats.images import decode_image
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import SemanticMap, image_size_of
 from curate.segmenters.classes import checked_classes, describe_unexpected_ids
 
 _MAX_CLASSES = 256
@@ -20,7 +20,7 @@ class SavedSegmenter:
     """A `Segmenter` that reads DIRECTORY/FRAME.png with a single channel: a class id per pixel.
 
     Args:
-        directory: the folder of the maps.
+        directory: the folder of the maps FRAME.png, or CAMERA/FRAME.png for several cameras.
         classes: the class ids that count for each category.
         divisor: for 16-bit maps of class * divisor + instance number: 1000 for Cityscapes'
             instanceIds, 256 for KITTI's. A value below the divisor is a class id without instance.
@@ -55,9 +55,9 @@ class SavedSegmenter:
             DataError: if the map is missing, has another size than the frame's image, or contains
                 ids that its class set does not have.
         """
-        path = self.directory / f"{frame.frame_id}.png"
+        path = self.directory / frame.camera / f"{frame.frame_id}.png"
         class_ids = self._class_ids(path, decode_image(path, cv2.IMREAD_UNCHANGED))
-        width, height = frame.image_size
+        width, height = image_size_of(frame)
         if class_ids.shape != (height, width):
             raise DataError(
                 f"{path}: the map is {class_ids.shape[1]} x {class_ids.shape[0]} pixels, "

@@ -2,14 +2,14 @@
 
 Source: Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the readme of its
 object development kit. Two layouts are supported:
-ROOT/training/{velodyne,image_2,calib,label_2} and ROOT/{velodyne,image_2,calib,label_2}. label_2
-and ROOT/ImageSets/*.txt are optional.
+ROOT/training/{velodyne,image_2,calib,label_2} and ROOT/{velodyne,image_2,calib,label_2}. image_2,
+label_2 and ROOT/ImageSets/*.txt are optional.
 """
 
 import io
 import logging
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from curate.datasets.formats.containment import Boundary, check_frame_id
-from curate.datasets.formats.images import read_sized_image
+from curate.datasets.formats.images import check_image_size, read_optional_image
 from curate.datasets.kitti.labels import read_objects, to_annotations
 from curate.detections import Annotations
-from curate.errors import DataError
+from curate.errors import ConfigError, DataError
 from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles
@@ -46,15 +46,24 @@ class KittiDataset:
 
     Args:
         root: the folder that contains training/velodyne or velodyne.
+        image_size: width and height in pixels of the calibrated camera's image, for a data set
+            without images; without it, such a data set has no camera.
         follow_links: whether links may lead out of the root.
 
     Raises:
         DataError: if the root contains neither.
+        ConfigError: if the image size is invalid, or given for a data set with images.
     """
 
     name = "kitti"
 
-    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
+    def __init__(
+        self,
+        root: StrPath,
+        *,
+        image_size: Sequence[int] | None = None,
+        follow_links: bool = False,
+    ) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         homes = [self.root / "training", self.root]
@@ -66,6 +75,8 @@ class KittiDataset:
             )
         self._home = home
         self._folders = [home / name for name in ("velodyne", "image_2", "calib", "label_2")]
+        self._has_images = contains_images(home / "image_2")
+        self._image_size = image_size_option(image_size, self._has_images, home / "image_2")
 
     def frame_ids(self) -> tuple[str, ...]:
         """Return the ids of all frames with a velodyne file, sorted."""
@@ -104,7 +115,9 @@ class KittiDataset:
         label = label_2 / f"{frame_id}.txt"
         files = FrameFiles(
             points=velodyne / f"{frame_id}.bin",
-            image=next((image for image in images if image.exists()), images[0]),
+            image=next((image for image in images if image.exists()), images[0])
+            if self._has_images
+            else None,
             calibration=calib / f"{frame_id}.txt",
             label=label if label.exists() else None,
         )
@@ -138,7 +151,7 @@ class KittiDataset:
         files = self.files(frame_id)
         sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
         calibration = read_calibration(files.calibration)
-        size, pixels = read_sized_image(files.image, pixels=image)
+        size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
@@ -293,6 +306,29 @@ def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
         for entry in entries:
             if not entry.name.startswith(".") and fnmatchcase(entry.name, pattern):
                 yield folder / entry.name
+
+
+def contains_images(folder: Path) -> bool:
+    """Return whether a folder exists and contains a PNG or JPEG."""
+    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in visible_files(folder, "*"))
+
+
+def image_size_option(
+    size: Sequence[int] | None, has_images: bool, place: Path
+) -> tuple[int, int] | None:
+    """Return the option `image_size` of a data set without images; None if it is not given.
+
+    Raises:
+        ConfigError: if it is not a size, or the data set has images.
+    """
+    if size is None:
+        return None
+    if has_images:
+        raise ConfigError(
+            f"dataset.options.image_size is for data sets without images, but {place} contains "
+            "some; remove the option"
+        )
+    return check_image_size(size, "dataset.options.image_size")
 
 
 def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str, ...]]:

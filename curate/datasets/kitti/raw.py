@@ -6,15 +6,18 @@ A frame id is the drive and the number: 2011_09_26_drive_0001_sync_0000000005. D
 contain labels in the format of the KITTI object data set.
 """
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from curate.datasets.formats.containment import Boundary, check_frame_id
-from curate.datasets.formats.images import read_sized_image
+from curate.datasets.formats.images import read_optional_image
 from curate.datasets.kitti.dataset import (
+    contains_images,
+    image_size_option,
     parse_matrix,
     read_bytes,
     read_frame_lists,
@@ -27,6 +30,8 @@ from curate.errors import DataError
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles
 
+_log = logging.getLogger(__name__)
+
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
 _TO_CAMERA, _CAMERAS = "calib_velo_to_cam.txt", "calib_cam_to_cam.txt"
 # The root is a date folder with drives, or a folder of date folders.
@@ -34,10 +39,11 @@ _DRIVES = ("*", "*/*")
 
 
 class KittiRawDataset:
-    """A `Dataset` of synced drives; frames without an image are skipped.
+    """A `Dataset` of synced drives; if there are images, frames without one are skipped.
 
     Args:
         root: a date folder with drives, or a folder of date folders.
+        image_size: see `KittiDataset`.
         follow_links: whether links may lead out of the root.
 
     Raises:
@@ -46,7 +52,13 @@ class KittiRawDataset:
 
     name = "kitti-raw"
 
-    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
+    def __init__(
+        self,
+        root: StrPath,
+        *,
+        image_size: Sequence[int] | None = None,
+        follow_links: bool = False,
+    ) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         drives = (
@@ -61,19 +73,33 @@ class KittiRawDataset:
                 f"also contains {_TO_CAMERA}, or to the folder of all dates"
             )
 
+        self._has_images = any(contains_images(path / _IMAGES) for path in self._drives.values())
+        self._image_size = image_size_option(image_size, self._has_images, self.root)
+
     def frame_ids(self) -> tuple[str, ...]:
-        """Return the ids of all frames with points and image, sorted."""
+        """Return the ids of all frames with points, and with an image if there are any, sorted."""
         return tuple(self._frames)
 
     @cached_property
     def _frames(self) -> Mapping[str, tuple[Path, str]]:
         """The folder of the drive and the number of each frame."""
-        frames = {
+        swept = {
             f"{drive}_{points.stem}": (folder, points.stem)
             for drive, folder in self._drives.items()
             for points in visible_files(folder / _POINTS, "*.bin")
-            if (folder / _IMAGES / f"{points.stem}.png").exists()
         }
+        frames = {
+            frame: (folder, number)
+            for frame, (folder, number) in swept.items()
+            if not self._has_images or (folder / _IMAGES / f"{number}.png").exists()
+        }
+        if len(frames) < len(swept):
+            _log.warning(
+                "%s: %d of %d frames have no image; these frames are skipped",
+                self.root,
+                len(swept) - len(frames),
+                len(swept),
+            )
         return dict(sorted(frames.items()))
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
@@ -97,7 +123,7 @@ class KittiRawDataset:
         label = drive / "label_2" / f"{number}.txt"
         files = FrameFiles(
             points=drive / _POINTS / f"{number}.bin",
-            image=drive / _IMAGES / f"{number}.png",
+            image=drive / _IMAGES / f"{number}.png" if self._has_images else None,
             calibration=drive.parent / _TO_CAMERA,
             label=label if label.exists() else None,
         )
@@ -113,7 +139,7 @@ class KittiRawDataset:
         files = self.files(frame_id)
         sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
         calibration = read_raw_calibration(files.calibration.parent)
-        size, pixels = read_sized_image(files.image, pixels=image)
+        size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:

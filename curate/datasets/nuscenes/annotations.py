@@ -4,7 +4,7 @@ Only the records of the requested frame are parsed as JSON; the table is indexed
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -23,9 +23,9 @@ from curate.datasets.nuscenes.tables import (
 )
 from curate.detections import Annotations, as_categories
 from curate.errors import DataError
-from curate.frames import Calibration
+from curate.frames import Calibration, Camera
 from curate.geometry.poses import boxes_in_frame
-from curate.geometry.projection import image_rectangles
+from curate.geometry.projection import camera_of_boxes, image_rectangles
 from curate.geometry.similarity import wrap_angle
 
 # KITTI's occlusion level for nuScenes' visibility token (up to 40, 60, 80, 100 percent visible).
@@ -52,34 +52,36 @@ class AnnotationTable:
         self.rename = rename
         self.minimum_points = minimum_points
 
-    def read(
-        self, token: str, calibration: Calibration, image_size: tuple[int, int]
-    ) -> Annotations:
-        """Return the objects of a frame in the camera's view, in the order of the table.
+    def read(self, token: str, cameras: Sequence[Camera]) -> Annotations:
+        """Return the objects of a frame that any of its cameras sees, in the order of the table.
+
+        An object's truncation, alpha and 2D box are those in the camera that shows most of it.
 
         Args:
             token: sample token of the frame.
-            calibration: calibration of the frame, with the pose of the LiDAR.
-            image_size: (width, height) in pixels.
+            cameras: cameras of the frame; their calibrations contain the pose of the LiDAR.
 
         Raises:
             DataError: if a table is missing or damaged, or a record is invalid.
         """
         records = [record for record in self._records(token) if self._has_enough_points(record)]
-        boxes = self._boxes(records, calibration)
+        boxes = self._boxes(records, cameras[0].calibration)
         categories = as_categories([self._category(record) for record in records])
         visibilities = [str(record.get("visibility_token")) for record in records]
         levels = [_OCCLUSION.get(visibility, _UNKNOWN) for visibility in visibilities]
-        rectangles = image_rectangles(boxes, calibration, image_size)
+        truncated, alpha = np.ones(len(boxes)), np.zeros(len(boxes))
+        rectangles = np.full((len(boxes), 4), np.nan)
+        shown_by = camera_of_boxes(boxes, cameras)
+        for number, camera in enumerate(cameras):
+            shown = shown_by == number
+            calibration, size = camera.calibration, camera.image_size
+            rectangles[shown] = image_rectangles(boxes[shown], calibration, size)
+            truncated[shown] = _truncation(boxes[shown], rectangles[shown], calibration, size)
+            alpha[shown] = _observation_angles(boxes[shown], calibration)
         objects = Annotations(
-            boxes,
-            categories,
-            _truncation(boxes, rectangles, calibration, image_size),
-            np.array(levels, dtype=np.int64),
-            _observation_angles(boxes, calibration),
-            rectangles,
+            boxes, categories, truncated, np.array(levels, dtype=np.int64), alpha, rectangles
         )
-        return objects.select(~np.isnan(rectangles).any(axis=1))
+        return objects.select(shown_by >= 0)
 
     def _records(self, token: str) -> list[Record]:
         with self.path.open("rb") as file:
