@@ -29,6 +29,8 @@ _MIN_POINTS = 20
 # Limits the influence of a single near box.
 _MAX_POINTS_PER_BOX = 100
 _TOP_BOXES = 20
+# Share of boxes outside the image above which they are reported: some are cut by its border.
+_OUTSIDE_LIMIT = 0.1
 
 _Conversion = Callable[[np.ndarray], np.ndarray]
 
@@ -130,7 +132,10 @@ def _projections(frame: Frame, found: Detections) -> Finding:
     summary = f"{outside} of {len(found)} boxes project outside the image"
     if outside == len(found):
         return Finding("image", "wrong", summary)
-    return Finding("image", "suspect" if outside > len(found) / 2 else "ok", summary)
+    if outside > _OUTSIDE_LIMIT * len(found):
+        evidence = "no image evidence can confirm or refute them (semantic.outside)"
+        return Finding("image", "suspect", f"{summary}: {evidence}")
+    return Finding("image", "ok", summary)
 
 
 def _convention(frame: Frame, found: Detections) -> Finding:

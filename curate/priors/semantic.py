@@ -19,7 +19,10 @@ from curate.segmenters.base import Segmenter, SemanticMap, image_size_of
 from curate.shapes import Float, Int, Num, Shaped
 
 Mean = Literal["geometric", "product", "arithmetic"]
-Outside = Literal["neutral", "drop"]
+Outside = Literal["expected", "neutral", "drop"]
+
+EXPECTED_SHARE = 0.7
+"""S/A of a correct label that no camera shows: the median of correct labels on KITTI's frames."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +31,13 @@ class SemanticSettings:
 
     Attributes:
         mean: "geometric" for sqrt(s S/A), "product" for s S/A, "arithmetic" for (s + S/A) / 2.
-        outside: rho_anno of a box outside the image: s for "neutral", 0 for "drop".
+        outside: rho_anno of a box that no camera shows: 0.7 s^2 for "expected", s for "neutral", 0
+            for "drop". The first is s times the expected share, which is 0.7 for a correct label;
+            s takes the place of the probability that the label is correct.
     """
 
     mean: Mean = "geometric"
-    outside: Outside = "neutral"
+    outside: Outside = "expected"
 
     def __post_init__(self) -> None:
         """Raise ConfigError for an unknown option."""
@@ -137,12 +142,19 @@ class SemanticPrior(EvidenceSource):
         return {**measured, "rho_anno": rho}
 
     def describe(self, row: Mapping[str, Any]) -> str:
-        """Return Eq. 9 with the numbers of one label."""
+        """Return the rule that gave rho_anno, with the numbers of one label."""
+        camera = f"camera {row['camera']}: " if row.get("camera") not in (None, "none") else ""
+        if row["box_pixels"] == 0:
+            rule = {
+                "expected": f"{EXPECTED_SHARE:g} s^2", "neutral": "s", "drop": "0",
+            }[self.settings.outside]  # fmt: skip
+            outside = f"no image shows the box, so outside = '{self.settings.outside}' applies"
+            return f"{outside}: rho_anno = {rule} with s = {{score}} = {{rho_anno}}".format(**row)
         formula = {
             "geometric": "sqrt(s S/A)", "product": "s S/A", "arithmetic": "(s + S/A) / 2",
         }[self.settings.mean]  # fmt: skip
         numbers = "s = {score}, S = {mask_pixels}, A = {box_pixels} pixels = {rho_anno}"
-        return f"Eq. 9: rho_anno = {formula} with {numbers}".format(**row)
+        return f"{camera}Eq. 9: rho_anno = {formula} with {numbers}".format(**row)
 
 
 def semantic_trust(
@@ -159,7 +171,10 @@ def semantic_trust(
         rho = scores * share
     else:
         rho = (scores + share) / 2
-    return np.where(box_pixels > 0, rho, scores if settings.outside == "neutral" else 0.0)
+    outside = {
+        "expected": EXPECTED_SHARE * scores**2, "neutral": scores, "drop": np.zeros(len(scores)),
+    }[settings.outside]  # fmt: skip
+    return np.where(box_pixels > 0, rho, outside)
 
 
 def count_pixels(

@@ -8,6 +8,7 @@ from curate.errors import ConfigError
 from curate.files.atomic import replace_file
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
+from curate.geometry.projection import camera_of_boxes
 from curate.viewing.bird_eye import draw_bird_eye
 from curate.viewing.canvas import Canvas, save_png
 from curate.viewing.chart_style import ImageFormat
@@ -88,6 +89,7 @@ def shown_labels(workspace: Workspace, frame: Frame, found: FrameBoxes, policy: 
         count_points_in_boxes(frame.points, labels.boxes),
         zero_weight_of(workspace.config, policy),
         found.numbers,
+        unseen=camera_of_boxes(labels.boxes, frame.cameras) < 0 if frame.cameras else None,
     )
 
 

@@ -37,6 +37,7 @@ from pipelines.engine.stage import (
 from pipelines.labels.sources import Source, prepare_stage, source_of, sources_of
 from pipelines.registry import PRIORS
 from pipelines.workspace.config import Config
+from pipelines.workspace.images import check_segmentable
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256, stat_fingerprint
 
 
@@ -171,6 +172,8 @@ def stages(names: Sequence[str]) -> tuple[FramesStage, ...]:
 
 
 def _check(name: str, workspace: Workspace) -> None:
+    if PRIORS.takes(name, "segmenter"):
+        check_segmentable(workspace.config, workspace.dataset)
     check_prior(workspace.config, name)
 
 

@@ -6,7 +6,6 @@ A frame id is the drive and the number: 2011_09_26_drive_0001_sync_0000000005. D
 contain labels in the format of the KITTI object data set.
 """
 
-import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -29,8 +28,6 @@ from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles
-
-_log = logging.getLogger(__name__)
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
 _TO_CAMERA, _CAMERAS = "calib_velo_to_cam.txt", "calib_cam_to_cam.txt"
@@ -83,24 +80,28 @@ class KittiRawDataset:
     @cached_property
     def _frames(self) -> Mapping[str, tuple[Path, str]]:
         """The folder of the drive and the number of each frame."""
-        swept = {
+        frames = {
+            frame: (folder, number)
+            for frame, (folder, number) in self._sweeps.items()
+            if not self._has_images or (folder / _IMAGES / f"{number}.png").exists()
+        }
+        return dict(sorted(frames.items()))
+
+    @cached_property
+    def _sweeps(self) -> Mapping[str, tuple[Path, str]]:
+        """The same for all point files, with or without an image."""
+        return {
             f"{drive}_{points.stem}": (folder, points.stem)
             for drive, folder in self._drives.items()
             for points in visible_files(folder / _POINTS, "*.bin")
         }
-        frames = {
-            frame: (folder, number)
-            for frame, (folder, number) in swept.items()
-            if not self._has_images or (folder / _IMAGES / f"{number}.png").exists()
-        }
-        if len(frames) < len(swept):
-            _log.warning(
-                "%s: %d of %d frames have no image; these frames are skipped",
-                self.root,
-                len(swept) - len(frames),
-                len(swept),
-            )
-        return dict(sorted(frames.items()))
+
+    def skipped_frames(self) -> str:
+        """Return how many frames are skipped because they have no image; "" if none is."""
+        count = len(self._sweeps) - len(self._frames)
+        return (
+            f"{count} of {len(self._sweeps)} frames have no image and are skipped" if count else ""
+        )
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in ROOT/ImageSets by file name."""

@@ -6,7 +6,6 @@ in nuScenes' result files. Point files have five float32 per point; the fifth, t
 dropped. Intensities are 0 to 255.
 """
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -31,8 +30,6 @@ from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Camera, Frame, FrameFiles
-
-_log = logging.getLogger(__name__)
 
 _COLUMNS, _FULL_INTENSITY = 5, 255.0
 
@@ -120,8 +117,14 @@ class NuScenesDataset:
                     f"{self.root}: {missing} are missing, such as {first}; set the root to the "
                     "folder with samples/"
                 )
-            _log.info("%s: %s are missing; these frames are skipped", self.root, missing)
         return present, has_images
+
+    def skipped_frames(self) -> str:
+        """Return how many key frames are skipped because files are missing; "" if none is."""
+        total = len(self._keyframes)
+        count = total - len(self._present[0])
+        missing = f"the files of {count} of {total} key frames are missing; these are skipped"
+        return missing if count else ""
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the official lists train and val of v1.0-trainval and v1.0-mini.
