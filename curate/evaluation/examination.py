@@ -13,7 +13,7 @@ import numpy as np
 from curate.detections import Detections
 from curate.frames import Calibration, Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes, points_in_box_mask
-from curate.geometry.projection import image_rectangles, in_view
+from curate.geometry.projection import box_rectangles, in_camera_view
 from curate.geometry.similarity import wrap_angle
 
 # Limits of the ratio gained points / lost points, above which a conversion is reported. Measured on
@@ -29,6 +29,8 @@ _MIN_POINTS = 20
 # Limits the influence of a single near box.
 _MAX_POINTS_PER_BOX = 100
 _TOP_BOXES = 20
+# Share of boxes outside the image above which they are reported: some are cut by its border.
+_OUTSIDE_LIMIT = 0.1
 
 _Conversion = Callable[[np.ndarray], np.ndarray]
 
@@ -63,7 +65,7 @@ def examine_frame(frame: Frame) -> list[Finding]:
     )
     tall = np.ptp(frame.points[:, 2]) > max(np.ptp(frame.points[:, 0]), np.ptp(frame.points[:, 1]))
     intensity = float(frame.points[:, 3].max())
-    seen = float(in_view(frame.points, frame.calibration, frame.image_size).mean())
+    seen = float(in_camera_view(frame).mean())
     return [
         Finding("points", "ok", f"{count} points, {ranges} m")
         if not tall
@@ -73,7 +75,9 @@ def examine_frame(frame: Frame) -> list[Finding]:
         else Finding(
             "intensity", "suspect", f"up to {intensity:.2f}: expected in [0, 1], not all 0"
         ),
-        Finding("calibration", "ok", f"{seen:.0%} of the points appear in the image")
+        Finding("camera", "ok", "none: nothing is compared with images")
+        if not frame.cameras
+        else Finding("calibration", "ok", f"{seen:.0%} of the points appear in the image")
         if seen > 0.02
         else Finding(
             "calibration", "wrong", f"{seen:.1%} of the points appear in the image: is x forward, "
@@ -97,7 +101,7 @@ def examine_detections(frame: Frame, found: Detections, categories: Sequence[str
         Finding("detections", "ok", f"{len(found)} boxes, scores {low:.2f} to {high:.2f}"),
         _names(found, categories),
         _points(frame, found),
-        _projections(frame, found),
+        *([_projections(frame, found)] if frame.cameras else []),
         _convention(frame, found),
     ]
 
@@ -123,12 +127,15 @@ def _points(frame: Frame, found: Detections) -> Finding:
 
 
 def _projections(frame: Frame, found: Detections) -> Finding:
-    rectangles = image_rectangles(found.boxes, frame.calibration, frame.image_size)
+    rectangles = box_rectangles(found.boxes, frame)
     outside = int(np.isnan(rectangles).any(axis=1).sum())
     summary = f"{outside} of {len(found)} boxes project outside the image"
     if outside == len(found):
         return Finding("image", "wrong", summary)
-    return Finding("image", "suspect" if outside > len(found) / 2 else "ok", summary)
+    if outside > _OUTSIDE_LIMIT * len(found):
+        evidence = "no image evidence can confirm or refute them (semantic.outside)"
+        return Finding("image", "suspect", f"{summary}: {evidence}")
+    return Finding("image", "ok", summary)
 
 
 def _convention(frame: Frame, found: Detections) -> Finding:

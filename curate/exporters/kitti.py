@@ -47,7 +47,7 @@ class WeightedFrame:
         ignored: (n,) bool, True for labels of weight 0 that are regions to ignore; the others of
             weight 0 are background.
         calibration: calibration of the frame.
-        image_size: (width, height) in pixels.
+        image_size: (width, height) in pixels; None without a camera.
     """
 
     frame_id: str
@@ -55,7 +55,7 @@ class WeightedFrame:
     weights: np.ndarray
     ignored: np.ndarray
     calibration: Calibration
-    image_size: tuple[int, int]
+    image_size: tuple[int, int] | None
 
 
 class KittiExporter:

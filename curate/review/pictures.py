@@ -42,11 +42,7 @@ class NumberedLabels(ShownLabels):
 
 
 def draw_review(frame: Frame, shown: ShownFrame, *, title: str = "") -> np.ndarray:
-    """Draw the numbered boxes, human labels dashed; return (height, width, 3) uint8 RGB.
-
-    Raises:
-        DataError: if the frame has no image.
-    """
+    """Draw the numbered boxes, human labels dashed; return (height, width, 3) uint8 RGB."""
     human = np.array([box.human for box in shown.boxes], dtype=bool)
     labels = NumberedLabels(
         shown.array,

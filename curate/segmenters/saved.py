@@ -11,7 +11,7 @@ from curate.datasets.frame_names import files_by_frame
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import SemanticMap, image_size_of
 from curate.segmenters.classes import checked_classes, describe_unexpected_ids
 
 _MAX_CLASSES = 256
@@ -21,7 +21,8 @@ class SavedSegmenter:
     """A `Segmenter` that reads DIRECTORY/FRAME.png with a single channel: a class id per pixel.
 
     Args:
-        directory: the folder of the maps; if none is in it, they are in its subfolders.
+        directory: the folder of the maps, or of folders CAMERA of maps for several cameras; if
+            no map is in it, they are in its subfolders.
         classes: the class ids that count for each category.
         divisor: for 16-bit maps of class * divisor + instance number: 1000 for Cityscapes'
             instanceIds, 256 for KITTI's. A value below the divisor is a class id without instance.
@@ -51,7 +52,17 @@ class SavedSegmenter:
         self.divisor = divisor
         if not self.directory.is_dir():
             raise DataError(f"{self.directory}: no such folder of semantic maps")
-        self._maps = files_by_frame(self.directory, "*.png", frame_ids)
+        self._frame_ids = frame_ids
+        self._found: dict[str, Mapping[str, Path]] = {}
+        if next(self.directory.glob("*.png"), None):
+            self._maps("")
+
+    def _maps(self, camera: str) -> Mapping[str, Path]:
+        """Return the map of each frame from a camera; "" for the only one."""
+        if camera not in self._found:
+            folder = self.directory / camera
+            self._found[camera] = files_by_frame(folder, "*.png", self._frame_ids)
+        return self._found[camera]
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's saved map.
@@ -60,9 +71,11 @@ class SavedSegmenter:
             DataError: if the map is missing, has another size than the frame's image, or contains
                 ids that its class set does not have.
         """
-        path = self._maps.get(frame.frame_id, self.directory / f"{frame.frame_id}.png")
+        path = self._maps(frame.camera).get(
+            frame.frame_id, self.directory / frame.camera / f"{frame.frame_id}.png"
+        )
         class_ids = self._class_ids(path, decode_image(path, cv2.IMREAD_UNCHANGED))
-        width, height = frame.image_size
+        width, height = image_size_of(frame)
         if class_ids.shape != (height, width):
             raise DataError(
                 f"{path}: the map is {class_ids.shape[1]} x {class_ids.shape[0]} pixels, "

@@ -13,6 +13,8 @@ TITLE_HEIGHT = 36
 REPREDICTION_DASHES = (6.0, 4.0)
 TRUTH_DOTS = (1.5, 3.0)
 HUMAN_DASHES = (12.0, 3.0)
+# Width of the cross in a label that no camera shows.
+UNSEEN_STROKE = 1.0
 
 _BAR_PIXELS = 120
 _GAP = 24.0
@@ -35,6 +37,7 @@ def draw_legend(
     repredictions: bool = False,
     unweighted: bool = False,
     human: bool = False,
+    unseen: bool = False,
     style: Style = DARK,
 ) -> None:
     """Draw the strip at the bottom: the weight scale, and the line styles that are used."""
@@ -55,6 +58,10 @@ def draw_legend(
             _swatch(canvas, (left, baseline), colour, pattern)
             canvas.text(left + 28, baseline, name, style.text)
             left += 28 + canvas.text_width(name) + _GAP
+    if unseen:
+        outline = _swatch(canvas, (left, baseline), style.text, None)
+        canvas.lines(outline[[[0, 2], [1, 3]]], style.text, UNSEEN_STROKE)
+        canvas.text(left + 28, baseline, "no image evidence", style.text)
 
 
 def _weight_bar(canvas: Canvas, left: float, top: float, baseline: float, style: Style) -> float:
@@ -75,7 +82,8 @@ def _swatch(
     place: tuple[float, float],
     colour: Colour,
     pattern: tuple[float, float] | None,
-) -> None:
+) -> np.ndarray:
+    """Draw an outline and return its (4, 2) corners."""
     corners = np.array([[0, -10], [20, -10], [20, 1], [0, 1]])
     outline = corners + np.array(place)
     if pattern is None:
@@ -83,3 +91,4 @@ def _swatch(
     else:
         sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
         canvas.dashes(sides, colour, 1.5, pattern)
+    return outline

@@ -70,6 +70,7 @@ class FrameContent:
             repredictions=self.repredictions is not None,
             unweighted=bool(np.isnan(self.labels.weights).any()),
             human=self.human_boxes is not None and len(self.human_boxes) > 0,
+            unseen=self.labels.unseen is not None and bool(self.labels.unseen.any()),
             style=self.style,
         )
 

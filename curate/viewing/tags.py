@@ -34,6 +34,7 @@ class ShownLabels:
         points: (n,) LiDAR points inside each box; None if they were not counted.
         zero_weight: the meaning of weight 0, for the legend.
         numbers: (n,) k of each label in its frame; None for 0 to n - 1.
+        unseen: (n,) bool, labels that no camera of the frame shows; None if there is no camera.
     """
 
     boxes: np.ndarray
@@ -43,6 +44,7 @@ class ShownLabels:
     points: np.ndarray | None = None
     zero_weight: ZeroWeight = "background"
     numbers: np.ndarray | None = None
+    unseen: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.boxes)

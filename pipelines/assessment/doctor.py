@@ -8,6 +8,7 @@ from curate.detectors.base import RecordedViews
 from curate.errors import ConfigError, CurateError
 from curate.evaluation.examination import Finding, examine_detections, examine_frame
 from curate.frames import Frame
+from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
 from pipelines.engine.rounds import newest_checkpoint
 from pipelines.stages.predict import checked, visible
@@ -87,8 +88,14 @@ def _no_views(config: Config) -> Finding:
 
 
 def _segmenter(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
-    found = open_segmenter(workspace.config).segment(frame)
-    width, height = frame.image_size
+    segmenter = open_segmenter(workspace.config)
+    return [found for view in frame.views() for found in _map(workspace, segmenter, view)]
+
+
+def _map(workspace: Workspace, segmenter: Segmenter, view: Frame) -> Sequence[Finding]:
+    """Check the semantic map of a frame with one camera."""
+    found = segmenter.segment(view)
+    width, height = image_size_of(view)
     if found.class_ids.shape != (height, width):
         shape = list(found.class_ids.shape)
         message = f"the map is {shape}, the image [{height}, {width}]"
@@ -104,4 +111,5 @@ def _segmenter(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     }
     summary = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
     state = "ok" if any(shares.values()) else "suspect"
-    return [Finding("segmenter", state, f"share of the pixels: {summary}")]
+    camera = f"{view.camera}: " if view.camera else ""
+    return [Finding("segmenter", state, f"{camera}share of the pixels: {summary}")]

@@ -1,11 +1,15 @@
 """Evaluate a detector on the val split, which is never trained on."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from curate.datasets.kitti.labels import KittiObjects, from_annotations, from_detections
 from curate.detections import Detections
 from curate.errors import FramesFailed, WorkspaceError
+from curate.geometry.projection import box_rectangles
 from pipelines.engine.executors.base import FrameJob
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
@@ -77,5 +81,7 @@ def val_objects(workspace: Workspace, found: Mapping[str, Detections]) -> ValObj
     for name, annotations in truth.items():
         frame = workspace.dataset.read(name, points=False)
         labels.append(from_annotations(annotations, frame.calibration))
-        results.append(from_detections(found[name], frame.calibration, frame.image_size))
+        objects = from_detections(found[name], frame.calibration, frame.image_size)
+        rectangles = box_rectangles(found[name].boxes, frame)
+        results.append(replace(objects, boxes_2d=np.where(np.isnan(rectangles), -1.0, rectangles)))
     return labels, results

@@ -209,7 +209,7 @@ def from_annotations(annotations: Annotations, calibration: Calibration) -> Kitt
 
 
 def from_detections(
-    detections: Detections, calibration: Calibration, image_size: tuple[int, int]
+    detections: Detections, calibration: Calibration, image_size: tuple[int, int] | None
 ) -> KittiObjects:
     """Return detections as KITTI objects, in the same order.
 
@@ -220,7 +220,8 @@ def from_detections(
     Args:
         detections: boxes in the LiDAR frame.
         calibration: calibration of the frame.
-        image_size: (width, height) of the image in pixels.
+        image_size: (width, height) of the image in pixels; None if there is no image, so that
+            nothing is clipped.
     """
     dimensions, locations, rotations_y = _boxes_camera(detections.boxes, calibration)
     boxes_2d = image_rectangles(detections.boxes, calibration, image_size)

@@ -1,5 +1,6 @@
 """KITTI tracking: sequences, label lines with frame and track, and skipped frames."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -85,12 +86,25 @@ def test_an_invalid_line_is_reported(tmp_path: Path, line: str, message: str) ->
         KittiTrackingDataset(tmp_path).annotations("0000_000000")
 
 
-def test_skipped_frames_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_skipped_frames_are_counted(tmp_path: Path) -> None:
     write_toy_tracking(tmp_path)
     for number in ("000000", "000001"):
         (tmp_path / "training" / "image_02" / "0001" / f"{number}.png").unlink()
-    assert len(KittiTrackingDataset(tmp_path).frame_ids()) == 2
-    assert "2 of 4 frames have no image in image_02/SEQUENCE; these frames" in caplog.text
+    dataset = KittiTrackingDataset(tmp_path)
+    assert dataset.frame_ids() == ("0000_000000", "0000_000001")
+    assert dataset.skipped_frames() == "2 of 4 frames have no image and are skipped"
+
+
+def test_without_images_there_is_no_camera(tmp_path: Path) -> None:
+    """Unless the size of the image is given."""
+    write_toy_tracking(tmp_path)
+    shutil.rmtree(tmp_path / "training" / "image_02")
+    dataset = KittiTrackingDataset(tmp_path)
+    assert len(dataset.frame_ids()) == 4
+    assert dataset.files("0000_000000").image is None
+    assert dataset.read("0000_000000").cameras == ()
+    (camera,) = KittiTrackingDataset(tmp_path, image_size=[120, 40]).read("0000_000000").cameras
+    assert camera.image_size == (120, 40)
 
 
 def test_lists_of_the_sequence_are_read(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """tracklet_labels.xml of KITTI raw, compared with an independent calculation."""
 
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,13 @@ def test_states_become_kittis_levels(tmp_path: Path) -> None:
     assert truth.occluded.tolist() == [1, 2, 3, 0]
     assert truth.truncated[:3].tolist() == [0, 0, 0]
     assert 0.2 < truth.truncated[3] < 0.8
+
+
+def test_without_images_all_objects_are_kept(tmp_path: Path) -> None:
+    write_tracklets(tmp_path, tracklet(pose(tx=10)), tracklet(pose(tx=-15, truncation=3)))
+    shutil.rmtree(tmp_path / DAY / DRIVE / "image_02")
+    truth = KittiRawDataset(tmp_path).annotations(frame(0))
+    assert truth.boxes[:, 0].tolist() == [10, -15]
 
 
 def test_label_files_come_before_tracklets(tmp_path: Path) -> None:
