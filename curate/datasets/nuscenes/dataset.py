@@ -152,12 +152,13 @@ class NuScenesDataset:
 
     def file_names(self) -> Mapping[str, str]:
         """Return the sample token of each name of a sweep or image without suffix."""
-        files = ((file, token) for token in self._present for file in self._names(token))
-        return {Path(file).name.partition(".")[0]: token for file, token in files}
-
-    def _names(self, token: str) -> tuple[str, str]:
-        frame = self._keyframes[token]
-        return frame.points, frame.image
+        names: dict[str, str] = {}
+        for token in self._present[0]:
+            frame = self._keyframes[token]
+            names |= {
+                Path(file).name.partition(".")[0]: token for file in (frame.points, *frame.images)
+            }
+        return names
 
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; calibration and labels are tables of all frames.
