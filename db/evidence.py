@@ -2,7 +2,9 @@
 
 `point_prior` and `semantic_prior` are tables of the schema. Any other source has a table
 `prior_NAME`, which is created when the source is first used, and a row in `evidence_source` with
-its declaration. From these rows the view `weighted_labels` gets its columns after the core ones.
+its declaration. From these rows the view `weighted_labels` gets its columns after the core ones. A
+column of a table of the schema that only some workspaces use, such as the camera of the semantic
+prior, is declared in the same way.
 """
 
 import json
@@ -61,7 +63,9 @@ class Declaration:
 
 
 def evidence_table(declaration: Declaration) -> Table:
-    """Return the table of a source that is not part of the schema."""
+    """Return the table of a source."""
+    if declaration.name in OWN_TABLES:
+        return Base.metadata.tables[declaration.table]
     prediction = Base.metadata.tables["prediction"]
     columns = [
         Column(each.name, _TYPES[each.kind], nullable=each.optional, comment=each.meaning)
@@ -78,7 +82,7 @@ def evidence_table(declaration: Declaration) -> Table:
 
 
 def read_declarations(connection: Connection) -> tuple[Declaration, ...]:
-    """Return the declarations of all sources outside the schema, sorted by name."""
+    """Return the stored declarations, sorted by name."""
     c = _RECORD.c
     rows = connection.execute(select(c.name, c.source, c.columns, c.rho_column).order_by(c.name))
     return tuple(
@@ -100,14 +104,17 @@ def declare(connection: Connection, declaration: Declaration) -> None:
     recreates the views.
     """
     former = {each.name: each for each in read_declarations(connection)}.get(declaration.name)
-    if declaration.name in OWN_TABLES or former == declaration:
+    if former == declaration:
         return
+    own = declaration.name in OWN_TABLES
     if former is not None:
-        connection.execute(DropTable(evidence_table(former)))
+        if not own:
+            connection.execute(DropTable(evidence_table(former)))
         task = Base.metadata.tables["task"]
         connection.execute(task.delete().where(task.c.stage == former.source))
         connection.execute(_RECORD.delete().where(_RECORD.c.name == declaration.name))
-    connection.execute(CreateTable(evidence_table(declaration)))
+    if not own:
+        connection.execute(CreateTable(evidence_table(declaration)))
     row = {
         "name": declaration.name,
         "source": declaration.source,

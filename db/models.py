@@ -94,7 +94,10 @@ class Frame(Base):
     frame: Mapped[str] = mapped_column(comment="frame id within the data set")
     split: Mapped[str] = mapped_column(comment="labeled | unlabeled | val")
     points_path: Mapped[str] = mapped_column(comment="relative to the data set's root")
-    image_path: Mapped[str] = mapped_column(comment="relative to the data set's root")
+    image_path: Mapped[str | None] = mapped_column(
+        sort_order=1,
+        comment="of the first camera, relative to the data set's root; null = no images",
+    )
     calibration_path: Mapped[str] = mapped_column(comment="relative to the data set's root")
     label_path: Mapped[str | None] = mapped_column(
         comment="relative to the data set's root; never for unlabeled frames"
@@ -342,6 +345,11 @@ class SemanticPrior(Base):
         doc="pixels of the projected box's rectangle, A; 0 = outside the image",
     )
     rho_anno: Mapped[Share] = mapped_column(doc="trust in [0, 1], Eq. 9")
+    camera: Mapped[str | None] = mapped_column(
+        sort_order=1,
+        comment="of several, the one that shows most of the box; null = one camera, or none shows "
+        "it",
+    )
 
 
 class EvidenceSource(Base):

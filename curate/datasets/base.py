@@ -55,6 +55,15 @@ class FileNamed(Protocol):
         ...
 
 
+@runtime_checkable
+class Incomplete(Protocol):
+    """A data set that skips frames with missing files."""
+
+    def skipped_frames(self) -> str:
+        """Return how many frames are skipped because of which files; "" if none is."""
+        ...
+
+
 def sequences_of(dataset: Dataset, frames: Iterable[str]) -> Mapping[str, str]:
     """Return the sequence of each frame, without frames of unknown sequence."""
     if not isinstance(dataset, Sequenced):

@@ -1,9 +1,9 @@
-"""A reader of any folder of point files and images with a single calibration.
+"""A reader of any folder of point files, with the images of no, one or several cameras.
 
 The file ROOT/dataset.toml describes the folder:
 
 points = "lidar"              # folder of FRAME.bin, .pcd, .ply or .npy
-images = "camera"             # folder of FRAME.png or .jpg; if there are no images, instead:
+images = "camera"             # folder of FRAME.png or .jpg; if there are no images, optionally:
 # image_size = [1242, 375]    # width and height in pixels of the calibrated camera's image
 labels = "label_2"            # optional: folder of KITTI label files of the labeled frames
 splits = "lists"              # optional: folder of train.txt, val.txt
@@ -17,10 +17,21 @@ intensity_scale = 255.0       # the value of full intensity in the files
                               # or calibration = "calib", a folder of such files FRAME.txt
 projection = [[...], [...], [...]]             # 3 x 4, camera (z forward) to pixels
 lidar_to_camera = [[...], [...], [...]]        # 3 x 4 or 4 x 4, LiDAR (x forward) to camera
+
+Several cameras each have a table [cameras.NAME] with images (or image_size) and calibration, in
+place of the keys of the same names above. The labels are in the frame of the first camera. Without
+images, image_size and cameras, there is no camera; calibration is then only needed for labels.
+
+[cameras.left]
+images = "left"
+[cameras.left.calibration]
+projection = [[...], [...], [...]]
+lidar_to_camera = [[...], [...], [...]]
 """
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,7 +41,7 @@ import numpy as np
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES, read_cloud
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder
-from curate.datasets.formats.images import read_sized_image
+from curate.datasets.formats.images import check_image_size, read_optional_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.dataset import checked_frames, read_frame_lists
@@ -41,16 +52,39 @@ from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
-from curate.frames import Calibration, Frame, FrameFiles
+from curate.frames import Calibration, Camera, Frame, FrameFiles, calibration_without_camera
 from curate.geometry.mounting import RotationY, check_rotation_y
 from curate.spelling import did_you_mean
 
 DESCRIPTION = "dataset.toml"
 _FOLDERS = ("points", "images", "labels", "splits")
 _TEXTS = (*_FOLDERS, "sequence_separator")
+_OF_CAMERA = ("images", "image_size", "calibration")
 # The keys that describe the point files; the settings in [dataset] have the same names.
 _LAYOUT = ("columns", "column_names", "intensity_field", "intensity_scale")
-_KEYS = (*_TEXTS, *_LAYOUT, "image_size", "calibration")
+_KEYS = (*_TEXTS, *_LAYOUT, "image_size", "calibration", "cameras")
+
+
+@dataclass(frozen=True)
+class _CameraTable:
+    """The part of dataset.toml that describes one camera.
+
+    Attributes:
+        name: name of the camera; "" for the only one.
+        images: its images; None if there are none.
+        image_size: (width, height) in pixels of a camera without images; None if it has images.
+        calibration: path of a file in KITTI's format or of a folder with a file FRAME.txt for each
+            frame, or a table of matrices.
+    """
+
+    name: str
+    images: FrameFolder | None
+    image_size: tuple[int, int] | None
+    calibration: Path | Mapping[str, Any]
+
+    def image(self, frame_id: str) -> Path | None:
+        """Return the path of a frame's image, whether it exists or not; None without images."""
+        return None if self.images is None else self.images.path(frame_id)
 
 
 class FolderDataset:
@@ -64,9 +98,7 @@ class FolderDataset:
 
     Raises:
         ConfigError: if `rotation_y` is unknown.
-        DataError: if dataset.toml is missing or malformed, or specifies neither images nor their
-            size. The size is necessary: the camera's field of view decides which points are passed
-            to a detector, and it clips every 2D box.
+        DataError: if dataset.toml is missing or malformed.
         ConfigError: if the layout and dataset.toml contradict each other.
     """
 
@@ -92,30 +124,28 @@ class FolderDataset:
             )
         self._description = _read_description(self._path)
         self._layout = _merged(_described_layout(self._path, self._description), layout, self._path)
-        keys = (*_FOLDERS, "calibration")
-        paths = [self._description[key] for key in keys if key in self._description]
-        self._boundary.check(*(self.root / path for path in paths if isinstance(path, str)))
+        self._cameras = _cameras(self._path, self._description)
+        paths = [self._description[key] for key in _FOLDERS if key in self._description]
+        paths += [camera.images.folder for camera in self._cameras if camera.images]
+        paths += [each.calibration for each in self._cameras if isinstance(each.calibration, Path)]
+        self._boundary.check(*(self.root / path for path in paths))
 
     def frame_ids(self) -> tuple[str, ...]:
         """Return the ids of all frames with a point file, sorted.
 
         Raises:
-            DataError: if there are none, or a frame has two point files or two images.
+            DataError: if there are none, or a frame has two point files or two images of a camera.
         """
         return self._frame_ids
 
     @cached_property
     def _frame_ids(self) -> tuple[str, ...]:
-        return checked_frames(self._points, self._images, self.root, self.name)
+        images = [each.images for each in self._cameras if each.images is not None]
+        return checked_frames(self._points, images, self.root, self.name)
 
     @cached_property
     def _points(self) -> FrameFolder:
         return FrameFolder(self.root / self._description["points"], CLOUD_SUFFIXES, "point")
-
-    @cached_property
-    def _images(self) -> FrameFolder:
-        folder = self.root / self._description.get("images", "images")
-        return FrameFolder(folder, IMAGE_SUFFIXES, "image")
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in the folder `splits`, by file name without suffix.
@@ -137,7 +167,7 @@ class FolderDataset:
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files.
 
-        The paths of image and calibration are returned even if there are no such files.
+        The paths of images and calibration are returned even if there are no such files.
 
         Raises:
             DataError: if there is no such frame, or it has two point files or two images.
@@ -146,12 +176,18 @@ class FolderDataset:
         points = self._points.path(frame_id)
         if frame_id not in self._points:
             raise DataError(f"{self._points.folder}: no point file for frame {frame_id}")
+        images = [each.image(frame_id) for each in self._cameras]
+        calibration = self._description.get("calibration")
+        path = self._path
+        if isinstance(calibration, str):
+            path = _of_frame(self.root / calibration, frame_id)
         label = self._label(frame_id)
         files = FrameFiles(
             points=points,
-            image=self._images.path(frame_id),
-            calibration=self._calibration_path(frame_id),
+            image=images[0] if images else None,
+            calibration=path,
             label=label if label is not None and label.exists() else None,
+            further_images=tuple(image for image in images[1:] if image is not None),
         )
         self._boundary.check(*files.paths())
         return files
@@ -173,25 +209,18 @@ class FolderDataset:
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
             sweep = read_cloud(files.points, self._layout)
-        size, pixels = self._size_and_pixels(files.image, pixels=image)
-        return Frame(frame_id, sweep, self._calibration(files.calibration), size, pixels)
+        found = Frame(frame_id, sweep, self._label_calibration(frame_id), None)
+        if not self._cameras:
+            return found
+        return found.with_cameras([self._camera(each, frame_id, image) for each in self._cameras])
 
-    def _size_and_pixels(
-        self, image: Path, *, pixels: bool
-    ) -> tuple[tuple[int, int], np.ndarray | None]:
-        """Return (width, height) of an image, from dataset.toml if there are none, and its pixels.
-
-        The pixels are None if they are not requested.
-        """
-        if "images" in self._description:
-            return read_sized_image(image, pixels=pixels)
-        if pixels:
-            raise DataError(
-                f"{self._path}: the image of frame {image.stem} is needed, but there is no key "
-                "images; set it to the folder of images"
-            )
-        width, height = self._description["image_size"]
-        return (width, height), None
+    def _camera(self, table: _CameraTable, frame_id: str, pixels: bool) -> Camera:
+        """Return a camera of a frame, with its pixels if requested and if there are images."""
+        image = table.image(frame_id)
+        size, content = read_optional_image(image, table.image_size, pixels=pixels)
+        if size is None:
+            raise DataError(f"{self._path}: the camera of frame {frame_id} has no image size")
+        return Camera(table.name, self._calibration(table.name, frame_id), size, content)
 
     def annotations(self, frame_id: str) -> Annotations:
         """Return the frame's ground truth in the LiDAR frame.
@@ -199,8 +228,8 @@ class FolderDataset:
         Raises:
             DataError: if there is no label file, or it is malformed.
         """
-        files = self.files(frame_id)
-        if files.label is None:
+        label = self.files(frame_id).label
+        if label is None:
             expected = self._label(frame_id)
             if expected is None:
                 raise DataError(
@@ -209,42 +238,38 @@ class FolderDataset:
                 )
             raise DataError(f"{expected}: no such label file")
         return read_annotations(
-            files.label,
-            self._calibration(files.calibration),
+            label,
+            self._label_calibration(frame_id),
             categories=None,
             rotation_y=self._rotation_y,
         )
 
-    def _calibration_path(self, frame_id: str) -> Path:
-        """Return the file with the calibration of a frame."""
-        calibration = self._description["calibration"]
-        if not isinstance(calibration, str):
-            return self._path
-        path = self.root / calibration
-        return path / f"{frame_id}.txt" if self._calibrated_by_frame else path
+    def _label_calibration(self, frame_id: str) -> Calibration:
+        """Return the calibration that the labels refer to: that of the first camera."""
+        if not self._calibrations:
+            return calibration_without_camera()
+        return self._calibration(next(iter(self._calibrations)), frame_id)
+
+    def _calibration(self, camera: str, frame_id: str) -> Calibration:
+        """Return the calibration of a camera in a frame."""
+        found = self._calibrations[camera]
+        return read_calibration(_of_frame(found, frame_id)) if isinstance(found, Path) else found
 
     @cached_property
-    def _calibrated_by_frame(self) -> bool:
-        """Whether the calibration is a folder with a file for each frame."""
-        calibration = self._description["calibration"]
-        return isinstance(calibration, str) and (self.root / calibration).is_dir()
+    def _calibrations(self) -> Mapping[str, Calibration | Path]:
+        """The calibration of each camera by name; without a camera, that of the labels.
 
-    def _calibration(self, path: Path) -> Calibration:
-        """Return the calibration in a file, which is read once if all frames share it."""
-        return read_calibration(path) if self._calibrated_by_frame else self._shared_calibration
-
-    @cached_property
-    def _shared_calibration(self) -> Calibration:
-        calibration = self._description["calibration"]
-        if isinstance(calibration, str):
-            return read_calibration(self.root / calibration)
-        projection = _matrix(self._path, calibration, "projection", ((3, 4),))
-        extrinsic = np.eye(4)
-        rows = _matrix(self._path, calibration, "lidar_to_camera", ((3, 4), (4, 4)))
-        extrinsic[: len(rows)] = rows
-        if abs(np.linalg.det(extrinsic)) < 1e-6:
-            raise DataError(f"{self._path}: calibration.lidar_to_camera cannot be inverted")
-        return Calibration(projection, extrinsic)
+        A folder stands for a file per frame. Calibrations that all frames share are read once.
+        """
+        tables = {each.name: each.calibration for each in self._cameras}
+        if not tables and "calibration" in self._description:
+            tables = {"": _calibration_of(self._path.parent, self._description["calibration"])}
+        return {
+            name: calibration
+            if isinstance(calibration, Path) and calibration.is_dir()
+            else _read_calibration(self._path, _place(name, "calibration"), calibration)
+            for name, calibration in tables.items()
+        }
 
     def _label(self, frame_id: str) -> Path | None:
         if "labels" not in self._description:
@@ -268,30 +293,112 @@ def _read_description(path: Path) -> Mapping[str, Any]:
             f"{path}: unknown key {unknown[0]}; use one of {', '.join(_KEYS)}"
             f"{did_you_mean(unknown[0], _KEYS)}"
         )
-    for key in ("points", "calibration"):
-        if key not in content:
-            raise DataError(f"{path}: no key {key}")
-    if "images" not in content and "image_size" not in content:
-        raise DataError(
-            f"{path}: no key images; data sets without a camera are not supported: the camera's "
-            "field of view selects the points and clips every 2D box; if only the images are "
-            "missing, set image_size = [width, height]"
-        )
-    if "images" in content and "image_size" in content:
-        raise DataError(
-            f"{path}: both images and image_size are set; image_size is only for data sets "
-            "without images, remove one of them"
-        )
+    if "points" not in content:
+        raise DataError(f"{path}: no key points")
+    has_camera = not content.keys().isdisjoint(("images", "image_size"))
+    if (
+        "calibration" not in content
+        and "cameras" not in content
+        and has_camera | ("labels" in content)
+    ):
+        raise DataError(f"{path}: no key calibration")
     invalid = [key for key in _TEXTS if not isinstance(content.get(key, ""), str)]
-    invalid += [] if _is_size(content.get("image_size", [1, 1])) else ["image_size"]
-    if not isinstance(content["calibration"], str | dict):
+    if not isinstance(content.get("calibration", ""), str | dict):
         invalid.append("calibration")
     if invalid:
         raise DataError(
-            f"{path}: invalid value of {invalid[0]}; folders and separators are strings, sizes "
-            "positive numbers, and calibration is a table, a file or a folder"
+            f"{path}: invalid value of {invalid[0]}; folders and separators are strings, and "
+            "calibration is a table, a file or a folder"
         )
     return content
+
+
+def _cameras(path: Path, description: Mapping[str, Any]) -> Sequence[_CameraTable]:
+    """Return the cameras of a description, in its order; empty if it has none.
+
+    Raises:
+        DataError: if the table of a camera is malformed, or cameras are described twice.
+    """
+    tables = description.get("cameras")
+    if tables is None:
+        has_camera = not description.keys().isdisjoint(("images", "image_size"))
+        return [_camera_table(path, "", description)] if has_camera else []
+    shared = [key for key in _OF_CAMERA if key in description]
+    if shared:
+        raise DataError(
+            f"{path}: both {shared[0]} and [cameras.NAME]; move {shared[0]} into the table of its "
+            "camera"
+        )
+    if not isinstance(tables, dict) or not tables:
+        raise DataError(f"{path}: cameras must be tables [cameras.NAME]")
+    for name, table in tables.items():
+        check_frame_id(name)  # the name of a folder of semantic maps
+        if not isinstance(table, dict):
+            raise DataError(f"{path}: cameras.{name} is not a table [cameras.{name}]")
+        unknown = sorted(set(table) - set(_OF_CAMERA))
+        if unknown:
+            raise DataError(
+                f"{path}: unknown key cameras.{name}.{unknown[0]}"
+                f"{did_you_mean(unknown[0], _OF_CAMERA)}; use one of {', '.join(_OF_CAMERA)}"
+            )
+        if "calibration" not in table:
+            raise DataError(f"{path}: no key cameras.{name}.calibration")
+    cameras = [_camera_table(path, name, table) for name, table in tables.items()]
+    with_images = [each.name for each in cameras if each.images]
+    if len(with_images) not in (0, len(cameras)):
+        raise DataError(
+            f"{path}: cameras {', '.join(with_images)} have images, the others only an image_size; "
+            "give images for all cameras, or for none"
+        )
+    return cameras if len(cameras) > 1 else [replace(cameras[0], name="")]
+
+
+def _camera_table(path: Path, name: str, table: Mapping[str, Any]) -> _CameraTable:
+    """Return the description of one camera."""
+    if ("images" in table) == ("image_size" in table):
+        both = "both" if "images" in table else "neither"
+        raise DataError(
+            f"{path}: {_place(name, 'images')} and image_size: {both} are set; image_size is only "
+            "for cameras without images, "
+            + ("remove one" if both == "both" else "set one")
+            + " of them"
+        )
+    images, size, calibration = (table.get(key) for key in _OF_CAMERA)
+    if not isinstance(images, str | None) or not isinstance(calibration, str | dict):
+        raise DataError(
+            f"{path}: {_place(name, 'images')} must be a folder, and calibration a file or a table"
+        )
+    try:
+        image_size = None if size is None else check_image_size(size, _place(name, "image_size"))
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from None
+    return _CameraTable(
+        name,
+        None if images is None else FrameFolder(path.parent / images, IMAGE_SUFFIXES, "image"),
+        image_size,
+        _calibration_of(path.parent, calibration),
+    )
+
+
+def _place(name: str, key: str) -> str:
+    """Return the place of a key of a camera in dataset.toml."""
+    return f"cameras.{name}.{key}" if name else key
+
+
+def _calibration_of(root: Path, value: str | Mapping[str, Any]) -> Path | Mapping[str, Any]:
+    return root / value if isinstance(value, str) else value
+
+
+def _read_calibration(path: Path, place: str, calibration: Path | Mapping[str, Any]) -> Calibration:
+    """Return the calibration in a file, or in a table of dataset.toml."""
+    if isinstance(calibration, Path):
+        return read_calibration(calibration)
+    projection = _matrix(path, place, calibration, "projection", ((3, 4),))
+    extrinsic = np.eye(4)
+    rows = _matrix(path, place, calibration, "lidar_to_camera", ((3, 4), (4, 4)))
+    extrinsic[: len(rows)] = rows
+    check_lidar_to_camera(extrinsic, f"{path}: {place}.lidar_to_camera")
+    return Calibration(projection, extrinsic)
 
 
 def _described_layout(path: Path, description: Mapping[str, Any]) -> PointLayout:
@@ -348,13 +455,9 @@ def _is_integer(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-def _is_size(value: object) -> bool:
-    """Return whether the value is a list of width and height in pixels."""
-    return (
-        isinstance(value, list)
-        and len(value) == 2
-        and all(isinstance(side, int) and _positive(side) for side in value)
-    )
+def _of_frame(path: Path, frame_id: str) -> Path:
+    """Return a path of a calibration, or of the frame's file in it if it is a folder."""
+    return path / f"{frame_id}.txt" if path.is_dir() else path
 
 
 def _positive(value: object) -> bool:
@@ -363,7 +466,11 @@ def _positive(value: object) -> bool:
 
 
 def _matrix(
-    path: Path, calibration: Mapping[str, Any], key: str, shapes: tuple[tuple[int, int], ...]
+    path: Path,
+    place: str,
+    calibration: Mapping[str, Any],
+    key: str,
+    shapes: tuple[tuple[int, int], ...],
 ) -> np.ndarray:
     try:
         matrix = np.array(calibration.get(key, ()), dtype=np.float64)
@@ -371,5 +478,5 @@ def _matrix(
         matrix = np.zeros(0)
     if matrix.shape not in shapes or not np.isfinite(matrix).all():
         expected = " or ".join(f"{rows} x {columns}" for rows, columns in shapes)
-        raise DataError(f"{path}: calibration.{key} must be {expected} finite numbers")
+        raise DataError(f"{path}: {place}.{key} must be {expected} finite numbers")
     return matrix

@@ -1,11 +1,13 @@
 """What a camera sees of ground truth that has no 2D boxes."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from curate.detections import Annotations
-from curate.frames import Calibration
+from curate.frames import Calibration, Camera
 from curate.geometry.mounting import observation_angles
-from curate.geometry.projection import image_rectangles
+from curate.geometry.projection import camera_of_boxes, image_rectangles
 
 # Margin around the image for truncation, in image widths and heights. It bounds the 2D box of an
 # object that is partly behind the camera.
@@ -13,31 +15,29 @@ _MARGIN = 10
 
 
 def seen_objects(
-    boxes: np.ndarray,
-    categories: np.ndarray,
-    occluded: np.ndarray,
-    calibration: Calibration,
-    image_size: tuple[int, int],
+    boxes: np.ndarray, categories: np.ndarray, occluded: np.ndarray, cameras: Sequence[Camera]
 ) -> Annotations:
-    """Return the objects in the camera's view, with 2D box, truncation and alpha from the boxes.
+    """Return the objects that any of the cameras sees, in their order.
+
+    An object's truncation, alpha and 2D box are those in the camera that shows most of it.
 
     Args:
         boxes: (n, 7) in the LiDAR frame.
         categories: (n,) str.
         occluded: (n,) int64, KITTI's occlusion levels.
-        calibration: calibration of the frame.
-        image_size: (width, height) in pixels.
+        cameras: the cameras of the frame, at least one.
     """
-    rectangles = image_rectangles(boxes, calibration, image_size)
-    objects = Annotations(
-        boxes,
-        categories,
-        truncation(boxes, rectangles, calibration, image_size),
-        occluded,
-        observation_angles(boxes, calibration),
-        rectangles,
-    )
-    return objects.select(~np.isnan(rectangles).any(axis=1))
+    truncated, alpha = np.ones(len(boxes)), np.zeros(len(boxes))
+    rectangles = np.full((len(boxes), 4), np.nan)
+    shown_by = camera_of_boxes(boxes, cameras)
+    for number, camera in enumerate(cameras):
+        shown = shown_by == number
+        calibration, size = camera.calibration, camera.image_size
+        rectangles[shown] = image_rectangles(boxes[shown], calibration, size)
+        truncated[shown] = truncation(boxes[shown], rectangles[shown], calibration, size)
+        alpha[shown] = observation_angles(boxes[shown], calibration)
+    objects = Annotations(boxes, categories, truncated, occluded, alpha, rectangles)
+    return objects.select(shown_by >= 0)
 
 
 def truncation(

@@ -11,7 +11,7 @@ from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.mounting import Mounting, defines_headings
 from curate.geometry.points_in_boxes import count_points_in_boxes
-from curate.geometry.projection import image_rectangles, in_view
+from curate.geometry.projection import box_rectangles, image_rectangles, in_camera_view
 
 _TOP_BOXES = 20
 # The height of the sensors is measured on the ground this near, by the points up to this height
@@ -28,6 +28,8 @@ _BORDER_PIXELS, _MIN_HEIGHT_PIXELS = 2.0, 10.0
 _MIN_RECTANGLES = 3
 _RECTANGLE_LIMIT = 1.25
 _RESIZED = "was the image resized, but not the calibration's projection?"
+# Share of boxes outside the image above which they are reported: some are cut by its border.
+_OUTSIDE_LIMIT = 0.1
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def examine_frame(frame: Frame) -> list[Finding]:
     )
     tall = np.ptp(frame.points[:, 2]) > max(np.ptp(frame.points[:, 0]), np.ptp(frame.points[:, 1]))
     intensity = float(frame.points[:, 3].max())
-    seen = float(in_view(frame.points, frame.calibration, frame.image_size).mean())
+    seen = float(in_camera_view(frame).mean())
     return [
         Finding("points", "ok", f"{count} points, {ranges} m")
         if not tall
@@ -70,14 +72,15 @@ def examine_frame(frame: Frame) -> list[Finding]:
         else Finding(
             "intensity", "suspect", f"up to {intensity:.2f}: expected in [0, 1], not all 0"
         ),
-        Finding("calibration", "ok", f"{seen:.0%} of the points appear in the image")
+        Finding("camera", "ok", "none: nothing is compared with images")
+        if not frame.cameras
+        else Finding("calibration", "ok", f"{seen:.0%} of the points appear in the image")
         if seen > 0.02
         else Finding(
             "calibration", "wrong", f"{seen:.1%} of the points appear in the image: is x forward, "
             "and does the calibration belong to these sensors?",
         ),
-        _mounting(frame),
-        _scale(frame),
+        *(finding for view in frame.views() for finding in (_mounting(view), _scale(view))),
     ]  # fmt: skip
 
 
@@ -96,7 +99,7 @@ def examine_detections(frame: Frame, found: Detections, categories: Sequence[str
         Finding("detections", "ok", f"{len(found)} boxes, scores {low:.2f} to {high:.2f}"),
         _names(found, categories),
         _points(frame, found),
-        _projections(frame, found),
+        *([_projections(frame, found)] if frame.cameras else []),
         _convention(frame, found),
     ]
 
@@ -122,12 +125,15 @@ def _points(frame: Frame, found: Detections) -> Finding:
 
 
 def _projections(frame: Frame, found: Detections) -> Finding:
-    rectangles = image_rectangles(found.boxes, frame.calibration, frame.image_size)
+    rectangles = box_rectangles(found.boxes, frame)
     outside = int(np.isnan(rectangles).any(axis=1).sum())
     summary = f"{outside} of {len(found)} boxes project outside the image"
     if outside == len(found):
         return Finding("image", "wrong", summary)
-    return Finding("image", "suspect" if outside > len(found) / 2 else "ok", summary)
+    if outside > _OUTSIDE_LIMIT * len(found):
+        evidence = "no image evidence can confirm or refute them (semantic.outside)"
+        return Finding("image", "suspect", f"{summary}: {evidence}")
+    return Finding("image", "ok", summary)
 
 
 def _convention(frame: Frame, found: Detections) -> Finding:
@@ -165,12 +171,14 @@ def examine_labels(labeled: Sequence[tuple[Frame, Annotations]]) -> list[Finding
     count = sum(len(each.boxes) for each in sweeps)
     names = f"{len(labeled)} frames" if len(labeled) > 1 else f"frame {labeled[0][0].frame_id}"
     where = f"the {count} labeled boxes of {names}"
+    # With several cameras, 2D boxes are projections.
+    pictured = [(frame, truth) for frame, truth in labeled if len(frame.cameras) == 1]
     if count == 0:
         return [Finding("labels", "ok", f"no labeled objects in {names}")]
     return [
         _label_points(sweeps, count, names),
         _judged("label boxes", sweeps, where, labels=True),
-        _label_rectangles(labeled),
+        *([_label_rectangles(pictured)] if pictured else []),
     ]
 
 
@@ -221,11 +229,12 @@ def _height_ratios(frame: Frame, truth: Annotations) -> list[float]:
 
 
 def _mounting(frame: Frame) -> Finding:
-    """Describe how the camera is mounted, and how high the sensors are above the ground."""
+    """Describe how the camera of a view is mounted, and how high the sensors are."""
     found = Mounting.of(frame.calibration)
     angles = np.rad2deg([found.yaw_rad, found.pitch_rad, found.roll_rad]) + 0.0
     yaw, pitch, roll = (f"{angle:.1f}" for angle in angles)
-    message = f"yaw {yaw}, pitch {pitch}, roll {roll} degrees against the LiDAR"
+    name = f"{frame.camera}: " if frame.camera else ""
+    message = f"{name}yaw {yaw}, pitch {pitch}, roll {roll} degrees against the LiDAR"
     ground = _ground_height(frame.points)
     if np.isfinite(ground):
         camera = np.linalg.inv(frame.calibration.lidar_to_camera)[2, 3]
@@ -246,8 +255,8 @@ def _ground_height(points: np.ndarray) -> float:
 
 
 def _scale(frame: Frame) -> Finding:
-    """Compare the principal point with the middle of the image."""
-    width, height = frame.image_size
+    """Compare the principal point of a view with the middle of its image."""
+    width, height = frame.cameras[0].image_size
     projection = frame.calibration.projection
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = (projection[:2, 2] / projection[2, 2]).tolist()

@@ -53,13 +53,22 @@ class LabelFileDescription:
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """A frame to learn from, with the paths of its files relative to the root of the data set."""
+    """A frame to learn from, with the paths of its files relative to the root of the data set.
+
+    The image is that of the first camera, and None if the data set has no images.
+    """
 
     frame: str
     split: str
     points: str
     image: str | None
     calibration: str
+    further_images: tuple[str, ...] = ()
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """The paths of the images of all cameras."""
+        return (*((self.image,) if self.image else ()), *self.further_images)
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from curate.errors import ConfigError
 from curate.exporters.base import LabelFileDescription, LabelSet
 from curate.exporters.objects import FrameObjects, categories_of, count_labels, frame_objects
 from curate.exporters.place import check_place, has_description
 from curate.files.atomic import replace_file
-from curate.frames import Frame
-from curate.geometry.projection import image_rectangles
+from curate.frames import Camera, Frame
+from curate.geometry.projection import camera_of_boxes, image_rectangles
 
 _FORMAT = "curate weighted labels, COCO"
 
@@ -37,6 +38,7 @@ class CocoExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
+            ConfigError: if the data set has no images.
             DataError: if the calibration or the image of a frame cannot be read.
         """
         check_place(path, has_description("info", _FORMAT))
@@ -54,13 +56,18 @@ def _document(
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     background: list[dict[str, Any]] = []
-    for number, objects in enumerate(frames, start=1):
+    for objects in frames:
         frame = read(objects.frame_id)
-        images.append(_image(number, objects, frame))
-        made = _annotations(objects, frame, ids)
-        for annotation, is_background in zip(made, objects.background, strict=True):
-            target = background if is_background else annotations
-            target.append({"id": len(target) + 1, "image_id": number} | annotation)
+        _check_images(frame, objects)
+        shown_by = camera_of_boxes(objects.detections.boxes, frame.cameras)
+        for number, camera in enumerate(frame.cameras):
+            images.append(_image(len(images) + 1, objects, camera, number))
+            # A label outside all images is with the first one, so that no label is lost.
+            first = (shown_by < 0) & (number == 0)
+            made = _annotations(objects, camera, ids, first)
+            for k, annotation in made:
+                target = background if objects.background[k] else annotations
+                target.append({"id": len(target) + 1, "image_id": len(images)} | annotation)
     return {
         "info": {
             "description": _FORMAT,
@@ -77,26 +84,45 @@ def _document(
     }
 
 
-def _image(number: int, objects: FrameObjects, frame: Frame) -> dict[str, Any]:
-    width, height = frame.image_size
+def _check_images(frame: Frame, objects: FrameObjects) -> None:
+    """Raise ConfigError if a frame has no camera, or no image."""
+    if not frame.cameras or not objects.images:
+        raise ConfigError(
+            f"frame {frame.frame_id}: COCO's annotations need images, and the data set has none; "
+            "export another format, such as kitti, csv or parquet"
+        )
+
+
+def _image(number: int, objects: FrameObjects, camera: Camera, position: int) -> dict[str, Any]:
+    width, height = camera.image_size
     return {
         "id": number,
-        "file_name": objects.files[1],
+        "file_name": objects.images[position],
         "width": int(width),
         "height": int(height),
         "frame": objects.frame_id,
+        **({"camera": camera.name} if camera.name else {}),
         "split": "labeled" if objects.labeled else "unlabeled",
     }
 
 
 def _annotations(
-    objects: FrameObjects, frame: Frame, ids: dict[str, int]
-) -> Iterator[dict[str, Any]]:
-    """Yield the annotations of a frame without the ids of annotation and image."""
+    objects: FrameObjects, camera: Camera, ids: dict[str, int], unseen: np.ndarray
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield k and the annotation, without its ids, of the labels that a camera shows.
+
+    Args:
+        objects: the labels of a frame.
+        camera: the camera.
+        ids: numbers of the categories.
+        unseen: (n,) bool, labels outside all images that are written with this image.
+    """
     found = objects.detections
-    rectangles = np.nan_to_num(image_rectangles(found.boxes, frame.calibration, frame.image_size))
+    rectangles = image_rectangles(found.boxes, camera.calibration, camera.image_size)
+    shown = unseen | ~np.isnan(rectangles).any(axis=1)
+    rectangles = np.nan_to_num(rectangles)
     sizes = rectangles[:, 2:] - rectangles[:, :2]
-    for k in range(len(found)):
+    for k in np.flatnonzero(shown).tolist():
         annotation = {
             "category_id": ids[str(found.categories[k])],
             "bbox": [*rectangles[k, :2].tolist(), *sizes[k].tolist()],
@@ -109,4 +135,5 @@ def _annotations(
             "k": int(objects.numbers[k]),
             "provenance": str(objects.provenance[k]),
         }
-        yield annotation if objects.labeled else annotation | {"score": float(found.scores[k])}
+        scored = {} if objects.labeled else {"score": float(found.scores[k])}
+        yield k, annotation | scored

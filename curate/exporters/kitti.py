@@ -51,7 +51,7 @@ class WeightedFrame:
         ignored: (n,) bool, True for labels of weight 0 that are regions to ignore; the others of
             weight 0 are background.
         calibration: calibration of the frame.
-        image_size: (width, height) in pixels.
+        image_size: (width, height) in pixels; None without a camera.
         numbers: (n,) k of each label; None for 0 to n - 1.
         provenance: (n,) str, detector or human; None for detector.
     """
@@ -61,7 +61,7 @@ class WeightedFrame:
     weights: np.ndarray
     ignored: np.ndarray
     calibration: Calibration
-    image_size: tuple[int, int]
+    image_size: tuple[int, int] | None
     numbers: np.ndarray | None = None
     provenance: np.ndarray | None = None
 

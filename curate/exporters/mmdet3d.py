@@ -13,6 +13,8 @@ for ground truth), `category` and `ignored` (True if a label of weight 0 is a re
 False if it is background), `k` and `provenance` (detector, human if a person decided, or
 ground_truth). `zero_weight` in `metainfo` gives the meaning of weight 0.
 
+Without a camera, `images` has the transforms of the reference calibration only: no path, no size.
+
 KITTI's categories have the numbers of `KittiDataset`; other categories follow. R0_rect is the
 identity, and Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera.
 """
@@ -86,8 +88,9 @@ def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
 def _info(
     index: int, objects: FrameObjects, frame: Frame, numbers: Mapping[str, int]
 ) -> dict[str, Any]:
-    points, image = (PurePosixPath(file).name for file in objects.files)
-    width, height = frame.image_size
+    points, image, *_ = (*(PurePosixPath(file).name for file in objects.files), None)
+    width, height = frame.image_size or (None, None)
+    of_image = {"img_path": image, "height": height, "width": width}
     calibration = frame.calibration
     to_image = np.vstack([calibration.projection, [0, 0, 0, 1]])
     return {
@@ -95,9 +98,7 @@ def _info(
         "frame": objects.frame_id,
         "images": {
             "CAM2": {
-                "img_path": image,
-                "height": int(height),
-                "width": int(width),
+                **{key: value for key, value in of_image.items() if value is not None},
                 "cam2img": to_image.tolist(),
                 "lidar2cam": calibration.lidar_to_camera.tolist(),
                 "lidar2img": (to_image @ calibration.lidar_to_camera).tolist(),
@@ -116,7 +117,7 @@ def _info(
 def _instances(
     objects: FrameObjects,
     calibration: Calibration,
-    image_size: tuple[int, int],
+    image_size: tuple[int, int] | None,
     numbers: Mapping[str, int],
 ) -> list[dict[str, Any]]:
     found = objects.detections

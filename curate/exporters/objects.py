@@ -21,7 +21,7 @@ class FrameObjects:
     Attributes:
         frame_id: name of the frame.
         labeled: True for ground truth (X_l), False for pseudo-labels (X_u).
-        files: points and image, relative to the root of the data set.
+        files: points, then the image of each camera, relative to the root of the data set.
         detections: boxes in the LiDAR frame; ground truth has score 1.
         weights: (n,) in [0, 1]; ground truth has weight 1.
         ignored: (n,) bool, True for labels of weight 0 that are regions to ignore.
@@ -34,7 +34,7 @@ class FrameObjects:
 
     frame_id: str
     labeled: bool
-    files: tuple[str, str]
+    files: tuple[str, ...]
     detections: Detections
     weights: np.ndarray
     ignored: np.ndarray
@@ -43,6 +43,11 @@ class FrameObjects:
     occluded: np.ndarray
     numbers: np.ndarray
     provenance: np.ndarray
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """The images of the cameras, relative to the root; empty without images."""
+        return self.files[1:]
 
     @property
     def background(self) -> np.ndarray:
@@ -109,7 +114,7 @@ def _true_objects(files: FrameFiles, rows: Columns) -> FrameObjects:
     return FrameObjects(
         files.frame,
         labeled=True,
-        files=(files.points, str(files.image)),
+        files=(files.points, *files.images),
         detections=_detections(rows, [1.0] * count),
         weights=np.ones(count),
         ignored=np.zeros(count, dtype=bool),
@@ -130,7 +135,7 @@ def _weighted_objects(files: FrameFiles, rows: Columns, labels: LabelSet) -> Fra
     return FrameObjects(
         files.frame,
         labeled=False,
-        files=(files.points, str(files.image)),
+        files=(files.points, *files.images),
         detections=_detections(rows, rows["score"]),
         weights=weights,
         ignored=(weights == 0) & ignoring & (provenance != "human"),

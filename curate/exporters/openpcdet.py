@@ -29,6 +29,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from curate.datasets.kitti.labels import DONT_CARE, KittiObjects, from_detections
+from curate.errors import ConfigError
 from curate.exporters.base import LabelSet
 from curate.exporters.folder import write_folder, write_pickle
 from curate.exporters.objects import UNKNOWN, FrameObjects, difficulties, frame_objects
@@ -50,6 +51,7 @@ class OpenPCDetExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
+            ConfigError: if the frames have no image size, which OpenPCDet's readers need.
             DataError: if the calibration, the image or the points of a frame cannot be read.
         """
         return int(write_folder(path, _FORMAT, partial(_fill, labels=labels))["labels"])
@@ -75,6 +77,12 @@ def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
 
 
 def _info(objects: FrameObjects, frame: Frame) -> Info:
+    if frame.image_size is None:
+        raise ConfigError(
+            f"frame {frame.frame_id}: OpenPCDet's infos need the size of the camera's image, and "
+            "the data set has no camera; declare its image_size (docs/datasets.md), or export "
+            "kitti, mmdet3d or csv"
+        )
     width, height = frame.image_size
     last_row = np.array([[0.0, 0, 0, 1]])
     in_camera = from_detections(

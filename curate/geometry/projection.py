@@ -1,10 +1,12 @@
 """Projection from the LiDAR frame into the image (KITTI: Geiger et al., IJRR 2013, eq. 8)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from curate.frames import Calibration
+from curate.frames import Calibration, Camera, Frame
 from curate.geometry.boxes import box_corners
-from curate.shapes import Bool, Float, Num
+from curate.shapes import Bool, Float, Int, Num
 
 # Depth of the near plane. Parts of a box in front of it are cut off, because the projection is
 # unbounded as the depth approaches 0.
@@ -13,6 +15,9 @@ _NEAR_METRES = 0.1
 # Points closer than this to the border of the view, relative to the terms of their projection, are
 # computed again with NumPy, so that the result does not depend on the rounding of the kernel.
 _UNDECIDED = 1e-10
+
+# Points along each side of a box, to measure how much of it is in an image.
+_GRID = 8
 
 # The twelve edges between the corners of `box_corners`: bottom, top, vertical.
 _EDGE_STARTS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3])
@@ -68,8 +73,19 @@ def in_view(
     return visible
 
 
+def in_camera_view(frame: Frame) -> Bool[np.ndarray, " n"]:
+    """Return whether any camera of the frame sees each of its points; all True without a camera."""
+    if not frame.cameras:
+        return np.ones(len(frame.points), dtype=bool)
+    seen = [
+        in_view(frame.points, camera.calibration, camera.image_size) for camera in frame.cameras
+    ]
+    visible: np.ndarray = np.logical_or.reduce(seen)
+    return visible
+
+
 def image_rectangles(
-    boxes: Num[np.ndarray, "n 7"], calibration: Calibration, image_size: tuple[int, int]
+    boxes: Num[np.ndarray, "n 7"], calibration: Calibration, image_size: tuple[int, int] | None
 ) -> Float[np.ndarray, "n 4"]:
     """Return the 2D boxes of 3D boxes: the rectangle around each projected box, within the image.
 
@@ -78,7 +94,7 @@ def image_rectangles(
     Args:
         boxes: (n, 7) in the LiDAR frame.
         calibration: calibration of the frame.
-        image_size: (width, height) in pixels.
+        image_size: (width, height) in pixels; None if there is no image: nothing is clipped.
 
     Returns:
         (n, 4) left, top, right, bottom in pixels, within [0, width - 1] and [0, height - 1]; NaN if
@@ -92,10 +108,69 @@ def image_rectangles(
     valid = ~np.isnan(pixels)
     low = np.min(pixels, axis=1, where=valid, initial=np.inf)
     high = np.max(pixels, axis=1, where=valid, initial=-np.inf)
+    if image_size is None:
+        return np.where(valid.any(axis=(1, 2))[:, None], np.hstack([low, high]), np.nan)
     last_pixel = np.asarray(image_size) - 1.0
     rectangles = np.hstack([np.clip(low, 0, last_pixel), np.clip(high, 0, last_pixel)])
     rectangles[~((high > 0) & (low < last_pixel)).all(axis=1)] = np.nan
     return rectangles
+
+
+def camera_of_boxes(
+    boxes: Num[np.ndarray, "n 7"], cameras: Sequence[Camera]
+) -> Int[np.ndarray, " n"]:
+    """Return (n,) int64 the number of the camera that shows most of each box; -1 if none shows it.
+
+    That is the camera with the largest share of the box's volume in its image. If several have the
+    same share, for example the whole box, it is the one with the larger rectangle in pixels.
+
+    Args:
+        boxes: (n, 7) in the LiDAR frame.
+        cameras: the cameras of the frame.
+    """
+    chosen = np.full(len(boxes), -1, dtype=np.int64)
+    best = np.full((2, len(boxes)), -1.0)
+    for number, camera in enumerate(cameras):
+        rectangles = image_rectangles(boxes, camera.calibration, camera.image_size)
+        areas = np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)
+        # With a single camera, the shares need not be computed.
+        shares = _shares_in_image(boxes, camera) if len(cameras) > 1 else np.ones(len(boxes))
+        larger = (shares > best[0]) | ((shares == best[0]) & (areas > best[1]))
+        better = ~np.isnan(areas) & larger
+        chosen[better] = number
+        best[:, better] = shares[better], areas[better]
+    return chosen
+
+
+def box_rectangles(boxes: Num[np.ndarray, "n 7"], frame: Frame) -> Float[np.ndarray, "n 4"]:
+    """Return the rectangle of each box in the camera that shows most of it.
+
+    Without a camera, it is the projection by the frame's calibration, without a border.
+
+    Returns:
+        (n, 4) left, top, right, bottom in pixels, see `image_rectangles`; NaN for boxes that no
+        camera shows.
+    """
+    if len(frame.cameras) < 2:
+        return image_rectangles(boxes, frame.calibration, frame.image_size)
+    rectangles = np.full((len(boxes), 4), np.nan)
+    chosen = camera_of_boxes(boxes, frame.cameras)
+    for number, camera in enumerate(frame.cameras):
+        shown = chosen == number
+        rectangles[shown] = image_rectangles(boxes[shown], camera.calibration, camera.image_size)
+    return rectangles
+
+
+def _shares_in_image(boxes: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return (n,) the share of each box's volume in the image, by a regular grid of points."""
+    steps = (np.arange(_GRID) + 0.5) / _GRID - 0.5
+    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    x, y, z = (grid * boxes[:, None, 3:6]).transpose(2, 0, 1)
+    cos, sin = np.cos(boxes[:, 6:]), np.sin(boxes[:, 6:])
+    places = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1) + boxes[:, None, :3]
+    inside = in_view(places.reshape(-1, 3), camera.calibration, camera.image_size)
+    shares: np.ndarray = inside.reshape(len(boxes), -1).mean(axis=1)
+    return shares
 
 
 def _homogeneous(points_lidar: np.ndarray, calibration: Calibration) -> np.ndarray:

@@ -53,6 +53,8 @@ class EvidenceDeclaration(Protocol):
     """All columns that the source stores for a label."""
     rho_column: ClassVar[str | None] = None
     """The column with a prior's trust rho in [0, 1]; rho_det is the product over the priors."""
+    camera_columns: ClassVar[tuple[Column, ...]] = ()
+    """Further columns if frames have several cameras, of sources with a table of the schema."""
 
 
 class EvidenceSource(EvidenceDeclaration, Protocol):
@@ -176,14 +178,18 @@ def check_evidence(
         DataError: if a column is missing, not declared, or of another length or type, or a value is
             null in a column that is not optional; the message shows source and column.
     """
-    names = [column.name for column in source.columns]
+    columns = [
+        *source.columns,
+        *(column for column in source.camera_columns if column.name in evidence),
+    ]
+    names = [column.name for column in columns]
     for name in (*names, *evidence):
         if (name in names) != (name in evidence):
             reason = "is missing" if name in names else "is not declared"
             raise DataError(f"evidence source '{source.name}': column {name} {reason}")
     return {
         column.name: _plain(source, column, np.asarray(evidence[column.name]), count)
-        for column in source.columns
+        for column in columns
     }
 
 

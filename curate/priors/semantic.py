@@ -13,13 +13,16 @@ import numpy as np
 from curate.detections import Detections
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
-from curate.geometry.projection import image_rectangles
+from curate.geometry.projection import camera_of_boxes, image_rectangles
 from curate.priors.base import Column, Evidence, EvidenceSource, Measured
-from curate.segmenters.base import Segmenter, SemanticMap
+from curate.segmenters.base import Segmenter, SemanticMap, image_size_of
 from curate.shapes import Float, Int, Num, Shaped
 
 Mean = Literal["geometric", "product", "arithmetic"]
-Outside = Literal["neutral", "drop"]
+Outside = Literal["expected", "neutral", "drop"]
+
+EXPECTED_SHARE = 0.7
+"""S/A of a correct label that no camera shows: the median of correct labels on KITTI's frames."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +31,13 @@ class SemanticSettings:
 
     Attributes:
         mean: "geometric" for sqrt(s S/A), "product" for s S/A, "arithmetic" for (s + S/A) / 2.
-        outside: rho_anno of a box outside the image: s for "neutral", 0 for "drop".
+        outside: rho_anno of a box that no camera shows: 0.7 s^2 for "expected", s for "neutral", 0
+            for "drop". The first is s times the expected share, which is 0.7 for a correct label;
+            s takes the place of the probability that the label is correct.
     """
 
     mean: Mean = "geometric"
-    outside: Outside = "neutral"
+    outside: Outside = "expected"
 
     def __post_init__(self) -> None:
         """Raise ConfigError for an unknown option."""
@@ -65,6 +70,15 @@ class SemanticPrior(EvidenceSource):
         Column("rho_anno", "float64", "1", "semantic prior, Eq. 9, from s, S and A"),
     )
     rho_column: ClassVar[str | None] = "rho_anno"
+    camera_columns: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "camera",
+            "name",
+            "",
+            "the camera that shows most of the box; null if none shows it",
+            optional=True,
+        ),
+    )
     measured_columns: ClassVar[tuple[str, ...]] = ("mask_pixels", "box_pixels")
 
     @property
@@ -80,41 +94,67 @@ class SemanticPrior(EvidenceSource):
     def measure(self, frame: Frame, detections: Detections) -> Measured:
         """Segment the frame and count the pixels of each projected box.
 
-        A frame without detections is not segmented.
+        Of several cameras, the one that shows most of a box counts, see `camera_of_boxes`. An image
+        that counts for no box is not segmented.
 
         Raises:
-            ConfigError: if there is no segmenter, or it has no classes for a detection's category.
+            ConfigError: if there is no segmenter or no camera, or the segmenter has no classes for
+                a detection's category.
             ModelError: if the size of the semantic map differs from the image size.
         """
         if self.segmenter is None:
             raise ConfigError("semantic prior: pixels cannot be counted without a segmenter")
-        if len(detections) == 0:
-            return dict.fromkeys(self.measured_columns, np.zeros(0, dtype=np.int64))
-        semantic_map = self.segmenter.segment(frame)
-        width, height = frame.image_size
+        if not frame.cameras:
+            raise ConfigError(
+                f"frame {frame.frame_id} has no camera, so the semantic prior cannot be computed; "
+                "leave 'semantic' out of run.priors"
+            )
+        counts = np.zeros((2, len(detections)), dtype=np.int64)
+        names = np.full(len(detections), None, dtype=object)
+        chosen = camera_of_boxes(detections.boxes, frame.cameras)
+        for number, view in enumerate(frame.views()):
+            shown = np.flatnonzero(chosen == number)
+            if len(shown):
+                counts[:, shown] = self._count(view, detections.select(shown))
+                names[shown] = view.camera or None
+        measured = dict(zip(self.measured_columns, counts, strict=True))
+        return measured | {"camera": names} if len(frame.cameras) > 1 else measured
+
+    def _count(self, view: Frame, shown: Detections) -> tuple[np.ndarray, np.ndarray]:
+        """Return S and A of labels in the image of a frame with one camera."""
+        if self.segmenter is None:
+            raise ConfigError("semantic prior: pixels cannot be counted without a segmenter")
+        semantic_map = self.segmenter.segment(view)
+        width, height = size = image_size_of(view)
         if semantic_map.class_ids.shape != (height, width):
             map_size = " x ".join(str(side) for side in semantic_map.class_ids.shape[::-1])
             raise ModelError(
-                f"frame {frame.frame_id}: the semantic map has {map_size} pixels, the image "
+                f"frame {view.frame_id}: the semantic map has {map_size} pixels, the image "
                 f"{width} x {height}; the segmenter must return a map of the image size",
             )
-        rectangles = image_rectangles(detections.boxes, frame.calibration, frame.image_size)
-        counts = count_pixels(rectangles, detections.categories, semantic_map)
-        return dict(zip(self.measured_columns, counts, strict=True))
+        rectangles = image_rectangles(shown.boxes, view.calibration, size)
+        return count_pixels(rectangles, shown.categories, semantic_map)
 
     def rate(self, detections: Detections, measured: Measured) -> Evidence:
         """Return S, A and rho_anno (Eq. 9)."""
-        mask_pixels, box_pixels = (measured[name] for name in self.measured_columns)
+        mask_pixels, box_pixels = measured["mask_pixels"], measured["box_pixels"]
         rho = semantic_trust(detections.scores, mask_pixels, box_pixels, self.settings)
-        return {"mask_pixels": mask_pixels, "box_pixels": box_pixels, "rho_anno": rho}
+        return {**measured, "rho_anno": rho}
 
     def describe(self, row: Mapping[str, Any]) -> str:
-        """Return Eq. 9 with the numbers of one label."""
+        """Return the rule that gave rho_anno, with the numbers of one label."""
+        camera = f"camera {row['camera']}: " if row.get("camera") not in (None, "none") else ""
+        if row["box_pixels"] == 0:
+            rule = {
+                "expected": f"{EXPECTED_SHARE:g} s^2", "neutral": "s", "drop": "0",
+            }[self.settings.outside]  # fmt: skip
+            outside = f"no image shows the box, so outside = '{self.settings.outside}' applies"
+            return f"{outside}: rho_anno = {rule} with s = {{score}} = {{rho_anno}}".format(**row)
         formula = {
             "geometric": "sqrt(s S/A)", "product": "s S/A", "arithmetic": "(s + S/A) / 2",
         }[self.settings.mean]  # fmt: skip
         numbers = "s = {score}, S = {mask_pixels}, A = {box_pixels} pixels = {rho_anno}"
-        return f"Eq. 9: rho_anno = {formula} with {numbers}".format(**row)
+        return f"{camera}Eq. 9: rho_anno = {formula} with {numbers}".format(**row)
 
 
 def semantic_trust(
@@ -131,7 +171,10 @@ def semantic_trust(
         rho = scores * share
     else:
         rho = (scores + share) / 2
-    return np.where(box_pixels > 0, rho, scores if settings.outside == "neutral" else 0.0)
+    outside = {
+        "expected": EXPECTED_SHARE * scores**2, "neutral": scores, "drop": np.zeros(len(scores)),
+    }[settings.outside]  # fmt: skip
+    return np.where(box_pixels > 0, rho, outside)
 
 
 def count_pixels(

@@ -39,11 +39,7 @@ class NumberedLabels(ShownLabels):
 
 
 def draw_review(frame: Frame, shown: ShownFrame, *, title: str = "") -> np.ndarray:
-    """Draw the numbered boxes, human labels dashed; return (height, width, 3) uint8 RGB.
-
-    Raises:
-        DataError: if the frame has no image.
-    """
+    """Draw the numbered boxes, human labels dashed; return (height, width, 3) uint8 RGB."""
     labels = NumberedLabels(
         shown.array,
         as_categories([box.category for box in shown.boxes]),

@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from curate.errors import ModelError
 from curate.frames import Frame
 from curate.shapes import UInt8
 
@@ -24,8 +25,22 @@ class SemanticMap:
     category_classes: Mapping[str, tuple[int, ...]]
 
 
+def image_size_of(frame: Frame) -> tuple[int, int]:
+    """Return (width, height) of the frame's image in pixels.
+
+    Raises:
+        ModelError: if the frame has no camera.
+    """
+    if frame.image_size is None:
+        raise ModelError(f"frame {frame.frame_id} has no camera, so there is no image to segment")
+    return frame.image_size
+
+
 class Segmenter(Protocol):
     """Returns the semantic class of every pixel; raises `ModelError` or `DataError`.
+
+    A frame to segment has one camera: of a frame with several, each is segmented by itself, with
+    the name of the camera in `frame.camera`.
 
     A segmenter that never reads `frame.points` may define a further attribute `needs_points` =
     False. Then the points are not loaded for it.

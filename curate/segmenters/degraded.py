@@ -1,6 +1,7 @@
 """Ground-truth semantic maps of simulated frames, degraded by an error model.
 
-The errors of a frame are drawn from a generator seeded with (seed, frame id), in this order:
+The errors of a frame are drawn from a generator seeded with (seed, frame id), or for several
+cameras (seed, camera, frame id), in this order:
 
 1. Missed instances: every connected region of a class is erased with probability
    `missed_instance`, or `missed_small_instance` if it has fewer than `small_px` pixels.
@@ -98,13 +99,14 @@ class DegradedSegmenter:
         self.classes = self._truth.classes
 
     def segment(self, frame: Frame) -> SemanticMap:
-        """Return the frame's degraded map; it depends on the seed and the frame id only.
+        """Return the frame's degraded map; it depends on seed, frame id and camera only.
 
         Raises:
             DataError: if the ground-truth map is missing, or does not fit the frame's image.
         """
         truth = self._truth.segment(frame)
-        digest = hashlib.sha256(frame.frame_id.encode()).digest()
+        name = f"{frame.camera}/{frame.frame_id}" if frame.camera else frame.frame_id
+        digest = hashlib.sha256(name.encode()).digest()
         generator = np.random.default_rng([self.seed, int.from_bytes(digest[:8], "little")])
         return SemanticMap(degrade(truth.class_ids, self.errors, generator), truth.category_classes)
 

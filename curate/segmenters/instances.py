@@ -15,7 +15,7 @@ from curate.errors import ConfigError, DataError
 from curate.files.json_text import read_json
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import SemanticMap, image_size_of
 from curate.segmenters.classes import background_id, checked_classes
 from curate.segmenters.masks import decode_mask
 
@@ -28,7 +28,8 @@ class InstanceSegmenter:
     Args:
         path: a file with `images` and `annotations`; a file with a list of results, where
             `image_id` is the frame's name or number; or a folder with a file FRAME.json per frame,
-            which contains such a list or `{annotations: [...]}`.
+            which contains such a list or `{annotations: [...]}`. With several cameras, the names
+            are CAMERA/FRAME.
         classes: the COCO category ids that count for each category.
         minimum_score: masks below it are dropped; a mask without a score counts as score 1.
         frame_ids: the frames of the data set, with which the names of files and images are matched
@@ -54,11 +55,26 @@ class InstanceSegmenter:
         self.path = Path(path)
         self.classes = checked_classes(classes)
         self.minimum_score = minimum_score
-        self._files = self._frames = None
-        if self.path.is_dir():
-            self._files = files_by_frame(self.path, (".json",), frame_ids)
-        else:
-            self._frames = _by_frame(self.path, FrameNames.of(frame_ids))
+        self._frame_ids = frame_ids
+        self._files: dict[str, Mapping[str, Path]] = {}
+        self._frames: dict[str, Mapping[str, Objects]] = {}
+        if not self.path.is_dir():
+            self._objects_by_frame("")
+        elif next(self.path.glob("*.json"), None):
+            self._file_by_frame("")
+
+    def _file_by_frame(self, camera: str) -> Mapping[str, Path]:
+        """Return the file of each frame from a camera; "" for the only one."""
+        if camera not in self._files:
+            folder = self.path / camera
+            self._files[camera] = files_by_frame(folder, (".json",), self._frame_ids)
+        return self._files[camera]
+
+    def _objects_by_frame(self, camera: str) -> Mapping[str, Objects]:
+        """Return the objects of each frame from a camera; "" for the only one."""
+        if camera not in self._frames:
+            self._frames[camera] = _by_frame(self.path, FrameNames.of(self._frame_ids), camera)
+        return self._frames[camera]
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's masks as a semantic map.
@@ -66,18 +82,18 @@ class InstanceSegmenter:
         Raises:
             DataError: if the frame has no masks, or a mask is malformed or of another size.
         """
-        width, height = frame.image_size
+        size = width, height = image_size_of(frame)
         used_ids = {class_id for ids in self.classes.values() for class_id in ids}
         background = background_id(self.classes)
         class_ids = np.full((height, width), background, dtype=np.uint8)
-        source, objects = self._objects(frame.frame_id)
+        source, objects = self._objects(frame.frame_id, frame.camera)
         scored = [(_score(source, number, entry), number) for number, entry in enumerate(objects)]
         for score, number in sorted(scored, key=lambda pair: pair[0]):
             if score < self.minimum_score:
                 continue
             entry = objects[number]
             try:
-                mask = decode_mask(entry["segmentation"], frame.image_size)
+                mask = decode_mask(entry["segmentation"], size)
                 category = entry["category_id"]
             except KeyError as error:
                 raise DataError(f"{source}: object {number} has no {error.args[0]}") from None
@@ -88,23 +104,31 @@ class InstanceSegmenter:
             class_ids[mask] = category if category in used_ids else background
         return SemanticMap(class_ids, self.classes)
 
-    def _objects(self, frame_id: str) -> tuple[str, Objects]:
+    def _objects(self, frame_id: str, camera: str) -> tuple[str, Objects]:
         """Return the place of a frame's objects, for error messages, and the objects."""
-        if self._files is not None:
-            path = self._files.get(frame_id, self.path / f"{frame_id}.json")
+        name = f"{camera}/{frame_id}" if camera else frame_id
+        if self.path.is_dir():
+            default = self.path / camera / f"{frame_id}.json"
+            path = self._file_by_frame(camera).get(frame_id, default)
             return str(path), _object_list(path, read_json(path, "instance mask"))
+        frames = self._objects_by_frame(camera)
         names = (frame_id, str(int(frame_id))) if frame_id.isdecimal() else (frame_id,)
-        for name in names:
-            if self._frames is not None and name in self._frames:
-                return f"{self.path}: frame {frame_id}", self._frames[name]
+        for each in names:
+            if each in frames:
+                return f"{self.path}: frame {name}", frames[each]
         raise DataError(
-            f"{self.path}: no masks for frame {frame_id}; list a frame without objects in "
-            '`images`: {"images": [{"id": 1, "file_name": "FRAME.png"}], "annotations": [...]}'
+            f"{self.path}: no masks for frame {name}; list a frame without objects in `images`: "
+            f'{{"images": [{{"id": 1, "file_name": "{name}.png"}}], "annotations": [...]}}'
         )
 
 
-def _by_frame(path: Path, frame_ids: FrameNames) -> Mapping[str, list[Mapping[str, Any]]]:
-    """Return the objects of each frame of the data set, or of each image without `frame_ids`."""
+def _by_frame(
+    path: Path, frame_ids: FrameNames, camera: str
+) -> Mapping[str, list[Mapping[str, Any]]]:
+    """Return the objects of each frame of the data set, or of each image without `frame_ids`.
+
+    With several cameras, images are those in a folder with the name of the camera.
+    """
     document = read_json(path, "instance mask")
     images = document.get("images", ()) if isinstance(document, dict) else ()
     try:
@@ -120,6 +144,9 @@ def _by_frame(path: Path, frame_ids: FrameNames) -> Mapping[str, list[Mapping[st
         ) from None
     if len(found) < len(names):
         raise DataError(f"{path}: two images have the same file_name; remove one")
+    several = any(Path(name).parent.name == camera for name in found) if camera else False
+    if several:
+        found = {name: each for name, each in found.items() if Path(name).parent.name == camera}
     if not len(frame_ids):
         return {last_part(name): objects for name, objects in found.items()}
     matched, unmatched = frame_ids.match(found, path)

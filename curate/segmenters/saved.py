@@ -10,7 +10,7 @@ from curate.datasets.frame_names import files_by_frame
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import SemanticMap, image_size_of
 from curate.segmenters.classes import CLASS_MAPS, checked_classes, describe_unexpected_ids
 from curate.segmenters.colours import COLOUR_TABLES, colour_table, ids_of_colours
 from curate.segmenters.map_files import MapFile, read_map
@@ -30,7 +30,8 @@ class SavedSegmenter:
     declared, because no file states them.
 
     Args:
-        directory: the folder of the maps; if none is in it, they are in its subfolders.
+        directory: the folder of the maps, or of folders CAMERA of maps for several cameras; if
+            no map is in it, they are in its subfolders.
         classes: the class ids that count for each category.
         divisor: for maps of class * divisor + instance number: 1000 for Cityscapes' instanceIds,
             256 for KITTI's. 1 for class ids in 16 bits, which could be either.
@@ -78,7 +79,17 @@ class SavedSegmenter:
         self._ignores_palette = colours == "none"
         if not self.directory.is_dir():
             raise DataError(f"{self.directory}: no such folder of semantic maps")
-        self._maps = files_by_frame(self.directory, _SUFFIXES, frame_ids)
+        self._frame_ids = frame_ids
+        self._found: dict[str, Mapping[str, Path]] = {}
+        if any(path.suffix in _SUFFIXES for path in self.directory.iterdir()):
+            self._maps("")
+
+    def _maps(self, camera: str) -> Mapping[str, Path]:
+        """Return the map of each frame from a camera; "" for the only one."""
+        if camera not in self._found:
+            folder = self.directory / camera
+            self._found[camera] = files_by_frame(folder, _SUFFIXES, self._frame_ids)
+        return self._found[camera]
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's saved map.
@@ -87,9 +98,9 @@ class SavedSegmenter:
             DataError: if the map is missing, has another size than the frame's image, can be read
                 in two ways, or contains ids that its class set does not have.
         """
-        path = self._path(frame.frame_id)
+        path = self._path(frame)
         class_ids = self._class_ids(path, read_map(path))
-        width, height = frame.image_size
+        width, height = image_size_of(frame)
         if class_ids.shape != (height, width):
             raise DataError(
                 f"{path}: the map is {class_ids.shape[1]} x {class_ids.shape[0]} pixels, "
@@ -99,15 +110,17 @@ class SavedSegmenter:
             raise DataError(f"{path}: {problem}")
         return SemanticMap(class_ids, self.classes)
 
-    def _path(self, frame_id: str) -> Path:
-        """Return the file of a frame's map."""
-        if frame_id in self._maps:
-            return self._maps[frame_id]
-        paths = [self.directory / f"{frame_id}{suffix}" for suffix in _SUFFIXES]
+    def _path(self, frame: Frame) -> Path:
+        """Return the file of the map of a frame from its camera."""
+        folder, name = self.directory / frame.camera, frame.frame_id
+        matched = self._maps(frame.camera)
+        if name in matched:
+            return matched[name]
+        paths = [folder / f"{name}{suffix}" for suffix in _SUFFIXES]
         found = [path for path in paths if path.exists()]
         if len(found) > 1:
             raise DataError(f"{found[0]}: {found[1].name} is a map of the same frame; remove one")
-        lossy = list(self.directory.glob(f"{glob.escape(frame_id)}.jp*g"))
+        lossy = list(folder.glob(f"{glob.escape(name)}.jp*g"))
         return (found or lossy or paths)[0]
 
     def _class_ids(self, path: Path, content: MapFile) -> np.ndarray:

@@ -29,7 +29,7 @@ from curate.exporters.label_file import (
 )
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.geometry.projection import in_view
+from curate.geometry.projection import in_camera_view
 from curate.shapes import Bool, Float, Int
 
 # Ground-truth categories that look like another one: an ignore region for that category.
@@ -136,7 +136,7 @@ class WeightedLabels(Dataset[Sample]):
         frame = self._read(frame_id)
         boxes, categories, weights = self._boxes[frame_id]
         labeled = bool(self.labeled[index])
-        points = frame.points[in_view(frame.points, frame.calibration, frame.image_size)]
+        points = frame.points[in_camera_view(frame)]
         return Sample(frame_id, labeled, points, boxes, categories, weights, self.zero_weight)
 
     def collate(self, samples: Sequence[Sample]) -> LabelBatch:

@@ -13,6 +13,7 @@ from curate.viewing.legend import (
     STRIP_HEIGHT,
     TITLE_HEIGHT,
     TRUTH_DOTS,
+    UNSEEN_STROKE,
     draw_cross,
     draw_title,
 )
@@ -129,6 +130,8 @@ def paint_bird_eye(canvas: Canvas, points: np.ndarray, shown: FrameContent, regi
     for index in np.argsort(labels.emphasis, kind="stable").tolist():
         colour = labels.colour(index, style)
         _draw_label(canvas, footprints[index], colour, labels.emphasis[index])
+        if labels.unseen is not None and labels.unseen[index]:
+            canvas.lines(footprints[index][[[0, 2], [1, 3]]], colour, UNSEEN_STROKE)
     if shown.repredictions is not None:
         _draw_repredictions(canvas, region, shown.repredictions, style)
     for footprint in footprints[labels.is_rejected]:

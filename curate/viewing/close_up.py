@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from curate.frames import Frame
+from curate.frames import Camera, Frame
 from curate.geometry.boxes import bev_corners
-from curate.geometry.projection import image_rectangles
+from curate.geometry.projection import camera_of_boxes, image_rectangles
 from curate.viewing.bird_eye import Region
 from curate.viewing.canvas import Canvas
 from curate.viewing.legend import REPREDICTION_DASHES
@@ -35,13 +35,20 @@ class CloseUpLabel:
 
 
 def draw_close_up(frame: Frame, label: CloseUpLabel) -> np.ndarray:
-    """Return (260, 650, 3) uint8 RGB; the left part is empty if the label is outside the image."""
-    canvas = Canvas(_WIDE + _SIDE, _SIDE, DARK.background)
+    """Return (260, 650, 3) uint8 RGB: the camera image on the left, the points on the right.
+
+    Of several cameras, the one that shows most of the label is drawn. If none shows it, the left
+    part says so; without images, it is left out.
+    """
+    wide = _WIDE if any(camera.image is not None for camera in frame.cameras) else 0
+    canvas = Canvas(wide + _SIDE, _SIDE, DARK.background)
     red, green, blue = weight_colours(np.array([label.weight]))[0].tolist()
     colour = (red, green, blue)
     boxes = label.box[None] if label.former is None else np.stack([label.box, label.former])
     _draw_above(canvas, frame, boxes, colour)
-    _draw_image(canvas, frame, boxes, colour)
+    if wide:
+        [number] = camera_of_boxes(boxes[:1], frame.cameras)
+        _draw_image(canvas, frame.cameras[number] if number >= 0 else None, boxes, colour)
     return canvas.finish()
 
 
@@ -56,7 +63,7 @@ def _draw_above(
     points = frame.points[near]
     points = points[np.argsort(points[:, 2], kind="stable")]
     # Region reserves space for a title, which a close-up does not have.
-    shift = np.array([_WIDE, -region.to_pixels(np.array([region.x_max, y]))[1]])
+    shift = np.array([canvas.width - _SIDE, -region.to_pixels(np.array([region.x_max, y]))[1]])
     places = region.to_pixels(points[:, :2].astype(np.float64)) + shift
     canvas.dots(places, height_shades(points[:, 2]))
     outlines = region.to_pixels(bev_corners(boxes)) + shift
@@ -69,21 +76,21 @@ def _draw_above(
 
 
 def _draw_image(
-    canvas: Canvas, frame: Frame, boxes: np.ndarray, colour: tuple[int, int, int]
+    canvas: Canvas, camera: Camera | None, boxes: np.ndarray, colour: tuple[int, int, int]
 ) -> None:
-    """Draw the left part: the camera image around the label."""
+    """Draw the left part: the camera image around the label; None if no camera shows it."""
     canvas.box(0, 0, _WIDE, _SIDE, DARK.panel)
-    rectangle = image_rectangles(boxes[:1], frame.calibration, frame.image_size)[0]
-    if frame.image is None or np.isnan(rectangle).any():
+    if camera is None or camera.image is None:
         canvas.text(20, _SIDE / 2, "outside the image", DARK.text)
         return
-    window = _window(rectangle, frame.image_size)
+    rectangle = image_rectangles(boxes[:1], camera.calibration, camera.image_size)[0]
+    window = _window(rectangle, camera.image_size)
     left, top, right, bottom = window
     factor = min(_WIDE / (right - left), _SIDE / (bottom - top))
     size = (round((right - left) * factor), round((bottom - top) * factor))
     corner = np.array([(_WIDE - size[0]) // 2, (_SIDE - size[1]) // 2])
-    canvas.image(int(corner[0]), int(corner[1]), *size, frame.image[top:bottom, left:right])
-    strokes = box_strokes(boxes, frame.calibration, frame.image_size)
+    canvas.image(int(corner[0]), int(corner[1]), *size, camera.image[top:bottom, left:right])
+    strokes = box_strokes(boxes, camera.calibration, camera.image_size)
     low, high = corner, corner + np.array(size)
     for index, box_lines in enumerate(strokes):
         places = (box_lines - np.array([left, top])) * factor + corner

@@ -13,6 +13,8 @@ TITLE_HEIGHT = 36
 REPREDICTION_DASHES = (6.0, 4.0)
 TRUTH_DOTS = (1.5, 3.0)
 HUMAN_DASHES = (12.0, 3.0)
+# Width of the cross in a label that no camera shows.
+UNSEEN_STROKE = 1.0
 
 _BAR_PIXELS = 120
 _GAP = 24.0
@@ -36,6 +38,7 @@ def draw_legend(
     unweighted: bool = False,
     human: bool = False,
     rejected: bool = False,
+    unseen: bool = False,
     style: Style = DARK,
 ) -> None:
     """Draw the strip at the bottom: the weight scale, and the line styles that are used."""
@@ -59,6 +62,10 @@ def draw_legend(
                 draw_cross(canvas, outline, style)
             canvas.text(left + 28, baseline, name, style.text)
             left += 28 + canvas.text_width(name) + _GAP
+    if unseen:
+        outline = _swatch(canvas, (left, baseline), style.text, None)
+        canvas.lines(outline[[[0, 2], [1, 3]]], style.text, UNSEEN_STROKE)
+        canvas.text(left + 28, baseline, "no image evidence", style.text)
 
 
 def draw_cross(canvas: Canvas, corners: np.ndarray, style: Style = DARK) -> None:

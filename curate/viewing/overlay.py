@@ -70,6 +70,7 @@ class FrameContent:
             unweighted=bool(np.isnan(self.labels.weights).any()),
             human=bool(self.labels.is_human.any()),
             rejected=bool(self.labels.is_rejected.any()),
+            unseen=self.labels.unseen is not None and bool(self.labels.unseen.any()),
             style=self.style,
         )
 

@@ -4,8 +4,9 @@ Format: rerun's .rrd, https://rerun.io. The timeline `frame` counts the recorded
 """
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 
 from curate.errors import ConfigError, one_line
-from curate.frames import Calibration, Frame
+from curate.frames import Calibration, Camera, Frame
 from curate.viewing.palette import DARK, height_shades, weight_colours
 from curate.viewing.tags import ShownLabels, ShownRepredictions
 
@@ -72,12 +73,14 @@ def write_recording(path: Path, frames: Iterable[RecordedFrame]) -> int:
     stream = rerun.RecordingStream("curate")
     count = 0
     try:
-        _open(stream, partial)
+        frames = iter(frames)
+        first = list(islice(frames, 1))
+        _open(stream, partial, first[0].frame.cameras if first else ())
         # With `frame` as the only timeline, the viewer opens with it.
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for recorded in frames:
+        for recorded in chain(first, frames):
             stream.set_time(TIMELINE, sequence=count)
             _log_frame(rerun, stream, recorded)
             count += 1
@@ -133,10 +136,10 @@ def captions(labels: ShownLabels, evidence: Mapping[str, np.ndarray]) -> list[st
     return lines
 
 
-def _open(stream: Any, path: Path) -> None:
+def _open(stream: Any, path: Path, cameras: Sequence[Camera]) -> None:
     """Open a file for the stream; with RERUN=off in the environment rerun writes nothing."""
     try:
-        stream.save(path, default_blueprint=_blueprint())
+        stream.save(path, default_blueprint=_blueprint(cameras))
     except (OSError, RuntimeError) as error:
         raise ConfigError(
             f"{path.parent}: a recording cannot be written there: {one_line(error)}"
@@ -151,7 +154,8 @@ def _log_frame(rerun: ModuleType, stream: Any, recorded: RecordedFrame) -> None:
     positions = frame.points[:, :3]
     shades = height_shades(positions[:, 2])
     stream.log(POINTS, rerun.Points3D(positions, colors=shades, radii=_POINT_RADIUS))
-    _log_camera(rerun, stream, frame)
+    for camera in frame.cameras:
+        _log_camera(rerun, stream, camera)
     if len(labels):
         words = captions(labels, recorded.evidence)
         colours = weight_colours(labels.weights)
@@ -171,18 +175,24 @@ def _log_frame(rerun: ModuleType, stream: Any, recorded: RecordedFrame) -> None:
     stream.log(TRUTH, _boxes(rerun, TRUTH, truth[seen], white, names))
 
 
-def _log_camera(rerun: ModuleType, stream: Any, frame: Frame) -> None:
-    """Log the pose of the camera, its intrinsics and its image."""
-    if frame.image is None:
+def _log_camera(rerun: ModuleType, stream: Any, camera: Camera) -> None:
+    """Log the pose of a camera, its intrinsics and its image."""
+    if camera.image is None:
         return
-    intrinsics, rotation, centre = camera_pose(frame.calibration)
-    stream.log(CAMERA, rerun.Transform3D(translation=centre, mat3x3=rotation))
-    pinhole = rerun.Pinhole(image_from_camera=intrinsics, resolution=frame.image_size)
-    stream.log(CAMERA, pinhole)
-    pixels = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
+    place = _place(camera)
+    intrinsics, rotation, centre = camera_pose(camera.calibration)
+    stream.log(place, rerun.Transform3D(translation=centre, mat3x3=rotation))
+    pinhole = rerun.Pinhole(image_from_camera=intrinsics, resolution=camera.image_size)
+    stream.log(place, pinhole)
+    pixels = cv2.cvtColor(camera.image, cv2.COLOR_RGB2BGR)
     _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     image = rerun.EncodedImage(contents=content.tobytes(), media_type="image/jpeg")
-    stream.log(f"{CAMERA}/image", image)
+    stream.log(f"{place}/image", image)
+
+
+def _place(camera: Camera) -> str:
+    """Return the entity of a camera."""
+    return f"{CAMERA}/{camera.name}" if camera.name else CAMERA
 
 
 def _boxes(
@@ -201,8 +211,8 @@ def _boxes(
     )
 
 
-def _blueprint() -> Any:
-    """Return the layout of the viewer: the LiDAR view on top, the image below."""
+def _blueprint(cameras: Sequence[Camera]) -> Any:
+    """Return the layout of the viewer: the LiDAR view on top, the images below."""
     from rerun import blueprint
 
     boxes = [f"/{place}" for place in (PREDICTIONS, REPREDICTIONS, TRUTH)]
@@ -210,11 +220,17 @@ def _blueprint() -> Any:
         blueprint.Vertical(
             blueprint.Spatial3DView(origin="/world", name="LiDAR"),
             blueprint.Horizontal(
-                blueprint.Spatial2DView(
-                    origin=f"/{CAMERA}", contents=[f"/{CAMERA}/**", *boxes], name="Camera"
+                *(
+                    blueprint.Spatial2DView(
+                        origin=f"/{place}",
+                        contents=[f"/{place}/**", *boxes],
+                        name=camera.name or "Camera",
+                    )
+                    for camera in cameras
+                    for place in [_place(camera)]
                 ),
                 blueprint.TextDocumentView(origin=f"/{TITLE}", name="Frame"),
-                column_shares=[4, 1],
+                column_shares=[*([4] * len(cameras)), 1],
             ),
             row_shares=[3, 2],
         ),

@@ -36,6 +36,7 @@ class ShownLabels:
         numbers: (n,) k of each label in its frame; None for 0 to n - 1.
         decisions: (n,) str, what a person decided about each label: accepted, moved, added,
             rejected, or ""; None if nobody decided.
+        unseen: (n,) bool, labels that no camera of the frame shows; None if there is no camera.
     """
 
     boxes: np.ndarray
@@ -46,6 +47,7 @@ class ShownLabels:
     zero_weight: ZeroWeight = "background"
     numbers: np.ndarray | None = None
     decisions: np.ndarray | None = None
+    unseen: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.boxes)

@@ -81,6 +81,8 @@ class Evidence:
         iou: (n,) the detector's estimate of the label's 3D IoU with its object, in [0, 1]; NaN if
             there is no estimate. All NaN by default.
         boxes: (n, 7) in the LiDAR frame; needed only with a memory.
+        unseen: (n,) bool, labels without image evidence, which must not outweigh the others. By
+            default there are none.
         memory: the policy's labels of the previous round, for policies with `remembers`; None in
             the first round.
     """
@@ -93,14 +95,22 @@ class Evidence:
     iou: np.ndarray = field(default_factory=lambda: np.zeros(0))
     boxes: np.ndarray = field(default_factory=empty_boxes)
     memory: Memory | None = None
+    unseen: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
         """Raise DataError if a column is not aligned or out of its range."""
         if len(self.iou) == 0:
             object.__setattr__(self, "iou", np.full(len(self.loss), np.nan))
+        if len(self.unseen) == 0:
+            object.__setattr__(self, "unseen", np.zeros(len(self.loss), dtype=bool))
         if self.memory is not None and len(self.boxes) != len(self.loss):
             raise DataError("evidence: a memory was given without the boxes of the labels")
-        columns = {"frame_index": self.frame_index, "category": self.category, **self._numbers()}
+        columns = {
+            "frame_index": self.frame_index,
+            "category": self.category,
+            "unseen": self.unseen,
+            **self._numbers(),
+        }
         for name, column in columns.items():
             if column.shape != (len(self.loss),):
                 raise DataError(

@@ -20,7 +20,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from curate.errors import ConfigError
-from curate.shapes import Float
+from curate.shapes import Bool, Float
 from curate.weighting.base import Age, Evidence, Policy, Weights
 
 Scope = Literal["round", "category", "frame"]
@@ -73,6 +73,8 @@ class PSPSL(SPSL):
         self_paced: false removes the factor 1 - L / lambda, to measure the effect of the schedule:
             v = rho_det for every label that matched, else 0. If no label of the round matched, as
             for a detector without a second pass, v = rho_det for every label.
+
+    A label without image evidence weighs at most as much as the best label with it.
     """
 
     self_paced: bool = True
@@ -82,9 +84,22 @@ class PSPSL(SPSL):
         """Return the weight of every label; see `self_paced` for labels without a match."""
         if not self.self_paced:
             counted = evidence.matched | (not evidence.matched.any())
-            return Weights.without_age(np.where(counted, evidence.rho_det, 0.0))
+            v = np.where(counted, evidence.rho_det, 0.0)
+            return Weights.without_age(limit_unseen(v, evidence.unseen))
         lambda_u = age_parameter(evidence, age, self.scope, self.quantile)
-        return Weights(evidence.rho_det * easiness(evidence.loss, lambda_u), lambda_u)
+        v = evidence.rho_det * easiness(evidence.loss, lambda_u)
+        return Weights(limit_unseen(v, evidence.unseen), lambda_u)
+
+
+def limit_unseen(
+    v: Float[np.ndarray, " n"], unseen: Bool[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Return (n,) weights in which no label without image evidence outweighs the best one with it.
+
+    The weights stay as they are if no label with image evidence has a weight above 0.
+    """
+    limit = v.max(where=~unseen, initial=0.0)
+    return np.where(unseen, np.minimum(v, limit), v) if limit > 0 else v
 
 
 def easiness(

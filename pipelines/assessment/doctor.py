@@ -14,6 +14,7 @@ from curate.evaluation.examination import (
 )
 from curate.frames import Frame
 from curate.names import NameFinding, renamed
+from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
 from pipelines.category_names import detector_differences, find_differences
 from pipelines.engine.rounds import newest_checkpoint
@@ -121,8 +122,14 @@ def _no_views(config: Config) -> Finding:
 
 
 def _segmenter(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
-    found = open_segmenter(workspace.config).segment(frame)
-    width, height = frame.image_size
+    segmenter = open_segmenter(workspace.config)
+    return [found for view in frame.views() for found in _map(workspace, segmenter, view)]
+
+
+def _map(workspace: Workspace, segmenter: Segmenter, view: Frame) -> Sequence[Finding]:
+    """Check the semantic map of a frame with one camera."""
+    found = segmenter.segment(view)
+    width, height = image_size_of(view)
     if found.class_ids.shape != (height, width):
         shape = list(found.class_ids.shape)
         message = f"the map is {shape}, the image [{height}, {width}]"
@@ -138,4 +145,5 @@ def _segmenter(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     }
     summary = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
     state = "ok" if any(shares.values()) else "suspect"
-    return [Finding("segmenter", state, f"share of the pixels: {summary}")]
+    camera = f"{view.camera}: " if view.camera else ""
+    return [Finding("segmenter", state, f"{camera}share of the pixels: {summary}")]

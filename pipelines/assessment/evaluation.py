@@ -1,7 +1,7 @@
 """Evaluate a detector on the val split, which is never trained on."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from curate.evaluation.missing_boxes import ProjectedBoxes, with_projected_boxes
 from curate.evaluation.reliability import MatchSettings, Overlap
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
-from curate.geometry.projection import image_rectangles
+from curate.geometry.projection import box_rectangles
 from pipelines.engine.executors.base import FrameJob
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
@@ -81,10 +81,8 @@ def match_settings(config: Config, overlap: Overlap) -> MatchSettings:
 
 
 def rectangles_in_image(boxes: np.ndarray, frame: Frame) -> np.ndarray | None:
-    """Return (n, 4) projected boxes, see `image_rectangles`; None for a frame without an image."""
-    if frame.image_size is None:
-        return None
-    return image_rectangles(boxes, frame.calibration, frame.image_size)
+    """Return (n, 4) projected boxes, see `box_rectangles`; None for a frame without an image."""
+    return None if frame.image_size is None else box_rectangles(boxes, frame)
 
 
 def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str, Detections]:
@@ -208,6 +206,8 @@ def _in_camera_frame(
     for name, annotations in truth.items():
         frame = frames[name]
         sides.append(kitti_objects(annotations, frame))
-        results.append(from_detections(found[name], frame.calibration, frame.image_size))
+        objects = from_detections(found[name], frame.calibration, frame.image_size)
+        rectangles = box_rectangles(found[name].boxes, frame)
+        results.append(replace(objects, boxes_2d=np.where(np.isnan(rectangles), -1.0, rectangles)))
     totals = sum(each.missing for each in sides), sum(each.projected for each in sides)
     return [each.objects for each in sides], results, totals

@@ -9,6 +9,7 @@ from curate.segmenters.classes import CLASS_MAPS
 from pipelines.commands.options import JsonOption, complete, one_of, registered
 from pipelines.registry import DATASETS, DETECTORS, SEGMENTERS
 from pipelines.reports.terminal import print_json, print_line
+from pipelines.workspace.splits import SPLITS
 
 
 def init(
@@ -23,9 +24,7 @@ def init(
     ] = "kitti",
     dataset_option: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option(
-            help="Option of the data set, as NAME=VALUE, e.g. camera=CAM_BACK; repeatable."
-        ),
+        typer.Option(help="Option of the data set, as NAME=VALUE, e.g. cameras=all; repeatable."),
     ] = None,
     labeled: Annotated[
         str,
@@ -99,7 +98,9 @@ def init(
     from pipelines.assembly import check_extensions
     from pipelines.category_names import check_before_init, stored_names
     from pipelines.workspace.config import change_setting, make_config
+    from pipelines.workspace.images import fit_priors, report_images
     from pipelines.workspace.setup import check_files, initialise
+    from pipelines.workspace.workspace import open_dataset
 
     if not root.is_dir():
         raise ConfigError(f"--root {root}: no such folder")
@@ -126,8 +127,11 @@ def init(
     check_extensions(config)
     check_files(config)
     check_before_init(config)
+    chosen = any(setting.partition("=")[0].strip() == "run.priors" for setting in settings or ())
+    config = fit_priors(config, open_dataset(config), explicit=chosen)
     workspace = initialise(directory, config, labeled, val)
-    counts = {split: len(workspace.frames(split)) for split in ("labeled", "unlabeled", "val")}
+    report_images(config, workspace.dataset, list(workspace.frames(*SPLITS)))
+    counts = {split: len(workspace.frames(split)) for split in SPLITS}
     objects = stored_names(workspace)
     if as_json:
         print_json({"workspace": str(workspace.root), "frames": counts, "objects": objects})

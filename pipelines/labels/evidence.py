@@ -77,6 +77,9 @@ def read_evidence(
     rho = rho_columns(workspace.config.run.priors)
     measured = {"score": "prediction", "iou": "prediction", "loss": "consistency"}
     tables = {name: table for name, table in measured.items() if name in requested} | rho
+    config = workspace.config
+    if "semantic" in config.run.priors and config.semantic.outside == "expected":
+        tables["box_pixels"] = "semantic_prior"
     if boxes:
         tables |= dict.fromkeys(BOX_COLUMNS, "prediction")
     with workspace.database.reading() as connection:
@@ -94,6 +97,7 @@ def read_evidence(
         rho={column: found[column] for column in rho},
         iou=found.get("iou", missing),
         boxes=np.stack([found[name] for name in BOX_COLUMNS], axis=1) if boxes else empty_boxes(),
+        unseen=found.get("box_pixels", missing) == 0,
     )
 
 

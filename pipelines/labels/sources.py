@@ -2,12 +2,13 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 from curate.errors import ConfigError
 from curate.exporters.columns import WEIGHTED_LABELS
-from curate.priors.base import check_declaration
+from curate.priors.base import Column, check_declaration
+from curate.priors.semantic import SemanticPrior
 from db import bulk
 from db.evidence import OWN_TABLES, Declaration, declare, read_declarations
 from db.views import create_views, drop_views
@@ -15,7 +16,12 @@ from pipelines.registry import PRIORS
 from pipelines.workspace.workspace import Workspace
 
 _log = logging.getLogger(__name__)
-_RESERVED = frozenset({*(column.name for column in WEIGHTED_LABELS), "probability", "frame_id"})
+_RESERVED = frozenset(
+    {
+        *(column.name for column in (*WEIGHTED_LABELS, *SemanticPrior.camera_columns)),
+        *("probability", "frame_id"),
+    }
+)
 _FRAME_MEMBERS = ("measured_columns", "measure", "rate")
 
 
@@ -28,12 +34,14 @@ class Source:
         declaration: its name and its columns.
         measured_columns: names of the columns that it measures; empty for a source of sequences.
         of_sequences: whether it processes whole sequences, not single frames.
+        camera_columns: further columns if frames have several cameras.
     """
 
     configured: str
     declaration: Declaration
     measured_columns: tuple[str, ...]
     of_sequences: bool
+    camera_columns: tuple[Column, ...] = ()
 
     @property
     def table(self) -> str:
@@ -65,7 +73,8 @@ def source_of(configured: str) -> Source:
         )
     declaration = Declaration(kind.name, configured, tuple(kind.columns), kind.rho_column)
     measured = () if of_sequences else tuple(kind.measured_columns)
-    return Source(configured, declaration, measured, of_sequences)
+    further = tuple(kind.camera_columns) if configured in OWN_TABLES else ()
+    return Source(configured, declaration, measured, of_sequences, further)
 
 
 def sources_of(names: Sequence[str]) -> tuple[Source, ...]:
@@ -92,6 +101,23 @@ def sources_of(names: Sequence[str]) -> tuple[Source, ...]:
     return found
 
 
+def prepare_stage(workspace: Workspace, source: Source) -> None:
+    """Prepare the table of a source before its stage runs, see `prepare_table`.
+
+    With several cameras, the column of the semantic prior's camera is declared too.
+    """
+    prepare_table(workspace, source)
+    if source.camera_columns and _has_cameras(workspace):
+        further = replace(source.declaration, columns=source.camera_columns, rho_column=None)
+        _declare(workspace, further)
+
+
+def _has_cameras(workspace: Workspace) -> bool:
+    """Return whether the frames have several cameras."""
+    frames = workspace.dataset.frame_ids()
+    return len(workspace.dataset.read(frames[0], points=False).cameras) > 1
+
+
 def prepare_table(workspace: Workspace, source: Source) -> None:
     """Create the table of a source on its first use, and recreate the views with its columns.
 
@@ -99,9 +125,12 @@ def prepare_table(workspace: Workspace, source: Source) -> None:
         ConfigError: if another stored source has a column of the same name.
     """
     bulk.use_source(source.declaration)
-    database, declaration = workspace.database, source.declaration
-    if declaration.name in OWN_TABLES:
-        return
+    if source.declaration.name not in OWN_TABLES:
+        _declare(workspace, source.declaration)
+
+
+def _declare(workspace: Workspace, declaration: Declaration) -> None:
+    database = workspace.database
     with database.reading() as connection:
         stored = read_declarations(connection)
     if declaration in stored:

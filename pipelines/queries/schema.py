@@ -20,7 +20,7 @@ from curate.errors import ConfigError, DatabaseError, one_line
 from curate.exporters.columns import WEIGHTED_LABELS
 from curate.priors.base import Column
 from curate.spelling import did_you_mean
-from db.evidence import Declaration, evidence_table, label_columns
+from db.evidence import OWN_TABLES, Declaration, evidence_table, label_columns
 from db.models import Base
 from db.views import VIEW_COLUMNS
 from pipelines.queries.run_query import run_query
@@ -102,7 +102,8 @@ def working_schema(declared: Sequence[Declaration] = ()) -> tuple[Relation, ...]
     for name, sources in VIEW_COLUMNS.items():
         pairs = (source.split(".") for source in sources)
         views.append(_view(name, (_column(tables[table], column) for table, column in pairs)))
-    return (*views, *tables.values(), *map(_of_source, declared))
+    others = [each for each in declared if each.name not in OWN_TABLES]
+    return (*views, *tables.values(), *map(_of_source, others))
 
 
 def exported_schema(path: Path) -> tuple[Relation, ...]:

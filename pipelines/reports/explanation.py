@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Select, and_, select, text
+from sqlalchemy import Select, and_, func, select, text
 
 from curate.detections import Detections
 from curate.errors import WorkspaceError
@@ -131,7 +131,9 @@ def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
     evidence = _evidence(config, label, views)
     priors_only = not views and not _self_paced(config, label["policy"])
     recomputed = _weight(label, evidence, age, priors_only=priors_only)
-    lines = _lines(config, label, views, age, evidence, recomputed)
+    limit = _limit(workspace, config, label, recomputed)
+    lines = _lines(config, label, views, age, evidence, recomputed, limit)
+    recomputed = recomputed if limit is None else limit
     return Explanation(label, views, age, evidence, recomputed, tuple(lines))
 
 
@@ -319,6 +321,23 @@ def _weight(
     return v * (evidence.rho_det if label["policy"] == "pspsl" else 1.0)
 
 
+def _limit(
+    workspace: Workspace, config: Config, label: dict[str, Any], recomputed: float | None
+) -> float | None:
+    """Return the weight of the best label with image evidence, if it limits this label's weight."""
+    applies = label["box_pixels"] == 0 and config.semantic.outside == "expected"
+    if not applies or label["policy"] != "pspsl" or not recomputed:
+        return None
+    weight, prior = bulk.table("weight"), bulk.table("semantic_prior")
+    same = and_(*(weight.c[key] == prior.c[key] for key in ("round", "frame_id", "k")))
+    query = select(func.max(weight.c.v)).select_from(weight.join(prior, same)).where(
+        weight.c.round == label["round"], weight.c.policy == label["policy"],
+        prior.c.box_pixels > 0,
+    )  # fmt: skip
+    best = workspace.database.rows(query)[0][0]
+    return float(best) if best and best < recomputed else None
+
+
 def _lines(
     config: Config,
     label: dict[str, Any],
@@ -326,6 +345,7 @@ def _lines(
     age: AgeParameter | None,
     evidence: Recomputed,
     recomputed: float | None,
+    limit: float | None,
 ) -> list[str]:
     number = _numbers(label)
     section = config.repredict
@@ -352,6 +372,11 @@ def _lines(
     lines.append(f"  weight         {number['weight']}{_meaning(config, label)}")
     if recomputed is not None:
         lines.append(f"  recomputed     {_working(label, evidence, age)}{recomputed:.4f}")
+        if limit is not None:
+            lines.append(
+                f"  limited        to {limit:.4f}, the weight of the best label with image evidence"
+            )
+            recomputed = limit
         if not math.isclose(recomputed, label["weight"], abs_tol=1e-6):
             lines.append(
                 "  they differ: the settings have changed since; rerun `curate solve` to update "

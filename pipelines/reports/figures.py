@@ -40,10 +40,19 @@ def summary(
         low, high = float(totals.ages[0]), float(totals.ages[-1])
         facts.append(("lambda", f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"))
     facts.append(("age e/E", _age(workspace, number)))
+    if totals.unseen is not None:
+        facts.append(("without image evidence", f"{totals.unseen:,} ({totals.unseen / n:.1%})"))
     note = (
         f"{n:,} labels in {totals.frames:,} unlabeled frames, {kept:,} with a weight "
         f"above 0; the others are {ZERO_WEIGHT_WORDS[zero_weight_of(workspace.config, policy)]}."
     )
+    if totals.unseen:
+        without, with_images = totals.heaviest
+        note += (
+            f" No camera shows {totals.unseen:,} of the labels (semantic.outside = "
+            f"'{workspace.config.semantic.outside}'): their highest weight is {without:.4g}, that "
+            f"of a label with image evidence {with_images:.4g}."
+        )
     return Section("The round", note, facts=facts)
 
 

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError
 from curate.files.atomic import replace_file
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
+from curate.geometry.projection import camera_of_boxes
 from curate.viewing.bird_eye import draw_bird_eye
 from curate.viewing.canvas import Canvas, save_png
 from curate.viewing.chart_style import ImageFormat
@@ -89,6 +90,7 @@ def shown_labels(workspace: Workspace, frame: Frame, found: FrameBoxes, policy: 
         zero_weight_of(workspace.config, policy),
         found.numbers,
         found.decisions,
+        unseen=camera_of_boxes(labels.boxes, frame.cameras) < 0 if frame.cameras else None,
     )
 
 
@@ -96,16 +98,16 @@ def draw_labels(workspace: Workspace, round_number: int, name: str) -> list[Path
     """Draw image overlay and bird's eye view into two files in `pictures`; return their paths."""
     policy = workspace.config.run.method
     frame = workspace.dataset.read(name, image=True)
-    if frame.image is None:
-        raise DataError(f"frame {name}: the data set has no image")
     found = read_frame(workspace, name, round_number, policy)
     labels = shown_labels(workspace, frame, found, policy)
     title = f"frame {name}, round {round_number}, weights by {policy}"
     stem = f"round-{round_number:02d}-{name}-{policy}"
     pictures = {
         f"{stem}-bird-eye.png": draw_bird_eye(frame.points, labels, title=title),
-        f"{stem}-image.png": draw_overlay(frame.image, frame.calibration, labels, title=title),
     }
+    if frame.image is not None:
+        overlay = draw_overlay(frame.image, frame.calibration, labels, title=title)
+        pictures[f"{stem}-image.png"] = overlay
     folder = workspace.root / "pictures"
     for file, picture in pictures.items():
         save_png(folder / file, picture)

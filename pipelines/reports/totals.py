@@ -75,6 +75,9 @@ class RoundTotals:
         shares: the columns with values from 0 to 1, with their meanings; each has a histogram.
         frames: number of frames with labels.
         trusted: number of labels with a weight above 0.5.
+        unseen: number of labels without image evidence, because no camera shows them; None if the
+            round has no image evidence.
+        heaviest: the highest weight of a label without and with image evidence.
         ages: the `SHOWN_AGES` smallest values of lambda, and the greatest.
         everything: sums over all labels.
         cells: sums by category and index in `BANDS`.
@@ -85,6 +88,8 @@ class RoundTotals:
     shares: Mapping[str, str]
     frames: int = 0
     trusted: int = 0
+    unseen: int | None = None
+    heaviest: tuple[float, float] = (0.0, 0.0)
     ages: np.ndarray = field(default_factory=lambda: np.zeros(0))
     everything: Sums = field(default_factory=Sums)
     cells: dict[tuple[str, int], Sums] = field(default_factory=dict)
@@ -108,6 +113,7 @@ class RoundTotals:
         self.frames += len(labels.frame_names)
         self.trusted += int((weights > 0.5).sum())
         self.everything.add(weights, scores)
+        self._add_unseen(weights, labels.numbers["box_pixels"])
         ages = labels.numbers["lambda_u"]
         ages = np.unique([*self.ages, *np.unique(ages[~np.isnan(ages)])])
         self.ages = np.unique([*ages[:SHOWN_AGES], *ages[-1:]])
@@ -120,6 +126,18 @@ class RoundTotals:
             in_cell = cell == number
             sums = self.cells.setdefault((labels.category_names[category], band), Sums())
             sums.add(weights[in_cell], scores[in_cell])
+
+    def _add_unseen(self, weights: np.ndarray, box_pixels: np.ndarray) -> None:
+        """Count the labels without image evidence."""
+        if np.isnan(box_pixels).all():
+            return
+        unseen = box_pixels == 0
+        self.unseen = (self.unseen or 0) + int(unseen.sum())
+        without, with_images = self.heaviest
+        self.heaviest = (
+            weights.max(where=unseen, initial=without),
+            weights.max(where=box_pixels > 0, initial=with_images),
+        )
 
 
 def read_shares(workspace: Workspace) -> dict[str, str]:

@@ -152,7 +152,7 @@ class FramePages:
         with self._workspace.database.reading() as connection:
             declared = read_declarations(connection)
         tables = [bulk.table(name) for name in ("consistency", *OWN_TABLES.values())]
-        tables += [evidence_table(each) for each in declared]
+        tables += [evidence_table(each) for each in declared if each.name not in OWN_TABLES]
         evidence = [
             column.name for column in label_columns(declared) if _is_evidence(column, tables)
         ]

@@ -1,8 +1,8 @@
 """export: write the weighted labels of a round to files that trainers read."""
 
 import shutil
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -193,6 +193,7 @@ def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:
         labels = StoredLabels(workspace, round_number, policy, columns)
         frames = _frames(connection, labels.frames(connection))
         truth = _ground_truth(connection)
+    frames = _with_further_images(workspace, frames)
     read = partial(workspace.dataset.read, points=False)
     return LabelSet(
         description, frames, truth, labels, read, workspace.dataset.read, labels.columns
@@ -253,6 +254,20 @@ def _frames(connection: Connection, with_labels: set[str]) -> list[FrameFiles]:
         FrameFiles(**row)
         for row in rows
         if row["split"] == "labeled" or row["frame"] in with_labels
+    ]
+
+
+def _with_further_images(workspace: Workspace, frames: list[FrameFiles]) -> list[FrameFiles]:
+    """Return the frames with the images of all cameras, if the data set has several."""
+    root, files = workspace.config.dataset.root, workspace.dataset.files
+    if not frames or not files(frames[0].frame).further_images:
+        return frames
+
+    def relative(paths: Sequence[Path]) -> tuple[str, ...]:
+        return tuple(str(path.relative_to(root)) for path in paths)
+
+    return [
+        replace(each, further_images=relative(files(each.frame).further_images)) for each in frames
     ]
 
 

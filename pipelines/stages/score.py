@@ -34,10 +34,11 @@ from pipelines.engine.stage import (
     SequenceStage,
     Settings,
 )
-from pipelines.labels.sources import Source, prepare_table, source_of, sources_of
+from pipelines.labels.sources import Source, prepare_stage, source_of, sources_of
 from pipelines.registry import PRIORS
 from pipelines.stages.predict import unset_rename
 from pipelines.workspace.config import Config
+from pipelines.workspace.images import check_segmentable
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256, stat_fingerprint
 
 
@@ -141,7 +142,7 @@ def stage(source: Source) -> FramesStage:
             writes=(source.table,),
             settings=partial(_sequence_settings, source),
             function=lambda workspace, _context: ScoreSequence(workspace.config, name),
-            prepare=partial(prepare_table, source=source),
+            prepare=partial(prepare_stage, source=source),
         )
     learns = ("ground_truth",) if PRIORS.takes(name, "thresholds") else ()
     return FrameStage(
@@ -158,7 +159,7 @@ def stage(source: Source) -> FramesStage:
             function=partial(_function, Rescore, name),
         ),
         check=partial(_check, name),
-        prepare=partial(prepare_table, source=source),
+        prepare=partial(prepare_stage, source=source),
     )
 
 
@@ -172,6 +173,8 @@ def stages(names: Sequence[str]) -> tuple[FramesStage, ...]:
 
 
 def _check(name: str, workspace: Workspace) -> None:
+    if PRIORS.takes(name, "segmenter"):
+        check_segmentable(workspace.config, workspace.dataset)
     check_prior(workspace.config, name)
 
 
@@ -238,7 +241,8 @@ def _read_measured(
     source: Source, workspace: Workspace, context: RoundContext, frame_ids: Sequence[int]
 ) -> Mapping[int, Measured]:
     """Return the measured columns of some frames by frame key, each in the order of k."""
-    table, names = bulk.table(source.table), source.measured_columns
+    table = bulk.table(source.table)
+    names = (*source.measured_columns, *(each.name for each in source.camera_columns))
     query = (
         select(table.c.frame_id, *(table.c[column] for column in names))
         .where(table.c.round == context.number, table.c.frame_id.in_(frame_ids))
@@ -252,4 +256,7 @@ def _read_measured(
 
 def _array(values: Sequence[Any]) -> np.ndarray:
     """Return a stored column as an array, with NaN for null."""
-    return np.array(values, dtype=np.float64) if None in values else np.array(values)
+    if None not in values:
+        return np.array(values)
+    has_text = any(isinstance(value, str) for value in values)
+    return np.array(values, dtype=object if has_text else np.float64)

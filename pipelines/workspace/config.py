@@ -323,9 +323,10 @@ class SemanticSection(Section):
         default="geometric",
         description="How s and S/A are combined: sqrt(s S/A), s S/A or (s + S/A) / 2.",
     )
-    outside: Literal["neutral", "drop"] = Field(
-        default="neutral",
-        description="Trust rho_anno of a box outside the image: 'neutral' is s, 'drop' is 0.",
+    outside: Literal["expected", "neutral", "drop"] = Field(
+        default="expected",
+        description="Trust rho_anno of a box that no camera shows: 'expected' is 0.7 s^2, and such "
+        "a label never outweighs the best label with image evidence; 'neutral' is s; 'drop' is 0.",
     )
 
 

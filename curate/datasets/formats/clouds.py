@@ -40,6 +40,9 @@ _VALUE_BYTES = 4
 _ROUNDING = 0.01
 _SATURATED_SHARE = 0.001
 _USUAL_SCALES = (255, 4095, 65535)
+# A file without an apparent problem is not rejected because a few rows look better otherwise.
+_LEAST_ROWS = 4
+_MISSING = "contains NaN or infinite numbers"
 
 
 def read_cloud(
@@ -90,23 +93,22 @@ def _read_bin(path: Path, layout: PointLayout, *, drop_missing: bool) -> Float32
     else:
         points = np.zeros((len(table), 4), dtype=np.float32)
         points[:, : len(chosen)] = table[:, chosen]
-    # Fast path: the minimum and maximum over all columns reveal NaN and infinite numbers as well.
-    missing = 0
-    if not np.isfinite([points.min(initial=0), points.max(initial=0)]).all():
-        finite = np.isfinite(points).all(axis=1)
-        missing = len(points) - int(finite.sum())
-        first = int(np.flatnonzero(~finite)[0])
-        points = points[finite]
     problem = _problem(points, layout)
+    missing = np.zeros(0, dtype=int)
+    if problem is _MISSING:
+        finite = np.isfinite(points).all(axis=1)
+        missing = np.flatnonzero(~finite)
+        points = points[finite]
+        problem = _problem(points, layout)
     # A declared layout needs a second look only if something is wrong with the points.
-    if problem or not layout.is_declared or missing:
-        others = better_readings(values, len(names))
+    if problem or len(missing) or not layout.is_declared:
+        others = better_readings(values, len(names), least_rows=1 if problem else _LEAST_ROWS)
         if others:
             raise DataError(_two_readings(path, values, len(names), others, problem))
-    if missing and not drop_missing:
+    if len(missing) and not drop_missing:
         raise DataError(
-            f"{path}: {missing} of {len(table)} points are NaN or infinite, "
-            f"the first is point {first}; remove them from the file"
+            f"{path}: {len(missing)} of {len(table)} points are NaN or infinite, "
+            f"the first is point {missing[0]}; remove them from the file"
         )
     if problem:
         raise DataError(f"{path}: {problem}")
@@ -160,17 +162,20 @@ def _either(numbers: object) -> str:
 
 
 def _problem(points: Float[np.ndarray, "n 4"], layout: PointLayout) -> str | None:
-    """Return what is wrong with the points and how to fix it, or None."""
-    coordinates = points[:, :3]
-    low, high = coordinates.min(initial=0), coordinates.max(initial=0)
+    """Return what is wrong with the points and how to fix it, or None; `_MISSING` for NaN."""
+    # Fast path: the extremes over all columns reveal NaN and infinite numbers as well.
+    low, high = float(points.min(initial=0)), float(points.max(initial=0))
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return _MISSING
     if low < -MAX_RANGE_METRES or high > MAX_RANGE_METRES:
-        far = np.abs(coordinates).max(axis=1)
+        far = np.abs(points[:, :3]).max(axis=1)
         k = int(far.argmax())
-        return (
-            f"point {k} is {far[k]:.4g} m away; points must be in metres from the LiDAR, "
-            f"remove those beyond {MAX_RANGE_METRES:g} m"
-        )
-    return _intensity_problem(points[:, 3], layout.full_intensity)
+        if far[k] > MAX_RANGE_METRES:
+            return (
+                f"point {k} is {far[k]:.4g} m away; points must be in metres from the LiDAR, "
+                f"remove those beyond {MAX_RANGE_METRES:g} m"
+            )
+    return _intensity_problem(np.ascontiguousarray(points[:, 3]), layout.full_intensity)
 
 
 def _intensity_problem(intensities: Float[np.ndarray, " n"], full: float) -> str | None:
@@ -199,11 +204,14 @@ def _intensity_problem(intensities: Float[np.ndarray, " n"], full: float) -> str
 
 def _scaled(points: Float32[np.ndarray, "n 4"], layout: PointLayout) -> Float32[np.ndarray, "n 4"]:
     """Divide the intensities by the full intensity and clip them to [0, 1], in place."""
-    intensities = points[:, 3]
+    intensities = np.ascontiguousarray(points[:, 3])
     if layout.full_intensity != 1:
         intensities /= np.float32(layout.full_intensity)
     if intensities.min(initial=0) < 0 or intensities.max(initial=0) > 1:
         np.clip(intensities, 0, 1, out=intensities)
+    elif layout.full_intensity == 1:
+        return points
+    points[:, 3] = intensities
     return points
 
 

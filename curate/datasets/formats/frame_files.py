@@ -4,6 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
+from functools import cached_property
 from pathlib import Path
 
 from curate.errors import DataError
@@ -14,7 +15,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 class FrameFolder:
     """The files FRAME.suffix of a folder; suffixes are compared without case.
 
-    The folder is listed once. A folder that does not exist is empty.
+    The folder is listed once, when it is first needed. A folder that does not exist is empty.
 
     Args:
         folder: the folder.
@@ -26,27 +27,29 @@ class FrameFolder:
         self.folder = folder
         self._suffixes = suffixes
         self._kind = kind
-        self._names: dict[str, str] = {}
-        self._second: dict[str, str] = {}
-        self.others: Counter[str] = Counter()
-        for name in visible_names(folder):
+
+    @cached_property
+    def _listing(self) -> tuple[dict[str, str], dict[str, str], Counter[str]]:
+        """The file of each frame, a second file of a frame, and the count of other files."""
+        names: dict[str, str] = {}
+        second: dict[str, str] = {}
+        others: Counter[str] = Counter()
+        for name in visible_names(self.folder):
             stem, dot, ending = name.rpartition(".")
-            if f"{dot}{ending}".lower() not in suffixes:
-                self.others[ending if dot else ""] += 1
-            elif stem in self._names:
-                self._second[stem] = name
+            if f"{dot}{ending}".lower() not in self._suffixes:
+                others[ending if dot else ""] += 1
+            elif stem in names:
+                second[stem] = name
             else:
-                self._names[stem] = name
+                names[stem] = name
+        return names, second, others
 
     def __contains__(self, frame: str) -> bool:
-        return frame in self._names
-
-    def __len__(self) -> int:
-        return len(self._names)
+        return frame in self._listing[0]
 
     def frames(self) -> tuple[str, ...]:
         """Return the frames that have a file, sorted."""
-        return tuple(sorted(self._names))
+        return tuple(sorted(self._listing[0]))
 
     def path(self, frame: str) -> Path:
         """Return the path of a frame's file, which need not exist.
@@ -54,13 +57,14 @@ class FrameFolder:
         Raises:
             DataError: if the frame has two files.
         """
-        if frame in self._second:
-            one, two = sorted((self._names[frame], self._second[frame]))
+        names, second, _ = self._listing
+        if frame in second:
+            one, two = sorted((names[frame], second[frame]))
             raise DataError(
                 f"{self.folder}: frame {frame} has two {self._kind} files, {one} and {two}; "
                 "remove or rename one of them"
             )
-        return self.folder / self._names.get(frame, f"{frame}{self._suffixes[0]}")
+        return self.folder / names.get(frame, f"{frame}{self._suffixes[0]}")
 
     def check(self, frames: Iterable[str]) -> None:
         """Check that none of the frames has two files.
@@ -68,18 +72,19 @@ class FrameFolder:
         Raises:
             DataError: if one has.
         """
-        for frame in sorted(self._second.keys() & set(frames)):
+        for frame in sorted(self._listing[1].keys() & set(frames)):
             self.path(frame)
 
     def content(self) -> str:
         """Return what the folder contains instead, for the message that there is no such file."""
         if not self.folder.is_dir():
             return "there is no such folder"
-        if not self.others:
+        others = self._listing[2]
+        if not others:
             return "it is empty"
         listed = [
             f"{count} {f'*.{ending}' if ending else 'folders or files without a suffix'}"
-            for ending, count in self.others.most_common(3)
+            for ending, count in others.most_common(3)
         ]
         return f"it contains {', '.join(listed)}"
 

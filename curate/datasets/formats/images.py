@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curate.errors import DataError
+from curate.errors import ConfigError, DataError
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_START = PNG_SIGNATURE + b"\0\0\0\rIHDR"
@@ -54,6 +54,25 @@ def read_sized_image(path: Path, *, pixels: bool) -> tuple[tuple[int, int], np.n
     image = read_image(path)
     height, width = image.shape[:2]
     return (width, height), image
+
+
+def read_optional_image(
+    path: Path | None, size: tuple[int, int] | None, *, pixels: bool
+) -> tuple[tuple[int, int] | None, np.ndarray | None]:
+    """Return size and pixels as `read_sized_image`; for no path, the given size and no pixels."""
+    return (size, None) if path is None else read_sized_image(path, pixels=pixels)
+
+
+def check_image_size(size: object, place: str) -> tuple[int, int]:
+    """Return a size in a configuration, [width, height] in pixels, as a tuple.
+
+    Raises:
+        ConfigError: if it is not two positive integers; the message starts with the place.
+    """
+    match size:
+        case [int(width), int(height)] if 0 < width <= MAX_PIXELS and 0 < height <= MAX_PIXELS:
+            return width, height
+    raise ConfigError(f"{place} is {size!r}, expected [width, height] in pixels")
 
 
 def decode_image(path: Path, mode: int) -> np.ndarray:

@@ -33,26 +33,42 @@ _TOLERATED = 0.001
 _MAX_COORDINATE = 2000.0
 
 
-def better_readings(values: Float[np.ndarray, " n"], columns: int) -> tuple[int, ...]:
+def better_readings(
+    values: Float[np.ndarray, " n"], columns: int, *, least_rows: int = 1
+) -> tuple[int, ...]:
     """Return the numbers of columns that fit the values clearly better than `columns`.
+
+    The best one comes first.
 
     Args:
         values: all numbers of the file, in its order.
         columns: the number of columns to compare with; the values need not be divisible by it.
+        least_rows: readings with fewer rows are not considered; a few rows may look like anything.
     """
     sample = _sample(values)
     sizes = np.log1p(np.minimum(np.abs(np.nan_to_num(sample)), 1e6))
     limit = _explained(sizes, columns) + _MARGIN
-    better: list[int] = []
-    for candidate in fitting(len(values)):
-        multiple = any(candidate % other == 0 for other in better)
-        if candidate == columns or multiple or _explained(sizes, candidate) <= limit:
-            continue
-        rows = sample.reshape(-1, candidate)
-        two_points = candidate == 2 * columns and _are_points_twice(rows)
-        if _are_points(rows) and not two_points:
-            better.append(candidate)
-    return tuple(better)
+    shares = {
+        candidate: _explained(sizes, candidate)
+        for candidate in fitting(len(values))
+        if candidate != columns and len(values) // candidate >= least_rows
+    }
+    better = {
+        candidate: share
+        for candidate, share in shares.items()
+        if share > limit
+        and _may_be_points(sample.reshape(-1, candidate))
+        and not _repeats(sample, candidate, columns)
+    }
+    # A multiple of the true number explains no more than it.
+    distinct = [
+        each
+        for each, share in better.items()
+        if not any(
+            share < better[other] + _MARGIN and _repeats(sample, each, other) for other in better
+        )
+    ]
+    return tuple(sorted(distinct, key=lambda each: -better[each]))
 
 
 def fitting(count: int) -> Sequence[int]:
@@ -82,7 +98,7 @@ def _explained(sizes: np.ndarray, columns: int) -> float:
     return 1 - unexplained * (table.size - 1) / (table.size - columns)
 
 
-def _are_points(rows: np.ndarray) -> bool:
+def _may_be_points(rows: np.ndarray) -> bool:
     """Return whether the rows may be x, y, z, intensity and others."""
     known = rows[np.isfinite(rows[:, :4]).all(axis=1)]
     if len(known) == 0:
@@ -91,6 +107,13 @@ def _are_points(rows: np.ndarray) -> bool:
     if rows.shape[1] > 3:
         bad |= known[:, 3] < 0
     return float(bad.mean()) <= _TOLERATED
+
+
+def _repeats(sample: np.ndarray, columns: int, fewer: int) -> bool:
+    """Return whether a row of `columns` may be several points of `fewer` columns."""
+    if columns == 2 * fewer:
+        return _are_points_twice(sample.reshape(-1, columns))
+    return columns != fewer and columns % fewer == 0
 
 
 def _are_points_twice(rows: np.ndarray) -> bool:

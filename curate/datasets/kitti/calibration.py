@@ -119,7 +119,7 @@ def read_calibration(path: Path, camera: int = LEFT_COLOUR) -> Calibration:
     rectification = lines.matrix(_RECTIFICATIONS, _SQUARE)
     to_camera = _to_camera(lines, camera)
     to_rectified = lines.matrix(_TO_RECTIFIED, _WIDE)
-    needed = {names: projection}
+    needed: dict[tuple[str, ...], np.ndarray | None] = {names: projection}
     if to_rectified is None:
         needed |= {_RECTIFICATIONS: rectification, _TO_CAMERA: to_camera}
     _require(lines, needed)
@@ -130,7 +130,7 @@ def read_calibration(path: Path, camera: int = LEFT_COLOUR) -> Calibration:
         if to_rectified is not None and not np.allclose(product, to_rectified, atol=1e-4):
             raise DataError(f"{place} differs from Tr; both lead to the rectified camera")
         to_rectified = product
-    lidar_to_camera = _square(to_rectified)
+    lidar_to_camera = _square(np.asarray(to_rectified))
     check_lidar_to_camera(lidar_to_camera, place)
     return Calibration(np.asarray(projection), lidar_to_camera)
 

@@ -2,14 +2,15 @@
 
 Source: Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the readme of its
 object development kit. Two layouts are supported:
-ROOT/training/{velodyne,image_2,calib,label_2} and ROOT/{velodyne,image_2,calib,label_2}. label_2
-and ROOT/ImageSets/*.txt are optional. Converters of the Waymo Open Dataset write the same layout
-with image_0 to image_4, label_0 to label_4 or label_all, and a Tr_velo_to_cam_N for each camera.
+ROOT/training/{velodyne,image_2,calib,label_2} and ROOT/{velodyne,image_2,calib,label_2}. image_2,
+label_2 and ROOT/ImageSets/*.txt are optional. Converters of the Waymo Open Dataset write the same
+layout with image_0 to image_4, label_0 to label_4 or label_all, and a Tr_velo_to_cam_N for each
+camera.
 """
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -18,8 +19,13 @@ import numpy as np
 from curate.datasets.formats.binary import read_bytes
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES, read_cloud
 from curate.datasets.formats.containment import Boundary, check_frame_id
-from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder, visible_files
-from curate.datasets.formats.images import read_sized_image
+from curate.datasets.formats.frame_files import (
+    IMAGE_SUFFIXES,
+    FrameFolder,
+    visible_files,
+    visible_names,
+)
+from curate.datasets.formats.images import check_image_size, read_optional_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.frame_names import FrameNames, match_frame_list
 from curate.datasets.kitti.calibration import read_calibration
@@ -50,12 +56,15 @@ class KittiDataset:
         camera: number of the camera, for image_N and PN. The default is the left colour camera 2;
             camera 0, the front camera, if each camera has a Tr_velo_to_cam_N of its own, as
             converters of the Waymo Open Dataset write; or the first camera with a folder image_N.
+        image_size: width and height in pixels of the calibrated camera's image, for a data set
+            without images; without it, such a data set has no camera.
         follow_links: whether links may lead out of the root.
         rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
     Raises:
         DataError: if the root contains neither.
-        ConfigError: if `rotation_y` is unknown, or there is no folder of images of the camera.
+        ConfigError: if `rotation_y` is unknown, there is no folder of images of the camera, or the
+            image size is invalid, or given for a data set with images.
     """
 
     name = "kitti"
@@ -66,6 +75,7 @@ class KittiDataset:
         *,
         layout: PointLayout = UNDECLARED,
         camera: int | None = None,
+        image_size: Sequence[int] | None = None,
         follow_links: bool = False,
         rotation_y: RotationY = "calibration",
     ) -> None:
@@ -86,6 +96,9 @@ class KittiDataset:
         # Converters of data with several cameras write all labels in the frame of camera 0.
         self._front = _has_own_extrinsics(home / "calib")
         self.camera = _camera(home, camera, front=self._front)
+        folder = home / f"image_{self.camera}"
+        self._has_images = contains_images(folder)
+        self._image_size = image_size_option(image_size, self._has_images, folder)
 
     def frame_ids(self) -> tuple[str, ...]:
         """Return the ids of all frames with a point file, sorted.
@@ -97,7 +110,7 @@ class KittiDataset:
 
     @cached_property
     def _frame_ids(self) -> tuple[str, ...]:
-        return checked_frames(self._points, self._images, self.root, self.name)
+        return checked_frames(self._points, [self._images], self.root, self.name)
 
     @cached_property
     def _points(self) -> FrameFolder:
@@ -139,7 +152,7 @@ class KittiDataset:
         label = self._labels / f"{frame_id}.txt"
         files = FrameFiles(
             points=self._points.path(frame_id),
-            image=self._images.path(frame_id),
+            image=self._images.path(frame_id) if self._has_images else None,
             calibration=self._home / "calib" / f"{frame_id}.txt",
             label=label if label.exists() else None,
         )
@@ -181,7 +194,7 @@ class KittiDataset:
         if points:
             sweep = read_points(files.points, self._layout)
         calibration = read_calibration(files.calibration, self.camera)
-        size, pixels = read_sized_image(files.image, pixels=image)
+        size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
@@ -214,13 +227,13 @@ def read_points(path: Path, layout: PointLayout = UNDECLARED) -> Float32[np.ndar
 
 
 def checked_frames(
-    points: FrameFolder, images: FrameFolder, root: Path, kind: str
+    points: FrameFolder, images: Iterable[FrameFolder], root: Path, kind: str
 ) -> tuple[str, ...]:
     """Return the frames with a point file, after a check that their files are unambiguous.
 
     Args:
         points: the point files.
-        images: the images.
+        images: the images of each camera.
         root: root of the data set.
         kind: name of the data set, for the message that there are no frames.
 
@@ -234,7 +247,8 @@ def checked_frames(
             f"{points.content()}{layout_hint(root, kind)}"
         )
     points.check(frames)
-    images.check(frames)
+    for camera in images:
+        camera.check(frames)
     return frames
 
 
@@ -251,25 +265,9 @@ def frame_number(stem: str, path: Path) -> int:
     return int(stem)
 
 
-def log_skipped(root: Path, kept: int, count: int, folder: str) -> None:
-    """Log how many frames are skipped because they have no image; nothing if there are none.
-
-    Raises:
-        DataError: if all frames are.
-    """
-    if count and not kept:
-        raise DataError(
-            f"{root}: none of the {count} frames has an image "
-            f"({', '.join(IMAGE_SUFFIXES)}) in {folder}"
-        )
-    if kept < count:
-        _log.warning(
-            "%s: %d of %d frames have no image in %s; these frames are skipped",
-            root,
-            count - kept,
-            count,
-            folder,
-        )
+def describe_skipped(kept: int, count: int) -> str:
+    """Return how many frames are skipped because they have no image; "" if none is."""
+    return f"{count - kept} of {count} frames have no image and are skipped" if kept < count else ""
 
 
 def _has_own_extrinsics(calib: Path) -> bool:
@@ -289,7 +287,7 @@ def _camera(home: Path, camera: int | None, *, front: bool) -> int:
     if camera is None:
         first = 0 if front else 2
         return first if first in present or not present else present[0]
-    if camera not in present:
+    if present and camera not in present:
         listed = ", ".join(f"{number} (image_{number})" for number in present) or "none"
         raise ConfigError(
             f"dataset.options.camera = {camera!r}: {home} has no folder image_{camera}; its "
@@ -319,6 +317,29 @@ def read_drives(folder: Path) -> Mapping[str, str]:
     if not all(1 <= number <= len(drives) for number in numbers):
         raise DataError(f"{path}: contains a line number that train_mapping.txt does not have")
     return {f"{i:06d}": drives[number - 1] for i, number in enumerate(numbers)}
+
+
+def contains_images(folder: Path) -> bool:
+    """Return whether a folder exists and contains a PNG or JPEG."""
+    return any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in visible_names(folder))
+
+
+def image_size_option(
+    size: Sequence[int] | None, has_images: bool, place: Path
+) -> tuple[int, int] | None:
+    """Return the option `image_size` of a data set without images; None if it is not given.
+
+    Raises:
+        ConfigError: if it is not a size, or the data set has images.
+    """
+    if size is None:
+        return None
+    if has_images:
+        raise ConfigError(
+            f"dataset.options.image_size is for data sets without images, but {place} contains "
+            "some; remove the option"
+        )
+    return check_image_size(size, "dataset.options.image_size")
 
 
 def read_frame_lists(

@@ -258,7 +258,7 @@ def from_annotations(annotations: Annotations, calibration: Calibration) -> Kitt
 def from_detections(
     detections: Detections,
     calibration: Calibration,
-    image_size: tuple[int, int],
+    image_size: tuple[int, int] | None,
     rotation_y: RotationY = "calibration",
 ) -> KittiObjects:
     """Return detections as KITTI objects, in the same order.
@@ -270,7 +270,8 @@ def from_detections(
     Args:
         detections: boxes in the LiDAR frame.
         calibration: calibration of the frame.
-        image_size: (width, height) of the image in pixels.
+        image_size: (width, height) of the image in pixels; None if there is no image, so that
+            nothing is clipped.
         rotation_y: the meaning of rotation_y; see `curate.geometry.mounting.RotationY`. alpha
             always follows the calibration.
 

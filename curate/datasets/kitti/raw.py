@@ -7,9 +7,8 @@ are those in DRIVE/label_2, in the format of the KITTI object data set, or else 
 DRIVE/tracklet_labels.xml.
 """
 
-import logging
-from collections.abc import Mapping
-from functools import cache, cached_property
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +16,14 @@ import numpy as np
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder
-from curate.datasets.formats.images import read_sized_image
+from curate.datasets.formats.images import read_optional_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.kitti.calibration import RAW_CAMERAS, RAW_TO_CAMERA, read_raw_calibration
 from curate.datasets.kitti.dataset import (
+    contains_images,
+    describe_skipped,
     frame_number,
-    log_skipped,
+    image_size_option,
     read_frame_lists,
     read_points,
 )
@@ -34,8 +35,6 @@ from curate.errors import DataError
 from curate.files.paths import StrPath
 from curate.frames import Frame, FrameFiles
 from curate.geometry.mounting import RotationY, check_rotation_y
-
-_log = logging.getLogger(__name__)
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
 # The root is a date folder with drives, or a folder of date folders.
@@ -59,11 +58,12 @@ class _Drive:
 
 
 class KittiRawDataset:
-    """A `Dataset` of synced drives; frames without an image are skipped.
+    """A `Dataset` of synced drives; if there are images, frames without one are skipped.
 
     Args:
         root: a date folder with drives, or a folder of date folders.
         layout: the declared layout of the point files.
+        image_size: see `KittiDataset`.
         follow_links: whether links may lead out of the root.
         rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
@@ -78,6 +78,7 @@ class KittiRawDataset:
         root: StrPath,
         *,
         layout: PointLayout = UNDECLARED,
+        image_size: Sequence[int] | None = None,
         follow_links: bool = False,
         rotation_y: RotationY = "calibration",
     ) -> None:
@@ -86,7 +87,7 @@ class KittiRawDataset:
         self.root = Path(root)
         self._layout = layout
         self._boundary = Boundary(self.root, follow_links=follow_links)
-        self._tracklets = cache(TrackletTable)
+        self._tracklets: dict[Path, TrackletTable] = {}
         folders = (
             path.parent.parent
             for pattern in _DRIVES
@@ -100,8 +101,11 @@ class KittiRawDataset:
                 f"{layout_hint(self.root, self.name)}"
             )
 
+        self._has_images = any(contains_images(path / _IMAGES) for path in self._folders.values())
+        self._image_size = image_size_option(image_size, self._has_images, self.root)
+
     def frame_ids(self) -> tuple[str, ...]:
-        """Return the ids of all frames with points and image, sorted.
+        """Return the ids of all frames with points, and with an image if there are any, sorted.
 
         Raises:
             DataError: if a frame has two point files or two images.
@@ -111,19 +115,27 @@ class KittiRawDataset:
     @cached_property
     def _frames(self) -> Mapping[str, tuple[_Drive, str]]:
         """The drive and the number of each frame."""
+        return {
+            frame: (drive, number)
+            for frame, (drive, number) in sorted(self._sweeps.items())
+            if not self._has_images or number in drive.images
+        }
+
+    @cached_property
+    def _sweeps(self) -> Mapping[str, tuple[_Drive, str]]:
+        """The same for all point files, with or without an image."""
         frames: dict[str, tuple[_Drive, str]] = {}
-        count = 0
         for name, folder in self._folders.items():
             drive = _Drive(folder)
             numbers = drive.points.frames()
             drive.points.check(numbers)
             drive.images.check(numbers)
-            count += len(numbers)
-            frames |= {
-                f"{name}_{number}": (drive, number) for number in numbers if number in drive.images
-            }
-        log_skipped(self.root, len(frames), count, f"DRIVE/{_IMAGES}")
-        return dict(sorted(frames.items()))
+            frames |= {f"{name}_{number}": (drive, number) for number in numbers}
+        return frames
+
+    def skipped_frames(self) -> str:
+        """Return how many frames are skipped because they have no image; "" if none is."""
+        return describe_skipped(len(self._frames), len(self._sweeps))
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in ROOT/ImageSets by file name."""
@@ -143,7 +155,7 @@ class KittiRawDataset:
         label = drive.label(number)
         files = FrameFiles(
             points=drive.points.path(number),
-            image=drive.images.path(number),
+            image=drive.images.path(number) if self._has_images else None,
             calibration=drive.folder.parent / RAW_TO_CAMERA,
             label=label if label.exists() else None,
         )
@@ -161,7 +173,7 @@ class KittiRawDataset:
         if points:
             sweep = read_points(files.points, self._layout)
         calibration = read_raw_calibration(files.calibration.parent)
-        size, pixels = read_sized_image(files.image, pixels=image)
+        size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
@@ -177,10 +189,11 @@ class KittiRawDataset:
         if files.label is None:
             raise DataError(f"{drive.label(number)}: no such label file")
         if drive.has_tracklets:
-            frame = self.read(frame_id, points=False)
-            table = self._tracklets(files.label)
+            if files.label not in self._tracklets:
+                self._tracklets[files.label] = TrackletTable(files.label)
+            table = self._tracklets[files.label]
             index = frame_number(number, files.points)
-            return table.read(index, frame.calibration, frame.image_size)
+            return table.read(index, self.read(frame_id, points=False))
         calibration = read_raw_calibration(files.calibration.parent)
         return read_annotations(
             files.label, calibration, categories=None, rotation_y=self._rotation_y

@@ -13,7 +13,7 @@ becomes 0, 0.5 and 1: in KITTI's evaluation, a partly truncated object counts as
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +21,14 @@ import numpy as np
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder, visible_names
-from curate.datasets.formats.images import read_sized_image
+from curate.datasets.formats.images import read_optional_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.dataset import (
+    contains_images,
+    describe_skipped,
     frame_number,
-    log_skipped,
+    image_size_option,
     read_frame_lists,
     read_points,
 )
@@ -56,11 +58,12 @@ class _Sequence:
 
 
 class KittiTrackingDataset:
-    """A `Dataset` of sequences; frames without an image are skipped.
+    """A `Dataset` of sequences; if there are images, frames without one are skipped.
 
     Args:
         root: the folder that contains training/velodyne or velodyne.
         layout: the declared layout of the point files.
+        image_size: see `KittiDataset`.
         follow_links: whether links may lead out of the root.
         rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
@@ -76,6 +79,7 @@ class KittiTrackingDataset:
         root: StrPath,
         *,
         layout: PointLayout = UNDECLARED,
+        image_size: Sequence[int] | None = None,
         follow_links: bool = False,
         rotation_y: RotationY = "calibration",
     ) -> None:
@@ -84,7 +88,7 @@ class KittiTrackingDataset:
         self.root = Path(root)
         self._layout = layout
         self._boundary = Boundary(self.root, follow_links=follow_links)
-        self._rows = cache(rows_by_frame)
+        self._rows: dict[Path, Mapping[int, Sequence[tuple[int, Sequence[str]]]]] = {}
         homes = [self.root / "training", self.root]
         home = next((home for home in homes if (home / "velodyne").is_dir()), None)
         if home is None:
@@ -93,9 +97,12 @@ class KittiTrackingDataset:
                 f"data set in the layout of KITTI tracking{layout_hint(self.root, self.name)}"
             )
         self._home = home
+        images = home / "image_02"
+        self._has_images = any(contains_images(images / name) for name in visible_names(images))
+        self._image_size = image_size_option(image_size, self._has_images, images)
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return the ids of all frames with points and image, sorted.
+        """Return the ids of all frames with points, and with an image if there are any, sorted.
 
         Raises:
             DataError: if there are none, or a frame has two point files or two images.
@@ -105,28 +112,36 @@ class KittiTrackingDataset:
     @cached_property
     def _frames(self) -> Mapping[str, tuple[_Sequence, str]]:
         """The sequence and the number of each frame."""
+        return {
+            frame: (sequence, number)
+            for frame, (sequence, number) in sorted(self._sweeps.items())
+            if not self._has_images or number in sequence.images
+        }
+
+    @cached_property
+    def _sweeps(self) -> Mapping[str, tuple[_Sequence, str]]:
+        """The same for all point files, with or without an image."""
         frames: dict[str, tuple[_Sequence, str]] = {}
-        count = 0
-        for name in sorted(visible_names(self._home / "velodyne")):
+        for name in visible_names(self._home / "velodyne"):
             sequence = _Sequence(self._home, name)
             numbers = sequence.points.frames()
             sequence.points.check(numbers)
             sequence.images.check(numbers)
-            count += len(numbers)
-            for number in numbers:
-                if number in sequence.images:
-                    frames[f"{name}_{number}"] = sequence, number
-        if not count:
+            frames |= {f"{name}_{number}": (sequence, number) for number in numbers}
+        if not frames:
             raise DataError(
                 f"{self._home / 'velodyne'}: no point files SEQUENCE/FRAME.bin"
                 f"{layout_hint(self.root, self.name)}"
             )
-        log_skipped(self.root, len(frames), count, "image_02/SEQUENCE")
-        return dict(sorted(frames.items()))
+        return frames
+
+    def skipped_frames(self) -> str:
+        """Return how many frames are skipped because they have no image; "" if none is."""
+        return describe_skipped(len(self._frames), len(self._sweeps))
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in ROOT/ImageSets by file name."""
-        return read_frame_lists(self.root / "ImageSets", self._boundary)
+        return read_frame_lists(self.root / "ImageSets", self._boundary, self.frame_ids())
 
     def sequence_of(self, frame_id: str) -> str | None:
         """Return the sequence of a frame, or None if there is no such frame."""
@@ -141,7 +156,7 @@ class KittiTrackingDataset:
         sequence, number = self._frame(frame_id)
         files = FrameFiles(
             points=sequence.points.path(number),
-            image=sequence.images.path(number),
+            image=sequence.images.path(number) if self._has_images else None,
             calibration=sequence.calibration,
             label=sequence.label if sequence.label.exists() else None,
         )
@@ -159,7 +174,7 @@ class KittiTrackingDataset:
         if points:
             sweep = read_points(files.points, self._layout)
         calibration = read_calibration(files.calibration)
-        size, pixels = read_sized_image(files.image, pixels=image)
+        size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
     def annotations(self, frame_id: str) -> Annotations:
@@ -172,7 +187,9 @@ class KittiTrackingDataset:
         sequence, number = self._frame(frame_id)
         if files.label is None:
             raise DataError(f"{sequence.label}: no such label file")
-        rows = self._rows(files.label).get(frame_number(number, files.points), [])
+        if files.label not in self._rows:
+            self._rows[files.label] = rows_by_frame(files.label)
+        rows = self._rows[files.label].get(frame_number(number, files.points), [])
         objects = parse_rows(files.label, rows, categories=None)
         levels = objects.truncated.tolist()
         objects = replace(

@@ -23,7 +23,9 @@ from curate.datasets.formats.binary import read_bytes
 from curate.datasets.image_truth import seen_objects
 from curate.detections import Annotations, as_categories
 from curate.errors import DataError
-from curate.frames import Calibration
+from curate.frames import Frame
+from curate.geometry.mounting import observation_angles
+from curate.geometry.projection import image_rectangles
 from curate.geometry.similarity import wrap_angle
 
 TRACKLETS = "tracklet_labels.xml"
@@ -58,26 +60,32 @@ class TrackletTable:
         self.path = path
         self._frames = _poses_by_frame(path)
 
-    def read(
-        self, number: int, calibration: Calibration, image_size: tuple[int, int]
-    ) -> Annotations:
+    def read(self, number: int, frame: Frame) -> Annotations:
         """Return the objects in the camera's view, in the LiDAR frame, in the file's order.
 
         The file has no 2D boxes: these, and truncation and alpha, follow from the projection.
-        Objects whose state is "outside" or "behind" the image are left out, too.
+        Objects whose state is "outside" or "behind" the image are left out, too. Without a camera,
+        all objects are returned.
 
         Args:
             number: number of the frame in the drive, from 0.
-            calibration: calibration of the frame.
-            image_size: (width, height) in pixels.
+            frame: the frame with its camera.
         """
-        poses = [pose for pose in self._frames.get(number, ()) if pose.truncation not in _OUTSIDE]
-        return seen_objects(
-            np.array([pose.box for pose in poses]).reshape(-1, 7),
-            as_categories([pose.category for pose in poses]),
-            np.array([pose.occlusion for pose in poses], dtype=np.int64),
-            calibration,
-            image_size,
+        poses = self._frames.get(number, [])
+        if frame.cameras:
+            poses = [pose for pose in poses if pose.truncation not in _OUTSIDE]
+        boxes = np.array([pose.box for pose in poses]).reshape(-1, 7)
+        categories = as_categories([pose.category for pose in poses])
+        occluded = np.array([pose.occlusion for pose in poses], dtype=np.int64)
+        if frame.cameras:
+            return seen_objects(boxes, categories, occluded, frame.cameras)
+        return Annotations(
+            boxes,
+            categories,
+            np.zeros(len(boxes)),
+            occluded,
+            observation_angles(boxes, frame.calibration),
+            image_rectangles(boxes, frame.calibration, None),
         )
 
 

@@ -1,4 +1,4 @@
-"""Reader of nuScenes: the key frames of the LiDAR and one camera, from nuScenes' tables."""
+"""Reader of nuScenes: the key frames of the LiDAR and of cameras, from nuScenes' tables."""
 
 from curate.datasets.nuscenes.dataset import NuScenesDataset
 

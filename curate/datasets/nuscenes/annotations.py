@@ -4,7 +4,7 @@ Only the records of the requested frame are parsed as JSON; the table is indexed
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from curate.datasets.nuscenes.tables import (
 )
 from curate.detections import Annotations, as_categories
 from curate.errors import DataError
-from curate.frames import Calibration
+from curate.frames import Calibration, Camera
 from curate.geometry.poses import boxes_in_frame
 
 # KITTI's occlusion level for nuScenes' visibility token (up to 40, 60, 80, 100 percent visible).
@@ -48,27 +48,24 @@ class AnnotationTable:
         self.rename = rename
         self.minimum_points = minimum_points
 
-    def read(
-        self, token: str, calibration: Calibration, image_size: tuple[int, int]
-    ) -> Annotations:
-        """Return the objects of a frame in the camera's view, in the order of the table.
+    def read(self, token: str, cameras: Sequence[Camera]) -> Annotations:
+        """Return the objects of a frame that any of its cameras sees, in the order of the table.
+
+        An object's truncation, alpha and 2D box are those in the camera that shows most of it.
 
         Args:
             token: sample token of the frame.
-            calibration: calibration of the frame, with the pose of the LiDAR.
-            image_size: (width, height) in pixels.
+            cameras: cameras of the frame; their calibrations contain the pose of the LiDAR.
 
         Raises:
             DataError: if a table is missing or damaged, or a record is invalid.
         """
         records = [record for record in self._records(token) if self._has_enough_points(record)]
-        boxes = self._boxes(records, calibration)
+        boxes = self._boxes(records, cameras[0].calibration)
         categories = as_categories([self._category(record) for record in records])
         visibilities = [str(record.get("visibility_token")) for record in records]
         levels = [_OCCLUSION.get(visibility, _UNKNOWN) for visibility in visibilities]
-        return seen_objects(
-            boxes, categories, np.array(levels, dtype=np.int64), calibration, image_size
-        )
+        return seen_objects(boxes, categories, np.array(levels, dtype=np.int64), cameras)
 
     def _records(self, token: str) -> list[Record]:
         with self.path.open("rb") as file:

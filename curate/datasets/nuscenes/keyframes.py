@@ -1,4 +1,4 @@
-"""The key frames of nuScenes: one LiDAR sweep and one image each, with the poses of both sensors.
+"""The key frames of nuScenes: a LiDAR sweep and an image per camera, with the sensors' poses.
 
 A LiDAR point is projected into the image through the map frame, because sweep and image are taken
 at different times:
@@ -13,7 +13,7 @@ z up.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,10 +31,10 @@ from curate.datasets.nuscenes.tables import (
     text,
 )
 from curate.errors import ConfigError, DataError
-from curate.frames import Calibration
+from curate.frames import Calibration, Camera
 from curate.geometry.poses import invert_pose
 
-LIDAR = "LIDAR_TOP"
+LIDAR, FRONT_CAMERA = "LIDAR_TOP", "CAM_FRONT"
 # Rotation from x forward, y left (ours) to x right, y forward (nuScenes).
 TO_SENSOR_AXES = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
@@ -44,21 +44,20 @@ _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A sample with its sweep and image.
+    """A sample with its sweep and the images of its cameras.
 
     Attributes:
         scene: name of the scene.
         points: path of the point file, relative to the root.
-        image: path of the image, relative to the root.
-        image_size: (width, height) in pixels.
-        calibration: calibration of the camera, with the pose of the LiDAR in the map frame.
+        images: paths of the images, relative to the root.
+        cameras: the cameras in the same order, without images; the calibrations contain the pose of
+            the LiDAR in the map frame.
     """
 
     scene: str
     points: str
-    image: str
-    image_size: tuple[int, int]
-    calibration: Calibration
+    images: tuple[str, ...]
+    cameras: tuple[Camera, ...]
 
 
 @dataclass(frozen=True)
@@ -70,18 +69,17 @@ class _Sensor:
     record: Record
 
 
-def read_keyframes(tables: Path, camera: str) -> dict[str, Keyframe]:
-    """Return the key frames with a sweep and an image of the camera, sorted by sample token.
+def read_keyframes(tables: Path, cameras: Sequence[str]) -> dict[str, Keyframe]:
+    """Return the key frames with a sweep and an image of each camera, sorted by sample token.
 
     Args:
         tables: folder of the tables, such as v1.0-mini.
-        camera: channel of the camera, such as CAM_FRONT.
+        cameras: channels of the cameras, such as CAM_FRONT.
 
     Raises:
         DataError: if a table is missing or damaged, or refers to a missing record.
-        ConfigError: if there is no such camera.
     """
-    sensors = _sensors(tables, camera)
+    sensors = _sensors(tables, cameras)
     path = tables / "scene.json"
     scenes = {token: text(path, record, "name") for token, record in read_table(path).items()}
     path = tables / "sample.json"
@@ -90,34 +88,67 @@ def read_keyframes(tables: Path, camera: str) -> dict[str, Keyframe]:
     }
     path = tables / "sample_data.json"
     by_channel = _sensor_data(path, sensors)
-    pairs = {token: pair for token, pair in sorted(by_channel.items()) if len(pair) == 2}
+    complete = {
+        token: records
+        for token, records in sorted(by_channel.items())
+        if len(records) == 1 + len(cameras)
+    }
     needed = {
-        text(path, record, "ego_pose_token") for pair in pairs.values() for record in pair.values()
+        text(path, record, "ego_pose_token")
+        for records in complete.values()
+        for record in records.values()
     }
     vehicle = _vehicle_poses(tables / "ego_pose.json", needed)
     frames = {}
-    for token, pair in pairs.items():
+    for token, records in complete.items():
         scene = scenes.get(scene_of_sample.get(token, ""))
         if scene is None:
             raise DataError(
                 f"{tables / 'sample.json'}: sample {token} is missing or has no valid scene"
             )
-        frames[token] = _keyframe(tables, scene, pair[LIDAR], pair[camera], sensors, vehicle)
+        images = [records[camera] for camera in cameras]
+        frames[token] = _keyframe(tables, scene, records[LIDAR], images, sensors, vehicle)
     return frames
 
 
-def _sensors(tables: Path, camera: str) -> dict[str, _Sensor]:
+def choose_cameras(tables: Path, option: str, requested: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the channels of the requested cameras.
+
+    Args:
+        tables: folder of the tables.
+        option: name of the option, for messages.
+        requested: a channel, several channels, or "all", with the front camera first.
+
+    Raises:
+        DataError: if the table of sensors is missing or damaged.
+        ConfigError: if there is no such camera, or one is listed twice.
+    """
+    path = tables / "sensor.json"
+    channels = {text(path, record, "channel") for record in read_table(path).values()}
+    known = sorted(name for name in channels if name.startswith("CAM"))
+    known.sort(key=lambda name: name != FRONT_CAMERA)
+    if requested == "all" and option == "cameras":
+        return tuple(known)
+    names = [requested] if isinstance(requested, str) else list(requested)
+    for name in names or [""]:
+        if name not in known:
+            others = ', or "all"' if option == "cameras" else ""
+            shown = ", ".join(sorted(known))
+            raise ConfigError(f"dataset.options.{option} {name!r}: use one of {shown}{others}")
+        if names.count(name) > 1:
+            raise ConfigError(f"dataset.options.{option}: '{name}' is listed twice")
+    return tuple(names)
+
+
+def _sensors(tables: Path, cameras: Sequence[str]) -> dict[str, _Sensor]:
     """Return the LiDARs and cameras of all vehicles, by token of calibrated_sensor."""
     path = tables / "sensor.json"
     channels = {token: text(path, record, "channel") for token, record in read_table(path).items()}
-    cameras = sorted(name for name in channels.values() if name.startswith("CAM"))
-    if camera not in cameras:
-        raise ConfigError(f"dataset.options.camera '{camera}': use one of {', '.join(cameras)}")
     path = tables / "calibrated_sensor.json"
     sensors = {}
     for token, record in read_table(path).items():
         channel = channels.get(text(path, record, "sensor_token"), "")
-        if channel in (LIDAR, camera):
+        if channel in (LIDAR, *cameras):
             sensors[token] = _Sensor(channel, pose(path, record), record)
     return sensors
 
@@ -154,26 +185,41 @@ def _keyframe(
     tables: Path,
     scene: str,
     sweep: Record,
-    image: Record,
+    images: Sequence[Record],
     sensors: Mapping[str, _Sensor],
     vehicle: Mapping[str, np.ndarray],
 ) -> Keyframe:
-    lidar, camera = (sensors[record["calibrated_sensor_token"]] for record in (sweep, image))
+    lidar = sensors[sweep["calibrated_sensor_token"]]
     lidar_to_map = vehicle[sweep["ego_pose_token"]] @ lidar.to_vehicle @ TO_SENSOR_AXES
-    camera_to_map = vehicle[image["ego_pose_token"]] @ camera.to_vehicle
-    path = tables / "calibrated_sensor.json"
-    intrinsic = numbers(path, camera.record, "camera_intrinsic", (3, 3))
     path = tables / "sample_data.json"
     return Keyframe(
         scene,
         text(path, sweep, "filename"),
-        text(path, image, "filename"),
-        _image_size(path, image),
+        tuple(text(path, image, "filename") for image in images),
+        tuple(_camera(tables, image, lidar_to_map, sensors, vehicle) for image in images),
+    )
+
+
+def _camera(
+    tables: Path,
+    image: Record,
+    lidar_to_map: np.ndarray,
+    sensors: Mapping[str, _Sensor],
+    vehicle: Mapping[str, np.ndarray],
+) -> Camera:
+    """Return the camera of an image, without its pixels."""
+    camera = sensors[image["calibrated_sensor_token"]]
+    camera_to_map = vehicle[image["ego_pose_token"]] @ camera.to_vehicle
+    path = tables / "calibrated_sensor.json"
+    intrinsic = numbers(path, camera.record, "camera_intrinsic", (3, 3))
+    return Camera(
+        camera.channel,
         Calibration(
             projection=np.column_stack([intrinsic, np.zeros(3)]),
             lidar_to_camera=invert_pose(camera_to_map) @ lidar_to_map,
             lidar_to_map=lidar_to_map,
         ),
+        _image_size(tables / "sample_data.json", image),
     )
 
 

@@ -9,7 +9,7 @@ A Parquet file is read one row group at a time, see `arrow_groups`. An invalid r
 frame.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,6 +65,9 @@ class ParquetRecord:
         A damaged row group is left out: it affects only its frames.
         """
         return self.groups.distinct("category")
+
+    def check(self, frame_ids: Iterable[str]) -> None:
+        """Do nothing: rows are checked when their frame is requested."""
 
     def result(self, frame_id: str) -> Detections:
         """Return the detections of the original frame.

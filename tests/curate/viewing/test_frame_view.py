@@ -1,13 +1,13 @@
 """The image of a whole frame, and its line styles."""
 
 import numpy as np
-import pytest
 from support.toys import toy_calibration
 
-from curate.errors import DataError
-from curate.frames import Frame
+from curate.frames import Calibration, Camera, Frame
+from curate.viewing.bird_eye import bird_eye_size, draw_bird_eye, region_around
 from curate.viewing.canvas import Canvas, jpeg
 from curate.viewing.frame_view import draw_frame
+from curate.viewing.overlay import overlay_size
 from curate.viewing.palette import DARK, weight_colours
 from curate.viewing.tags import ShownLabels, ShownRepredictions
 
@@ -54,10 +54,32 @@ def test_a_label_without_weight_has_its_own_colour():
     assert weight_colours(np.array([np.nan]))[0].tolist() == list(DARK.unweighted)
 
 
-def test_a_frame_without_image_is_rejected():
-    """The error contains the frame."""
-    with pytest.raises(DataError, match="000000"):
-        draw_frame(frame(image=False), shown(0.5))
+def test_without_images_the_bird_eye_view_is_drawn_alone():
+    """It has the title and the width of a bird's eye view."""
+    alone = draw_frame(frame(image=False), shown(0.5), title="frame 000000")
+    expected = draw_bird_eye(np.zeros((0, 4)), shown(0.5), title="frame 000000")
+    np.testing.assert_array_equal(alone, expected)
+
+
+def test_every_camera_that_shows_a_label_is_drawn():
+    """One after the other, with their names; a camera without labels is left out."""
+    calibration = toy_calibration()
+    turned = np.diag([-1.0, -1, 1, 1])
+    behind = Calibration(calibration.projection, calibration.lidar_to_camera @ turned)
+    pixels = np.full((40, 120, 3), 90, np.uint8)
+    cameras = [
+        Camera(name, each, (120, 40), pixels)
+        for name, each in (("front", calibration), ("back", behind))
+    ]
+    both = np.concatenate([BOX, BOX * np.array([-1, 1, 1, 1, 1, 1, 1])])
+    labels = ShownLabels(both, np.array(["Car"] * 2), np.ones(2), np.array([0.9, 0.4]))
+    several = draw_frame(frame().with_cameras(cameras), labels)
+    one = draw_frame(frame().with_cameras(cameras), shown(0.9))
+    height = overlay_size(pixels)[1]
+    region = region_around([both], 1200)
+    assert several.shape[0] == 2 * height + bird_eye_size(region)[1]
+    assert one.shape == draw_frame(frame(), shown(0.9)).shape
+    assert has(several[height : 2 * height], weight_colours(np.array([0.4]))[0])
 
 
 def test_dashes_have_gaps_and_end_with_the_image():
