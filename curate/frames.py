@@ -6,12 +6,18 @@ y down, z forward, in metres; image coordinates are pixels from the top left cor
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
 from curate.errors import ConfigError
 from curate.shapes import Float, Float32, UInt8
+
+RotationY = Literal["calibration", "openpcdet", "mmdetection3d", "view-of-delft"]
+"""The meaning of rotation_y in files of KITTI's form, named by who writes it.
+
+"calibration": it follows the mounting of the camera, see `curate.geometry.mounting`. All others
+compute it from the yaw in the LiDAR frame as -yaw - pi/2, whatever the mounting is."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +29,13 @@ class Calibration:
         lidar_to_camera: (4, 4) LiDAR frame to rectified camera frame (KITTI's R0_rect * Tr).
         lidar_to_map: (4, 4) pose of the LiDAR in the map frame at the time of the sweep; None if
             the data set has no poses.
+        rotation_y: the meaning of rotation_y in the data set's label files.
     """
 
     projection: Float[np.ndarray, "3 4"]
     lidar_to_camera: Float[np.ndarray, "4 4"]
     lidar_to_map: Float[np.ndarray, "4 4"] | None = None
+    rotation_y: RotationY = "calibration"
 
     @property
     def lidar_to_image(self) -> Float[np.ndarray, "3 4"]:

@@ -39,8 +39,8 @@ from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
 from curate.files.toml_text import parse_toml
-from curate.frames import Calibration, Frame, FrameFiles
-from curate.geometry.mounting import RotationY, check_lidar_to_camera, check_rotation_y
+from curate.frames import Calibration, Frame, FrameFiles, RotationY
+from curate.geometry.mounting import check_lidar_to_camera, check_rotation_y
 
 DESCRIPTION = "dataset.toml"
 _FOLDERS = ("points", "images", "labels", "splits")
@@ -54,7 +54,7 @@ class FolderDataset:
     Args:
         root: the folder with dataset.toml.
         follow_links: whether links and paths in dataset.toml may lead out of the folder.
-        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
         ConfigError: if `rotation_y` is unknown.
@@ -189,21 +189,19 @@ class FolderDataset:
                     "to the folder of label files"
                 )
             raise DataError(f"{expected}: no such label file")
-        return read_annotations(
-            label, self._calibration, categories=None, rotation_y=self._rotation_y
-        )
+        return read_annotations(label, self._calibration, categories=None)
 
     @cached_property
     def _calibration(self) -> Calibration:
         calibration = self._description["calibration"]
         if isinstance(calibration, str):
-            return read_calibration(self.root / calibration)
+            return read_calibration(self.root / calibration, self._rotation_y)
         projection = _matrix(self._path, calibration, "projection", ((3, 4),))
         extrinsic = np.eye(4)
         rows = _matrix(self._path, calibration, "lidar_to_camera", ((3, 4), (4, 4)))
         extrinsic[: len(rows)] = rows
         check_lidar_to_camera(extrinsic, f"{self._path}: calibration.lidar_to_camera")
-        return Calibration(projection, extrinsic)
+        return Calibration(projection, extrinsic, rotation_y=self._rotation_y)
 
     def _label(self, frame_id: str) -> Path | None:
         if "labels" not in self._description:

@@ -14,19 +14,15 @@ away from it. Its rotation_y is -pi/2, and its yaw in the LiDAR frame pi/2.
 """
 
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import Self, get_args
 
 import numpy as np
 
 from curate.errors import ConfigError, DataError
-from curate.frames import Calibration
+from curate.frames import Calibration, RotationY
 from curate.geometry.similarity import wrap_angle
 from curate.shapes import Float, Num
 from curate.spelling import did_you_mean
-
-RotationY = Literal["calibration", "openpcdet", "mmdetection3d", "view-of-delft"]
-"""The meaning of rotation_y, named by who writes it. All but "calibration" compute it from the
-LiDAR's yaw as -yaw - pi/2, whatever the mounting of the camera."""
 
 # Entries of R R^T - 1 of a rotation written with few digits. A scaled or sheared one has far more.
 _LARGEST_ERROR = 0.01
@@ -103,14 +99,14 @@ def check_lidar_to_camera(matrix: Float[np.ndarray, "4 4"], place: str) -> None:
 
 
 def yaws_of_rotations_y(
-    rotations_y: Num[np.ndarray, " n"], calibration: Calibration, meaning: RotationY = "calibration"
+    rotations_y: Num[np.ndarray, " n"], calibration: Calibration, meaning: RotationY | None = None
 ) -> Float[np.ndarray, " n"]:
     """Return the yaws of headings in the LiDAR frame, in (-pi, pi].
 
     Args:
         rotations_y: (n,) radians.
         calibration: calibration of the frame.
-        meaning: see `RotationY`.
+        meaning: of rotation_y; None for that of the data set.
 
     Raises:
         DataError: if the mounting does not define the headings.
@@ -120,7 +116,7 @@ def yaws_of_rotations_y(
 
 
 def rotations_y_of_yaws(
-    yaws: Num[np.ndarray, " n"], calibration: Calibration, meaning: RotationY = "calibration"
+    yaws: Num[np.ndarray, " n"], calibration: Calibration, meaning: RotationY | None = None
 ) -> Float[np.ndarray, " n"]:
     """Return (n,) rotation_y in (-pi, pi], the inverse of `yaws_of_rotations_y`."""
     zero, sign = _heading(calibration, meaning)
@@ -132,16 +128,17 @@ def observation_angles(
 ) -> Float[np.ndarray, " n"]:
     """Return KITTI's alpha in (-pi, pi]: rotation_y minus the angle of the ray to the bottom.
 
+    It is the heading that the camera sees, so it follows the calibration. Where the mounting does
+    not define it, rotation_y is -yaw - pi/2.
+
     Args:
         boxes: (n, 7) in the LiDAR frame.
         calibration: calibration of the frame.
-
-    Raises:
-        DataError: if the mounting does not define the headings.
     """
+    meaning: RotationY = "calibration" if defines_headings(calibration) else "openpcdet"
     bottoms = bottom_centres_in_camera(boxes, calibration)
     rays = np.arctan2(bottoms[:, 0], bottoms[:, 2])
-    return wrap_angle(rotations_y_of_yaws(boxes[:, 6], calibration) - rays)
+    return wrap_angle(rotations_y_of_yaws(boxes[:, 6], calibration, meaning) - rays)
 
 
 def bottom_centres_in_camera(
@@ -155,9 +152,9 @@ def bottom_centres_in_camera(
     return found
 
 
-def _heading(calibration: Calibration, meaning: RotationY) -> tuple[float, int]:
+def _heading(calibration: Calibration, meaning: RotationY | None) -> tuple[float, int]:
     """Return the yaw of rotation_y -pi/2, and 1 if rotation_y grows clockwise seen from above."""
-    if meaning != "calibration":
+    if (meaning or calibration.rotation_y) != "calibration":
         return 0.0, 1
     down = -float(calibration.lidar_to_camera[1, 2])
     if not defines_headings(calibration):

@@ -24,8 +24,8 @@ from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
-from curate.frames import Calibration, Frame, FrameFiles
-from curate.geometry.mounting import RotationY, check_lidar_to_camera, check_rotation_y
+from curate.frames import Calibration, Frame, FrameFiles, RotationY
+from curate.geometry.mounting import check_lidar_to_camera, check_rotation_y
 from curate.shapes import Float, Float32
 
 _log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ class KittiDataset:
     Args:
         root: the folder that contains training/velodyne or velodyne.
         follow_links: whether links may lead out of the root.
-        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
         DataError: if the root contains neither.
@@ -148,7 +148,7 @@ class KittiDataset:
         """
         files = self.files(frame_id)
         sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
-        calibration = read_calibration(files.calibration)
+        calibration = read_calibration(files.calibration, self._rotation_y)
         size, pixels = read_sized_image(files.image, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
@@ -161,8 +161,8 @@ class KittiDataset:
         files = self.files(frame_id)
         if files.label is None:
             raise DataError(f"{self._home / 'label_2' / frame_id}.txt: no such label file")
-        calibration = read_calibration(files.calibration)
-        return read_annotations(files.label, calibration, rotation_y=self._rotation_y)
+        calibration = read_calibration(files.calibration, self._rotation_y)
+        return read_annotations(files.label, calibration)
 
 
 def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:
@@ -208,8 +208,12 @@ def check_point_range(path: Path, points: Float[np.ndarray, "n _"]) -> None:
         )
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path, rotation_y: RotationY = "calibration") -> Calibration:
     """Return the calibration of the left colour camera (P2, R0_rect, Tr_velo_to_cam).
+
+    Args:
+        path: the calibration file.
+        rotation_y: the meaning of rotation_y in the label files of the data set.
 
     Raises:
         DataError: if the file or one of the three matrices is missing, or a matrix has a wrong
@@ -230,7 +234,7 @@ def read_calibration(path: Path) -> Calibration:
     extrinsic[:3] = matrices["Tr_velo_to_cam"]
     lidar_to_camera = rectify @ extrinsic
     check_lidar_to_camera(lidar_to_camera, str(path))
-    return Calibration(matrices["P2"], lidar_to_camera)
+    return Calibration(matrices["P2"], lidar_to_camera, rotation_y=rotation_y)
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:

@@ -25,8 +25,8 @@ from curate.datasets.kitti.labels import read_annotations
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
-from curate.frames import Calibration, Frame, FrameFiles
-from curate.geometry.mounting import RotationY, check_lidar_to_camera, check_rotation_y
+from curate.frames import Calibration, Frame, FrameFiles, RotationY
+from curate.geometry.mounting import check_lidar_to_camera, check_rotation_y
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
 _TO_CAMERA, _CAMERAS = "calib_velo_to_cam.txt", "calib_cam_to_cam.txt"
@@ -40,7 +40,7 @@ class KittiRawDataset:
     Args:
         root: a date folder with drives, or a folder of date folders.
         follow_links: whether links may lead out of the root.
-        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
         DataError: if there is no drive.
@@ -123,7 +123,7 @@ class KittiRawDataset:
         """
         files = self.files(frame_id)
         sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
-        calibration = read_raw_calibration(files.calibration.parent)
+        calibration = read_raw_calibration(files.calibration.parent, self._rotation_y)
         size, pixels = read_sized_image(files.image, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
@@ -137,15 +137,16 @@ class KittiRawDataset:
         if files.label is None:
             drive, number = self._frames[frame_id]
             raise DataError(f"{drive / 'label_2' / number}.txt: no such label file")
-        calibration = read_raw_calibration(files.calibration.parent)
-        return read_annotations(files.label, calibration, rotation_y=self._rotation_y)
+        calibration = read_raw_calibration(files.calibration.parent, self._rotation_y)
+        return read_annotations(files.label, calibration)
 
 
-def read_raw_calibration(folder: Path) -> Calibration:
+def read_raw_calibration(folder: Path, rotation_y: RotationY = "calibration") -> Calibration:
     """Return the calibration of the left colour camera (P_rect_02, R_rect_00, R and T).
 
     Args:
         folder: the date folder.
+        rotation_y: the meaning of rotation_y in the label files of the data set.
 
     Raises:
         DataError: if a file or an entry is missing or malformed, or the transform from LiDAR to
@@ -156,7 +157,8 @@ def read_raw_calibration(folder: Path) -> Calibration:
     extrinsic[:3, 3:] = _entry(folder / _TO_CAMERA, "T", (3, 1))
     rectify[:3, :3] = _entry(folder / _CAMERAS, "R_rect_00", (3, 3))
     check_lidar_to_camera(rectify @ extrinsic, str(folder / _TO_CAMERA))
-    return Calibration(_entry(folder / _CAMERAS, "P_rect_02", (3, 4)), rectify @ extrinsic)
+    projection = _entry(folder / _CAMERAS, "P_rect_02", (3, 4))
+    return Calibration(projection, rectify @ extrinsic, rotation_y=rotation_y)
 
 
 def _entry(path: Path, key: str, shape: tuple[int, int]) -> np.ndarray:
