@@ -13,11 +13,15 @@ import numpy as np
 from curate.errors import ConfigError
 from curate.shapes import Float, Float32, UInt8
 
-RotationY = Literal["calibration", "openpcdet", "mmdetection3d", "view-of-delft"]
+RotationY = Literal[
+    "calibration", "openpcdet", "mmdetection3d", "view-of-delft", "nuscenes", "dair-v2x"
+]
 """The meaning of rotation_y in files of KITTI's form, named by who writes it.
 
-"calibration": it follows the mounting of the camera, see `curate.geometry.mounting`. All others
-compute it from the yaw in the LiDAR frame as -yaw - pi/2, whatever the mounting is."""
+"calibration": an angle about the LiDAR's vertical from the direction in which the camera looks.
+"openpcdet", "mmdetection3d", "view-of-delft": -yaw - pi/2, whatever the mounting of the camera is.
+"nuscenes" (its export to KITTI), "dair-v2x": the heading projected into the camera's xz plane.
+All agree for a camera that looks along x and is level. See `curate.geometry.mounting`."""
 
 
 @dataclass(frozen=True)

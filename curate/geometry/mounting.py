@@ -9,6 +9,10 @@ counted from the azimuth of the optical axis.
     yaw = mounting yaw - rotation_y - pi/2      camera upright
     yaw = mounting yaw + rotation_y + pi/2      camera upside down
 
+This is the meaning "calibration" of `curate.frames.RotationY`. Other tools take -yaw - pi/2 under
+every mounting, or project the heading into the camera's xz plane; for a level camera that looks
+along x there is no difference.
+
 Example: a camera that looks to the left (mounting yaw pi/2) and 12 degrees down sees a car drive
 away from it. Its rotation_y is -pi/2, and its yaw in the LiDAR frame pi/2.
 """
@@ -24,6 +28,8 @@ from curate.geometry.similarity import wrap_angle
 from curate.shapes import Float, Num
 from curate.spelling import did_you_mean
 
+_FORMULA = ("openpcdet", "mmdetection3d", "view-of-delft")
+_PROJECTED = ("nuscenes", "dair-v2x")
 # Entries of R R^T - 1 of a rotation written with few digits. A scaled or sheared one has far more.
 _LARGEST_ERROR = 0.01
 # Below this angle between the camera's y axis and the horizontal plane, an angle about that axis is
@@ -111,7 +117,12 @@ def yaws_of_rotations_y(
     Raises:
         DataError: if the mounting does not define the headings.
     """
-    zero, sign = _heading(calibration, meaning)
+    meaning = meaning or calibration.rotation_y
+    if meaning in _PROJECTED:
+        planar = np.stack([np.cos(rotations_y), -np.sin(rotations_y)])
+        headings = np.linalg.solve(_projection(calibration), planar)
+        return wrap_angle(np.arctan2(headings[1], headings[0]))
+    zero, sign = _zero(calibration, meaning)
     return wrap_angle(zero - sign * (rotations_y + np.pi / 2))
 
 
@@ -119,7 +130,11 @@ def rotations_y_of_yaws(
     yaws: Num[np.ndarray, " n"], calibration: Calibration, meaning: RotationY | None = None
 ) -> Float[np.ndarray, " n"]:
     """Return (n,) rotation_y in (-pi, pi], the inverse of `yaws_of_rotations_y`."""
-    zero, sign = _heading(calibration, meaning)
+    meaning = meaning or calibration.rotation_y
+    if meaning in _PROJECTED:
+        planar = _projection(calibration) @ np.stack([np.cos(yaws), np.sin(yaws)])
+        return wrap_angle(np.arctan2(-planar[1], planar[0]))
+    zero, sign = _zero(calibration, meaning)
     return wrap_angle(sign * (zero - yaws) - np.pi / 2)
 
 
@@ -152,15 +167,26 @@ def bottom_centres_in_camera(
     return found
 
 
-def _heading(calibration: Calibration, meaning: RotationY | None) -> tuple[float, int]:
+def _zero(calibration: Calibration, meaning: RotationY) -> tuple[float, int]:
     """Return the yaw of rotation_y -pi/2, and 1 if rotation_y grows clockwise seen from above."""
-    if (meaning or calibration.rotation_y) != "calibration":
+    if meaning in _FORMULA:
         return 0.0, 1
-    down = -float(calibration.lidar_to_camera[1, 2])
+    _check_headings(calibration)
+    upright = calibration.lidar_to_camera[1, 2] < 0
+    return Mounting.of(calibration).yaw_rad, 1 if upright else -1
+
+
+def _projection(calibration: Calibration) -> np.ndarray:
+    """Return the (2, 2) matrix from x, y of a heading in the LiDAR frame to the camera's x, z."""
+    _check_headings(calibration)
+    return np.asarray(calibration.lidar_to_camera[np.ix_([0, 2], [0, 1])])
+
+
+def _check_headings(calibration: Calibration) -> None:
     if not defines_headings(calibration):
+        angle = np.rad2deg(np.arcsin(abs(calibration.lidar_to_camera[1, 2])))
         raise DataError(
-            f"the camera's y axis is {np.rad2deg(np.arcsin(abs(down))):.1f} degrees from the "
-            "horizontal plane of the LiDAR frame: rotation_y, an angle about this axis, is not a "
-            "heading; correct the calibration, or use boxes in the LiDAR frame"
+            f"the camera's y axis is {angle:.1f} degrees from the horizontal plane of the LiDAR "
+            "frame: rotation_y, an angle about this axis, is not a heading; correct the "
+            "calibration, or use boxes in the LiDAR frame"
         )
-    return Mounting.of(calibration).yaw_rad, 1 if down > 0 else -1

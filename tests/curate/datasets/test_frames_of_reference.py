@@ -6,12 +6,13 @@ The labels are written with scipy's rotations, not with curate's conversions.
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles.camera_boxes import in_camera
+from oracles.camera_boxes import in_camera, projected_rotations_y
 from support.dataset_layouts import DRIVE, write_toy_folder, write_toy_raw
 from support.rigs import Rig, assert_equal_boxes, detections, rigs
 from support.toys import write_toy_kitti
@@ -23,7 +24,7 @@ from curate.errors import ConfigError, DataError
 from curate.frames import RotationY
 from pipelines.registry import DATASETS
 
-MEANINGS: tuple[RotationY, ...] = ("calibration", "openpcdet", "mmdetection3d", "view-of-delft")
+MEANINGS: tuple[RotationY, ...] = get_args(RotationY)
 
 
 def _text(matrix: np.ndarray) -> str:
@@ -76,7 +77,9 @@ def write_labels(path: Path, found: Detections, rig: Rig, meaning: RotationY) ->
     bottoms, rotations_y = in_camera(
         found.boxes, rig.turn, np.array(rig.origin), rig.yaw, upside_down=rig.upside_down
     )
-    if meaning != "calibration":
+    if meaning in ("nuscenes", "dair-v2x"):
+        rotations_y = projected_rotations_y(found.boxes, rig.turn)
+    elif meaning != "calibration":
         rotations_y = -found.boxes[:, 6] - np.pi / 2
     lines = [
         f"{name} 0 0 0 1 2 3 4 {_text(np.array([*box[5:2:-1], *bottoms[k], rotations_y[k]]))}\n"

@@ -171,6 +171,22 @@ def test_labels_in_a_wrong_convention_are_reported(change, message):
     assert message in found.message
 
 
+@pytest.mark.parametrize(
+    ("read", "written"), [("calibration", "openpcdet"), ("mmdetection3d", "calibration")]
+)
+def test_another_meaning_of_rotation_y_is_reported(read, written):
+    """The camera looks aside, and the data set declares the wrong meaning."""
+    aside = replace(Rig(yaw=0.6).calibration, rotation_y=read)
+    frame = replace(street(), calibration=aside)
+    objects = from_annotations(labels(BOXES), replace(aside, rotation_y=written))
+    found = checks([(frame, to_annotations(objects, aside))])["label boxes"]
+    assert found.state == "wrong"
+    assert "turned by the yaw of the camera: rotation_y has another meaning" in found.message
+    right = replace(aside, rotation_y=written)
+    frame = replace(frame, calibration=right)
+    assert checks([(frame, to_annotations(objects, right))])["label boxes"].state == "ok"
+
+
 def test_labels_without_points_are_reported():
     """All of them, or many; a single one may be hidden."""
     frame, far = street(), BOXES + np.array([60, 0, 0, 0, 0, 0, 0])
