@@ -188,5 +188,5 @@ def _check_headings(calibration: Calibration) -> None:
         raise DataError(
             f"the camera's y axis is {angle:.1f} degrees from the horizontal plane of the LiDAR "
             "frame: rotation_y, an angle about this axis, is not a heading; correct the "
-            "calibration, or use boxes in the LiDAR frame"
+            "calibration, or set rotation_y to the tool with the formula -yaw - pi/2 that wrote it"
         )
