@@ -14,6 +14,9 @@ CurateError (1)
 Each message is one line: what is wrong, where (file and line), and what to do.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class CurateError(Exception):
     """Base class of the tree; `exit_code` is the exit status of the command that raised it."""
@@ -73,6 +76,15 @@ class TrainerFailed(CurateError):  # noqa: N818 - it reports another program's f
     """The user's trainer ended with an error, or without a checkpoint."""
 
     exit_code = 10
+
+
+@contextmanager
+def error_prefix(place: str) -> Iterator[None]:
+    """Put a place, such as a file, a frame or a setting, in front of the message of an error."""
+    try:
+        yield
+    except CurateError as error:
+        raise type(error)(f"{place}: {error}") from error
 
 
 def one_line(error: BaseException, max_length: int | None = None) -> str:

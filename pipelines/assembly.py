@@ -4,15 +4,14 @@ No other module creates detectors, segmenters, priors or policies.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.consistency import ConsistencySettings
 from curate.datasets.frame_names import FrameNames
 from curate.detectors.base import Detector, TrainableDetector, choose_preset
-from curate.errors import ConfigError, CurateError
+from curate.errors import ConfigError, error_prefix
 from curate.files.toml_text import toml_key
 from curate.frames import Calibration
 from curate.names import inline_table, listed, mapping
@@ -31,15 +30,6 @@ Kind = TypeVar("Kind")
 SHIPPED_SEGMENTER = Path(__file__).parent.parent / "curate/segmenters/models/simulated.onnx"
 
 
-@contextmanager
-def _error_prefix(key: str) -> Iterator[None]:
-    """Put the configuration key in front of the message of an error."""
-    try:
-        yield
-    except CurateError as error:
-        raise type(error)(f"{key}: {error}") from error
-
-
 def open_detector(config: Config, path: Path) -> Detector:
     """Return the configured detector, loaded from a checkpoint, a model or result files."""
     section = config.detector
@@ -56,7 +46,7 @@ def check_detector(config: Config) -> None:
         ConfigError: if it cannot be imported, does not accept its options, or does not have the
             configured preset.
     """
-    with _error_prefix("detector.name"):
+    with error_prefix("detector.name"):
         registry.DETECTORS.check(
             config.detector.name,
             config.detector.path,
@@ -98,7 +88,7 @@ def trainable_detector(config: Config) -> Trainable | None:
         ConfigError: if the detector has no preset of the configured name, or its class cannot be
             used.
     """
-    with _error_prefix("detector.name"):
+    with error_prefix("detector.name"):
         detector = registry.trainable(config.detector.name)
     preset = config.train.preset
     if detector is None:
@@ -218,7 +208,7 @@ def check_segmenter(config: Config) -> None:
     """
     name = "onnx" if config.segmenter.name == "simulated" else config.segmenter.name
     if name != "none":
-        with _error_prefix("segmenter.name"):
+        with error_prefix("segmenter.name"):
             registry.SEGMENTERS.check(
                 name,
                 segmenter_path(config),
@@ -268,7 +258,7 @@ def check_policy(config: Config, name: str) -> None:
     Raises:
         ConfigError: if it cannot be imported, or rejects its options.
     """
-    with _error_prefix("run.method" if name == config.run.method else "--policy"):
+    with error_prefix("run.method" if name == config.run.method else "--policy"):
         open_policy(config, name)
 
 
@@ -280,7 +270,7 @@ def check_executor(config: Config) -> None:
     """
     section = config.run
     options = section.executor_options.get(section.executor, {})
-    with _error_prefix("run.executor"):
+    with error_prefix("run.executor"):
         registry.EXECUTORS.check(section.executor, offered=("workers",), options=options)
 
 
@@ -290,7 +280,7 @@ def check_labels_format(config: Config) -> None:
     Raises:
         ConfigError: if the exporter cannot be imported or created.
     """
-    with _error_prefix("train.labels_format"):
+    with error_prefix("train.labels_format"):
         registry.EXPORTERS.build(config.train.labels_format, offered={}, options={})
 
 
@@ -349,12 +339,12 @@ def check_prior(config: Config, name: str) -> None:
     Raises:
         CurateError: if it cannot be imported or created, or its segmenter cannot be opened.
     """
-    with _error_prefix("run.priors"):
+    with error_prefix("run.priors"):
         whole_sequences = hasattr(registry.PRIORS.load(name), "score_sequence")
         reads_pixels = registry.PRIORS.takes(name, "segmenter")
     if reads_pixels:
         check_segmenter(config)
-    with _error_prefix("run.priors"):
+    with error_prefix("run.priors"):
         if whole_sequences:
             open_sequence_source(config, name)
         else:

@@ -52,8 +52,15 @@ from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
-from curate.frames import Calibration, Camera, Frame, FrameFiles, calibration_without_camera
-from curate.geometry.mounting import RotationY, check_rotation_y
+from curate.frames import (
+    Calibration,
+    Camera,
+    Frame,
+    FrameFiles,
+    RotationY,
+    calibration_without_camera,
+)
+from curate.geometry.mounting import check_lidar_to_camera, check_rotation_y
 from curate.spelling import did_you_mean
 
 DESCRIPTION = "dataset.toml"
@@ -94,7 +101,7 @@ class FolderDataset:
         root: the folder with dataset.toml.
         layout: the declared layout of the point files, in place of the keys of dataset.toml.
         follow_links: whether links and paths in dataset.toml may lead out of the folder.
-        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
         ConfigError: if `rotation_y` is unknown.
@@ -237,12 +244,7 @@ class FolderDataset:
                     "to the folder of label files"
                 )
             raise DataError(f"{expected}: no such label file")
-        return read_annotations(
-            label,
-            self._label_calibration(frame_id),
-            categories=None,
-            rotation_y=self._rotation_y,
-        )
+        return read_annotations(label, self._label_calibration(frame_id), categories=None)
 
     def _label_calibration(self, frame_id: str) -> Calibration:
         """Return the calibration that the labels refer to: that of the first camera."""
@@ -253,7 +255,9 @@ class FolderDataset:
     def _calibration(self, camera: str, frame_id: str) -> Calibration:
         """Return the calibration of a camera in a frame."""
         found = self._calibrations[camera]
-        return read_calibration(_of_frame(found, frame_id)) if isinstance(found, Path) else found
+        if isinstance(found, Path):
+            return read_calibration(_of_frame(found, frame_id), rotation_y=self._rotation_y)
+        return found
 
     @cached_property
     def _calibrations(self) -> Mapping[str, Calibration | Path]:
@@ -267,7 +271,10 @@ class FolderDataset:
         return {
             name: calibration
             if isinstance(calibration, Path) and calibration.is_dir()
-            else _read_calibration(self._path, _place(name, "calibration"), calibration)
+            else replace(
+                _read_calibration(self._path, _place(name, "calibration"), calibration),
+                rotation_y=self._rotation_y,
+            )
             for name, calibration in tables.items()
         }
 

@@ -10,7 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from curate.frames import Calibration
+from curate.frames import Calibration, RotationY
+from curate.geometry.mounting import (
+    defines_headings,
+    rotations_y_of_yaws,
+    yaws_of_rotations_y,
+)
 from curate.geometry.points_in_boxes import points_in_box_mask
 from curate.geometry.similarity import wrap_angle
 from curate.shapes import Float, Num, Shaped
@@ -47,6 +52,7 @@ class _Mistake:
         convert: returns the corrected boxes.
         limit: of the ratio of gained and lost points.
         label_cause: what is probably wrong with labels; the same if empty.
+        only_labels: whether boxes of a detector are not examined for it.
     """
 
     change: str
@@ -54,6 +60,7 @@ class _Mistake:
     convert: _Conversion
     limit: float
     label_cause: str = ""
+    only_labels: bool = False
 
 
 @dataclass(frozen=True)
@@ -106,6 +113,8 @@ def suspect_convention(sweeps: Sequence[BoxesInSweep], *, labels: bool) -> Suspi
         return Suspicion(swapped, certain=True, inside=inside)
     best, best_ratio = "", 0.0
     for mistake in _MISTAKES:
+        if mistake.only_labels and not labels:
+            continue
         exchanged = [
             _exchanged(each.points, each.boxes, mistake.convert(each.boxes, each.calibration))
             for each in sweeps
@@ -164,6 +173,15 @@ def _rotation_y(boxes: np.ndarray, _calibration: Calibration) -> np.ndarray:
     return _with(boxes, yaw=-boxes[:, 6] - np.pi / 2)
 
 
+def _other_rotation_y(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """Return the boxes as they are if rotation_y of their label file has the other meaning."""
+    if not defines_headings(calibration):
+        return boxes
+    other: RotationY = "openpcdet" if calibration.rotation_y == "calibration" else "calibration"
+    rotations_y = rotations_y_of_yaws(boxes[:, 6], calibration)
+    return _with(boxes, yaw=yaws_of_rotations_y(rotations_y, calibration, other))
+
+
 def _raised(boxes: np.ndarray, _calibration: Calibration) -> np.ndarray:
     return _with(boxes, centres=boxes[:, :3] + np.outer(boxes[:, 5] / 2, [0, 0, 1]))
 
@@ -180,6 +198,11 @@ def _from_camera(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
 
 
 _MISTAKES = (
+    _Mistake(
+        "turned by the yaw of the camera",
+        "rotation_y has another meaning, set dataset.options.rotation_y",
+        _other_rotation_y, _TURNED_LIMIT, only_labels=True,
+    ),
     _Mistake(
         "turned by 90 degrees", "yaw is measured from y, or length and width are swapped",
         _turned, _TURNED_LIMIT,

@@ -9,25 +9,27 @@ counted from the azimuth of the optical axis.
     yaw = mounting yaw - rotation_y - pi/2      camera upright
     yaw = mounting yaw + rotation_y + pi/2      camera upside down
 
+This is the meaning "calibration" of `curate.frames.RotationY`. Other tools take -yaw - pi/2 under
+every mounting, or project the heading into the camera's xz plane; for a level camera that looks
+along x there is no difference.
+
 Example: a camera that looks to the left (mounting yaw pi/2) and 12 degrees down sees a car drive
 away from it. Its rotation_y is -pi/2, and its yaw in the LiDAR frame pi/2.
 """
 
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import Self, get_args
 
 import numpy as np
 
 from curate.errors import ConfigError, DataError
-from curate.frames import Calibration
+from curate.frames import Calibration, RotationY
 from curate.geometry.similarity import wrap_angle
 from curate.shapes import Float, Num
 from curate.spelling import did_you_mean
 
-RotationY = Literal["calibration", "openpcdet", "mmdetection3d", "view-of-delft"]
-"""The meaning of rotation_y, named by who writes it. All but "calibration" compute it from the
-LiDAR's yaw as -yaw - pi/2, whatever the mounting of the camera."""
-
+_FORMULA = ("openpcdet", "mmdetection3d", "view-of-delft")
+_PROJECTED = ("nuscenes", "dair-v2x")
 # Entries of R R^T - 1 of a rotation written with few digits. A scaled or sheared one has far more.
 _LARGEST_ERROR = 0.01
 # Below this angle between the camera's y axis and the horizontal plane, an angle about that axis is
@@ -103,27 +105,36 @@ def check_lidar_to_camera(matrix: Float[np.ndarray, "4 4"], place: str) -> None:
 
 
 def yaws_of_rotations_y(
-    rotations_y: Num[np.ndarray, " n"], calibration: Calibration, meaning: RotationY = "calibration"
+    rotations_y: Num[np.ndarray, " n"], calibration: Calibration, meaning: RotationY | None = None
 ) -> Float[np.ndarray, " n"]:
     """Return the yaws of headings in the LiDAR frame, in (-pi, pi].
 
     Args:
         rotations_y: (n,) radians.
         calibration: calibration of the frame.
-        meaning: see `RotationY`.
+        meaning: of rotation_y; None for that of the data set.
 
     Raises:
         DataError: if the mounting does not define the headings.
     """
-    zero, sign = _heading(calibration, meaning)
+    meaning = meaning or calibration.rotation_y
+    if meaning in _PROJECTED:
+        planar = np.stack([np.cos(rotations_y), -np.sin(rotations_y)])
+        headings = np.linalg.solve(_projection(calibration), planar)
+        return wrap_angle(np.arctan2(headings[1], headings[0]))
+    zero, sign = _zero(calibration, meaning)
     return wrap_angle(zero - sign * (rotations_y + np.pi / 2))
 
 
 def rotations_y_of_yaws(
-    yaws: Num[np.ndarray, " n"], calibration: Calibration, meaning: RotationY = "calibration"
+    yaws: Num[np.ndarray, " n"], calibration: Calibration, meaning: RotationY | None = None
 ) -> Float[np.ndarray, " n"]:
     """Return (n,) rotation_y in (-pi, pi], the inverse of `yaws_of_rotations_y`."""
-    zero, sign = _heading(calibration, meaning)
+    meaning = meaning or calibration.rotation_y
+    if meaning in _PROJECTED:
+        planar = _projection(calibration) @ np.stack([np.cos(yaws), np.sin(yaws)])
+        return wrap_angle(np.arctan2(-planar[1], planar[0]))
+    zero, sign = _zero(calibration, meaning)
     return wrap_angle(sign * (zero - yaws) - np.pi / 2)
 
 
@@ -132,16 +143,17 @@ def observation_angles(
 ) -> Float[np.ndarray, " n"]:
     """Return KITTI's alpha in (-pi, pi]: rotation_y minus the angle of the ray to the bottom.
 
+    It is the heading that the camera sees, so it follows the calibration. Where the mounting does
+    not define it, rotation_y is -yaw - pi/2.
+
     Args:
         boxes: (n, 7) in the LiDAR frame.
         calibration: calibration of the frame.
-
-    Raises:
-        DataError: if the mounting does not define the headings.
     """
+    meaning: RotationY = "calibration" if defines_headings(calibration) else "openpcdet"
     bottoms = bottom_centres_in_camera(boxes, calibration)
     rays = np.arctan2(bottoms[:, 0], bottoms[:, 2])
-    return wrap_angle(rotations_y_of_yaws(boxes[:, 6], calibration) - rays)
+    return wrap_angle(rotations_y_of_yaws(boxes[:, 6], calibration, meaning) - rays)
 
 
 def bottom_centres_in_camera(
@@ -155,15 +167,26 @@ def bottom_centres_in_camera(
     return found
 
 
-def _heading(calibration: Calibration, meaning: RotationY) -> tuple[float, int]:
+def _zero(calibration: Calibration, meaning: RotationY) -> tuple[float, int]:
     """Return the yaw of rotation_y -pi/2, and 1 if rotation_y grows clockwise seen from above."""
-    if meaning != "calibration":
+    if meaning in _FORMULA:
         return 0.0, 1
-    down = -float(calibration.lidar_to_camera[1, 2])
+    _check_headings(calibration)
+    upright = calibration.lidar_to_camera[1, 2] < 0
+    return Mounting.of(calibration).yaw_rad, 1 if upright else -1
+
+
+def _projection(calibration: Calibration) -> np.ndarray:
+    """Return the (2, 2) matrix from x, y of a heading in the LiDAR frame to the camera's x, z."""
+    _check_headings(calibration)
+    return np.asarray(calibration.lidar_to_camera[np.ix_([0, 2], [0, 1])])
+
+
+def _check_headings(calibration: Calibration) -> None:
     if not defines_headings(calibration):
+        angle = np.rad2deg(np.arcsin(abs(calibration.lidar_to_camera[1, 2])))
         raise DataError(
-            f"the camera's y axis is {np.rad2deg(np.arcsin(abs(down))):.1f} degrees from the "
-            "horizontal plane of the LiDAR frame: rotation_y, an angle about this axis, is not a "
-            "heading; correct the calibration, or use boxes in the LiDAR frame"
+            f"the camera's y axis is {angle:.1f} degrees from the horizontal plane of the LiDAR "
+            "frame: rotation_y, an angle about this axis, is not a heading; correct the "
+            "calibration, or set rotation_y to the tool with the formula -yaw - pi/2 that wrote it"
         )
-    return Mounting.of(calibration).yaw_rad, 1 if down > 0 else -1

@@ -29,6 +29,14 @@ def in_camera(
     return bottoms, (ahead if upside_down else -ahead) - np.pi / 2
 
 
+def projected_rotations_y(boxes: np.ndarray, turn: Rotation) -> np.ndarray:
+    """Return (n,) the angles of the headings in the camera's xz plane, as nuScenes exports them."""
+    directions = turn.apply(
+        np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), 0 * boxes[:, 6]])
+    )
+    return -np.arctan2(directions[:, 2], directions[:, 0])
+
+
 def openpcdet_boxes(
     locations: np.ndarray, lengths_first: np.ndarray, rotations_y: np.ndarray, matrix: np.ndarray
 ) -> np.ndarray:

@@ -25,7 +25,7 @@ import numpy as np
 from curate.errors import DataError
 from curate.files.atomic import replace_file
 from curate.files.text import read_lines
-from curate.frames import Calibration
+from curate.frames import Calibration, RotationY
 from curate.geometry.mounting import check_lidar_to_camera
 
 LEFT_COLOUR = 2
@@ -101,12 +101,15 @@ class CalibrationLines:
         return np.asarray(found)
 
 
-def read_calibration(path: Path, camera: int = LEFT_COLOUR) -> Calibration:
+def read_calibration(
+    path: Path, camera: int = LEFT_COLOUR, rotation_y: RotationY = "calibration"
+) -> Calibration:
     """Return the calibration of one camera from a file with all matrices.
 
     Args:
         path: a calibration file of the object, tracking or odometry benchmark, or of a converter.
         camera: number of the camera.
+        rotation_y: the meaning of rotation_y in the label files of the data set.
 
     Raises:
         DataError: if the file or a matrix is missing, a matrix has a wrong number of entries,
@@ -132,16 +135,19 @@ def read_calibration(path: Path, camera: int = LEFT_COLOUR) -> Calibration:
         to_rectified = product
     lidar_to_camera = _square(np.asarray(to_rectified))
     check_lidar_to_camera(lidar_to_camera, place)
-    return Calibration(np.asarray(projection), lidar_to_camera)
+    return Calibration(np.asarray(projection), lidar_to_camera, rotation_y=rotation_y)
 
 
-def read_raw_calibration(folder: Path, camera: int = LEFT_COLOUR) -> Calibration:
+def read_raw_calibration(
+    folder: Path, camera: int = LEFT_COLOUR, rotation_y: RotationY = "calibration"
+) -> Calibration:
     """Return the calibration of one camera of KITTI's raw recordings.
 
     Args:
         folder: the date folder, with `RAW_CAMERAS` (P_rect_0n, R_rect_00) and `RAW_TO_CAMERA` (R,
             T).
         camera: number of the camera.
+        rotation_y: the meaning of rotation_y in the label files of the data set.
 
     Raises:
         DataError: if a file or an entry is missing or malformed, or the transform from LiDAR to
@@ -155,7 +161,7 @@ def read_raw_calibration(folder: Path, camera: int = LEFT_COLOUR) -> Calibration
     rectify[:3, :3] = cameras.required(("R_rect_00",), _SQUARE)
     projection = cameras.required((f"P_rect_{camera:02d}",), _WIDE)
     check_lidar_to_camera(rectify @ extrinsic, str(folder / RAW_TO_CAMERA))
-    return Calibration(projection, rectify @ extrinsic)
+    return Calibration(projection, rectify @ extrinsic, rotation_y=rotation_y)
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:

@@ -35,8 +35,8 @@ from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.files.text import read_lines, read_text
-from curate.frames import Frame, FrameFiles
-from curate.geometry.mounting import RotationY, check_rotation_y
+from curate.frames import Frame, FrameFiles, RotationY
+from curate.geometry.mounting import check_rotation_y
 from curate.shapes import Float32
 
 _log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class KittiDataset:
         image_size: width and height in pixels of the calibrated camera's image, for a data set
             without images; without it, such a data set has no camera.
         follow_links: whether links may lead out of the root.
-        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
         DataError: if the root contains neither.
@@ -193,7 +193,7 @@ class KittiDataset:
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
             sweep = read_points(files.points, self._layout)
-        calibration = read_calibration(files.calibration, self.camera)
+        calibration = read_calibration(files.calibration, self.camera, self._rotation_y)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
@@ -207,12 +207,8 @@ class KittiDataset:
         if files.label is None:
             raise DataError(f"{self._labels / frame_id}.txt: no such label file")
         camera = 0 if self._front else self.camera
-        return read_annotations(
-            files.label,
-            read_calibration(files.calibration, camera),
-            categories=None,
-            rotation_y=self._rotation_y,
-        )
+        calibration = read_calibration(files.calibration, camera, self._rotation_y)
+        return read_annotations(files.label, calibration, categories=None)
 
 
 def read_points(path: Path, layout: PointLayout = UNDECLARED) -> Float32[np.ndarray, "n 4"]:

@@ -21,13 +21,12 @@ from typing import Self
 import numpy as np
 
 from curate.detections import Annotations, Columns, Detections, as_categories
-from curate.errors import DataError
+from curate.errors import DataError, error_prefix
 from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
 from curate.files.text import read_lines
-from curate.frames import Calibration
+from curate.frames import Calibration, RotationY
 from curate.geometry.mounting import (
-    RotationY,
     bottom_centres_in_camera,
     observation_angles,
     rotations_y_of_yaws,
@@ -178,7 +177,6 @@ def read_annotations(
     calibration: Calibration,
     *,
     categories: Collection[str] | None = KITTI_CATEGORIES,
-    rotation_y: RotationY = "calibration",
 ) -> Annotations:
     """Return the ground truth of a label file; see `read_objects` and `to_annotations`.
 
@@ -187,21 +185,19 @@ def read_annotations(
             define the headings.
     """
     objects = read_objects(path, categories=categories)
-    try:
-        return to_annotations(objects, calibration, rotation_y)
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from None
+    with error_prefix(str(path)):
+        return to_annotations(objects, calibration)
 
 
 def to_annotations(
-    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY = "calibration"
+    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY | None = None
 ) -> Annotations:
     """Return the objects as ground truth in the LiDAR frame; boxes of DontCare regions are NaN.
 
     Args:
         objects: objects in the camera frame.
         calibration: calibration of the frame.
-        rotation_y: the meaning of rotation_y; see `curate.geometry.mounting.RotationY`.
+        rotation_y: the meaning of rotation_y; None for that of the data set.
 
     Raises:
         DataError: if the mounting of the camera does not define the headings.
@@ -219,7 +215,7 @@ def to_annotations(
 
 
 def to_detections(
-    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY = "calibration"
+    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY | None = None
 ) -> Detections:
     """Return the objects as detections in the LiDAR frame, without DontCare regions.
 
@@ -237,9 +233,7 @@ def from_annotations(annotations: Annotations, calibration: Calibration) -> Kitt
     Raises:
         DataError: if the mounting of the camera does not define the headings.
     """
-    dimensions, locations, rotations_y = _boxes_camera(
-        annotations.boxes, calibration, "calibration"
-    )
+    dimensions, locations, rotations_y = _boxes_camera(annotations.boxes, calibration, None)
     region = annotations.categories == DONT_CARE
     dimensions[region], locations[region], rotations_y[region] = -1, -1000, -10
     return KittiObjects(
@@ -259,7 +253,7 @@ def from_detections(
     detections: Detections,
     calibration: Calibration,
     image_size: tuple[int, int] | None,
-    rotation_y: RotationY = "calibration",
+    rotation_y: RotationY | None = None,
 ) -> KittiObjects:
     """Return detections as KITTI objects, in the same order.
 
@@ -272,8 +266,8 @@ def from_detections(
         calibration: calibration of the frame.
         image_size: (width, height) of the image in pixels; None if there is no image, so that
             nothing is clipped.
-        rotation_y: the meaning of rotation_y; see `curate.geometry.mounting.RotationY`. alpha
-            always follows the calibration.
+        rotation_y: the meaning of rotation_y; None for that of the data set. alpha follows the
+            calibration in any case.
 
     Raises:
         DataError: if the mounting of the camera does not define the headings.
@@ -295,7 +289,7 @@ def from_detections(
 
 
 def _boxes_lidar(
-    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY
+    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY | None
 ) -> np.ndarray:
     """Return the (n, 7) boxes in the LiDAR frame."""
     height, width, length = objects.dimensions.T
@@ -307,7 +301,7 @@ def _boxes_lidar(
 
 
 def _boxes_camera(
-    boxes: np.ndarray, calibration: Calibration, rotation_y: RotationY
+    boxes: np.ndarray, calibration: Calibration, rotation_y: RotationY | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (n, 3) height, width, length; (n, 3) bottom centres; (n,) rotation_y, as in KITTI."""
     return (

@@ -33,8 +33,8 @@ from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
-from curate.frames import Frame, FrameFiles
-from curate.geometry.mounting import RotationY, check_rotation_y
+from curate.frames import Frame, FrameFiles, RotationY
+from curate.geometry.mounting import check_rotation_y
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
 # The root is a date folder with drives, or a folder of date folders.
@@ -65,7 +65,7 @@ class KittiRawDataset:
         layout: the declared layout of the point files.
         image_size: see `KittiDataset`.
         follow_links: whether links may lead out of the root.
-        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
         DataError: if there is no drive.
@@ -172,7 +172,7 @@ class KittiRawDataset:
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
             sweep = read_points(files.points, self._layout)
-        calibration = read_raw_calibration(files.calibration.parent)
+        calibration = read_raw_calibration(files.calibration.parent, rotation_y=self._rotation_y)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
@@ -194,10 +194,8 @@ class KittiRawDataset:
             table = self._tracklets[files.label]
             index = frame_number(number, files.points)
             return table.read(index, self.read(frame_id, points=False))
-        calibration = read_raw_calibration(files.calibration.parent)
-        return read_annotations(
-            files.label, calibration, categories=None, rotation_y=self._rotation_y
-        )
+        calibration = read_raw_calibration(files.calibration.parent, rotation_y=self._rotation_y)
+        return read_annotations(files.label, calibration, categories=None)
 
     def _frame(self, frame_id: str) -> tuple[_Drive, str]:
         check_frame_id(frame_id)

@@ -23,10 +23,10 @@ from curate.detectors.recorded.results import (
 )
 from curate.detectors.recorded.table import TableRecord
 from curate.detectors.scores import describe_invalid_scores, to_probabilities
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, error_prefix
 from curate.files.paths import StrPath
-from curate.frames import Calibration, Frame
-from curate.geometry.mounting import RotationY, check_rotation_y
+from curate.frames import Calibration, Frame, RotationY
+from curate.geometry.mounting import check_rotation_y
 from curate.geometry.similarity import Similarity
 
 _log = logging.getLogger(__name__)
@@ -99,8 +99,8 @@ class RecordedDetector:
             other names stay unchanged.
         axes: axes of boxes in the LiDAR frame: "forward-left" (x forward, y left), or
             "right-forward" as in nuScenes' LiDAR frame.
-        rotation_y: who computed rotation_y of KITTI result files; see
-            `curate.geometry.mounting.RotationY`.
+        rotation_y: who computed rotation_y of KITTI result files, see `curate.frames.RotationY`;
+            None for the meaning in the data set's label files.
         sigmoid: whether scores are logits; they become probabilities first.
         frame_ids: the frames of the data set; recorded frames are matched with them in the
             spellings of `curate.datasets.frame_names`, and those of no frame are reported.
@@ -124,7 +124,7 @@ class RecordedDetector:
         frame_list: str | None = None,
         rename: Mapping[str, str] | None = None,
         axes: str = "forward-left",
-        rotation_y: RotationY = "calibration",
+        rotation_y: RotationY | None = None,
         sigmoid: bool = False,
         frame_ids: Sequence[str] = (),
         calibration: Callable[[str], Calibration] | None = None,
@@ -133,7 +133,8 @@ class RecordedDetector:
         check_kind(kind)
         if axes not in _AXES:
             raise ConfigError(f"detector.options.axes '{axes}': use one of {', '.join(_AXES)}")
-        check_rotation_y(rotation_y, "detector.options.rotation_y")
+        if rotation_y is not None:
+            check_rotation_y(rotation_y, "detector.options.rotation_y")
         self._rotation_y = rotation_y
         self.path = Path(path)
         self.minimum_score = minimum_score
@@ -223,10 +224,8 @@ class RecordedDetector:
         if not isinstance(result, KittiObjects):
             return result.in_lidar(calibration)
         place = f"{self.path}: frame {frame_id}"
-        try:
+        with error_prefix(place):
             found = to_detections(result, calibration, self._rotation_y)
-        except DataError as error:
-            raise DataError(f"{place}: {error}") from None
         return as_detections(place, found.boxes, found.scores, found.categories)
 
     def _match(self, frames: FrameNames) -> Mapping[str, str]:

@@ -171,6 +171,22 @@ def test_labels_in_a_wrong_convention_are_reported(change, message):
     assert message in found.message
 
 
+@pytest.mark.parametrize(
+    ("read", "written"), [("calibration", "openpcdet"), ("mmdetection3d", "calibration")]
+)
+def test_another_meaning_of_rotation_y_is_reported(read, written):
+    """The camera looks aside, and the data set declares the wrong meaning."""
+    aside = replace(Rig(yaw=0.6).calibration, rotation_y=read)
+    frame = replace(street(), calibration=aside)
+    objects = from_annotations(labels(BOXES), replace(aside, rotation_y=written))
+    found = checks([(frame, to_annotations(objects, aside))])["label boxes"]
+    assert found.state == "wrong"
+    assert "turned by the yaw of the camera: rotation_y has another meaning" in found.message
+    right = replace(aside, rotation_y=written)
+    frame = replace(frame, calibration=right)
+    assert checks([(frame, to_annotations(objects, right))])["label boxes"].state == "ok"
+
+
 def test_labels_without_points_are_reported():
     """All of them, or many; a single one may be hidden."""
     frame, far = street(), BOXES + np.array([60, 0, 0, 0, 0, 0, 0])
@@ -248,10 +264,23 @@ def test_real_labels_pass(kitti_root):
     """Every frame by itself and five at a time."""
     dataset = KittiDataset(kitti_root)
     labeled = [(dataset.read(name), dataset.annotations(name)) for name in dataset.frame_ids()]
-    groups = [[each] for each in labeled] + [labeled[i : i + 5] for i in range(0, 20, 5)]
-    for group in groups:
+    fives = [labeled[i : i + 5] for i in range(0, 20, 5)]
+    for group in [[each] for each in labeled] + fives:
         found = [*examine_frame(group[0][0]), *examine_labels(group)]
         assert {one.state for one in found} == {"ok"}, found
+    half = np.array([0, 0, 1, 0, 0, 0, 0])
+    changes = {
+        "length and width are swapped": lambda b: b[:, [0, 1, 2, 4, 3, 5, 6]],
+        "turned by 90 degrees": lambda b: b + QUARTER,
+        "raised by half their height": lambda b: b - b[:, 5:6] / 2 * half,
+        "lowered by half their height": lambda b: b + b[:, 5:6] / 2 * half,
+    }
+    for message, change in changes.items():
+        for group in fives:
+            wrong = [(frame, replace(truth, boxes=change(truth.boxes))) for frame, truth in group]
+            assert message in examine_labels(wrong)[1].message
+    mirrored = [(f, replace(t, boxes=t.boxes * [1, 1, 1, 1, 1, 1, -1])) for f, t in labeled]
+    assert "yaw is negated" in examine_labels(mirrored)[1].message
 
 
 @pytest.mark.kitti

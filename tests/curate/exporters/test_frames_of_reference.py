@@ -16,6 +16,7 @@ from support.rigs import LEFT, TILTED, Rig, assert_equal_boxes, detections, rigs
 from curate.datasets.kitti.labels import read_objects, to_detections
 from curate.detections import Detections
 from curate.detectors.recorded import RecordedDetector
+from curate.errors import DataError
 from curate.exporters.base import LabelSet
 from curate.exporters.coco import CocoExporter
 from curate.exporters.kitti import KittiExporter
@@ -92,6 +93,16 @@ def test_kitti_files_are_in_the_camera_frame(found: Detections, rig: Rig) -> Non
         assert_equal_boxes(back, found.boxes, FOUR_DIGITS)
         recorded = RecordedDetector(path / "label_2").predict(rig.frame("000001"))
         np.testing.assert_array_equal(recorded.boxes, back)
+
+
+def test_openpcdet_gets_the_boxes_of_a_camera_that_looks_down(tmp_path: Path) -> None:
+    """Its formula needs no heading in the camera frame; KITTI's files do."""
+    rig = Rig(pitch=1.57)
+    found = Detections(np.array([[1.0, 2, -3, 4, 2, 1.5, 0.4]]), np.ones(1), np.array(["Car"]))
+    for boxes in openpcdet_and_mmdet3d(tmp_path, found, rig):
+        assert_equal_boxes(boxes, found.boxes)
+    with pytest.raises(DataError, match=r"frame 000001: the camera's y axis is 0\.0 degrees"):
+        KittiExporter().write(tmp_path / "kitti", labels_of(found, rig))
 
 
 @settings(max_examples=20)

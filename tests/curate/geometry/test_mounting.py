@@ -1,5 +1,7 @@
 """The mounting of a camera, and rotation_y under it."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,6 +10,7 @@ from oracles.camera_boxes import mounted
 from support.rigs import FORWARD, LEFT, REAR, TILTED, UPSIDE_DOWN, Rig, rigs
 
 from curate.errors import DataError
+from curate.frames import RotationY
 from curate.geometry.mounting import (
     Mounting,
     check_lidar_to_camera,
@@ -57,7 +60,7 @@ def test_pitch_and_roll_do_not_turn_headings(pitch, roll):
 @given(rig=rigs)
 def test_the_conversion_is_invertible(rig):
     """For every mounting and every meaning of rotation_y."""
-    for meaning in ("calibration", "openpcdet"):
+    for meaning in get_args(RotationY):
         yaws = yaws_of_rotations_y(ANGLES, rig.calibration, meaning)
         back = rotations_y_of_yaws(yaws, rig.calibration, meaning)
         np.testing.assert_allclose(back, ANGLES, atol=1e-9)
@@ -70,6 +73,12 @@ def test_a_camera_without_a_heading_is_rejected(rig):
         yaws_of_rotations_y(ANGLES, rig.calibration)
     yaws = yaws_of_rotations_y(ANGLES, rig.calibration, "mmdetection3d")
     np.testing.assert_allclose(yaws, wrap_angle(-ANGLES - np.pi / 2))
+
+
+def test_all_meanings_agree_for_a_level_camera_that_looks_along_x():
+    yaws = [yaws_of_rotations_y(ANGLES, FORWARD.calibration, each) for each in get_args(RotationY)]
+    for found in yaws:
+        np.testing.assert_allclose(found, yaws[0], atol=1e-12)
 
 
 @given(rig=rigs)

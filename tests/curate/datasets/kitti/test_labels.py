@@ -1,5 +1,7 @@
 """KITTI's label format and its conversion to the LiDAR frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -200,7 +202,7 @@ def test_labels_of_a_camera_that_looks_down_are_rejected(tmp_path):
     down = Rig(pitch=np.pi / 2).calibration
     with pytest.raises(DataError, match=r"a\.txt: the camera's y axis is 0\.0 degrees"):
         read_annotations(path, down)
-    by_formula = read_annotations(path, down, rotation_y="openpcdet")
+    by_formula = read_annotations(path, replace(down, rotation_y="openpcdet"))
     assert by_formula.boxes[0, 6] == pytest.approx(1.25 - np.pi / 2)
 
 
