@@ -8,6 +8,7 @@ import typer
 
 from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import (
+    AllowEmptyOption,
     DryRunOption,
     JsonOption,
     LastRoundOption,
@@ -40,6 +41,7 @@ def export(
     policy: PolicyOption = None,
     round_number: LastRoundOption = None,
     workspace: WorkspaceOption = None,
+    allow_empty: AllowEmptyOption = False,
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -53,7 +55,7 @@ def export(
     from pipelines.labels.by_frame import weighted_round
     from pipelines.stages.export import export_as
 
-    opened = open_workspace(workspace)
+    opened = open_workspace(workspace, allow_empty=allow_empty)
     chosen = policy or opened.config.run.method
     number = round_number or weighted_round(opened, chosen)
     if file_format == "sqlite" and output is None:
