@@ -40,9 +40,8 @@ def check_names(workspace: Workspace) -> None:
 def find_differences(workspace: Workspace) -> list[NameFinding]:
     """Return the differences between label files, segmenter and settings; nothing is changed."""
     config = workspace.config
-    findings = compare_names(
-        label_names(config, stored_names(workspace)), config.dataset.categories
-    )
+    side = label_names(config, stored_names(workspace), original=False)
+    findings = compare_names(side, config.dataset.categories)
     return [*findings, *_settings(config), *_segmenter(config)]
 
 

@@ -28,6 +28,7 @@ from curate.frames import Calibration
 from curate.geometry.projection import image_rectangles
 from curate.geometry.similarity import wrap_angle
 from curate.shapes import Float, Int, Shaped
+from curate.spelling import did_you_mean
 
 DONT_CARE = "DontCare"
 KITTI_CATEGORIES = frozenset(
@@ -298,7 +299,10 @@ def _line_problem(
         kind = "result lines (which end with a score)" if fields == RESULT_FIELDS else "label lines"
         return f"{len(row)} fields, but {kind} have {fields}"
     if categories is not None and row[0] not in categories:
-        return f"unknown category {row[0][:40]!r}; use one of {', '.join(sorted(categories))}"
+        meant = did_you_mean(row[0], categories)
+        return (
+            f"unknown category {row[0][:40]!r}; use one of {', '.join(sorted(categories))}{meant}"
+        )
     problem = next(filter(None, map(_number_problem, row[1:])), None)
     if problem:
         return problem

@@ -57,17 +57,17 @@ class KittiEditor:
             path.stem: path for path in sorted(folder.glob("*.txt")) if path.name[0] not in "._"
         }
         check_frame_names(folder, paths, sheet)
-        return {name: _read_file(path, sheet, name, read) for name, path in paths.items()}
+        return {name: _read_file(path, name, read) for name, path in paths.items()}
 
 
-def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[EditedBox]:
+def _read_file(path: Path, name: str, read: Reader) -> list[EditedBox]:
     lines = [
         (number, line)
         for number, line in enumerate(_text(path).splitlines(), start=1)
         if line.strip()
     ]
     scored = bool(lines) and all(len(line.split()) == RESULT_FIELDS for _, line in lines)
-    objects = read_objects(path, scored=scored, categories={*sheet.categories, DONT_CARE})
+    objects = read_objects(path, scored=scored, categories=None)
     places = [number for number, line in lines if line.split()[0] != DONT_CARE]
     found = to_detections(objects, read(name).calibration)
     return [
