@@ -39,7 +39,8 @@ def lower(text: str) -> str:
 def names_of(work: Path) -> dict[str, int]:
     """Return the stored objects by category."""
     query = "SELECT category, count(*) FROM ground_truth GROUP BY category ORDER BY category"
-    return dict(Workspace.open(work).database.rows(text(query)))
+    with Workspace.open(work).database.reading() as connection:
+        return dict(connection.execute(text(query)).all())
 
 
 def toy_kitti_layout(root: Path) -> tuple[Path, Path]:
@@ -190,7 +191,8 @@ def test_wrong_names_stop_every_command(curate: Curate, workspace: Workspace, co
         err.replace(', Cyclist="cyclist"', "")
     )
     assert "rows" not in out
-    assert Workspace.open(workspace.root).database.rows(text("SELECT count(*) FROM task")) == [(0,)]
+    with workspace.database.reading() as connection:
+        assert connection.execute(text("SELECT count(*) FROM task")).scalar_one() == 0
 
 
 def test_a_mapping_set_after_init_renames_the_stored_truth(
@@ -239,7 +241,7 @@ def exports(work: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("command", ["predict", "repredict", "run", "evaluate", "audit"])
+@pytest.mark.parametrize("command", ["predict", "run", "evaluate", "audit"])
 def test_results_without_a_known_name_leave_the_export_untouched(
     curate: Curate, tmp_path: Path, toy_kitti: Path, command: str
 ) -> None:
