@@ -9,7 +9,8 @@ CurateError (1)
 ├── DatabaseError (7)    the database is unavailable, damaged, or of another version
 ├── FramesFailed (8)     the command finished, but some frames failed; each is recorded
 ├── CellsFailed (9)      the grid finished, but some cells failed; the others are kept
-└── TrainerFailed (10)   the user's trainer ended with an error, or without a checkpoint
+├── TrainerFailed (10)   the user's trainer ended with an error, or without a checkpoint
+└── LabelsVanished (11)  all labels, or all of a category, are gone; the former exports are kept
 
 Each message is one line: what is wrong, where (file and line), and what to do.
 """
@@ -76,6 +77,12 @@ class TrainerFailed(CurateError):  # noqa: N818 - it reports another program's f
     """The user's trainer ended with an error, or without a checkpoint."""
 
     exit_code = 10
+
+
+class LabelsVanished(CurateError):  # noqa: N818 - named after the labels, not after an error
+    """All labels, or all weighted labels of a category, are gone; the former exports are kept."""
+
+    exit_code = 11
 
 
 @contextmanager

@@ -48,6 +48,7 @@ class NamedSide:
         setting: the setting that renames them, such as "dataset.rename".
         rename: its value.
         accepted: names outside of `dataset.categories` that need no warning.
+        original: whether these are all names before renaming; false if some are renamed already.
     """
 
     title: str
@@ -55,6 +56,7 @@ class NamedSide:
     setting: str
     rename: Mapping[str, str]
     accepted: Collection[str] = ()
+    original: bool = True
 
 
 def renamed(objects: Objects, rename: Mapping[str, str] | None) -> Objects:
@@ -146,12 +148,10 @@ def listed(names: Collection[str] | Mapping[str, int]) -> str:
 def _unused(side: NamedSide, categories: Sequence[str]) -> list[NameFinding]:
     """Return findings for names that are renamed but never occur, or to an unknown category."""
     findings = []
-    never = [name for name in side.rename if name not in side.names and side.names]
-    for name in never:
-        if side.rename[name] not in side.names:
-            meant = did_you_mean(name, side.names)
-            message = f"{side.setting}: {side.title} have no {name!r}{meant}"
-            findings.append(NameFinding(False, message))
+    never = [name for name in side.rename if name not in side.names]
+    for name in never if side.original and side.names else ():
+        message = f"{side.setting}: {side.title} have no {name!r}{did_you_mean(name, side.names)}"
+        findings.append(NameFinding(False, message))
     known = {*categories, *side.accepted, DONT_CARE}
     for name, target in side.rename.items():
         if target not in known and target != name:
@@ -179,14 +179,9 @@ def _remedy(side: NamedSide, unknown: Sequence[str], categories: Sequence[str]) 
     if not example:
         return f"to use it, add {unknown[0]!r} to dataset.categories"
     such = "" if similar else ", for example"
-    table = inline_table({**_other_sources(side), **example})
+    table = inline_table({**side.rename, **example})
     section = side.setting.partition(".")[0]
     return (
         f"map names with --set '{side.setting}={table}' at init, or rename = {table} in "
         f"[{section}] of curate.toml{such}; or change dataset.categories"
     )
-
-
-def _other_sources(side: NamedSide) -> dict[str, str]:
-    """Return the present mapping, which the suggested one has to contain."""
-    return {name: target for name, target in side.rename.items() if name in side.names}

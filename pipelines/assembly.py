@@ -344,6 +344,7 @@ def check_prior(config: Config, name: str) -> None:
         reads_pixels = registry.PRIORS.takes(name, "segmenter")
     if reads_pixels:
         check_segmenter(config)
+        check_segmenter_names(config)
     with error_prefix("run.priors"):
         if whole_sequences:
             open_sequence_source(config, name)

@@ -4,7 +4,8 @@ The ground truth of unlabeled frames is never read for it: only the stored names
 """
 
 import logging
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import cache
 
 from sqlalchemy import func, select
 
@@ -39,9 +40,8 @@ def check_names(workspace: Workspace) -> None:
 def find_differences(workspace: Workspace) -> list[NameFinding]:
     """Return the differences between label files, segmenter and settings; nothing is changed."""
     config = workspace.config
-    findings = compare_names(
-        label_names(config, stored_names(workspace)), config.dataset.categories
-    )
+    side = label_names(config, stored_names(workspace), original=False)
+    findings = compare_names(side, config.dataset.categories)
     return [*findings, *_settings(config), *_segmenter(config)]
 
 
@@ -51,7 +51,7 @@ def check_detector_names(config: Config, detector: Detector) -> None:
     Raises:
         ConfigError: if they differ so that no work can start.
     """
-    report(detector_differences(config, detector))
+    report(detector_differences(config, detector), warn=_warn_once)
 
 
 def detector_differences(config: Config, detector: Detector) -> list[NameFinding]:
@@ -76,22 +76,13 @@ def detector_differences(config: Config, detector: Detector) -> list[NameFinding
 def check_before_init(config: Config) -> None:
     """Compare the names of settings, segmenter and a user-supplied detector with each other.
 
-    A detector that cannot be opened is only a warning: its file may be written later.
-
     Raises:
         ConfigError: if names differ so that no work can start.
     """
-    findings = [*_settings(config), *_segmenter(config)]
-    path, name = config.detector.path, config.detector.name
-    if path is not None and hasattr(registry.DETECTORS.load(name), "category_names"):
-        try:
-            findings += detector_differences(config, open_detector(config, path))
-        except CurateError as error:
-            findings.append(NameFinding(False, str(error)))
-    report(findings)
+    report([*_settings(config), *_segmenter(config), *_supplied_detector(config)])
 
 
-def report(findings: Iterable[NameFinding]) -> None:
+def report(findings: Iterable[NameFinding], warn: Callable[[str], None] = _log.warning) -> None:
     """Log the findings as warnings.
 
     Raises:
@@ -102,9 +93,34 @@ def report(findings: Iterable[NameFinding]) -> None:
         if finding.wrong:
             wrong.append(finding.message)
         else:
-            _log.warning("%s", finding.message)
+            warn(finding.message)
     if wrong:
         raise ConfigError("; ".join(wrong))
+
+
+@cache
+def _warn_once(message: str) -> None:
+    """Log a warning once per process: several stages open the same detector."""
+    _log.warning("%s", message)
+
+
+def all_differences(workspace: Workspace) -> list[NameFinding]:
+    """Return the differences between all sides, the detector included; nothing is changed."""
+    return [*find_differences(workspace), *_supplied_detector(workspace.config)]
+
+
+def _supplied_detector(config: Config) -> list[NameFinding]:
+    """Return the differences of a detector with a file of the user, if its class knows names.
+
+    A detector that cannot be opened is a warning: the commands that need it report it as an error.
+    """
+    path = config.detector.path
+    if path is None or not hasattr(registry.DETECTORS.load(config.detector.name), "category_names"):
+        return []
+    try:
+        return detector_differences(config, open_detector(config, path))
+    except CurateError as error:
+        return [NameFinding(False, str(error))]
 
 
 def stored_names(workspace: Workspace) -> Mapping[str, int]:

@@ -16,6 +16,7 @@ from curate.geometry.overlap import bev_iou
 from curate.geometry.similarity import wrap_angle
 from curate.review.human_labels import ACCEPTED, ADDED, MOVED, REJECTED, SAME_OBJECT_IOU
 from curate.review.sheet import ShownFrame
+from curate.spelling import did_you_mean
 
 # Editors round numbers; the KITTI files of a review have four decimals.
 _SAME_METRES, _SAME_RADIANS = 2e-3, 2e-3
@@ -135,7 +136,7 @@ def check_boxes(edited: Sequence[EditedBox], categories: Sequence[str]) -> None:
         if each.category not in categories:
             raise DataError(
                 f"{each.place}: unknown category {each.category!r}; the categories of this review "
-                f"are {', '.join(categories)}"
+                f"are {', '.join(categories)}{did_you_mean(each.category, categories)}"
             )
         box = np.array(each.box)
         if box.shape != (7,) or not np.isfinite(box).all():

@@ -9,6 +9,7 @@ import typer
 
 from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import (
+    AllowEmptyOption,
     DryRunOption,
     JsonOption,
     LastRoundOption,
@@ -46,6 +47,7 @@ def export(
         bool,
         typer.Option("--strict", help="Fail, and write nothing, if a failed frame is missing."),
     ] = False,
+    allow_empty: AllowEmptyOption = False,
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -64,7 +66,7 @@ def export(
     from pipelines.labels.by_frame import weighted_round
     from pipelines.stages.export import default_path, export_as, missing_frames
 
-    opened = open_workspace(workspace)
+    opened = open_workspace(workspace, allow_empty=allow_empty)
     chosen = policy or opened.config.run.method
     number = round_number or weighted_round(opened, chosen)
     missing = () if number is None else missing_frames(opened, number, chosen)

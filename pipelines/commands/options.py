@@ -1,6 +1,7 @@
 """Options that several commands share."""
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -99,6 +100,13 @@ DryRunOption = Annotated[
         help="Print what would run, why, and how long it would take; do not run it.",
     ),
 ]
+AllowEmptyOption = Annotated[
+    bool,
+    typer.Option(
+        "--allow-empty",
+        help="Write or train on labels even if all of them, or all of a category, are gone.",
+    ),
+]
 ChartFormatOption = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--format", help="Format of chart files: svg, png or pdf."),
@@ -110,11 +118,13 @@ def open_workspace(
     executor: str | None = None,
     workers: int | None = None,
     threads: int | None = None,
+    *,
+    allow_empty: bool = False,
 ) -> "Workspace":
     """Return the workspace with the settings that the command line changes for this run."""
     from pipelines.workspace.workspace import Workspace
 
-    workspace = Workspace.open(folder)
+    workspace = replace(Workspace.open(folder), allow_empty=allow_empty)
     changes: dict[str, Any] = {}
     if workers is not None:
         changes["workers"] = workers

@@ -6,6 +6,7 @@ import typer
 
 from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import (
+    AllowEmptyOption,
     DryRunOption,
     ExecutorOption,
     JsonOption,
@@ -36,6 +37,7 @@ def run(
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
+    allow_empty: AllowEmptyOption = False,
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -55,7 +57,7 @@ def run(
     from pipelines.round import graph_of
     from pipelines.stages.methods import with_method
 
-    opened = open_workspace(workspace, executor, workers)
+    opened = open_workspace(workspace, executor, workers, allow_empty=allow_empty)
     if method is not None:
         opened = replace(opened, config=with_method(opened.config, method))
     check_names(opened)

@@ -7,6 +7,7 @@ from typing import Annotated, Optional
 import typer
 
 from pipelines.commands.options import (
+    AllowEmptyOption,
     DryRunOption,
     JsonOption,
     PolicyOption,
@@ -40,6 +41,7 @@ def train_round(
     ] = None,
     threads: ThreadsOption = None,
     workspace: WorkspaceOption = None,
+    allow_empty: AllowEmptyOption = False,
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -57,7 +59,8 @@ def train_round(
     """
     given = {"command": command, "labels_format": labels_format}
     changes = {name: value for name, value in given.items() if value is not None}
-    opened = open_workspace(workspace, threads=threads).with_settings("train", **changes)
+    opened = open_workspace(workspace, threads=threads, allow_empty=allow_empty)
+    opened = opened.with_settings("train", **changes)
     run_round_command("train-round", opened, round_number, policy, as_json=as_json, dry_run=dry_run)
     if dry_run:
         return

@@ -31,6 +31,7 @@ from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.labels.by_frame import check_weights
 from pipelines.labels.human_labels import fingerprint
 from pipelines.stages.methods import zero_weight_of
+from pipelines.stages.vanished import check_labels, remember_labels
 from pipelines.workspace.workspace import Workspace, sha256
 
 CURRENT = "labels.sqlite"
@@ -112,14 +113,15 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     current = path.with_name(CURRENT) if job.policy == workspace.config.run.method else None
     if current:
         check_label_file_place(current)
+    written = [path, current] if current else [path]
+    check_labels(workspace, job.context.number, job.policy, written)
     unlabeled = open_policy(workspace.config, job.policy).uses_unlabeled
     labels = write_label_file(workspace, path, job.context.number, job.policy if unlabeled else "")
-    written = [path]
     if current:
         partial = path.with_suffix(".partial")
         shutil.copyfile(path, partial)
         partial.replace(current)
-        written.append(current)
+    remember_labels(workspace, job.context.number, job.policy, written)
 
     def write(connection: Connection) -> None:
         for each in written:
@@ -162,18 +164,23 @@ def export_as(
 
     Raises:
         WorkspaceError: if the policy has weighted nothing in that round.
+        LabelsVanished: if the export would lose all labels of a category.
         LeakageError: if ground truth of unlabeled or val frames would be exported.
     """
     from pipelines.firewall.rules import enforce
 
     enforce(workspace, round_number)
     labels = label_set(workspace, round_number, policy)
-    if all(each.split == "labeled" for each in labels.frames):
+    empty = all(each.split == "labeled" for each in labels.frames)
+    if empty and not workspace.allow_empty:
         raise WorkspaceError(
             f"round {round_number} has no labels weighted by {policy}; "
             f"run `curate solve --policy {policy}`"
         )
-    return exporter.write(path, labels)
+    check_labels(workspace, round_number, policy, [path])
+    count = exporter.write(path, labels)
+    remember_labels(workspace, round_number, policy, [path])
+    return count
 
 
 def label_set(workspace: Workspace, round_number: int, policy: str) -> LabelSet:

@@ -25,6 +25,7 @@ from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
 from pipelines.stages.external_trainer import train_externally
 from pipelines.stages.methods import Method, method_of, zero_weight_of
+from pipelines.stages.vanished import check_labels
 from pipelines.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -98,9 +99,11 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
     Raises:
         ConfigError: if curate cannot train the configured detector, or the command is wrong.
         TrainerFailed: if the command fails, or does not write a checkpoint.
+        LabelsVanished: if the round has no labels.
     """
     path = file(workspace, job.context, job.policy)
     trainable = trainable_detector(workspace.config)
+    check_labels(workspace, job.context.number, job.policy)
     statistics: list[Statistic] = []
 
     def write(connection: Connection) -> None:

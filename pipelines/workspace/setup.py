@@ -96,19 +96,19 @@ def initialise(
     return workspace
 
 
-def label_names(config: Config, names: Mapping[str, int]) -> NamedSide:
+def label_names(config: Config, names: Mapping[str, int], *, original: bool) -> NamedSide:
     """Return the names in the label files of X_l and val, for a comparison.
 
     Args:
         config: the configuration.
-        names: number of objects by name, before or after renaming.
+        names: number of objects by name.
+        original: whether the names are those of the label files; false for stored names.
     """
     kind = config.dataset.kind
     # nuScenes' classes are a fixed list, of which a user chooses some.
     accepted = set(names) if kind == "nuscenes" else _BENCHMARK_NAMES
-    return NamedSide(
-        "the label files", names, "dataset.rename", config.dataset.rename or {}, accepted
-    )
+    rename = config.dataset.rename or {}
+    return NamedSide("the label files", names, "dataset.rename", rename, accepted, original)
 
 
 def _compare_names(config: Config, dataset: Dataset, truth: Mapping[str, Annotations]) -> None:
@@ -120,7 +120,7 @@ def _compare_names(config: Config, dataset: Dataset, truth: Mapping[str, Annotat
             it may be a typing error.
     """
     names = Counter(name for found in truth.values() for name in found.categories.tolist())
-    side = label_names(config, dict(sorted(names.items())))
+    side = label_names(config, dict(sorted(names.items())), original=True)
     findings = compare_names(side, config.dataset.categories)
     if wrong := [finding.message for finding in findings if finding.wrong]:
         raise ConfigError("; ".join(wrong))

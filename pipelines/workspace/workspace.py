@@ -35,11 +35,13 @@ class Workspace:
         root: its folder, absolute.
         config: the settings of `curate.toml`, with the options of the command line applied.
         database: its database.
+        allow_empty: whether an export may lose all labels of a category (`--allow-empty`).
     """
 
     root: Path
     config: Config
     database: Database
+    allow_empty: bool = False
 
     @classmethod
     def open(cls, folder: Path | None = None) -> "Workspace":

@@ -14,7 +14,7 @@ from support.pipelines_cli import Curate
 from support.rounds import run_workspace
 
 from curate.datasets.kitti.dataset import KittiDataset
-from curate.errors import ConfigError, CurateError, DataError, FramesFailed
+from curate.errors import ConfigError, CurateError, DataError
 from pipelines.assembly import SHIPPED_SEGMENTER
 from pipelines.workspace.workspace import Workspace
 
@@ -47,17 +47,18 @@ def begin(curate: Curate, work: Path, root: Path, results: Path) -> tuple[int, s
     return curate("predict", "-w", work)
 
 
-def test_class_names_in_lower_case_fail_every_frame_with_a_fix(
+def test_class_names_in_lower_case_stop_predict_with_a_fix(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
-    """There would be no label at all; the printed setting works."""
-    results = write_results(tmp_path / "a.pkl", toy_kitti, name=np.char.lower)
+    """There would be no label at all; the older place of the setting works too."""
+    results = write_results(tmp_path / "a.pkl", toy_kitti)
     work = tmp_path / "w"
-    code, _, err = begin(curate, work, toy_kitti, results)
-    assert code == FramesFailed.exit_code
-    assert "returns 'car', but the data set's category is 'Car'" in err
-    setting = re.search(r"detector\.options\.(rename = )\{", err)
-    assert setting is not None
+    assert begin(curate, work, toy_kitti, results)[0] == 0
+    write_results(results, toy_kitti, name=np.char.lower)
+    code, _, err = curate("predict", "-w", work)
+    assert code == ConfigError.exit_code
+    assert "have car, cyclist, pedestrian, but dataset.categories are Car, Ped" in err
+    assert re.search(r"detector\.(rename=)\{", err) is not None
     toml = work / "curate.toml"
     table = 'options = {rename = {car = "Car", pedestrian = "Pedestrian", cyclist = "Cyclist"}}'
     head, section, rest = toml.read_text().partition("[detector]")
@@ -70,7 +71,7 @@ def test_class_names_in_lower_case_fail_every_frame_with_a_fix(
 def test_unknown_names_are_dropped_and_reported_once(
     curate: Curate, tmp_path: Path, toy_kitti: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The other boxes stay."""
+    """By init and by predict; the other boxes stay."""
     # A name that no other test of this process has used.
     results = write_results(
         tmp_path / "a.pkl", toy_kitti, name=lambda names: np.char.replace(names, "Cyclist", "Moped")
@@ -78,9 +79,9 @@ def test_unknown_names_are_dropped_and_reported_once(
     code, out, _ = begin(curate, tmp_path / "w", toy_kitti, results)
     assert code == 0
     assert "12 rows" in out
-    warned = [message for message in caplog.messages if "'Moped'" in message]
-    assert len(warned) == 1
-    assert "rename" in warned[0]
+    warned = [message for message in caplog.messages if "have Moped, which" in message]
+    assert len(warned) == 2
+    assert "dataset.categories" in warned[0]
 
 
 def test_results_for_other_frames_end_the_command(

@@ -145,7 +145,10 @@ def test_wrong_results_give_a_one_line_error(root: Path, tmp_path: Path, curate:
     assert "--dataset-option camera: give NAME=VALUE" in err
     (tmp_path / "a.json").write_text(json.dumps({"meta": {}, "results": {"x": []}}))
     named = ("--detector", "recorded", "--detector-path", tmp_path / "a.json")
-    own = ("--labeled", "0.5", "--dataset-option", 'rename={car = "PKW"}')
+    own = (
+        "--labeled", "0.5", "--dataset-option", 'rename={car = "PKW"}',
+        "--set", 'dataset.categories=["PKW", "bicycle"]',
+    )  # fmt: skip
     assert curate(*arguments, *named, *own)[0] == 0
     _, out, _ = curate(
         "query", "SELECT DISTINCT category FROM ground_truth ORDER BY 1", "-w", tmp_path / "work"

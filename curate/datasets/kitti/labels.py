@@ -34,6 +34,7 @@ from curate.geometry.mounting import (
 )
 from curate.geometry.projection import image_rectangles
 from curate.shapes import Float, Int, Shaped
+from curate.spelling import did_you_mean
 
 DONT_CARE = "DontCare"
 KITTI_CATEGORIES = frozenset(
@@ -370,7 +371,10 @@ def _line_problem(
         expected = "result lines have 16" if scored else "label lines have 15, or 16 with a score"
         return f"{len(row)} fields, but {expected}"
     if categories is not None and row[0] not in categories:
-        return f"unknown category {row[0][:40]!r}; use one of {', '.join(sorted(categories))}"
+        meant = did_you_mean(row[0], categories)
+        return (
+            f"unknown category {row[0][:40]!r}; use one of {', '.join(sorted(categories))}{meant}"
+        )
     fields = RESULT_FIELDS if scored else LABEL_FIELDS
     problem = next(filter(None, map(_number_problem, row[1:fields])), None)
     return problem or _size_problem(row)

@@ -1,6 +1,5 @@
 """KITTI benchmark results: a folder with one FRAME.txt per frame, sixteen fields per line."""
 
-import codecs
 import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -45,12 +44,12 @@ class KittiResults(Mapping[str, KittiObjects]):
 
         A file that cannot be read is left out: it affects only its frame.
         """
-        names: set[bytes] = set()
+        names: set[str] = set()
         for path in self._paths.values():
-            with contextlib.suppress(OSError):
-                lines = path.read_bytes().removeprefix(codecs.BOM_UTF8).splitlines()
+            with contextlib.suppress(OSError, UnicodeDecodeError):
+                lines = path.read_bytes().decode("utf-8-sig").splitlines()
                 names.update(line.split(None, 1)[0] for line in lines if line.strip())
-        return {name.decode(errors="replace") for name in names} - {DONT_CARE}
+        return names - {DONT_CARE}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._paths)

@@ -58,13 +58,11 @@ class KittiEditor:
             path.stem: path for path in sorted(folder.glob("*.txt")) if path.name[0] not in "._"
         }
         frames = match_frame_names(folder, paths, sheet)
-        return {
-            frame: _read_file(paths[name], sheet, frame, read) for name, frame in frames.items()
-        }
+        return {frame: _read_file(paths[name], frame, read) for name, frame in frames.items()}
 
 
-def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[EditedBox]:
-    objects = read_objects(path, categories={*sheet.categories, DONT_CARE})
+def _read_file(path: Path, name: str, read: Reader) -> list[EditedBox]:
+    objects = read_objects(path, categories=None)
     places = [number for number, row in read_rows(path) if row[0] != DONT_CARE]
     with error_prefix(str(path)):
         found = to_detections(objects, read(name).calibration)

@@ -222,7 +222,9 @@ def trained(
     own = initialise(tmp_path / f"{name}-{len(train)}", config, "0.25", "")
     settings = {"preset": tiny, "pretrain_steps": 5, "round_steps": 3} | train
     section = own.config.train.model_copy(update=settings)  # users cannot select the tiny preset
-    return run(replace(own, config=own.config.model_copy(update={"train": section})))
+    config = own.config.model_copy(update={"train": section})
+    # A teacher of so few steps may find nothing, so a round may have no labels.
+    return run(replace(own, config=config, allow_empty=True))
 
 
 def test_an_averaged_teacher_is_used_in_the_next_round(
@@ -248,7 +250,7 @@ def test_the_students_of_two_methods_are_separate(
     own = trained(workspace, tmp_path, tiny, "spsl")
     kept = [own.root / "checkpoints" / f"round-{n}.safetensors" for n in ("00", "01-spsl")]
     before = [sha256(path) for path in kept]
-    run(replace(own, config=with_method(own.config, "sess")))
+    run(replace(own, config=with_method(own.config, "sess"), allow_empty=True))
     assert [sha256(path) for path in kept] == before
     registered = rows(own, "SELECT round, policy, path FROM checkpoint WHERE round = 1 ORDER BY 2")
     assert registered == [

@@ -169,6 +169,30 @@ def test_low_scores_are_dropped_and_names_translated(written):
     assert record.predict(frame("000001")).categories.tolist() == ["car"]
 
 
+def test_every_format_knows_its_names(written):
+    """Of all frames, before the first one is predicted; renamed like the boxes."""
+    path, _, options = written
+    assert RecordedDetector(path, **options).category_names() == {"Car", "Pedestrian"}
+    renamed = RecordedDetector(path, rename={"Car": "car"}, **options)
+    assert renamed.category_names() == {"car", "Pedestrian"}
+
+
+def test_a_damaged_result_file_does_not_hide_the_names_of_others(tmp_path):
+    """It fails its frame alone, when that is predicted."""
+    folder = write_kitti(tmp_path / "results")
+    (folder / "000003.txt").write_bytes(b"\xff\xfe 1 2\n\nDontCare 1\n")
+    assert RecordedDetector(folder).category_names() == {"Car", "Pedestrian"}
+
+
+def test_the_names_of_further_passes_count(tmp_path):
+    """A name that occurs only in an augmented copy is compared too."""
+    van = Detections(BOXES, FOUND.scores, as_categories(["Car", "Van"]))
+    plain = write_openpcdet(tmp_path / "plain.pkl")
+    write_openpcdet(tmp_path / "flipped.pkl", {"000001": van})
+    record = RecordedDetector(plain, passes=[{"path": "flipped.pkl", "flip_y": True}])
+    assert record.category_names() == {"Car", "Pedestrian", "Van"}
+
+
 def test_a_second_pass_gives_views(written):
     """Its boxes stay in the frame of the copy; without one there are no views, and a warning."""
     path, write, options = written

@@ -37,6 +37,16 @@ def write(path: Path, *, group=2, **changes) -> Path:
     return path
 
 
+def test_the_names_of_all_rows_are_known(tmp_path):
+    """In any row group, plain or as a dictionary."""
+    names = {"Car", "Pedestrian", "Van"}
+    plain = write(tmp_path / "a.parquet", category=["Car", "Pedestrian", "Van"])
+    assert RecordedDetector(plain).category_names() == names
+    encoded = arrow.array(["Car", "Pedestrian", "Van"]).dictionary_encode()
+    path = write(tmp_path / "b.parquet", category=encoded)
+    assert RecordedDetector(path).category_names() == names
+
+
 def test_our_own_export_can_be_read_as_a_record(tmp_path):
     """Boxes, scores and categories to the last bit, for any size of row groups."""
     ParquetExporter(rows_per_group=2).write(tmp_path / "labels.parquet", toy_labels())

@@ -36,6 +36,13 @@ def test_it_returns_what_was_recorded(tmp_path):
     assert isinstance(detector, RecordedViews)
 
 
+def test_the_names_of_all_rows_are_known(tmp_path):
+    """Those of augmented copies too."""
+    van = MOVED.replace("Car", "Van")
+    record = RecordedDetector(write(tmp_path / "a.csv", PLAIN, van))
+    assert record.category_names() == {"Car", "Van"}
+
+
 def test_a_byte_order_mark_is_ignored(tmp_path):
     """The first column keeps its name."""
     path = write(tmp_path / "a.csv", PLAIN, MOVED)
