@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from curate.detectors.pillars import PillarDetector
     from curate.detectors.recorded import RecordedDetector
     from curate.errors import ConfigError, CurateError, DataError, LeakageError, ModelError
+    from curate.evaluation.difficulties import DistanceDifficulty, PointDifficulty
     from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
-    from curate.evaluation.kitti_folders import evaluate_folders, read_folders
+    from curate.evaluation.kitti_folders import SensorFolders, evaluate_folders, read_folders
     from curate.exporters.data_frames import read_labels
     from curate.frames import Calibration, Frame
     from curate.geometry.boxes import bev_corners, box_corners
@@ -79,6 +80,7 @@ __all__ = [
     "DataError",
     "DensityPrior",
     "Detections",
+    "DistanceDifficulty",
     "Evidence",
     "FolderDataset",
     "Frame",
@@ -96,12 +98,14 @@ __all__ = [
     "OnnxInstanceSegmenter",
     "OnnxSegmenter",
     "PillarDetector",
+    "PointDifficulty",
     "PointPrior",
     "Policy",
     "RecordedDetector",
     "Sample",
     "SavedSegmenter",
     "SemanticPrior",
+    "SensorFolders",
     "Similarity",
     "Threshold",
     "UDACurriculum",
@@ -188,7 +192,8 @@ PUBLIC_MODULES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     },
     "Evaluation": {
         "curate.evaluation.kitti_ap": ("evaluate", "KittiEvaluation"),
-        "curate.evaluation.kitti_folders": ("evaluate_folders", "read_folders"),
+        "curate.evaluation.kitti_folders": ("evaluate_folders", "read_folders", "SensorFolders"),
+        "curate.evaluation.difficulties": ("DistanceDifficulty", "PointDifficulty"),
     },
     "Errors": {
         "curate.errors": (

@@ -700,12 +700,12 @@ class EvaluationObject(Box, Base):
     )
     difficulty: Mapped[str] = mapped_column(
         comment="objects beyond it are ignored",
-        doc="easy | moderate | hard; harder objects are ignored",
+        doc="level with the most objects, such as hard; objects beyond it are ignored",
     )
 
 
 class EvaluationAp(Base):
-    """KITTI average precision of the detections of val frames."""
+    """KITTI average precision of the detections of val frames; null if it cannot be computed."""
 
     __tablename__ = "evaluation_ap"
     __table_args__ = ({"sqlite_with_rowid": False},)
@@ -717,7 +717,11 @@ class EvaluationAp(Base):
     )
     category: Mapped[str] = mapped_column(primary_key=True, doc="evaluated category")
     figure: Mapped[str] = mapped_column(primary_key=True, comment="image | aos | bev | 3d")
-    difficulty: Mapped[str] = mapped_column(primary_key=True, comment="easy | moderate | hard")
+    difficulty: Mapped[str] = mapped_column(
+        primary_key=True,
+        comment="easy | moderate | hard",
+        doc="easy | moderate | hard, or a level by points or distance, such as 0-30 m",
+    )
     objects: Mapped[int] = mapped_column(
         comment="that count", doc="number of objects, without ignored ones"
     )

@@ -162,7 +162,8 @@ def _print(figures: "Audit", title: str, overlaps: "Mapping[str, float]") -> Non
     )
     first = next(iter(by_policy.values()))
     print_counts({"objects": figures.counts, "labels": figures.label_counts})
-    print_line("every object of a category counts, whatever its 2D box, occlusion or truncation\n")
+    print_line("every object of a category counts, whatever its 2D box, occlusion or truncation")
+    print_line("\n")
     print_table(
         ("weight", "labels", "precision", "recall"),
         [

@@ -241,7 +241,7 @@ def _evaluate_folders(
     sensors: "SensorFolders",
 ) -> "EvaluationReport":
     """Return the evaluation of two folders."""
-    from curate.errors import ConfigError
+    from curate.errors import ConfigError, DataError
     from curate.evaluation.difficulties import open_difficulty
     from curate.evaluation.kitti_folders import load_folders
     from curate.evaluation.kitti_rules import overlaps_of
@@ -254,14 +254,19 @@ def _evaluate_folders(
         raise ConfigError(f"--min-overlap: {error}; see --categories") from error
     limits = {name: rules[name] for name in ("minimum_points", "distance_limits") if name in rules}
     levels = open_difficulty(rules.get("difficulty", "kitti"), **limits)
-    loaded = load_folders(
-        labels,
-        results,
-        categories=categories,
-        difficulty=levels,
-        sensors=sensors,
-        frame_list=frames,
-    )
+    try:
+        loaded = load_folders(
+            labels,
+            results,
+            categories=categories,
+            difficulty=levels,
+            sensors=sensors,
+            frame_list=frames,
+        )
+    except DataError as error:
+        if "unknown category" in str(error):
+            raise DataError(f"{error}; --categories evaluates other names") from error
+        raise
     objects = ValObjects(loaded.labels, loaded.results, levels, overlaps, loaded.points)
     return EvaluationReport(
         _compare(objects),

@@ -15,7 +15,7 @@ def print_counts(sides: Mapping[str, Counts]) -> None:
     """
     levels = next(iter(sides.values())).levels
     names = [short_level(level) for level in levels] if len(levels) > 1 else ["count"]
-    by_level = f" ({' / '.join(names)})" if len(levels) > 1 else ""
+    by_level = ", by level" if len(levels) > 1 else ""
     print_table(
         ("category", "", "in all", *names, f"do not count{by_level}"),
         _rows(sides),

@@ -8,8 +8,70 @@ HEIGHTS, OCCLUSIONS, TRUNCATIONS = (40, 25, 25), (0, 1, 2), (0.15, 0.3, 0.5)
 NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
+class Kitti:
+    """KITTI's rules on what counts."""
+
+    def __init__(self, difficulty):
+        self.difficulty = difficulty
+
+    def label_state(self, label, category):
+        """Return whether a label is counted, ignored or absent."""
+        return label_state(label, category, self.difficulty)
+
+    def result_state(self, result, category):
+        """Return whether a result is counted, ignored or absent."""
+        return result_state(result, category, self.difficulty)
+
+    def is_spared(self, result):
+        """Return whether a result is no false positive if it matches nothing."""
+        return False
+
+
+class ByPoints(Kitti):
+    """Levels by the LiDAR points in a label, which has them in the key "points"."""
+
+    def __init__(self, least):
+        self.least = least
+
+    def label_state(self, label, category):
+        """A label with too few points, or a neighbour, is ignored."""
+        if label["category"] == NEIGHBOURS.get(category):
+            return "ignored"
+        if label["category"] != category:
+            return "absent"
+        return "counted" if label["points"] >= self.least else "ignored"
+
+    def result_state(self, result, category):
+        """Every result of the category counts."""
+        return "counted" if result["category"] == category else "absent"
+
+
+class ByDistance(ByPoints):
+    """Ranges of distance: a result beyond the range can match, but is no false positive."""
+
+    def __init__(self, low, high):
+        super().__init__(1)
+        self.low, self.high = low, high
+
+    def is_inside(self, item):
+        """Return whether a box is in the range."""
+        x, _, z = item["location"]
+        return self.low <= math.sqrt(x * x + z * z) < self.high
+
+    def label_state(self, label, category):
+        """A label beyond the range is ignored."""
+        return super().label_state({**label, "points": int(self.is_inside(label))}, category)
+
+    def is_spared(self, result):
+        """Return whether the result is beyond the range."""
+        return not self.is_inside(result)
+
+
 def average_precision(labels, results, category, figure, difficulty, min_overlap):
-    """Return (R11, R40) in percent; labels and results are lists of dicts, one list per frame."""
+    """Return (R11, R40) in percent; labels and results are lists of dicts, one list per frame.
+
+    `difficulty` is an index of KITTI's levels, or rules such as `ByPoints`.
+    """
     metric = "image" if figure == "aos" else figure
     frames = [
         Frame(label, result, category, metric, difficulty, min_overlap)
@@ -43,8 +105,9 @@ class Frame:
 
     def __init__(self, labels, results, category, metric, difficulty, min_overlap):
         self.labels, self.results = labels, results
-        self.states = [label_state(label, category, difficulty) for label in labels]
-        self.result_states = [result_state(result, category, difficulty) for result in results]
+        self.rules = Kitti(difficulty) if isinstance(difficulty, int) else difficulty
+        self.states = [self.rules.label_state(label, category) for label in labels]
+        self.result_states = [self.rules.result_state(result, category) for result in results]
         self.overlap, self.min_overlap = OVERLAPS[metric], min_overlap
         self.regions = [label for label in labels if label["category"] == "DontCare"]
         if metric != "image":
@@ -90,7 +153,9 @@ class Frame:
         return hits, len(false), similarity
 
     def in_dontcare(self, index):
-        """Return whether a detection is in a DontCare region by more than the minimum overlap."""
+        """Return whether a detection is no false positive: spared, or in a DontCare region."""
+        if self.rules.is_spared(self.results[index]):
+            return True
         box = self.results[index]["box_2d"]
         area = (box[2] - box[0]) * (box[3] - box[1])
         return any(

@@ -2,10 +2,12 @@
 
 import pytest
 from support.kitti_scenes import car, to_objects
+from support.lidar_only import write_lidar_only
 
 from curate.datasets.kitti.labels import write_objects
 from curate.errors import DataError
-from curate.evaluation.kitti_folders import evaluate_folders, read_folders
+from curate.evaluation.difficulties import DistanceDifficulty, PointDifficulty
+from curate.evaluation.kitti_folders import SensorFolders, evaluate_folders, read_folders
 
 LINE = "Car 0.00 0 0.50 100 100 180 160 1.5 1.6 4.0 0.0 1.7 20.0 0.3"
 
@@ -91,3 +93,34 @@ def test_folders_without_text_files_are_rejected(folders, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=r"no \.txt files"):
         read_folders(folders[0], tmp_path / "empty")
+
+
+def test_missing_2d_boxes_are_projected_with_the_folders_of_sensors(tmp_path):
+    """Those beside the labels by default; a given image size replaces the images."""
+    made = write_lidar_only(tmp_path)
+    assert evaluate_folders(made.labels, made.results).objects[1].tolist() == [6, 6, 6]
+    for path in (made.root / "training" / "image_2").iterdir():
+        path.unlink()
+    assert evaluate_folders(made.labels, made.results).objects.sum() == 0
+    sized = SensorFolders(image_size=(1200, 400))
+    found = evaluate_folders(made.labels, made.results, sensors=sized)
+    assert found.objects[1].tolist() == [6, 6, 6]
+
+
+def test_levels_and_categories_of_folders(tmp_path):
+    """The points in each object are counted; a category that KITTI does not know needs its name."""
+    made = write_lidar_only(tmp_path)
+    by_points = evaluate_folders(made.labels, made.results, difficulty=PointDifficulty((8, 4, 3)))
+    assert by_points.objects.tolist() == [[6, 6, 6], [0, 0, 6], [0, 0, 0]]
+    for folder in (made.labels, made.results):
+        for path in folder.iterdir():
+            path.write_text(path.read_text().replace("Car", "Bus"))
+    with pytest.raises(DataError, match="unknown category 'Bus'"):
+        evaluate_folders(made.labels, made.results)
+    found = evaluate_folders(
+        *(made.labels, made.results),
+        min_overlaps={"Bus": 0.7},
+        difficulty=DistanceDifficulty(()),
+    )
+    assert found.objects.tolist() == [[6]]
+    assert found.ap_r40[0, 3].tolist() == [100]

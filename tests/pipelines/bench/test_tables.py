@@ -124,3 +124,36 @@ def test_cells_without_values() -> None:
     from curate.evaluation.comparison import Spread
 
     assert Entry(Spread(math.nan, math.nan, 0)).full == "-"
+
+
+def test_a_figure_that_cannot_be_computed_is_in_no_mean(toy_kitti: Path, tmp_path: Path) -> None:
+    """Without a counted object: "-" and null; the mean is over the others, as the report says."""
+    levels = {"Car": (60.0, 40.0), "Bus": (None, 20.0)}
+    thresholds = {"kitti": {"Car": 0.7, "Bus": 0.6}, "loose": {"Car": 0.5, "Bus": 0.375}}
+    bench = make_bench(tmp_path / "b", toy_kitti, methods=("baseline",))
+    result = synthetic_result(
+        Job(0.25, 0, "baseline"),
+        0.0,
+        ap={name: {"3d": levels, "bev": levels} for name in thresholds},
+        recall=levels,
+        thresholds=thresholds,
+        difficulties=("level 1", "level 2"),
+        labels=(),
+    )
+    assert result.mean("kitti", "3d") == pytest.approx((60 + 40 + 20) / 3)
+    write_result(bench.root, result)
+    report = BenchReport(bench)
+    found = table(report.finished, "3D AP, IoU 0.7/0.6")
+    assert found.columns[2:6] == ("Car\nlevel 1", "Car\nlevel 2", "Bus\nlevel 1", "Bus\nlevel 2")
+    assert row(found, "baseline") == ["1", "60.0", "40.0", "-", "20.0", "40.0", ""]
+    assert row(table(report.finished, "mean 3D AP, IoU 0.5/0.375"), "baseline") == ["40.0"]
+    assert "-, and not in any mean, because no object counts: Bus level 1" in report.markdown()
+    numbers = json.loads(json.dumps(report.numbers(), allow_nan=False))
+    assert numbers["jobs"][0]["ap"]["kitti"]["3d"]["Bus"] == [None, 20.0]
+
+
+def test_a_result_without_any_figure_has_no_mean() -> None:
+    """NaN, shown as "-"."""
+    levels = {"Car": (None,) * 3}
+    result = synthetic_result(Job(0.25, 0), 0.0, ap={"kitti": {"3d": levels}}, recall=levels)
+    assert math.isnan(result.mean("kitti", "3d"))
