@@ -69,7 +69,8 @@ def read_table(folder: Path, sheet: Sheet) -> dict[str, ExplicitDecisions]:
     # In some languages spreadsheets save CSV with semicolons.
     delimiter = ";" if ";" in text.partition("\n")[0] else ","
     rows = csv.DictReader(io.StringIO(text), delimiter=delimiter)
-    names = set(rows.fieldnames or ())
+    rows.fieldnames = [name.strip() for name in rows.fieldnames or ()]
+    names = set(rows.fieldnames)
     if not {"frame", "decision"} <= names or names.isdisjoint({"k", _OLD_NUMBER}):
         raise DataError(f"{path}:1: the columns frame, k and decision are required")
     found: dict[str, ExplicitDecisions] = {}
