@@ -16,10 +16,10 @@ from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
 from curate.files.batches import batched
 from curate.firewall.sequences import choose_sequences, group_by_sequence, shared_sequences
-from curate.segmenters.classes import CLASS_MAPS
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
+from pipelines.assembly import missing_classes
 from pipelines.workspace.config import Config
 from pipelines.workspace.split_record import split_rows
 from pipelines.workspace.splits import SPLITS
@@ -100,11 +100,7 @@ def _check_files(config: Config) -> None:
         and registry.SEGMENTERS.takes(name, "classes")
         and "classes" not in segmenter.options
     ):
-        raise ConfigError(
-            f"segmenter '{name}': its class ids have no meaning yet: give --segmenter-classes "
-            f"(one of {', '.join(CLASS_MAPS)}) or your own table, such as --set "
-            '"segmenter.options.classes={Car=[7]}"'
-        )
+        raise missing_classes(name)
 
 
 def choose_split(
