@@ -181,22 +181,11 @@ def check_segmenter(config: Config) -> None:
 
 
 def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, ...]]:
-    from curate.segmenters.classes import class_map
+    from curate.segmenters.classes import class_map, missing_classes
 
     if classes is None:
         raise missing_classes(segmenter)
     return class_map(classes)
-
-
-def missing_classes(segmenter: str) -> ConfigError:
-    """Return the error for a segmenter with class ids whose meaning is not configured."""
-    from curate.segmenters.classes import CLASS_MAPS
-
-    return ConfigError(
-        f"segmenter '{segmenter}': the meaning of its class ids is not configured: set "
-        f"segmenter.classes (at init: --segmenter-classes) to one of {', '.join(CLASS_MAPS)}, or "
-        "segmenter.options.classes to a table like {Car = [7]}"
-    )
 
 
 def segmenter_path(config: Config) -> Path | None:

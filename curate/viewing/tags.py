@@ -68,7 +68,7 @@ class ShownLabels:
     @property
     def is_human(self) -> np.ndarray:
         """(n,) bool, objects that a person accepted, moved or added; they have long dashes."""
-        return np.asarray(self._decided != "") & ~self.is_rejected
+        return np.asarray((self._decided != "") & (self._decided != "rejected"))
 
     @property
     def _decided(self) -> np.ndarray:

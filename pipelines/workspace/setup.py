@@ -16,10 +16,10 @@ from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
 from curate.files.batches import batched
 from curate.firewall.sequences import choose_sequences, group_by_sequence, shared_sequences
+from curate.segmenters.classes import missing_classes
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
-from pipelines.assembly import missing_classes
 from pipelines.workspace.config import Config
 from pipelines.workspace.split_record import split_rows
 from pipelines.workspace.splits import SPLITS
