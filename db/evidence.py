@@ -61,6 +61,12 @@ class Declaration:
         """Name of the source's table."""
         return OWN_TABLES.get(self.name, f"prior_{self.name}")
 
+    @property
+    def layout(self) -> tuple[Any, ...]:
+        """What stored evidence depends on: all but the meanings, which are only shown."""
+        columns = tuple((each.name, each.kind, each.unit, each.optional) for each in self.columns)
+        return self.name, self.source, columns, self.rho_column
+
 
 def evidence_table(declaration: Declaration) -> Table:
     """Return the table of a source."""
@@ -100,20 +106,22 @@ def declare(connection: Connection, declaration: Declaration) -> None:
     """Create the table of a source if it is missing, and record its declaration.
 
     A table of the same name with other columns, or of another class, is replaced by an empty one,
-    and the tasks of that source are deleted, so that its evidence is computed again. The caller
-    recreates the views.
+    and the tasks of that source are deleted, so that its evidence is computed again. If only the
+    meaning of a column has been reworded, the evidence stays. The caller recreates the views.
     """
     former = {each.name: each for each in read_declarations(connection)}.get(declaration.name)
     if former == declaration:
         return
     own = declaration.name in OWN_TABLES
+    same = former is not None and former.layout == declaration.layout
     if former is not None:
-        if not own:
-            connection.execute(DropTable(evidence_table(former)))
-        task = Base.metadata.tables["task"]
-        connection.execute(task.delete().where(task.c.stage == former.source))
         connection.execute(_RECORD.delete().where(_RECORD.c.name == declaration.name))
-    if not own:
+        if not same:
+            if not own:
+                connection.execute(DropTable(evidence_table(former)))
+            task = Base.metadata.tables["task"]
+            connection.execute(task.delete().where(task.c.stage == former.source))
+    if not (same or own):
         connection.execute(CreateTable(evidence_table(declaration)))
     row = {
         "name": declaration.name,

@@ -1,7 +1,9 @@
 """Opening a database: connection settings, migrations, and errors with a remedy."""
 
+import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from db.backups import back_up
 from db.claims import Check, claimed, round_resources, wait_for_transactions
 from db.lock_holders import find_writers
 from db.models import Base
+from db.read_only import is_read_only, read_only_uri
 from db.views import create_views, drop_views, refresh_views, views_are_current
 
 # A writer waits this long for another one before it fails.
@@ -43,7 +46,10 @@ class Database:
 
     def __init__(self, url: str | URL, backups: Path | None = None) -> None:
         self.url = parse_url(url) if isinstance(url, str) else url
-        self.engine = _engine(self.url)
+        self._read_only = self.url.get_backend_name() == "sqlite" and is_read_only(
+            Path(str(self.url.database))
+        )
+        self.engine = _engine(self.url, read_only=self._read_only)
         self._claims: list[Check] = []
         with ExitStack() as failed:
             failed.callback(self.close)
@@ -119,6 +125,13 @@ class Database:
             elif current == head:
                 self._require_tables(connection)
             views_current = current == head and views_are_current(connection)
+        if self._read_only:
+            if not views_current:
+                raise DatabaseError(
+                    f"{self.name}: an older curate wrote it, and it cannot be migrated without "
+                    "write permission: copy the workspace into a folder of your own"
+                )
+            return
         self._write_ahead()
         if views_current:
             return
@@ -227,9 +240,13 @@ def _upgrade(connection: Connection) -> None:
     command.upgrade(config, "head")
 
 
-def _engine(url: URL) -> Engine:
+def _engine(url: URL, *, read_only: bool = False) -> Engine:
+    options: dict[str, Any] = {}
+    if read_only:
+        uri = read_only_uri(Path(str(url.database)))
+        options["creator"] = partial(sqlite3.connect, uri, uri=True, check_same_thread=False)
     try:
-        engine = create_engine(url)
+        engine = create_engine(url, **options)
     except NoSuchModuleError as error:
         raise ConfigError(f"database {url!r}: {error}") from error
     except ImportError as error:
@@ -279,7 +296,8 @@ _REMEDIES = {
         "not a database": "; this file is damaged or not a database, move it away or restore it",
         "locked": "; another process is writing, wait for it or stop it",
         "readonly": "; give yourself write permission on the file and its folder",
-        "unable to open": "; check that the folder exists and can be written",
+        "unable to open": "; check that the folder exists and can be written, or copy the "
+        "workspace into a folder of your own",
         "disk I/O error": "; check free space, disk and mount, finished frames are kept",
         "full": "; free space on the disk and rerun the command, finished frames are kept",
     },

@@ -48,7 +48,7 @@ def errors_page(root: Path, note: str) -> str:
         parts += [f"### {kind.__name__}", "", f"Exit code {kind.exit_code}: {_meaning(kind)}", ""]
         if found:
             parts += ["| message | raised in |", "|---|---|"]
-            parts += [f"| {_code(one.text)} | `{one.source}` |" for one in found]
+            parts += [f"| {as_code(one.text)} | `{one.source}` |" for one in found]
             parts.append("")
     return "\n".join(parts)
 
@@ -151,7 +151,7 @@ def _meaning(kind: type[CurateError]) -> str:
     return " ".join((inspect.getdoc(kind) or "").split())
 
 
-def _code(text: str) -> str:
+def as_code(text: str) -> str:
     """Return a message as code in a cell of a table."""
     text = " ".join(text.split()).replace("|", "\\|")
     return f"`` {text} ``" if "`" in text else f"`{text}`"

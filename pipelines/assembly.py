@@ -218,14 +218,10 @@ def check_segmenter(config: Config) -> None:
 
 
 def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, ...]]:
-    from curate.segmenters.classes import CLASS_MAPS, class_map
+    from curate.segmenters.classes import class_map, missing_classes
 
     if classes is None:
-        raise ConfigError(
-            f"segmenter '{segmenter}': the meaning of its class numbers is not configured: set "
-            f"segmenter.classes to one of {', '.join(CLASS_MAPS)}, or segmenter.options.classes "
-            "to a table like {Car = [7]}"
-        )
+        raise missing_classes(segmenter)
     return class_map(classes)
 
 
@@ -303,7 +299,12 @@ def consistency_settings(config: Config) -> ConsistencySettings:
 
 
 def open_prior(
-    config: Config, name: str, thresholds: Mapping[str, float], *, measures: bool = True
+    config: Config,
+    name: str,
+    thresholds: Mapping[str, float],
+    *,
+    measures: bool = True,
+    segmenter: Segmenter | None = None,
 ) -> EvidenceSource:
     """Return a prior with its settings.
 
@@ -312,12 +313,13 @@ def open_prior(
         name: name of the prior.
         thresholds: points per category, learned from X_l; passed to priors with this argument.
         measures: whether the prior will read frames; its segmenter is opened only then.
+        segmenter: the configured segmenter, if it is open.
     """
     prior: EvidenceSource = registry.PRIORS.build(
         name,
         offered={
             "thresholds": lambda: thresholds,
-            "segmenter": lambda: open_segmenter(config) if measures else None,
+            "segmenter": lambda: (segmenter or open_segmenter(config)) if measures else None,
             "settings": lambda: semantic_settings(config),
         },
         options=config.run.prior_options.get(name, {}),
@@ -342,14 +344,26 @@ def check_prior(config: Config, name: str) -> None:
     with error_prefix("run.priors"):
         whole_sequences = hasattr(registry.PRIORS.load(name), "score_sequence")
         reads_pixels = registry.PRIORS.takes(name, "segmenter")
+    segmenter = _checked_segmenter(config) if reads_pixels else None
     if reads_pixels:
-        check_segmenter(config)
         check_segmenter_names(config)
     with error_prefix("run.priors"):
         if whole_sequences:
             open_sequence_source(config, name)
         else:
-            open_prior(config, name, dict.fromkeys(config.dataset.categories, 1.0))
+            thresholds = dict.fromkeys(config.dataset.categories, 1.0)
+            open_prior(config, name, thresholds, segmenter=segmenter)
+
+
+def _checked_segmenter(config: Config) -> Segmenter:
+    """Return the opened segmenter; an error names the setting that is wrong."""
+    check_segmenter(config)
+    try:
+        return open_segmenter(config)
+    except CurateError as error:
+        if str(error).startswith("segmenter"):
+            raise
+        raise type(error)(f"segmenter.path: {error}") from error
 
 
 def point_settings(config: Config) -> PointSettings:

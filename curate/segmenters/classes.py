@@ -70,6 +70,15 @@ def checked_classes(classes: Mapping[str, Sequence[int]]) -> ClassMap:
     return {category: tuple(ids) for category, ids in classes.items()}
 
 
+def missing_classes(segmenter: str) -> ConfigError:
+    """Return the error for a segmenter with class ids whose meaning is not configured."""
+    return ConfigError(
+        f"segmenter '{segmenter}': the meaning of its class ids is not configured: set "
+        f"segmenter.classes (at init: --segmenter-classes) to one of {', '.join(CLASS_MAPS)}, or "
+        "segmenter.options.classes to a table like {Car = [7]}"
+    )
+
+
 def background_id(classes: ClassMap) -> int:
     """Return a class id for background pixels: the lowest that counts for no category, or 0."""
     used = {class_id for ids in classes.values() for class_id in ids}

@@ -65,12 +65,12 @@ class ShownLabels:
     @property
     def is_rejected(self) -> np.ndarray:
         """(n,) bool, labels that a person rejected; they are crossed out."""
-        return self._decided == "rejected"
+        return np.asarray(self._decided == "rejected")
 
     @property
     def is_human(self) -> np.ndarray:
         """(n,) bool, objects that a person accepted, moved or added; they have long dashes."""
-        return (self._decided != "") & ~self.is_rejected
+        return np.asarray((self._decided != "") & (self._decided != "rejected"))
 
     @property
     def _decided(self) -> np.ndarray:

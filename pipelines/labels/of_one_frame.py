@@ -123,7 +123,7 @@ def _with_decisions(
     objects = Detections.from_rows(
         [(each.category, 1.0, *each.box, None) for each in decided.objects]
     )
-    every = labels.select(kept).joined(objects)
+    every = labels.select(kept).followed_by(objects)
     numbers = np.array([*kept.tolist(), *(each.k for each in decided.objects)], dtype=np.int64)
     weights = np.concatenate([weights[kept], np.ones(len(objects))])
     decisions = as_categories([decided.by_k.get(k, "") for k in numbers.tolist()])

@@ -148,7 +148,9 @@ def _declare(workspace: Workspace, declaration: Declaration) -> None:
         drop_views(connection)
         declare(connection, declaration)
         create_views(connection)
-    if any(other.name == declaration.name for other in stored):
+    if any(
+        other.name == declaration.name and other.layout != declaration.layout for other in stored
+    ):
         _log.warning(
             "evidence source '%s' has other columns than before, or is another class: table %s is "
             "replaced, and its evidence is computed again",

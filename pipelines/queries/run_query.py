@@ -13,6 +13,7 @@ from sqlalchemy.exc import DBAPIError
 
 from curate.errors import ConfigError, DatabaseError, joined_lines, one_line
 from curate.spelling import did_you_mean
+from db.read_only import read_only_uri
 from pipelines.queries.functions import FUNCTIONS, register_functions
 
 Names = Mapping[str, Sequence[str]]
@@ -78,7 +79,7 @@ def _run_on_sqlite(
     path: Path, sql: str, seconds: float
 ) -> tuple[Sequence[str], Iterator[tuple[Any, ...]]]:
     try:
-        connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+        connection = sqlite3.connect(read_only_uri(path), uri=True)
     except sqlite3.Error as error:
         raise DatabaseError(f"{path}: {error}") from error
     for category, limit in (

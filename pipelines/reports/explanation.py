@@ -115,8 +115,9 @@ def _human(workspace: Workspace, label: dict[str, Any]) -> Explanation:
     decision = describe_decision(workspace, label)
     if label["weight"] == 0 and decision.policy_weight is not None:
         computed = _computed(workspace, {**label, "weight": decision.policy_weight})
-        lines = (line.replace("  weight       ", "  policy weight", 1) for line in computed.lines)
-        return replace(computed, label=label, lines=(*lines, decision.lines[0]))
+        # The weight that counts is the person's, in the last line.
+        own = (line.replace("  weight       ", "  policy weight", 1) for line in computed.lines)
+        return replace(computed, label=label, lines=(*own, decision.lines[0]))
     lines = (*_head(_numbers(label)), *decision.lines)
     no_evidence = Recomputed(None, {}, math.nan)
     return Explanation(label, (), None, no_evidence, None, lines)

@@ -11,6 +11,7 @@ from typing import Any
 from datasette.database import Database
 
 from curate.errors import DatabaseError
+from db.read_only import read_only_uri
 from pipelines.queries.functions import register_functions
 from pipelines.queries.run_query import may_read
 
@@ -96,9 +97,7 @@ def connect_read_only(path: Path) -> sqlite3.Connection:
         DatabaseError: if the file is missing, damaged or not a SQLite file.
     """
     try:
-        # as_uri quotes characters with a meaning in URIs, such as a ? in a folder's name.
-        uri = f"{path.resolve().as_uri()}?mode=ro"
-        connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        connection = sqlite3.connect(read_only_uri(path), uri=True, check_same_thread=False)
         connection.execute("PRAGMA query_only = ON")
         connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
     except sqlite3.Error as error:

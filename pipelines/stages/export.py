@@ -56,9 +56,9 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
 
 
 def _further_columns(workspace: Workspace) -> list[str]:
-    """Return the declarations of the columns after the core ones, as text."""
+    """Return the layout of the columns after the core ones, as text."""
     with workspace.database.reading() as connection:
-        return [repr(each) for each in read_declarations(connection)]
+        return [repr(each.layout) for each in read_declarations(connection)]
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:

@@ -182,7 +182,7 @@ def _declared(source: Source) -> Settings:
     """Return the declaration of a source; nothing if its table is part of the schema."""
     if source.table in bulk.SCHEMA_TABLES:
         return {}
-    return {"columns": repr(source.declaration)}
+    return {"columns": repr(source.declaration.layout)}
 
 
 def _settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:

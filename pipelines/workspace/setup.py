@@ -20,7 +20,7 @@ from curate.exporters.base import named
 from curate.files.batches import batched
 from curate.firewall.sequences import choose_sequences, group_by_sequence, shared_sequences
 from curate.names import NamedSide, compare_names, inline_table
-from curate.segmenters.classes import CLASS_MAPS
+from curate.segmenters.classes import missing_classes
 from curate.spelling import closest, did_you_mean
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
@@ -168,11 +168,7 @@ def check_files(config: Config) -> None:
         and registry.SEGMENTERS.takes(name, "classes")
         and "classes" not in segmenter.options
     ):
-        raise ConfigError(
-            f"segmenter '{name}': its class ids have no meaning yet: give --segmenter-classes "
-            f"(one of {', '.join(CLASS_MAPS)}) or your own table, such as --set "
-            '"segmenter.options.classes={Car=[7]}"'
-        )
+        raise missing_classes(name)
 
 
 def choose_split(

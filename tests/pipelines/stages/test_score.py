@@ -17,6 +17,7 @@ from support.rounds import run, run_stage
 from support.toys import ToyPrior, ToySequences
 
 from curate.errors import ConfigError
+from db.evidence import read_declarations
 from pipelines.labels.sources import source_of
 from pipelines.registry import PRIORS
 from pipelines.round import round_graph
@@ -119,13 +120,32 @@ def test_a_changed_declaration_recreates_its_table(
     """The values are computed again; one line reports it."""
     own = workspace.with_settings("run", priors=("points", OWN))
     run(own)
-    changed = tuple(replace(column, meaning="changed") for column in ToyPrior.columns)
+    changed = tuple(replace(column, unit="m") for column in ToyPrior.columns)
     monkeypatch.setattr(ToyPrior, "columns", changed)
     source_of.cache_clear()
     assert run(own)[OWN] == 6
     [line] = [each for each in caplog.messages if "is replaced" in each]
     assert "evidence source 'toy'" in line
     assert "prior_toy" in line
+    source_of.cache_clear()
+
+
+def test_a_reworded_meaning_keeps_the_evidence(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Nothing is computed, exported or trained again; the new words are shown."""
+    own = workspace.with_settings("run", priors=("points", OWN))
+    run(own)
+    before = rows(own)
+    reworded = tuple(replace(column, meaning="other words") for column in ToyPrior.columns)
+    monkeypatch.setattr(ToyPrior, "columns", reworded)
+    source_of.cache_clear()
+    assert set(run(own).values()) == {0}
+    assert not [each for each in caplog.messages if "is replaced" in each]
+    assert rows(own) == before
+    with own.database.reading() as connection:
+        [stored] = [each for each in read_declarations(connection) if each.name == "toy"]
+    assert {column.meaning for column in stored.columns} == {"other words"}
     source_of.cache_clear()
 
 
