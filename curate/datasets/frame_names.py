@@ -296,10 +296,10 @@ def last_part(name: str) -> str:
 
 def _parts(name: str) -> tuple[list[str], str]:
     """Return the folders of a path of any system, and its last part without suffix."""
-    *folders, last = name.strip().replace("\\", "/").split("/")
-    while len(short := _SUFFIX.sub("", last)) < len(last) and short:
-        last = short
-    return [folder for folder in folders if folder], last
+    folders, _, last = name.strip().replace("\\", "/").rpartition("/")
+    while "." in last and (match := _SUFFIX.search(last)) and match.start():
+        last = last[: match.start()]
+    return [folder for folder in folders.split("/") if folder], last
 
 
 def _unpadded(text: str) -> str:
