@@ -104,23 +104,26 @@ class FrameNames(Sequence[str]):
             return _only(name, self._numbered.get(int(last), ()))
         return None
 
-    def require(self, name: str, place: object = None) -> str:
+    def require(
+        self, name: str, place: object = None, *, error_type: type[CurateError] = DataError
+    ) -> str:
         """Return the frame with a name.
 
         Args:
             name: the name.
-            place: file and line, for messages.
+            place: file and line, or the option of the command line, for messages.
+            error_type: class of the error.
 
         Raises:
-            DataError: if no frame has it, or several have.
+            CurateError: of class `error_type`, if no frame has it, or several have.
         """
         prefix = "" if place is None else f"{place}: "
         try:
             found = self.find(name)
         except DataError as error:
-            raise DataError(f"{prefix}{error}") from None
+            raise error_type(f"{prefix}{error}") from None
         if found is None:
-            raise DataError(f"{prefix}there is no frame {name[:200]!r}{self.nearest(name)}")
+            raise error_type(f"{prefix}there is no frame {name[:200]!r}{self.nearest(name)}")
         return found
 
     def match(self, names: Iterable[str], place: object) -> tuple[dict[str, str], list[str]]:
@@ -275,9 +278,10 @@ def match_frame_list(
     for number, line in read_frame_list(path, error_type=error_type):
         for name in [line] if line in frames or line in groups else line.split():
             try:
-                found |= dict.fromkeys(groups.get(name) or [_listed(frames, name, allow_missing)])
+                listed = groups.get(name) or [_listed(frames, name, allow_missing)]
             except DataError as error:
                 raise error_type(f"{path}:{number}: {error}") from None
+            found |= dict.fromkeys(listed)
     return tuple(found)
 
 
