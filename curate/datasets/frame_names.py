@@ -16,6 +16,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar, overload
@@ -209,12 +210,14 @@ def match_frames(
     return found
 
 
-def files_by_frame(folder: Path, pattern: str, frame_ids: Sequence[str]) -> Mapping[str, Path]:
+def files_by_frame(
+    folder: Path, patterns: str | Sequence[str], frame_ids: Sequence[str]
+) -> Mapping[str, Path]:
     """Return the file of each frame in a folder; files of other frames are left out.
 
     Args:
-        folder: the folder; if no file in it matches the pattern, its subfolders are searched.
-        pattern: of the file names, such as "*.png".
+        folder: the folder; if no file in it matches the patterns, its subfolders are searched.
+        patterns: of the file names in lower case, such as "*.png".
         frame_ids: the ids of all frames; if empty, no file is matched.
 
     Raises:
@@ -223,8 +226,9 @@ def files_by_frame(folder: Path, pattern: str, frame_ids: Sequence[str]) -> Mapp
     """
     if not len(frame_ids):
         return {}
-    paths = list(folder.glob(pattern)) or list(folder.rglob(pattern))
-    by_name = {path.relative_to(folder).as_posix(): path for path in paths if path.name[0] != "."}
+    allowed = (patterns,) if isinstance(patterns, str) else patterns
+    by_name = _matching(folder.iterdir(), allowed, folder)
+    by_name = by_name or _matching(folder.rglob("*"), allowed, folder)
     frames = FrameNames.of(frame_ids)
     found, unmatched = frames.match(by_name, folder)
     if unmatched and not found:
@@ -233,6 +237,15 @@ def files_by_frame(folder: Path, pattern: str, frame_ids: Sequence[str]) -> Mapp
             f"{frames.nearest(unmatched[0])}"
         )
     return {frame: by_name[name] for name, frame in found.items()}
+
+
+def _matching(paths: Iterable[Path], patterns: Sequence[str], folder: Path) -> Mapping[str, Path]:
+    """Return the visible files that match a pattern, by their paths in the folder."""
+    return {
+        path.relative_to(folder).as_posix(): path
+        for path in paths
+        if path.name[0] != "." and any(fnmatchcase(path.name.lower(), each) for each in patterns)
+    }
 
 
 def read_frame_list(

@@ -101,7 +101,7 @@ def test_missing_and_unreadable_maps_are_reported(tmp_path):
         SavedSegmenter(tmp_path, {"Car": (300,)})
 
 
-@pytest.mark.parametrize("name", ["1.png", "0001.png", "sub/000001.png"])
+@pytest.mark.parametrize("name", ["1.png", "0001.png", "000001.PNG", "sub/000001.png"])
 def test_maps_are_matched_with_frames_in_every_spelling(tmp_path, name):
     """A number, other leading zeros, a subfolder."""
     (tmp_path / name).parent.mkdir(exist_ok=True)
