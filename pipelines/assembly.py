@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from curate.consistency import ConsistencySettings
 from curate.datasets.frame_names import FrameNames
 from curate.detectors.base import Detector, TrainableDetector, choose_preset
-from curate.errors import ConfigError, error_prefix
+from curate.errors import ConfigError, CurateError, error_prefix
 from curate.files.toml_text import toml_key
 from curate.frames import Calibration
 from curate.names import inline_table, listed, mapping
