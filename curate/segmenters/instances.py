@@ -5,6 +5,7 @@ per frame. Where masks overlap, the mask with the higher score is on top.
 """
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -98,12 +99,12 @@ def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
     document = _read(path)
     images = document.get("images", ()) if isinstance(document, dict) else ()
     try:
-        names = {image["id"]: Path(image["file_name"]) for image in images}
+        keys = _keys({image["id"]: Path(image["file_name"]) for image in images})
         frames: dict[str | int, list[Mapping[str, Any]]] = {
-            key: [] for name in names.values() for key in _keys(name)
+            key: [] for of_image in keys.values() for key in of_image
         }
         for entry in _object_list(path, document):
-            for key in _keys(names[entry["image_id"]]) if names else (entry["image_id"],):
+            for key in keys[entry["image_id"]] if keys else (entry["image_id"],):
                 frames.setdefault(key, []).append(entry)
     except (KeyError, TypeError) as error:
         words = f"no {error.args[0]!s:.80}" if isinstance(error, KeyError) else str(error)
@@ -113,10 +114,16 @@ def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
     return frames
 
 
-def _keys(file: Path) -> tuple[str, ...]:
-    """Return the names of an image file: FRAME, and for one of several cameras CAMERA/FRAME."""
-    folder = file.parent.name
-    return (file.stem, f"{folder}/{file.stem}") if folder else (file.stem,)
+def _keys(files: Mapping[Any, Path]) -> dict[Any, list[str]]:
+    """Return the names of each image: CAMERA/FRAME, and FRAME if no other image has that name."""
+    stems = Counter(file.stem for file in files.values())
+    return {
+        number: [
+            *([file.stem] if stems[file.stem] == 1 else []),
+            *([f"{file.parent.name}/{file.stem}"] if file.parent.name else []),
+        ]
+        for number, file in files.items()
+    }
 
 
 def _object_list(path: Path, document: Any) -> list[Mapping[str, Any]]:
