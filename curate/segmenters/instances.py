@@ -5,7 +5,7 @@ per frame. Where masks overlap, the mask with the higher score is on top.
 """
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -58,8 +58,11 @@ class InstanceSegmenter:
         self._frame_ids = frame_ids
         self._files: dict[str, Mapping[str, Path]] = {}
         self._frames: dict[str, Mapping[str, Objects]] = {}
+        self._images: Mapping[str, Objects] = {}
         if not self.path.is_dir():
-            self._objects_by_frame("")
+            self._images = _objects_by_image(self.path)
+            if len({_folder(name) for name in self._images} - {""}) < 2:  # else one per camera
+                self._objects_by_frame("")
         elif next(self.path.glob("*.json"), None):
             self._file_by_frame("")
 
@@ -73,7 +76,8 @@ class InstanceSegmenter:
     def _objects_by_frame(self, camera: str) -> Mapping[str, Objects]:
         """Return the objects of each frame from a camera; "" for the only one."""
         if camera not in self._frames:
-            self._frames[camera] = _by_frame(self.path, FrameNames.of(self._frame_ids), camera)
+            frames = FrameNames.of(self._frame_ids)
+            self._frames[camera] = _by_frame(self.path, self._images, frames, camera)
         return self._frames[camera]
 
     def segment(self, frame: Frame) -> SemanticMap:
@@ -122,13 +126,8 @@ class InstanceSegmenter:
         )
 
 
-def _by_frame(
-    path: Path, frame_ids: FrameNames, camera: str
-) -> Mapping[str, list[Mapping[str, Any]]]:
-    """Return the objects of each frame of the data set, or of each image without `frame_ids`.
-
-    With several cameras, images are those in a folder with the name of the camera.
-    """
+def _objects_by_image(path: Path) -> Mapping[str, Objects]:
+    """Return the objects of each image, by its file name or its id."""
     document = read_json(path, "instance mask")
     images = document.get("images", ()) if isinstance(document, dict) else ()
     try:
@@ -144,11 +143,28 @@ def _by_frame(
         ) from None
     if len(found) < len(names):
         raise DataError(f"{path}: two images have the same file_name; remove one")
-    several = any(Path(name).parent.name == camera for name in found) if camera else False
-    if several:
-        found = {name: each for name, each in found.items() if Path(name).parent.name == camera}
+    return found
+
+
+def _folder(name: str) -> str:
+    """Return the folder of an image, which may be the name of its camera; "" without a folder."""
+    return PurePosixPath(name.replace("\\", "/")).parent.name
+
+
+def _by_frame(
+    path: Path, images: Mapping[str, Objects], frame_ids: FrameNames, camera: str
+) -> Mapping[str, Objects]:
+    """Return the objects of each frame of the data set, or of each image without `frame_ids`.
+
+    With several cameras, images are those in a folder with the name of the camera.
+    """
+    of_camera = {name: each for name, each in images.items() if camera and _folder(name) == camera}
+    found = of_camera or images
     if not len(frame_ids):
-        return {last_part(name): objects for name, objects in found.items()}
+        frames = {last_part(name): objects for name, objects in found.items()}
+        if len(frames) < len(found):
+            raise DataError(f"{path}: contains several images of a frame, of which only one counts")
+        return frames
     matched, unmatched = frame_ids.match(found, path)
     if unmatched and not matched:
         raise DataError(

@@ -17,6 +17,7 @@ from curate.segmenters.map_files import MapFile, read_map
 
 _MAX_CLASSES = 256
 _SUFFIXES = (".png", ".npy")
+_PATTERNS = tuple(f"*{suffix}" for suffix in _SUFFIXES)
 _CHANNELS = ("red", "green", "blue")
 # What a value below the divisor is, where a published format defines it: a class without
 # instances in Cityscapes' instanceIds, an instance of class 0 in KITTI's semantic instances.
