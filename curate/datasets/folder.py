@@ -31,7 +31,7 @@ lidar_to_camera = [[...], [...], [...]]
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
