@@ -4,13 +4,14 @@ No other module creates detectors, segmenters, priors or policies.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.consistency import ConsistencySettings
 from curate.detectors.base import Detector, TrainableDetector, choose_preset
-from curate.errors import ConfigError, error_prefix
+from curate.errors import ConfigError, CurateError
 from curate.frames import Calibration
 from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
@@ -24,6 +25,15 @@ from pipelines.workspace.workspace import open_dataset
 Kind = TypeVar("Kind")
 
 SHIPPED_SEGMENTER = Path(__file__).parent.parent / "curate/segmenters/models/simulated.onnx"
+
+
+@contextmanager
+def _error_prefix(key: str) -> Iterator[None]:
+    """Put the configuration key in front of the message of an error."""
+    try:
+        yield
+    except CurateError as error:
+        raise type(error)(f"{key}: {error}") from error
 
 
 def open_detector(config: Config, path: Path) -> Detector:
@@ -42,7 +52,7 @@ def check_detector(config: Config) -> None:
         ConfigError: if it cannot be imported, does not accept its options, or does not have the
             configured preset.
     """
-    with error_prefix("detector.name"):
+    with _error_prefix("detector.name"):
         registry.DETECTORS.check(
             config.detector.name,
             config.detector.path,
@@ -84,7 +94,7 @@ def trainable_detector(config: Config) -> Trainable | None:
         ConfigError: if the detector has no preset of the configured name, or its class cannot be
             used.
     """
-    with error_prefix("detector.name"):
+    with _error_prefix("detector.name"):
         detector = registry.trainable(config.detector.name)
     preset = config.train.preset
     if detector is None:
@@ -161,7 +171,7 @@ def check_segmenter(config: Config) -> None:
     """
     name = "onnx" if config.segmenter.name == "simulated" else config.segmenter.name
     if name != "none":
-        with error_prefix("segmenter.name"):
+        with _error_prefix("segmenter.name"):
             registry.SEGMENTERS.check(
                 name,
                 segmenter_path(config),
@@ -211,7 +221,7 @@ def check_policy(config: Config, name: str) -> None:
     Raises:
         ConfigError: if it cannot be imported, or rejects its options.
     """
-    with error_prefix("run.method" if name == config.run.method else "--policy"):
+    with _error_prefix("run.method" if name == config.run.method else "--policy"):
         open_policy(config, name)
 
 
@@ -223,7 +233,7 @@ def check_executor(config: Config) -> None:
     """
     section = config.run
     options = section.executor_options.get(section.executor, {})
-    with error_prefix("run.executor"):
+    with _error_prefix("run.executor"):
         registry.EXECUTORS.check(section.executor, offered=("workers",), options=options)
 
 
@@ -233,7 +243,7 @@ def check_labels_format(config: Config) -> None:
     Raises:
         ConfigError: if the exporter cannot be imported or created.
     """
-    with error_prefix("train.labels_format"):
+    with _error_prefix("train.labels_format"):
         registry.EXPORTERS.build(config.train.labels_format, offered={}, options={})
 
 
@@ -292,12 +302,12 @@ def check_prior(config: Config, name: str) -> None:
     Raises:
         CurateError: if it cannot be imported or created, or its segmenter cannot be opened.
     """
-    with error_prefix("run.priors"):
+    with _error_prefix("run.priors"):
         whole_sequences = hasattr(registry.PRIORS.load(name), "score_sequence")
         reads_pixels = registry.PRIORS.takes(name, "segmenter")
     if reads_pixels:
         check_segmenter(config)
-    with error_prefix("run.priors"):
+    with _error_prefix("run.priors"):
         if whole_sequences:
             open_sequence_source(config, name)
         else:
