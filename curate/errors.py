@@ -85,15 +85,6 @@ class LabelsVanished(CurateError):  # noqa: N818 - named after the labels, not a
     exit_code = 11
 
 
-@contextmanager
-def error_prefix(place: str) -> Iterator[None]:
-    """Put a place, such as a file, a frame or a setting, in front of the message of an error."""
-    try:
-        yield
-    except CurateError as error:
-        raise type(error)(f"{place}: {error}") from error
-
-
 def one_line(error: BaseException, max_length: int | None = None) -> str:
     """Return the message of another library's error on one line, to quote in an error message.
 
@@ -112,3 +103,12 @@ def joined_lines(error: BaseException | None) -> str:
 def first_line(error: BaseException) -> str:
     """Return the first line of another library's error message, or the error's type name."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+@contextmanager
+def error_prefix(place: str) -> Iterator[None]:
+    """Put a place, such as a file, a frame or a setting, in front of the message of an error."""
+    try:
+        yield
+    except CurateError as error:
+        raise type(error)(f"{place}: {error}") from error

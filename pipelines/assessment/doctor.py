@@ -6,12 +6,9 @@ import numpy as np
 
 from curate.detectors.base import RecordedViews
 from curate.errors import ConfigError, CurateError
-from curate.evaluation.examination import (
-    Finding,
-    examine_detections,
-    examine_frame,
-    examine_labels,
-)
+from curate.evaluation.camera_examination import examine_camera
+from curate.evaluation.examination import Finding, examine_detections, examine_frame
+from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
 from curate.names import NameFinding, renamed
 from curate.segmenters.base import Segmenter, image_size_of
@@ -47,6 +44,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     except CurateError as error:
         return name, [Finding("data set", "wrong", str(error))]
     findings = [*_names(find_differences(workspace)), *examine_frame(frame)]
+    findings += examine_camera(frame)
     findings += _guarded("labels", lambda: _labels(workspace, frame))
     findings += _guarded("detector", lambda: _detector(workspace, frame))
     if semantic:

@@ -11,7 +11,9 @@ from curate.datasets.kitti.dataset import KittiDataset
 from curate.datasets.kitti.labels import from_annotations, to_annotations
 from curate.detections import CATEGORIES, Annotations, Detections, as_categories
 from curate.detectors.recorded import RecordedDetector
-from curate.evaluation.examination import examine_detections, examine_frame, examine_labels
+from curate.evaluation.camera_examination import examine_camera
+from curate.evaluation.examination import examine_detections, examine_frame
+from curate.evaluation.label_examination import examine_labels
 from curate.frames import Calibration, Frame
 from curate.geometry.projection import image_rectangles, in_view
 
@@ -58,7 +60,7 @@ def convention(frame, found, boxes):
 def test_a_correct_frame_passes():
     """Every check, of data and of boxes."""
     frame = street()
-    assert {one.state for one in examine_frame(frame)} == {"ok"}
+    assert {one.state for one in [*examine_frame(frame), *examine_camera(frame)]} == {"ok"}
     assert set(states(frame, detections(BOXES)).values()) == {"ok"}
 
 
@@ -230,7 +232,7 @@ def test_labels_of_an_image_of_another_size_are_reported():
 )  # fmt: skip
 def test_an_image_of_another_scale_than_the_calibration_is_reported(size, state):
     """Half, double, 80 percent; a cropped image keeps its scale, unless the crop is odd."""
-    found = {one.check: one for one in examine_frame(replace(street(), image_size=size))}["scale"]
+    found = {one.check: one for one in examine_camera(replace(street(), image_size=size))}["scale"]
     assert found.state == state
     assert f"principal point (60, 20) in an image of {size[0]} x {size[1]}" in found.message
     assert ("was the image resized" in found.message) == (state != "ok")
@@ -240,7 +242,7 @@ def test_an_image_of_another_scale_than_the_calibration_is_reported(size, state)
 def test_the_mounting_and_the_heights_are_shown(rig):
     """The LiDAR is 1.6 m above the ground of the street, the camera elsewhere."""
     frame = replace(street(), calibration=rig.calibration)
-    found = {one.check: one for one in examine_frame(frame)}["camera"]
+    found = {one.check: one for one in examine_camera(frame)}["camera"]
     yaw, pitch, roll = np.rad2deg([rig.yaw, rig.pitch, rig.roll])
     height = 1.6 + rig.turn.inv().apply(-np.array(rig.origin))[2]
     assert found.state == "ok"
@@ -254,7 +256,7 @@ def test_a_camera_that_looks_down_is_suspect():
     """rotation_y is not a heading there; without ground nearby its height is unknown."""
     frame = replace(street(), calibration=Rig(pitch=1.55).calibration)
     far = frame.with_points(frame.points[frame.points[:, 0] > 20])
-    found = {one.check: one for one in examine_frame(far)}["camera"]
+    found = {one.check: one for one in examine_camera(far)}["camera"]
     assert found.state == "suspect"
     assert "no ground found near it: KITTI's rotation_y is undefined" in found.message
 
@@ -266,7 +268,7 @@ def test_real_labels_pass(kitti_root):
     labeled = [(dataset.read(name), dataset.annotations(name)) for name in dataset.frame_ids()]
     fives = [labeled[i : i + 5] for i in range(0, 20, 5)]
     for group in [[each] for each in labeled] + fives:
-        found = [*examine_frame(group[0][0]), *examine_labels(group)]
+        found = [*examine_frame(group[0][0]), *examine_camera(group[0][0]), *examine_labels(group)]
         assert {one.state for one in found} == {"ok"}, found
     half = np.array([0, 0, 1, 0, 0, 0, 0])
     changes = {

@@ -15,7 +15,9 @@ from support.paths import ROOT
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import ConfigError, DataError
-from curate.evaluation.examination import examine_frame, examine_labels
+from curate.evaluation.camera_examination import examine_camera
+from curate.evaluation.examination import examine_frame
+from curate.evaluation.label_examination import examine_labels
 from curate.simulation import simulate
 from curate.simulation.rig import CameraRig
 
@@ -196,7 +198,7 @@ def test_doctor_has_nothing_to_report(simulated):
     dataset = KittiDataset(simulated)
     labeled = [(dataset.read(name), dataset.annotations(name)) for name in dataset.frame_ids()]
     for group in [*[[each] for each in labeled], labeled[:5]]:
-        found = [*examine_frame(group[0][0]), *examine_labels(group)]
+        found = [*examine_frame(group[0][0]), *examine_camera(group[0][0]), *examine_labels(group)]
         assert {one.state for one in found} == {"ok"}, found
     swapped = [
         (frame, replace(truth, boxes=truth.boxes[:, [0, 1, 2, 4, 3, 5, 6]]))
