@@ -40,10 +40,10 @@ class SensorFolders:
         required: whether a frame without a file is an error; else the file is not used.
     """
 
-    calib: Path | None = None
-    images: Path | None = None
+    calib: StrPath | None = None
+    images: StrPath | None = None
     image_size: tuple[int, int] | None = None
-    velodyne: Path | None = None
+    velodyne: StrPath | None = None
     required: Collection[str] = ()
 
     def or_beside(self, labels: StrPath) -> "SensorFolders":
@@ -54,7 +54,7 @@ class SensorFolders:
         """
         given = [name for name in ("calib", "images", "velodyne") if getattr(self, name)]
         for name in given:
-            folder = getattr(self, name)
+            folder = Path(getattr(self, name))
             if not folder.is_dir():
                 raise DataError(f"{folder}: no such folder; use a folder with one file per frame")
         beside = Path(labels).absolute().parent
@@ -74,9 +74,10 @@ class SensorFolders:
         Raises:
             DataError: if the file is missing in a folder that is required.
         """
-        folder: Path | None = getattr(self, name)
-        if folder is None:
+        given: StrPath | None = getattr(self, name)
+        if given is None:
             return None
+        folder = Path(given)
         if name in self.required:
             return _sensor_file(folder, frame_id, suffixes)
         paths = (folder / f"{frame_id}{suffix}" for suffix in suffixes)
@@ -233,9 +234,9 @@ def _points(
     return counts
 
 
-def _sensor_file(folder: Path, frame_id: str, suffixes: Sequence[str]) -> Path:
+def _sensor_file(folder: StrPath, frame_id: str, suffixes: Sequence[str]) -> Path:
     """Return the file of a frame; raise `DataError` if it is missing."""
-    paths = [folder / f"{frame_id}{suffix}" for suffix in suffixes]
+    paths = [Path(folder) / f"{frame_id}{suffix}" for suffix in suffixes]
     found = next((path for path in paths if path.is_file()), None)
     if found is None:
         raise DataError(f"{paths[0]}: no such file; the evaluation of frame {frame_id} needs it")

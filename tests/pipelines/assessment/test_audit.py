@@ -242,3 +242,17 @@ def test_an_unknown_overlap_is_rejected(curate: Curate, workspace: Workspace) ->
     """The message lists the known ones."""
     code, _, err = curate("audit", "-w", workspace.root, "--overlap", "2d")
     assert (code, err) == (ConfigError.exit_code, "error: --overlap 2d: use bev or 3d\n")
+
+
+def test_iou_thresholds_of_the_settings_hold_for_folds_and_rerun_nothing(
+    workspace: Workspace,
+) -> None:
+    """A label of a car with an IoU between the two thresholds is correct by the lower one only."""
+    strict = workspace.with_settings("evaluation", overlaps={"Car": 0.95, "Cyclist": 0.95})
+    loose = workspace.with_settings("evaluation", overlaps={"Car": 0.01, "Cyclist": 0.01})
+    counts = []
+    for each in (strict, loose):
+        found, done = audit(each, folds=2)
+        counts.append(found.figures.whole()["uniform"].right)
+    assert counts[0] < counts[1]
+    assert done == []
