@@ -6,7 +6,7 @@ import shutil
 import sqlite3
 import time
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import curate
@@ -99,6 +99,7 @@ def _run_shared(workspace: Workspace, progress: Metered) -> list[Report]:
 def _open_cell(bench: Bench, job: Job) -> Workspace:
     """Open or create the workspace of a method, which starts as a copy of the shared one.
 
+    A method under which all labels of a category vanish is a result of the grid, not an error.
     Results in the copy that do not match the method's settings are stale and are computed again.
     """
     root = job.folder(bench.root)
@@ -113,7 +114,7 @@ def _open_cell(bench: Bench, job: Job) -> Workspace:
     for folder in ("exports", "pictures", "reports"):
         (root / folder).mkdir(exist_ok=True)
     write_config(root / CONFIG_NAME, config)
-    return Workspace.open(root)
+    return replace(Workspace.open(root), allow_empty=True)
 
 
 def _copy_database(source: Path, target: Path) -> None:
