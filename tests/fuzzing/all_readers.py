@@ -112,7 +112,8 @@ class Fuzzing:
             self._keep(note.read_text(), note.with_suffix("").read_bytes())
         if problem is not None:
             said = (home / "errors").read_text(errors="replace").strip().splitlines()[-1:]
-            content = (home / "damaged" / TARGETS[self.name].name).read_bytes()
+            damaged = home / "damaged" / TARGETS[self.name].name
+            content = damaged.read_bytes() if damaged.exists() else b""
             self._keep(": ".join([problem, *said])[:300], content)
 
     def _keep(self, finding: str, content: bytes) -> None:
@@ -140,9 +141,8 @@ def _problem(process: subprocess.Popen, damaged: Path, end: float) -> str | None
 def try_files(name: str, seed: int, home: Path) -> None:
     """Read damaged files until the parent process ends this one."""
     target = TARGETS[name]
+    (home / "damaged").mkdir()
     path = home / "damaged" / target.name
-    path.parent.parent.mkdir(parents=True, exist_ok=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
     target.write(path)
     valid = path.read_bytes()
     target.attempt(path)  # loads its libraries

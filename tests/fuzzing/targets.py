@@ -197,7 +197,7 @@ def _pickled(protocol: int) -> Callable[[Path], None]:
 
 
 def _json(path: Path) -> None:
-    entry = {"boxes_3d": [[1.0, 2, 0, 4, 2, 1.5, 0]], "scores_3d": [0.5], "labels_3d": [0]}
+    entry = {"bboxes_3d": [[1.0, 2, 0, 4, 2, 1.5, 0]], "scores_3d": [0.5], "labels_3d": [0]}
     path.write_text(json.dumps([{"frame_id": f"00000{i}", **entry} for i in range(2)]))
 
 

@@ -1,9 +1,10 @@
 """Detections of Argoverse 2's evaluation in a Feather file.
 
 Source: Argoverse 2's user guide of 3D detection (argoverse.github.io) and its code (av2-api). A row
-is a box: tx_m, ty_m, tz_m of its centre, length_m, width_m, height_m, rotation qw, qx, qy, qz, score,
-log_id, timestamp_ns, category, in the frame of the ego vehicle. The sweeps of Argoverse 2 are stored
-in the same frame, so the data set's points are expected in it. Other columns are ignored.
+is a box in the frame of the ego vehicle: tx_m, ty_m, tz_m of its centre, length_m, width_m,
+height_m, rotation qw, qx, qy, qz, score, log_id, timestamp_ns, category. The sweeps of Argoverse 2
+are stored in the same frame, so the data set's points are expected in it. Other columns are
+ignored.
 
 A log and a time become the name of a frame by a pattern, such as "{log_id}_{timestamp_ns}".
 """
@@ -17,7 +18,7 @@ from curate.detections import Detections
 from curate.detectors.recorded.arrow_groups import ArrowGroups, Run
 from curate.detectors.recorded.results import ReadOptions, as_detections
 from curate.detectors.recorded.rotations import check_rotations
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError
 from curate.geometry.poses import boxes_in_frame
 
 _CENTRE, _SIZE = ("tx_m", "ty_m", "tz_m"), ("length_m", "width_m", "height_m")

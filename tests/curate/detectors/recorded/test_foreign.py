@@ -136,7 +136,7 @@ FORMATS = {
     "openpcdet.pkl": (write_openpcdet, {}),
     "mmdetection3d.pkl": (
         write_mmdetection3d,
-        {"classes": CLASSES, "frame_list": "order.txt"},
+        {"classes": CLASSES, "frame_list": "order.txt", "version": "1.x"},
     ),
     "preds": (write_inferencer, {"classes": CLASSES}),
     "nuscenes.json": (write_nuscenes, {}),
@@ -251,15 +251,16 @@ def test_impossible_results_are_reported(tmp_path, change, message):
 def test_numbered_labels_need_class_names(tmp_path):
     """The order of classes is the model's; a wrong order would not be noticed."""
     path = write_mmdetection3d(tmp_path / "a.pkl")
+    declared = {"frame_list": "order.txt", "version": "1.x"}
     with pytest.raises(ConfigError, match=r"set detector\.options\.classes"):
         RecordedDetector(path, frame_list="order.txt")
     with pytest.raises(DataError, match="label 2, but"):
-        RecordedDetector(path, frame_list="order.txt", classes=["Pedestrian", "Cyclist"])
+        RecordedDetector(path, classes=["Pedestrian", "Cyclist"], **declared)
     with pytest.raises(ConfigError, match="frame_list"):
         RecordedDetector(path, classes=CLASSES)
     (tmp_path / "order.txt").write_text("000001\n")
     with pytest.raises(DataError, match="1 frame ids for 2"):
-        RecordedDetector(path, frame_list="order.txt", classes=CLASSES)
+        RecordedDetector(path, classes=CLASSES, **declared)
 
 
 @pytest.mark.parametrize(
@@ -270,7 +271,7 @@ def test_numbered_labels_need_class_names(tmp_path):
         ("a.json", [{"a": 1}], r"entries of an unknown format \(a\)"),
         ("a.json", [3], r"entries of an unknown format \(int\)"),
         ("a.json", [{"boxes_lidar": []}], "no frame_id, name, score"),
-        ("a.feather", [], "not a supported format of detections; expected a .csv or .parquet file"),
+        ("a.xml", [], "not a supported format of detections; expected a .csv or .parquet file"),
     ],
 )
 def test_unsupported_contents_are_rejected(tmp_path, name, content, message):
