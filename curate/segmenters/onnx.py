@@ -26,6 +26,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from curate.datasets.formats.images import MAX_PIXELS
 from curate.errors import ConfigError, ModelError
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
@@ -42,6 +43,7 @@ _EXPECTED = "expected class ids [1, h, w], or scores [1, classes, h, w] or [1, h
 # Hugging Face.
 _USUAL_NAMES = ("out", "logits")
 _LAYOUTS = ("first", "last")
+_MAX_CROPPED_PIXELS = 4 * MAX_PIXELS  # of all crops of an image
 # h and w are those of the input up to a common factor, rounded or padded by at most this ratio.
 _MAX_ASPECT_ERROR = 1.25
 
@@ -129,7 +131,13 @@ class OnnxSegmenter:
         if squeeze <= _SQUEEZE_LIMIT:
             return whole
         crop_width = max(round(width / squeeze), 1)
-        return cut_along(width, crop_width, max(self.tiles, ceil(squeeze)))
+        count = max(self.tiles, ceil(width / crop_width))
+        if count * shape.width * shape.height > _MAX_CROPPED_PIXELS:
+            raise ModelError(
+                f"{self._model.path}: takes images of {shape.width} x {shape.height} pixels, so an "
+                f"image of {width} x {height} needs {count} crops; use a model with another shape"
+            )
+        return cut_along(width, crop_width, count)
 
     def _run(self, image: np.ndarray) -> np.ndarray:
         """Return the (h, w) uint8 class ids of an (h, w, 3) image."""

@@ -253,6 +253,20 @@ def test_a_model_of_one_column_has_crops_of_one(tmp_path):
     np.testing.assert_array_equal(found, banded(8, 16, [7, 15])[..., 0])
 
 
+def test_crops_cover_an_image_whose_width_they_do_not_divide(tmp_path):
+    """Crops of 2.5 columns are rounded to 2: then more are needed than the squeeze says."""
+    path = red_channel_model(tmp_path / "a.onnx", [1, 16, 1, 3])
+    found = OnnxSegmenter(path, CLASSES).segment(frame(banded(40, 120, [7, 15]))).class_ids
+    np.testing.assert_array_equal(found, banded(40, 120, [7, 15])[..., 0])
+
+
+def test_a_model_that_would_need_endless_crops_is_rejected(tmp_path):
+    """Each column of the image would be enlarged to 24 x 65536 pixels."""
+    path = red_channel_model(tmp_path / "a.onnx", [1, 65536, 24, 3])
+    with pytest.raises(ModelError, match="an image of 120 x 40 needs 120 crops; use a model with"):
+        OnnxSegmenter(path, CLASSES).segment(frame(banded(40, 120, [7, 15])))
+
+
 def test_ids_beyond_8_bits_are_rejected(tmp_path):
     """Class 300 is not silently another class."""
     path = constant_model(tmp_path / "a.onnx", np.full((8, 8), 300))
