@@ -125,8 +125,9 @@ class Fuzzing:
 
 
 def _started(process: subprocess.Popen, marks: Path) -> float:
-    """Wait until a process has tried a file or has ended; return the time."""
-    while process.poll() is None and not marks.stat().st_size:
+    """Wait until a process has tried a file, has ended or hangs; return the time."""
+    latest = time.monotonic() + 5 * LIMIT_S
+    while time.monotonic() < latest and process.poll() is None and not marks.stat().st_size:
         time.sleep(0.1)
     return time.monotonic()
 
