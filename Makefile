@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # "no" goes on where the libraries of open3d are missing; only `simulate` and `demo` need them.
 SIMULATION ?= yes
 
-.PHONY: venv demo test shapes prove prove-bare fuzz fuzz-random bench lint docs site wheel clean
+.PHONY: venv demo test shapes prove prove-bare fuzz fuzz-all bench lint docs site wheel clean
 
 venv: $(READY)
 
@@ -32,9 +32,11 @@ prove-bare:
 wheel: $(READY)
 	$(BIN)/pip wheel -q --no-deps --no-build-isolation --wheel-dir dist .
 
-# `make test` tries the same examples every time; this tries new ones with every run.
-fuzz-random: $(READY)
-	$(BIN)/python -m pytest tests/fuzzing --hypothesis-profile=random
+# `make test` tries the same damaged files every time; this tries new ones, for an hour in all, and
+# prints a log. The files of its findings are in .fuzzing/.
+FUZZ_SECONDS ?= 3600
+fuzz-all: $(READY)
+	cd tests && PYTHONPATH=.:.. ../$(BIN)/python -m fuzzing.all_readers $(FUZZ_SECONDS) ../.fuzzing
 
 # Coverage-guided, where atheris is installed: make fuzz READER="label file" SECONDS=600
 READER ?= labels

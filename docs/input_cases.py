@@ -19,7 +19,8 @@ import numpy as np
 from curate.datasets.folder import FolderDataset
 from curate.datasets.formats.clouds import read_cloud
 from curate.datasets.formats.images import read_image
-from curate.datasets.kitti.dataset import read_calibration, read_frame_list
+from curate.datasets.frame_names import read_frame_list
+from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.labels import read_objects
 from curate.datasets.kitti.raw import read_raw_calibration
 from curate.detectors.recorded import RecordedDetector

@@ -19,7 +19,8 @@ from curate.exporters.base import FrameFiles, LabelFileDescription, LabelSet
 from curate.exporters.sqlite import SqliteExporter
 from db.session import Database
 
-# The default run tries the same examples every time; `make fuzz-random` tries others.
+# The default run tries the same examples every time; `make fuzz-all` and
+# --hypothesis-profile=random try others.
 # No deadline: on a busy machine the run time of an example says nothing.
 settings.register_profile(
     "same", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]

@@ -1,8 +1,8 @@
 """Detector that runs any 3D detector exported to ONNX, with configured inputs and outputs.
 
-The model takes the points of a sweep, [n, 3 or 4] or [1, n, 3 or 4] float32 (x, y, z,
-intensity). It returns boxes [n, >=7] or [1, n, >=7] with either scores and labels [n], or scores
-per class [n, classes]. If the export leaves out voxelisation or the decoding of anchors, the user
+The model takes the points of a sweep, [n, 3 or 4] or [1, n, 3 or 4] (x, y, z, intensity). It
+returns boxes [n, >=7] with either scores and labels [n], or scores per class [n, classes]; see
+`onnx_outputs`. If the export leaves out voxelisation or the decoding of anchors, the user
 provides them as two functions, each configured as `package.module:function`.
 """
 
@@ -15,14 +15,16 @@ import numpy as np
 
 from curate.detections import Detections, as_categories
 from curate.detectors.conventions import BoxConvention
+from curate.detectors.onnx_outputs import find_outputs, raw_boxes
 from curate.detectors.scores import describe_invalid_scores, to_probabilities
 from curate.errors import ConfigError, ModelError
-from curate.files.onnx_session import OnnxModel, is_numeric_array
+from curate.files.onnx_session import OnnxModel
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
 
-_KEYS = ("boxes", "scores", "labels")
+# Types of inputs of points.
+_FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
 
 
 class OnnxDetector:
@@ -35,7 +37,7 @@ class OnnxDetector:
         minimum_score: boxes with a lower score are left out.
         points: name of the input that takes the points; not needed if there is one input.
         outputs: names of the outputs for `boxes`, `scores` and, unless scores are per class,
-            `labels`; not needed for outputs with these names.
+            `labels`; not needed if names, types or shapes show which is which.
         convention: meaning of the numbers of a box, see `BoxConvention`.
         intensity_scale: factor from [0, 1] to the intensity range of the model, e.g. 255.
         first_label: the number of the first class.
@@ -116,37 +118,19 @@ class OnnxDetector:
         if self._preprocess:
             return _call(self._preprocess, scaled, self.model)
         columns = self._shape[-1] if isinstance(self._shape[-1], int) else 4
-        rows = np.ascontiguousarray(scaled[:, :columns])
+        rows = np.ascontiguousarray(scaled[:, :columns], dtype=self._kind)
         return {self._input: rows[None] if len(self._shape) == 3 else rows}
 
     def _detections(self, named: Mapping[str, np.ndarray]) -> Detections:
         """Return the outputs as detections; raise ModelError if their shapes do not fit."""
-        boxes, scores = (_without_batch(np.asarray(named[key]), key) for key in ("boxes", "scores"))
-        labels = named.get("labels")
-        if scores.ndim == 2 and scores.shape[1] == 1 and labels is not None:
-            scores = scores[:, 0]
-        if labels is None and scores.ndim == 2 and scores.shape[1]:
-            labels, scores = scores.argmax(axis=1) + self.first_label, scores.max(axis=1)
-        labels = np.zeros(0, np.int64) if labels is None else np.asarray(labels).reshape(-1)
-        shapes = {"boxes": boxes.shape, "scores": scores.shape, "labels": labels.shape}
-        other_types = [each.dtype for each in (boxes, scores, labels) if not is_numeric_array(each)]
-        if other_types:
-            raise ModelError(f"{self.model}: an output is {other_types[0]}, expected numbers")
-        if (
-            boxes.ndim != 2
-            or boxes.shape[1] < 7
-            or scores.shape != boxes.shape[:1]
-            or labels.shape != scores.shape
-        ):
-            described = ", ".join(f"{key} {list(shape)}" for key, shape in shapes.items())
-            raise ModelError(
-                f"{self.model}: the outputs are {described}; expected boxes [n, 7 or more] with "
-                "scores [n] and labels [n], or scores [n, classes]"
-            )
-        scores = scores.astype(np.float64)
+        try:
+            raw = raw_boxes(named, self.first_label, len(self.classes))
+        except ModelError as error:
+            raise ModelError(f"{self.model}: {error}") from None
+        scores, labels = raw.scores, raw.labels
         scores = to_probabilities(scores, sigmoid=self.sigmoid)
         self._check_values(scores, labels)
-        boxes = self.convention.to_boxes(boxes)
+        boxes = self.convention.to_boxes(raw.rows)
         index = labels.astype(np.int64) - self.first_label
         return Detections(boxes, scores, as_categories([self.classes[i] for i in index.tolist()]))
 
@@ -182,44 +166,29 @@ class OnnxDetector:
         if (
             len(inputs) != 1
             or not fits
-            or chosen.type != "tensor(float)"
+            or chosen.type not in _FLOATS
             or not _free(shape[-2])
             or not (_free(shape[-1]) or shape[-1] in {3, 4})
         ):
             raise ModelError(
-                f"{self.model}: the inputs are {described}; expected one tensor(float)[n, 4] of "
-                "points with a free n; set detector.options.preprocess to a function that makes "
-                "the inputs"
+                f"{self.model}: the inputs are {described}; expected one tensor [n, 4] of points "
+                "with a free n, float16, float or double; set detector.options.preprocess to a "
+                "function that makes the inputs"
             )
+        self._kind = _FLOATS[chosen.type]
         return chosen.name, shape
 
-    def _find_outputs(self, mapping: Mapping[str, str]) -> Mapping[str, str]:
+    def _find_outputs(self, declared: Mapping[str, str]) -> Mapping[str, str]:
         """Return the output names of boxes, scores and, if the model has them, labels."""
-        unknown = sorted(set(mapping) - set(_KEYS))
-        if unknown:
-            raise ConfigError(f"detector.options.outputs: {unknown[0]}: use {', '.join(_KEYS)}")
-        available = {output.name for output in self._network.outputs}
-        names = {key: mapping.get(key, key) for key in _KEYS}
-        if "labels" not in mapping and "labels" not in available:
-            del names["labels"]
-        missing = [name for name in names.values() if name not in available]
-        if missing:
-            raise ModelError(
-                f"{self.model}: the outputs are {', '.join(sorted(available))}; there is no output "
-                f"{missing[0]}; map boxes, scores and labels in detector.options.outputs"
-            )
-        return names
+        try:
+            return find_outputs(self._network.outputs, declared)
+        except ModelError as error:
+            raise ModelError(f"{self.model}: {error}") from None
 
 
 def _free(size: int | str | None) -> bool:
     """Return whether a dimension of a shape is not fixed."""
     return not isinstance(size, int)
-
-
-def _without_batch(output: np.ndarray, key: str) -> np.ndarray:
-    """Return an output without its leading batch axis of size one."""
-    batched = output.ndim == 3 or (key == "scores" and output.ndim == 2 and output.shape[0] == 1)
-    return output[0] if batched and output.shape[0] == 1 else output
 
 
 def _convention(options: Mapping[str, Any]) -> BoxConvention:

@@ -86,7 +86,7 @@ def ids_of_colours(pixels: np.ndarray, table: ColourTable) -> np.ndarray:
     sorted_codes = _codes(known)[order]
     ids = np.array(list(table.values()), dtype=np.int64)[order]
     place = np.searchsorted(sorted_codes, codes).clip(0, len(ids) - 1)
-    return np.where(sorted_codes[place] == codes, ids[place], -1)
+    return np.asarray(np.where(sorted_codes[place] == codes, ids[place], -1))
 
 
 def _codes(pixels: np.ndarray) -> np.ndarray:

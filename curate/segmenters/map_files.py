@@ -5,7 +5,6 @@ to 0..255. In a semantic map the indices and the values are the class ids. So a 
 is decoded as a grey image of its indices, and the scaling is undone.
 """
 
-import io
 import struct
 import zlib
 from collections.abc import Iterator
@@ -22,15 +21,12 @@ from curate.datasets.formats.images import (
     decode_content,
     read_bytes,
 )
-from curate.errors import DataError, one_line
+from curate.errors import DataError
+from curate.files.npy import map_npy
 
 _GREY, _PALETTE, _GREY_ALPHA = 0, 3, 4  # PNG's colour types
 _DEPTH_AT, _TYPE_AT = 24, 25  # in the file
 _CHUNK = struct.Struct(">I4s")
-_NPY_HEADERS = {
-    True: np.lib.format.read_array_header_1_0,
-    False: np.lib.format.read_array_header_2_0,
-}
 
 
 @dataclass(frozen=True)
@@ -52,9 +48,9 @@ def read_map(path: Path) -> MapFile:
     Raises:
         DataError: if the file is missing, damaged, or in a format that changes values.
     """
-    content = read_bytes(path)
     if path.suffix.lower() == ".npy":
-        return MapFile(_array(path, content))
+        return MapFile(_array(path))
+    content = read_bytes(path)
     if not content.startswith(PNG_START) or len(content) <= _TYPE_AT:
         decode_content(content, path, cv2.IMREAD_UNCHANGED)
         raise DataError(
@@ -80,23 +76,15 @@ def read_map(path: Path) -> MapFile:
     return MapFile(values, palette)
 
 
-def _array(path: Path, content: bytes) -> np.ndarray:
+def _array(path: Path) -> np.ndarray:
     """Return the (h, w) integers of a .npy file."""
-    stream = io.BytesIO(content)
-    try:
-        is_first = np.lib.format.read_magic(stream) == (1, 0)
-        shape, _, kind = _NPY_HEADERS[is_first](stream)
-        claimed = int(np.prod(shape, dtype=object)) * kind.itemsize
-        if len(shape) != 2 or kind.kind not in "iub" or not 0 < claimed <= len(content):
-            raise DataError(
-                f"{path}: contains {kind}{list(shape)}; expected integers [height, width] of at "
-                f"most {MAX_PIXELS} pixels"
-            )
-        stream.seek(0)
-        values: np.ndarray = np.lib.format.read_array(stream, allow_pickle=False)
-    except (ValueError, TypeError, OverflowError, SyntaxError) as error:
-        raise DataError(f"{path}: not a readable .npy file: {one_line(error, 200)}") from None
-    return values
+    values = map_npy(path)
+    if values.ndim != 2 or values.dtype.kind not in "iub" or not 0 < values.size <= MAX_PIXELS:
+        raise DataError(
+            f"{path}: contains {values.dtype} {list(values.shape)}; expected integers [height, "
+            f"width] of at most {MAX_PIXELS} pixels"
+        )
+    return np.array(values)
 
 
 def _chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:

@@ -1,8 +1,8 @@
 """A segmenter that runs any semantic segmentation model in ONNX format.
 
-The model takes one RGB image, uint8 or float32, [1, height, width, 3] or [1, 3, height, width], of
+The model takes one RGB image, uint8 or float, [1, height, width, 3] or [1, 3, height, width], of
 a fixed or a free size. It returns class ids [1, h, w], or class scores with the channels first or
-last.
+last. h and w have the proportions of the input.
 
 If the model has a fixed, nearly square input, a wide image has to be squeezed and small objects
 get lost. Such a model is run on crops instead, each as high as the image, evenly spread over its
@@ -26,6 +26,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from curate.datasets.formats.images import MAX_PIXELS
 from curate.errors import ConfigError, ModelError
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
@@ -38,6 +39,13 @@ from curate.segmenters.onnx_images import ImageModel, image_of
 _SQUEEZE_LIMIT = 1.5
 
 _EXPECTED = "expected class ids [1, h, w], or scores [1, classes, h, w] or [1, h, w, classes]"
+# Outputs that are the map where a model has several: of torchvision ("aux" is the other) and of
+# Hugging Face.
+_USUAL_NAMES = ("out", "logits")
+_LAYOUTS = ("first", "last")
+_MAX_CROPPED_PIXELS = 4 * MAX_PIXELS  # of all crops of an image
+# h and w are those of the input up to a common factor, rounded or padded by at most this ratio.
+_MAX_ASPECT_ERROR = 1.25
 
 
 class OnnxSegmenter:
@@ -50,10 +58,14 @@ class OnnxSegmenter:
             that many do not cover the image. 1: the whole image is always squeezed.
         scaling: how pixels are scaled for a float model: "imagenet" (mean 0, standard deviation 1),
             "unit" (0 to 1) or "none" (0 to 255).
+        output: name of the output with the map; not needed if there is one.
+        channels: whether scores have their class axis "first" or "last"; not needed where only one
+            of them leaves axes in the proportions of the input.
         threads: number of threads of ONNX Runtime.
 
     Raises:
-        ModelError: if the file is missing or not an ONNX model, or its input is not an image.
+        ModelError: if the file is missing or not an ONNX model, its input is not an image, or
+            several outputs can be the map.
         ConfigError: if an option or a class id is out of range.
     """
 
@@ -67,14 +79,19 @@ class OnnxSegmenter:
         *,
         tiles: int = 5,
         scaling: str = "imagenet",
+        output: str | None = None,
+        channels: str | None = None,
         threads: int = 1,
     ) -> None:
         if tiles < 1:
             raise ConfigError(f"segmenter tiles {tiles}: expected at least 1")
+        if channels not in {None, *_LAYOUTS}:
+            raise ConfigError(f"segmenter channels {channels!r}: use first or last")
         self.classes = checked_classes(classes)
         self.tiles = tiles
         self._model = ImageModel(Path(model), scaling, threads)
-        self._output = _map_output(self._model)
+        self._output = _map_output(self._model, output)
+        self._channels = channels
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's semantic map.
@@ -114,7 +131,13 @@ class OnnxSegmenter:
         if squeeze <= _SQUEEZE_LIMIT:
             return whole
         crop_width = max(round(width / squeeze), 1)
-        return cut_along(width, crop_width, max(self.tiles, ceil(squeeze)))
+        count = max(self.tiles, ceil(width / crop_width))
+        if count * shape.width * shape.height > _MAX_CROPPED_PIXELS:
+            raise ModelError(
+                f"{self._model.path}: takes images of {shape.width} x {shape.height} pixels, so an "
+                f"image of {width} x {height} needs {count} crops; use a model with another shape"
+            )
+        return cut_along(width, crop_width, count)
 
     def _run(self, image: np.ndarray) -> np.ndarray:
         """Return the (h, w) uint8 class ids of an (h, w, 3) image."""
@@ -125,7 +148,10 @@ class OnnxSegmenter:
         interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         pixels = cv2.resize(image, target, interpolation=interpolation)
         output = self._model.run(pixels, [self._output])[self._output]
-        class_ids = _class_ids(output, target, self._model.path)
+        try:
+            class_ids = _class_ids(output, target, self._channels)
+        except ModelError as error:
+            raise ModelError(f"{self._model.path}: {error}") from None
         return cv2.resize(class_ids, (width, height), interpolation=cv2.INTER_NEAREST)
 
 
@@ -155,49 +181,94 @@ def cut_along(width: int, crop_width: int, count: int) -> list[Crop]:
     ]
 
 
-def _map_output(model: ImageModel) -> str:
+def _map_output(model: ImageModel, declared: str | None) -> str:
     """Return the name of the output with the map.
 
     Raises:
-        ModelError: if the declared shape of the output is not that of a map.
+        ModelError: if there is none, or several can be it.
     """
-    output = model.outputs[0]
-    if output.shape and len(output.shape) not in {3, 4}:
-        raise ModelError(f"{model.path}: returns {output.name} {output.shape}; {_EXPECTED}")
-    name: str = output.name
-    return name
+    shown = ", ".join(map(str, model.outputs))
+    names = [output.name for output in model.outputs]
+    if declared is not None:
+        if declared not in names:
+            raise ModelError(
+                f"{model.path}: the outputs are {shown}; there is no output {declared}; set "
+                "segmenter.options.output"
+            )
+        return declared
+    # The shape is empty if the model does not declare it.
+    maps = [each.name for each in model.outputs if len(each.shape) in {0, 3, 4}]
+    usual = [name for name in _USUAL_NAMES if name in maps]
+    if not maps:
+        raise ModelError(f"{model.path}: returns {shown}; {_EXPECTED}")
+    if len(maps) > 1 and len(usual) != 1:
+        raise ModelError(
+            f"{model.path}: returns {shown}; several can be the map; set segmenter.options.output"
+        )
+    return (usual or maps)[0]
 
 
-def _class_ids(output: np.ndarray, size: tuple[int, int], model: Path) -> np.ndarray:
+def _class_ids(output: np.ndarray, size: tuple[int, int], channels: str | None) -> np.ndarray:
     """Return (h, w) uint8 class ids from the model's output.
 
-    An output of scores has its class axis first or last. The aspect ratio decides which: the two
-    axes that remain must be h and w, and their ratio is compared with that of the input.
-
     Args:
-        output: the model's output.
+        output: class ids [1, h, w], or scores [1, classes, h, w] or [1, h, w, classes].
         size: (width, height) of the model's input in pixels.
-        model: the model file, for error messages.
+        channels: whether the class axis is "first" or "last", None if the shape decides.
+
+    Raises:
+        ModelError: if it is neither.
     """
-    invalid = ModelError(f"{model}: returns {output.dtype} {list(output.shape)}; {_EXPECTED}")
+    returned = f"returns {output.dtype} {list(output.shape)}"
     if (
         not is_numeric_array(output)
         or output.ndim not in {3, 4}
-        or output.shape[0] != 1
+        or len(output) != 1
         or 0 in output.shape
     ):
-        raise invalid
-    scores = output[0]
-    if np.isnan(scores.max()):  # argmax would return the class of a NaN
-        raise ModelError(f"{model}: returns scores that are NaN; fix the model or its scaling")
-    if scores.ndim == 3:
-        first, second, third = scores.shape
-        aspect = np.log(size[1] / size[0])
-        channels_last = abs(np.log(first / second) - aspect) < abs(np.log(second / third) - aspect)
-        axis = 2 if channels_last else 0
-        single = scores.shape[axis] == 1
-        scores = scores.squeeze(axis) if single else scores.argmax(axis)
-    if not np.issubdtype(scores.dtype, np.integer) or scores.min() < 0 or scores.max() > 255:
-        raise invalid
-    class_ids: np.ndarray = scores.astype(np.uint8)
+        raise ModelError(f"{returned}; {_EXPECTED}")
+    values = output[0]
+    if np.isnan(values.max()):  # argmax would return the class of a NaN
+        raise ModelError("returns scores that are NaN; fix the model or its scaling")
+    if values.ndim == 3:
+        axis = _class_axis(returned, values.shape, size, channels)
+        values = values.squeeze(axis) if values.shape[axis] == 1 else values.argmax(axis)
+    if not np.issubdtype(values.dtype, np.integer) or values.min() < 0 or values.max() > 255:
+        raise ModelError(f"{returned}; {_EXPECTED}")
+    class_ids: np.ndarray = values.astype(np.uint8)
     return class_ids
+
+
+def _class_axis(
+    returned: str, shape: tuple[int, ...], size: tuple[int, int], channels: str | None
+) -> int:
+    """Return the class axis of scores: the other two have the size or proportions of the input.
+
+    For example, an input of 1248 x 384 and scores [96, 312, 19]: 312 / 96 are the proportions, so
+    the classes are last.
+
+    Raises:
+        ModelError: if both or neither have them, and the layout is not declared.
+    """
+    if channels is not None:
+        return -1 if channels == "last" else 0
+    maps = {0: shape[1:], -1: shape[:2]}
+    fitting = [axis for axis, (height, width) in maps.items() if (width, height) == size]
+    if not fitting:
+        errors = {
+            axis: width / height / (size[0] / size[1]) for axis, (height, width) in maps.items()
+        }
+        fitting = [
+            axis for axis, error in errors.items() if max(error, 1 / error) <= _MAX_ASPECT_ERROR
+        ]
+    if len(fitting) == 1:
+        return fitting[0]
+    if not fitting:
+        raise ModelError(
+            f"{returned} for an image of {size[0]} x {size[1]} pixels; {_EXPECTED}, in its "
+            "proportions"
+        )
+    raise ModelError(
+        f"{returned}, which can be {shape[0]} classes first or {shape[2]} classes last; set "
+        "segmenter.options.channels to first or last"
+    )

@@ -21,7 +21,17 @@ SCALINGS = {
 }
 """Mean and standard deviation by which pixels (0 to 255) are normalised for a float model."""
 
-_EXPECTED = "expected one image [1, height, width, 3] or [1, 3, height, width], uint8 or float32"
+# Types of inputs of images.
+_TYPES = {
+    "tensor(uint8)": np.uint8,
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+}
+_EXPECTED = (
+    "expected one image [1, height, width, 3] or [1, 3, height, width], uint8, float16, float32 or "
+    "double"
+)
 
 
 @dataclass(frozen=True)
@@ -30,7 +40,7 @@ class ImageInput:
 
     Attributes:
         name: name of the input.
-        is_float: whether the type is float32; otherwise it is uint8.
+        kind: numpy type of the values: uint8, float16, float32 or float64.
         channels_first: whether the axes are channels, height, width; otherwise the channels are
             last.
         batched: whether there is a leading batch axis of length 1.
@@ -39,7 +49,7 @@ class ImageInput:
     """
 
     name: str
-    is_float: bool
+    kind: type
     channels_first: bool
     batched: bool
     height: int | None
@@ -47,9 +57,9 @@ class ImageInput:
 
     def feed(self, pixels: np.ndarray, scaling: str) -> dict[str, np.ndarray]:
         """Return the session's inputs for (height, width, 3) uint8 RGB pixels of the input size."""
-        if self.is_float:
+        if self.kind is not np.uint8:
             mean, deviation = SCALINGS[scaling]
-            pixels = ((pixels - mean) / deviation).astype(np.float32)
+            pixels = ((pixels - mean) / deviation).astype(self.kind)
         if self.channels_first:
             pixels = pixels.transpose(2, 0, 1)
         return {self.name: np.ascontiguousarray(pixels[None] if self.batched else pixels)}
@@ -120,12 +130,12 @@ def _image_input(inputs: Sequence[ModelValue], model: Path, *, single: bool) -> 
     if (
         batch not in {1, None}
         or (first if channels_first else last) != 3
-        or image.type not in {"tensor(uint8)", "tensor(float)"}
+        or image.type not in _TYPES
     ):
         raise invalid
     height, width = (second, last) if channels_first else (first, second)
     if 0 in {height, width} or (height or 1) * (width or 1) > MAX_PIXELS:
         # Each frame would be enlarged to that size.
         raise ModelError(f"{model}: takes {shown}; expected an image of 1 to {MAX_PIXELS} pixels")
-    is_float = image.type == "tensor(float)"
-    return ImageInput(image.name, is_float, channels_first, batched, height, width)
+    kind = _TYPES[image.type]
+    return ImageInput(image.name, kind, channels_first, batched, height, width)

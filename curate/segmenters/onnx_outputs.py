@@ -165,12 +165,12 @@ def _mask_values(mask: np.ndarray) -> np.ndarray:
     """Return mask values from 0 to 1; of an integer mask, all values above 0 become 1.
 
     Raises:
-        ModelError: if a value is NaN, which would otherwise count as background.
+        ModelError: if a value is NaN or infinite, which would otherwise count as background.
     """
     if not np.issubdtype(mask.dtype, np.floating):
         return mask > 0
-    if np.isnan(mask).any():
-        raise ModelError("returns a mask that contains NaN")
+    if not np.isfinite(mask).all():
+        raise ModelError("returns a mask that contains NaN or infinite values")
     return mask
 
 

@@ -19,7 +19,6 @@ import warnings
 from contextlib import suppress
 from pathlib import Path
 
-from fuzzing.mutations import mutated
 from fuzzing.targets import TARGETS
 from support.paths import ROOT, TESTS
 from support.process_tree import forget_peak, peak
@@ -85,14 +84,13 @@ class Fuzzing:
 
     def last(self, seconds: float, seed: int) -> None:
         """Try files for that long; a process that ends by itself is recorded and replaced."""
-        begin = time.monotonic()
-        while time.monotonic() < begin + seconds:
+        while self.seconds < seconds:
             with tempfile.TemporaryDirectory() as home:
-                self._run_process(Path(home), begin + seconds, seed)
+                self.seconds += self._run_process(Path(home), seconds - self.seconds, seed)
             seed += 1_000_003
-        self.seconds = time.monotonic() - begin
 
-    def _run_process(self, home: Path, end: float, seed: int) -> None:
+    def _run_process(self, home: Path, seconds: float, seed: int) -> float:
+        """Return how long a process tried files, without the time that it took to start."""
         command = [sys.executable, "-m", "fuzzing.all_readers", "--one", self.name, seed, home]
         own = {"PYTHONPATH": f"{TESTS}:{ROOT}", "XDG_CACHE_HOME": str(home / "cache")}
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -104,7 +102,10 @@ class Fuzzing:
                 cwd=TESTS,
                 env=os.environ | own | threads,
             )
-            problem = _problem(process, home / "damaged" / TARGETS[self.name].name, end)
+            damaged = home / "damaged" / TARGETS[self.name].name
+            begin = _started(process, home / "marks")
+            problem = _problem(process, damaged, begin + seconds)
+            taken = time.monotonic() - begin
         tried = (home / "marks").read_bytes()
         self.files += len(tried)
         self.rejected += tried.count(REJECTED)
@@ -112,8 +113,9 @@ class Fuzzing:
             self._keep(note.read_text(), note.with_suffix("").read_bytes())
         if problem is not None:
             said = (home / "errors").read_text(errors="replace").strip().splitlines()[-1:]
-            content = (home / "damaged" / TARGETS[self.name].name).read_bytes()
+            content = damaged.read_bytes() if damaged.exists() else b""
             self._keep(": ".join([problem, *said])[:300], content)
+        return max(taken, 1.0)
 
     def _keep(self, finding: str, content: bytes) -> None:
         if finding not in self.findings:
@@ -122,9 +124,17 @@ class Fuzzing:
         self.findings[finding] = self.findings.get(finding, 0) + 1
 
 
+def _started(process: subprocess.Popen, marks: Path) -> float:
+    """Wait until a process has tried a file, has ended or hangs; return the time."""
+    latest = time.monotonic() + 5 * LIMIT_S
+    while time.monotonic() < latest and process.poll() is None and not marks.stat().st_size:
+        time.sleep(0.1)
+    return time.monotonic()
+
+
 def _problem(process: subprocess.Popen, damaged: Path, end: float) -> str | None:
     """Return how a process ended by itself, or that it hangs; None once the time is over."""
-    while time.monotonic() < end:
+    while time.monotonic() < end or process.poll() is not None:
         with suppress(subprocess.TimeoutExpired):
             return f"the process ended with code {process.wait(0.5)}"
         with suppress(FileNotFoundError):  # the first file is not written yet
@@ -140,16 +150,15 @@ def _problem(process: subprocess.Popen, damaged: Path, end: float) -> str | None
 def try_files(name: str, seed: int, home: Path) -> None:
     """Read damaged files until the parent process ends this one."""
     target = TARGETS[name]
+    (home / "damaged").mkdir()
     path = home / "damaged" / target.name
-    path.parent.parent.mkdir(parents=True, exist_ok=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
     target.write(path)
     valid = path.read_bytes()
     target.attempt(path)  # loads its libraries
     warnings.simplefilter("error", RuntimeWarning)
     findings: set[str] = set()
     while True:
-        content = mutated(valid, random.Random(seed).randint)  # noqa: S311
+        content = target.damage(valid, random.Random(seed).randint)  # noqa: S311
         path.write_bytes(content)
         forget_peak()
         before = peak()

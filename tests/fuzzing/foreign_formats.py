@@ -138,6 +138,64 @@ def read_wide_map(path: Path) -> None:
     SavedSegmenter(path.parent, CLASSES, divisor=1000).segment(_image_frame())
 
 
+def write_indexed_map(path: Path) -> None:
+    """Write a map of four bits with a palette, in the pattern of a chess board."""
+    from PIL import Image
+
+    rows, columns = np.mgrid[: IMAGE_SIZE[1], : IMAGE_SIZE[0]]
+    image = Image.fromarray(((rows + columns) % 16).astype(np.uint8), "P")
+    image.putpalette(list(range(48)))
+    image.save(path, bits=4)
+
+
+def write_coloured_map(path: Path) -> None:
+    """Write a map with Cityscapes' colours of road and car."""
+    pixels = np.full((IMAGE_SIZE[1], IMAGE_SIZE[0], 3), (128, 64, 128), dtype=np.uint8)
+    pixels[10:20, 10:20] = (142, 0, 0)
+    cv2.imwrite(str(path), pixels)
+
+
+def write_array_map(path: Path) -> None:
+    """Write a map as np.save does."""
+    np.save(path, np.ones((IMAGE_SIZE[1], IMAGE_SIZE[0]), dtype=np.int64))
+
+
+def read_other_map(path: Path) -> None:
+    """Read the file as a map of the frame: by its values, and by its colours."""
+    from curate.errors import DataError
+    from curate.segmenters.saved import SavedSegmenter
+
+    try:
+        SavedSegmenter(path.parent, CLASSES).segment(_image_frame())
+    except DataError:
+        SavedSegmenter(path.parent, CLASSES, colours="cityscapes").segment(_image_frame())
+
+
+def write_feather(path: Path) -> None:
+    """Write three sweeps of Argoverse 2 in two record batches."""
+    import pyarrow as pa
+    from pyarrow import feather
+
+    numbers = ("tx_m", "ty_m", "tz_m", "length_m", "width_m", "height_m", "score")
+    columns = {
+        **{name: np.linspace(0.1, 1, 12) for name in numbers},
+        **{name: np.full(12, float(name == "qw")) for name in ("qw", "qx", "qy", "qz")},
+        "log_id": ["02678d04"] * 12,
+        "timestamp_ns": [315966070559696000 + i // 4 for i in range(12)],
+        "category": ["REGULAR_VEHICLE", "PEDESTRIAN"] * 6,
+    }
+    feather.write_feather(pa.table(columns), path, chunksize=6)
+
+
+def read_recorded(path: Path) -> None:
+    """Read every frame of recorded detections."""
+    from curate.detectors.recorded import RecordedDetector
+
+    detector = RecordedDetector(path)
+    for name in detector.frame_ids():
+        detector.predict(replace(_mapped(), frame_id=name))
+
+
 def write_instance_model(path: Path) -> None:
     """Write a model with two constant objects."""
     import onnx
@@ -176,6 +234,9 @@ FORMATS: dict[str, tuple[str, Use, Use]] = {
     "nuscenes results": ("a.json", write_map_results, read_map_results),
     "masks": ("a.json", write_masks, read_masks),
     "saved map of 16 bits": ("000000.png", write_wide_map, read_wide_map),
+    "saved map with a palette": ("000000.png", write_indexed_map, read_other_map),
+    "saved map in colours": ("000000.png", write_coloured_map, read_other_map),
+    "saved map as an array": ("000000.npy", write_array_map, read_other_map),
     "onnx instances": ("a.onnx", write_instance_model, read_instance_model),
 } | {
     f"nuscenes {table}": (f"v1.0-mini/{table}.json", write_tables, read_tables)
@@ -185,3 +246,4 @@ FORMATS: dict[str, tuple[str, Use, Use]] = {
 
 if find_spec("pyarrow"):
     FORMATS["parquet"] = ("a.parquet", write_parquet, read_parquet)
+    FORMATS["feather"] = ("a.feather", write_feather, read_recorded)

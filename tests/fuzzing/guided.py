@@ -13,7 +13,6 @@ def main(name: str, seconds: int) -> int:
         sys.stderr.write("skipped: atheris is not installed; pip install atheris\n")
         return 0
     with atheris.instrument_imports(include=["curate", "pipelines", "db"]):
-        from fuzzing.mutations import mutated
         from fuzzing.targets import TARGETS
     if name not in TARGETS:
         sys.stderr.write(f"no reader {name!r}: use one of {', '.join(TARGETS)}\n")
@@ -25,7 +24,7 @@ def main(name: str, seconds: int) -> int:
 
     def once(content: bytes) -> None:
         provider = atheris.FuzzedDataProvider(content)
-        path.write_bytes(mutated(valid, provider.ConsumeIntInRange))
+        path.write_bytes(TARGETS[name].damage(valid, provider.ConsumeIntInRange))
         TARGETS[name].attempt(path)
 
     atheris.Setup([sys.argv[0], f"-max_total_time={seconds}", "-rss_limit_mb=2048"], once)

@@ -3,12 +3,14 @@
 import io
 import json
 import pickle
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from fuzzing.foreign_formats import FORMATS
+from fuzzing.mutations import Choose, mutated
+from fuzzing.native import damaged_onnx, damaged_png
 from support.dataset_layouts import write_cloud
 from support.exported import toy_labels
 from support.toys import IMAGE_SIZE, toy_calibration
@@ -59,11 +61,13 @@ class Target:
         name: of the file that it reads.
         write: creates a valid one in an otherwise empty folder, with the files that it refers to.
         read: reads it; raises nothing but `CurateError`.
+        damage: returns damaged content of the file.
     """
 
     name: str
     write: Callable[[Path], None]
     read: Callable[[Path], object]
+    damage: Callable[[bytes, Choose], bytes] = mutated
 
     def attempt(self, path: Path) -> CurateError | None:
         """Read the file; return the error if it is rejected, after checking that it is one line."""
@@ -225,8 +229,14 @@ def _pickled(protocol: int) -> Callable[[Path], None]:
     return lambda path: path.write_bytes(pickle.dumps(_entries(), protocol=protocol)) and None
 
 
+def _pseudo_labels(path: Path) -> None:
+    row = [1.5, 2, 0, 4, 2, 1.5, 0.5, 1, 0.75]
+    frame = {"gt_boxes": np.array([row, row]), "cls_scores": None, "iou_scores": np.full(2, 0.5)}
+    path.write_bytes(pickle.dumps({"000000": frame, "000001": frame}, protocol=4))
+
+
 def _json(path: Path) -> None:
-    entry = {"boxes_3d": [[1.0, 2, 0, 4, 2, 1.5, 0]], "scores_3d": [0.5], "labels_3d": [0]}
+    entry = {"bboxes_3d": [[1.0, 2, 0, 4, 2, 1.5, 0]], "scores_3d": [0.5], "labels_3d": [0]}
     path.write_text(json.dumps([{"frame_id": f"00000{i}", **entry} for i in range(2)]))
 
 
@@ -316,7 +326,8 @@ def _npy(path: Path) -> None:
     path.write_bytes(buffer.getvalue())
 
 
-TARGETS: Mapping[str, Target] = {
+_DAMAGES = {".png": damaged_png, ".onnx": damaged_onnx}
+TARGETS: dict[str, Target] = {
     "velodyne": Target("a.bin", _cloud, read_points),
     "calibration": Target(
         "a.txt", lambda path: write_calibration(path, toy_calibration()), read_calibration
@@ -346,6 +357,7 @@ TARGETS: Mapping[str, Target] = {
         _bytes(f"{COLUMNS}\n000000,0,0,0.0,1.0,Car,0.9,1,2,3,4,2,1.5,0.5\n".encode()),
         _read_table,
     ),
+    "st3d": Target("ps_label_e0.pkl", _pseudo_labels, _read_list),
     "pickle 2": Target("a.pkl", _pickled(2), _read_list),
     "pickle 5": Target("a.pkl", _pickled(5), _read_list),
     "json": Target("a.json", _json, _read_list),
@@ -354,3 +366,7 @@ TARGETS: Mapping[str, Target] = {
     "onnx segmenter": Target("a.onnx", _segmenter, _read_segmenter),
     "label file": Target("labels.sqlite", _label_file, _read_label_file),
 } | {name: Target(*of) for name, of in FORMATS.items()}
+TARGETS = {
+    name: replace(target, damage=_DAMAGES.get(Path(target.name).suffix, mutated))
+    for name, target in TARGETS.items()
+}

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from fuzzing.mutations import mutated
 from fuzzing.targets import TARGETS, Target
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -72,7 +71,7 @@ def test_a_damaged_file_is_read_or_rejected(tmp_path_factory: pytest.TempPathFac
     )
     @given(st.randoms(use_true_random=False))
     def damage(chance: random.Random) -> None:
-        try_damaged(target, path, mutated(content, chance.randint))
+        try_damaged(target, path, target.damage(content, chance.randint))
 
     target.attempt(path)  # loads its libraries
     with within_memory():
@@ -88,4 +87,4 @@ def test_many_damaged_files_are_read_or_rejected(tmp_path: Path, name: str) -> N
     target.attempt(path)
     with within_memory():
         for seed in range(MANY):
-            try_damaged(target, path, mutated(content, random.Random(seed).randint))  # noqa: S311
+            try_damaged(target, path, target.damage(content, random.Random(seed).randint))  # noqa: S311

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.fatal_files import write_aborting_parquet
 from support.pipelines_cli import Curate
 from support.rounds import run_workspace
 
@@ -124,6 +125,54 @@ def test_a_pickle_with_code_does_not_run_it(
     assert not pwned.exists()
     pickle.loads(results.read_bytes())
     assert pwned.exists()
+
+
+@pytest.mark.parametrize("executor", ["serial", "process"])
+def test_a_record_that_makes_pyarrow_abort_ends_the_command_in_one_line(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, executor: str
+) -> None:
+    """Case 24: the process ended with SIGABRT. The exit code is that of a data error."""
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    record = tmp_path / "damaged.parquet"
+    write_aborting_parquet(record)
+    arguments = ("--root", toy_kitti, "--detector", "recorded", "--detector-path", record)
+    code, _, err = curate("init", tmp_path / "w", *arguments, "--set", f"run.executor={executor}")
+    if code == 0:  # init need not open the record
+        code, _, err = curate("predict", "-w", tmp_path / "w")
+    assert code == DataError.exit_code
+    [line] = err.strip().splitlines()[-1:]
+    assert f"{record}: damaged: pyarrow ends the process (SIGABRT" in line
+
+
+def test_a_record_is_read_by_the_workers_of_a_read_only_folder(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """A valid Parquet record, several processes, nothing written beside it."""
+    arrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    dataset, rows = KittiDataset(toy_kitti), []
+    for name in dataset.frame_ids():
+        truth = dataset.annotations(name)
+        rows += [
+            (name, category, 0.9, *box)
+            for category, box in zip(truth.categories.tolist(), truth.boxes.tolist(), strict=True)
+        ]
+    names = ("frame", "category", "score", "x", "y", "z", "length", "width", "height", "yaw")
+    folder = tmp_path / "results"
+    folder.mkdir()
+    table = arrow.table(dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)))
+    parquet.write_table(table, folder / "a.parquet")
+    folder.chmod(0o500)
+    code, _, err = curate(
+        "init", tmp_path / "w", "--root", toy_kitti, "--labeled", "0.25", "--detector", "recorded",
+        "--detector-path", folder / "a.parquet",
+        "--set", "run.executor=process", "--set", "run.workers=2",
+    )  # fmt: skip
+    assert code == 0, err
+    code, _, err = curate("predict", "-w", tmp_path / "w")
+    assert code == 0, err
+    assert [path.name for path in folder.iterdir()] == ["a.parquet"]
+    folder.chmod(0o700)
 
 
 def test_sql_that_writes_does_not_change_the_database(curate: Curate, workspace: Workspace) -> None:

@@ -61,12 +61,15 @@ def write_aborting_parquet(path: Path) -> None:
     path.write_bytes(content.replace(optional, damaged))
 
 
-def write_overflowing_model(path: Path, *, early: bool = False) -> None:
-    """Write a model of points with an integer division that the processor answers with SIGFPE.
+def write_overflowing_model(
+    path: Path, *, early: bool = False, shape: tuple[str | int, ...] = ("n", 4)
+) -> None:
+    """Write a model with an integer division that the processor answers with SIGFPE.
 
     Args:
         path: of the .onnx file.
         early: whether already loading the model divides, instead of the first run.
+        shape: of its input; points by default.
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
@@ -87,14 +90,14 @@ def write_overflowing_model(path: Path, *, early: bool = False) -> None:
         helper.make_node("Identity", ["points"], ["boxes"]),
     ]
     outputs = [
-        helper.make_tensor_value_info("boxes", TensorProto.FLOAT, ("n", 4)),
+        helper.make_tensor_value_info("boxes", TensorProto.FLOAT, shape),
         helper.make_tensor_value_info("scores", TensorProto.FLOAT, (1,)),
         helper.make_tensor_value_info("labels", TensorProto.INT32, (1,)),
     ]
     graph = helper.make_graph(
         nodes,
         "overflowing",
-        [helper.make_tensor_value_info("points", TensorProto.FLOAT, ("n", 4))],
+        [helper.make_tensor_value_info("points", TensorProto.FLOAT, shape)],
         outputs,
         [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )

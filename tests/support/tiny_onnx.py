@@ -67,3 +67,33 @@ def tiny_detector(
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
     onnx.save(model, str(path))
+
+
+def constant_model(
+    path: Path,
+    outputs: dict[str, np.ndarray],
+    *,
+    inputs: dict[str, tuple[int, tuple[str | int, ...]]] | None = None,
+    free: tuple[str, ...] = (),
+) -> None:
+    """Write a model that returns the same arrays for any input.
+
+    Args:
+        path: of the .onnx file.
+        outputs: by name.
+        inputs: type and shape by name; points [n, 4] if omitted.
+        free: outputs with names instead of numbers for all axes but the last.
+    """
+    nodes, values = [], []
+    for name, array in outputs.items():
+        value = numpy_helper.from_array(array)
+        nodes.append(helper.make_node("Constant", [], [name], value=value))
+        shape = list(array.shape)
+        if name in free:
+            shape[:-1] = [f"{name}{axis}" for axis in range(array.ndim - 1)]
+        values.append(helper.make_tensor_value_info(name, value.data_type, shape))
+    taken = inputs or {"points": (TensorProto.FLOAT, ("n", 4))}
+    declared = [helper.make_tensor_value_info(name, *kind) for name, kind in taken.items()]
+    graph = helper.make_graph(nodes, "constant", declared, values)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    onnx.save(model, str(path))

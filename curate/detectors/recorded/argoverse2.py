@@ -1,9 +1,10 @@
 """Detections of Argoverse 2's evaluation in a Feather file.
 
 Source: Argoverse 2's user guide of 3D detection (argoverse.github.io) and its code (av2-api). A row
-is a box: tx_m, ty_m, tz_m of its centre, length_m, width_m, height_m, rotation qw, qx, qy, qz, score,
-log_id, timestamp_ns, category, in the frame of the ego vehicle. The sweeps of Argoverse 2 are stored
-in the same frame, so the data set's points are expected in it. Other columns are ignored.
+is a box in the frame of the ego vehicle: tx_m, ty_m, tz_m of its centre, length_m, width_m,
+height_m, rotation qw, qx, qy, qz, score, log_id, timestamp_ns, category. The sweeps of Argoverse 2
+are stored in the same frame, so the data set's points are expected in it. Other columns are
+ignored.
 
 A log and a time become the name of a frame by a pattern, such as "{log_id}_{timestamp_ns}".
 """
@@ -54,6 +55,10 @@ class Argoverse2Results(Mapping[str, Detections]):
                     "detector.options.frame_name"
                 )
             self._runs[name] = of_frame
+
+    def category_names(self) -> frozenset[str]:
+        """Return the category names of all boxes; reads only the column of categories."""
+        return self._groups.distinct("category")
 
     def __getitem__(self, frame_id: str) -> Detections:
         """Return the detections of a frame.

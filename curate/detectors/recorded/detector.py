@@ -1,9 +1,7 @@
 """Detector that returns stored predictions."""
 
-import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,6 +10,7 @@ import numpy as np
 from curate.datasets.frame_names import FrameNames, last_part
 from curate.datasets.kitti.labels import KittiObjects, to_detections
 from curate.detections import Detections, as_categories
+from curate.detectors.recorded.argoverse2 import check_frame_name
 from curate.detectors.recorded.formats import check_kind, detect_kind
 from curate.detectors.recorded.parquet import ParquetRecord
 from curate.detectors.recorded.passes import PassesRecord
@@ -20,6 +19,7 @@ from curate.detectors.recorded.results import (
     ReadOptions,
     RecordedResult,
     as_detections,
+    warn_once,
 )
 from curate.detectors.recorded.table import TableRecord
 from curate.detectors.scores import describe_invalid_scores, to_probabilities
@@ -29,7 +29,6 @@ from curate.frames import Calibration, Frame, RotationY
 from curate.geometry.mounting import check_rotation_y
 from curate.geometry.similarity import Similarity
 
-_log = logging.getLogger(__name__)
 # Formats that store the augmented copies in the same file.
 _TABLES: Mapping[str, Callable[[Path, bool], "Record"]] = {
     "csv": lambda path, sigmoid: TableRecord.read(path, sigmoid=sigmoid),
@@ -85,11 +84,11 @@ class RecordedDetector:
 
     Args:
         path: a CSV or Parquet file, a folder of KITTI result files, OpenPCDet's result.pkl,
-            mmdetection3d's results (pickle of arrays, JSON, or folder of JSON), or nuScenes'
-            results (JSON).
+            mmdetection3d's results (pickle of arrays, JSON, or folder of JSON), nuScenes' results
+            (JSON), Argoverse 2's results (Feather), or ST3D's pseudo-labels (pickle).
         minimum_score: boxes with a lower score are left out.
-        kind: the format: csv, parquet, kitti, openpcdet, mmdetection3d, nuscenes, or auto to
-            detect it from suffix and contents.
+        kind: the format: csv, parquet, kitti, openpcdet, mmdetection3d, nuscenes, argoverse2, st3d,
+            or auto to detect it from suffix and contents.
         passes: the passes over augmented copies, for formats other than CSV and Parquet; see
             `PassesRecord`.
         classes: class names of numbered labels, in the order of the model.
@@ -101,6 +100,10 @@ class RecordedDetector:
             "right-forward" as in nuScenes' LiDAR frame.
         rotation_y: who computed rotation_y of KITTI result files, see `curate.frames.RotationY`;
             None for the meaning in the data set's label files.
+        version: the version of mmdetection3d, "0.x" or "1.x", for results that do not show it.
+        ignored: whether to "drop" or "keep" ST3D's boxes with a negative category.
+        shift: SHIFT_COOR of ST3D's data set configuration, [x, y, z] in metres.
+        frame_name: name of a frame of Argoverse 2, e.g. "{log_id}_{timestamp_ns}".
         sigmoid: whether scores are logits; they become probabilities first.
         frame_ids: the frames of the data set; recorded frames are matched with them in the
             spellings of `curate.datasets.frame_names`, and those of no frame are reported.
@@ -125,6 +128,10 @@ class RecordedDetector:
         rename: Mapping[str, str] | None = None,
         axes: str = "forward-left",
         rotation_y: RotationY | None = None,
+        version: str | None = None,
+        ignored: str = "drop",
+        shift: Sequence[float] = (0.0, 0.0, 0.0),
+        frame_name: str | None = None,
         sigmoid: bool = False,
         frame_ids: Sequence[str] = (),
         calibration: Callable[[str], Calibration] | None = None,
@@ -144,7 +151,10 @@ class RecordedDetector:
         self._calibration = calibration
         self._wants_views = wants_views
         listed = self.path.parent / frame_list if frame_list else None
-        options = ReadOptions(tuple(classes), listed, sigmoid)
+        check_frame_name(frame_name)
+        options = ReadOptions(
+            tuple(classes), listed, sigmoid, version, ignored, shift, frame_name, frame_ids
+        )
         self._record = _open(self.path, kind, options, passes)
         # The name in the record of each frame that has another one there.
         found = self._match(FrameNames.of(frame_ids))
@@ -182,7 +192,7 @@ class RecordedDetector:
         """
         views = self._record.views(self._recorded_as.get(frame_id, frame_id))
         if self._wants_views and not views and not self._record.has_views:
-            _warn_once(
+            warn_once(
                 f"{self.path}: no second pass over augmented copies, so no label has a consistency "
                 "loss. Methods that need one give every label weight 0 unless solve.self_paced = "
                 "false. Add the second pass under passes in detector.options"
@@ -248,7 +258,7 @@ class RecordedDetector:
                 f"{frames.nearest(unmatched[0])}"
             )
         if unmatched:
-            _warn_once(
+            warn_once(
                 f"{self.path}: {len(unmatched)} of {len(names)} results are for frames that the "
                 f"data set does not have ({examples}); they are left out"
             )
@@ -281,9 +291,3 @@ def _open(
             "detector.options"
         )
     return _TABLES[kind](path, options.sigmoid)
-
-
-@cache
-def _warn_once(message: str) -> None:
-    """Log a warning once per process, however many stages and frames report it."""
-    _log.warning(message)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from curate.detectors.recorded.argoverse2 import Argoverse2Results
 from curate.detectors.recorded.json_files import holds_object, stream_results
 from curate.detectors.recorded.kitti_results import KittiResults
 from curate.detectors.recorded.mmdetection3d import holds_boxes, read_mmdetection3d
@@ -13,6 +14,7 @@ from curate.detectors.recorded.nuscenes import read_nuscenes
 from curate.detectors.recorded.openpcdet import read_openpcdet
 from curate.detectors.recorded.plain_pickle import read_plain_pickle
 from curate.detectors.recorded.results import ReadOptions, ResultsByFrame
+from curate.detectors.recorded.st3d import holds_pseudo_labels, read_st3d
 from curate.errors import ConfigError, DataError
 from curate.files.json_text import read_json
 
@@ -21,11 +23,12 @@ _LISTS: Mapping[str, Callable[[Path, Sequence[Any], ReadOptions], ResultsByFrame
     "openpcdet": read_openpcdet,
     "mmdetection3d": read_mmdetection3d,
 }
-KINDS = ("csv", "parquet", "kitti", *_LISTS, "nuscenes")
+KINDS = ("csv", "parquet", "kitti", *_LISTS, "nuscenes", "argoverse2", "st3d")
 _LIST_SUFFIXES = (".pkl", ".pickle", ".json")
 _EXPECTED = (
     "a .csv or .parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, "
-    "mmdetection3d's results as .pkl, .json or a folder of .json, or nuScenes' results as .json"
+    "mmdetection3d's results as .pkl, .json or a folder of .json, nuScenes' results as .json, "
+    "Argoverse 2's results as .feather, or ST3D's ps_label_e0.pkl"
 )
 
 
@@ -39,7 +42,9 @@ def detect_kind(path: Path) -> str:
         raise DataError(f"{path}: no such file of recorded detections")
     if path.is_dir():
         return "mmdetection3d" if any(path.glob("*.json")) else "kitti"
-    kinds = {".csv": "csv", ".parquet": "parquet"} | dict.fromkeys(_LIST_SUFFIXES, "list")
+    kinds = {".csv": "csv", ".parquet": "parquet", ".feather": "argoverse2"} | dict.fromkeys(
+        _LIST_SUFFIXES, "list"
+    )
     if path.suffix.lower() not in kinds:
         raise DataError(f"{path}: not a supported format of detections; expected {_EXPECTED}")
     return kinds[path.suffix.lower()]
@@ -50,7 +55,7 @@ def read_results(path: Path, kind: str, options: ReadOptions) -> ResultsByFrame:
 
     Args:
         path: file or folder.
-        kind: one of `KINDS`, or "list".
+        kind: one of `KINDS`, or "list" for a pickle or JSON file of any kind.
         options: see `ReadOptions`.
 
     Raises:
@@ -59,6 +64,8 @@ def read_results(path: Path, kind: str, options: ReadOptions) -> ResultsByFrame:
     """
     if kind == "kitti":
         return KittiResults(path)
+    if kind == "argoverse2":
+        return Argoverse2Results(path, options)
     if kind in ("list", "nuscenes") and path.suffix.lower() == ".json" and holds_object(path):
         return read_nuscenes(path, stream_results(path))
     content = _read(path)
@@ -66,6 +73,10 @@ def read_results(path: Path, kind: str, options: ReadOptions) -> ResultsByFrame:
         raise DataError(
             f"{path}: not nuScenes results; expected a JSON object with meta and results"
         )
+    if isinstance(content, Mapping) and (kind == "st3d" or holds_pseudo_labels(content)):
+        return read_st3d(path, content, options)
+    if kind == "st3d":
+        raise DataError(f"{path}: not ST3D's pseudo-labels; expected a dict of frames")
     if not isinstance(content, list | tuple):
         raise DataError(f"{path}: contains a {type(content).__name__}, not a list of frames")
     if kind == "list":
@@ -73,11 +84,13 @@ def read_results(path: Path, kind: str, options: ReadOptions) -> ResultsByFrame:
     return _LISTS[kind](path, content, options)
 
 
-def category_names(results: ResultsByFrame) -> set[str]:
+def category_names(results: ResultsByFrame) -> frozenset[str]:
     """Return the category names of all boxes of a pass."""
-    if isinstance(results, KittiResults):
+    if isinstance(results, KittiResults | Argoverse2Results):
         return results.category_names()
-    return {str(name) for result in results.values() for name in np.unique(result.categories)}
+    return frozenset(
+        str(name) for result in results.values() for name in np.unique(result.categories)
+    )
 
 
 def _detect_list_kind(path: Path, entries: Sequence[Any]) -> str:
@@ -89,6 +102,11 @@ def _detect_list_kind(path: Path, entries: Sequence[Any]) -> str:
         return "mmdetection3d"
     if isinstance(first, Mapping) and "boxes_lidar" in first:
         return "openpcdet"
+    if isinstance(first, Mapping) and {"location", "rotation_y"} <= set(first):
+        raise DataError(
+            f"{path}: boxes in the camera frame (location, rotation_y) without boxes_lidar; write "
+            "them as KITTI result files, which are converted by the calibration"
+        )
     names = " ".join(", ".join(map(str, first)).split())[:80] if isinstance(first, Mapping) else ""
     keys = names or type(first).__name__
     raise DataError(f"{path}: entries of an unknown format ({keys}); expected {_EXPECTED}")

@@ -1,11 +1,19 @@
-"""Results of mmdetection3d 1.0 or newer: boxes with bottom-centre positions, numbered labels.
+"""Results of mmdetection3d: boxes with bottom-centre positions, numbered labels.
 
 A list, in a pickle of arrays or in JSON, with boxes_3d (or bboxes_3d), scores_3d and labels_3d of
-each frame; or the folder of FRAME.json files that its inferencer writes. `boxes_3d` is (n, 7): x, y
-and z of the bottom centre, length, width, height, yaw counter-clockwise from x, in the LiDAR frame.
+each frame; or the folder of FRAME.json files that its inferencer writes. A box is (n, 7) in the
+LiDAR frame, x, y and z of the bottom centre first. The rest depends on the version:
+
+    1.x    length, width, height, yaw counter-clockwise from x
+    0.x    width, length, height, yaw clockwise from -y
+
+Source: LiDARInstance3DBoxes in mmdetection3d 0.18 and 1.1, and its notes on compatibility. The
+names pred_instances_3d, bboxes_3d and box_type_3d exist in 1.x only, so they declare it. boxes_3d
+alone has been written by both.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +21,19 @@ import numpy as np
 
 from curate.datasets.frame_names import read_frame_list
 from curate.detections import Detections
+from curate.detectors.conventions import BoxConvention
 from curate.detectors.recorded.results import ReadOptions, ResultsByFrame, as_detections
 from curate.errors import ConfigError, DataError
 
 # An entry may contain its boxes one level deeper, under either name.
 HOLDERS = ("pred_instances_3d", "pts_bbox")
 BOX_KEYS = ("boxes_3d", "bboxes_3d")
+# Keys that only version 1.x writes.
+_NEW_KEYS = ("pred_instances_3d", "bboxes_3d", "box_type_3d")
+_CONVENTIONS = {
+    "1.x": BoxConvention(origin="bottom"),
+    "0.x": BoxConvention(origin="bottom", order="wlh", yaw_sign=-1, yaw_offset_rad=-np.pi / 2),
+}
 _FRAME_KEYS = ("frame_id", "sample_idx", "lidar_path")
 
 
@@ -28,10 +43,12 @@ def read_mmdetection3d(path: Path, entries: Sequence[Any], options: ReadOptions)
     Args:
         path: the file or folder, for messages.
         entries: the content of the file, a dict per frame.
-        options: `classes` for the labels; `frame_list` if the entries have no frame ids.
+        options: `classes` for the labels; `frame_list` if the entries have no frame ids; `version`
+            if they do not show it.
 
     Raises:
-        ConfigError: if the classes are missing, or an entry has no frame id and there is no list.
+        ConfigError: if the classes are missing, an entry has no frame id and there is no list, or
+            the version is not declared.
         DataError: if an entry lacks a key or has invalid values, or a frame occurs twice.
     """
     if not options.classes:
@@ -45,7 +62,8 @@ def read_mmdetection3d(path: Path, entries: Sequence[Any], options: ReadOptions)
         if frame_id in found:
             raise DataError(f"{path}: entry {number}: frame {frame_id} occurs twice")
         place = f"{path}: entry {number} (frame {frame_id})"
-        found[frame_id] = _detections(place, entry, options.classes)
+        convention = _CONVENTIONS[_version(place, entry, options.version)]
+        found[frame_id] = _detections(place, entry, options.classes, convention)
     return found
 
 
@@ -59,7 +77,31 @@ def _inner(entry: Mapping[str, Any]) -> Mapping[str, Any]:
     return next(nested, entry)
 
 
-def _detections(place: str, entry: Any, classes: Sequence[str]) -> Detections:
+def _version(place: str, entry: Any, declared: str | None) -> str:
+    """Return the version that computed an entry's boxes.
+
+    Raises:
+        ConfigError: if neither the entry nor the options declare it, or they contradict each other.
+    """
+    keys = {*entry, *_inner(entry)} if isinstance(entry, Mapping) else set()
+    new_key = next((key for key in _NEW_KEYS if key in keys), None)
+    if new_key is not None and declared == "0.x":
+        raise ConfigError(
+            f"{place}: has {new_key}, which mmdetection3d 0.x does not write; remove "
+            "detector.options.version"
+        )
+    if new_key is None and declared is None:
+        raise ConfigError(
+            f"{place}: boxes_3d can be of mmdetection3d 1.x (length, width, height, yaw "
+            "counter-clockwise from x) or 0.x (width, length, height, yaw clockwise from -y); set "
+            'detector.options.version = "1.x" or "0.x"'
+        )
+    return declared or "1.x"
+
+
+def _detections(
+    place: str, entry: Any, classes: Sequence[str], convention: BoxConvention
+) -> Detections:
     inner = _inner(entry) if isinstance(entry, Mapping) else {}
     box_key = next((key for key in BOX_KEYS if key in inner), BOX_KEYS[0])
     missing = [key for key in (box_key, "scores_3d", "labels_3d") if key not in inner]
@@ -77,8 +119,7 @@ def _detections(place: str, entry: Any, classes: Sequence[str]) -> Detections:
         )
     names = [classes[label] for label in labels.tolist()]
     found = as_detections(place, inner[box_key], inner["scores_3d"], names)
-    found.boxes[:, 2] += found.boxes[:, 5] / 2
-    return found
+    return replace(found, boxes=convention.to_boxes(found.boxes))
 
 
 def _labels(place: str, labels: Any) -> np.ndarray:

@@ -17,9 +17,10 @@ import numpy as np
 from curate.datasets.nuscenes.names import CATEGORIES
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded.results import as_detections
+from curate.detectors.recorded.rotations import check_rotations
 from curate.errors import DataError
 from curate.frames import Calibration
-from curate.geometry.poses import boxes_in_frame, rotation_matrices
+from curate.geometry.poses import boxes_in_frame
 
 _KEYS = ("translation", "size", "rotation", "detection_name", "detection_score")
 _NUMBERS = 11  # translation, size, rotation, score
@@ -28,9 +29,6 @@ _LONG_CLASSES = ("car", "truck", "bus", "trailer", "bicycle", "motorcycle")
 # With this many boxes of long classes, and this share of them wider than long, the order of the
 # sizes is wrong.
 _MIN_LONG_BOXES, _MAX_WIDE_SHARE = 10, 0.9
-# Minimum cosine of a box's tilt. A misread quaternion tilts boxes more than any real object.
-_MIN_COS_TILT = 0.7
-_UNIT_TOLERANCE = 0.01
 # Metres: beyond the range of a LiDAR, but less than vehicles are from the origin of their map.
 _MAX_RANGE = 200.0
 # Metres; products of such numbers stay finite.
@@ -106,7 +104,7 @@ def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str
         if token in found:
             raise DataError(f"{path}: results of {_shortened(token)} occur twice; remove one")
         frame = _frame(path, token, boxes, interned)
-        _check_rotations(frame)
+        check_rotations(frame.place, frame.numbers[:, 6:10])
         width_length = frame.numbers[np.isin(frame.names, _LONG_CLASSES), 3:5]
         long_boxes += len(width_length)
         wide_boxes += int(np.sum(width_length[:, 0] > width_length[:, 1]))
@@ -172,23 +170,3 @@ def _row(place: str, token: str, box: Any) -> list[float]:
 def _shortened(text: Any) -> str:
     """Return a text from the file, short enough for a message."""
     return " ".join(text.split())[:80] if isinstance(text, str) else f"a {type(text).__name__}"
-
-
-def _check_rotations(found: MapBoxes) -> None:
-    """Raise DataError if a rotation is not a unit quaternion or tilts its box too far."""
-    rotations = found.numbers[:, 6:10]
-    lengths = np.linalg.norm(rotations, axis=1)
-    if (np.abs(lengths - 1) > _UNIT_TOLERANCE).any():
-        k = int(np.argmax(np.abs(lengths - 1)))
-        raise DataError(
-            f"{found.place}: box {k}: rotation {rotations[k].tolist()} is not a unit quaternion "
-            f"(w, x, y, z), its length is {lengths[k]:.3f}"
-        )
-    cos_tilt = rotation_matrices(rotations)[:, 2, 2]
-    if (cos_tilt < _MIN_COS_TILT).any():
-        k = int(np.argmin(cos_tilt))
-        angle = np.degrees(np.arccos(np.clip(cos_tilt[k], -1, 1)))
-        raise DataError(
-            f"{found.place}: box {k} would be tilted by {angle:.0f} degrees: rotation "
-            f"{rotations[k].tolist()} must be w, x, y, z, not x, y, z, w"
-        )

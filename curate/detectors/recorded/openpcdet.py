@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from curate.detectors.recorded.results import (
     ReadOptions,
     RecordedResult,
@@ -27,7 +29,8 @@ def read_openpcdet(path: Path, entries: Sequence[Any], _reading: ReadOptions) ->
         entries: the content of the file.
 
     Raises:
-        DataError: if an entry lacks a key or has invalid values, or a frame occurs twice.
+        DataError: if an entry lacks a key, has invalid values or those of an old version, or a
+            frame occurs twice.
     """
     found: dict[str, RecordedResult] = {}
     for number, entry in enumerate(entries):
@@ -39,5 +42,25 @@ def read_openpcdet(path: Path, entries: Sequence[Any], _reading: ReadOptions) ->
         if frame_id in found:
             raise DataError(f"{place}: frame {frame_id} occurs twice")
         place = f"{place} (frame {frame_id})"
-        found[frame_id] = as_detections(place, entry["boxes_lidar"], entry["score"], entry["name"])
+        boxes = as_detections(place, entry["boxes_lidar"], entry["score"], entry["name"])
+        _check_version(place, boxes.boxes, entry.get("dimensions"))
+        found[frame_id] = boxes
     return found
+
+
+def _check_version(place: str, boxes: np.ndarray, dimensions: Any) -> None:
+    """Raise DataError if boxes_lidar begin with the width, as before OpenPCDet 0.3.
+
+    For KITTI, an entry has the same boxes in the camera frame, where `dimensions` is always (n, 3)
+    length, height, width.
+    """
+    try:
+        lengths = np.array(dimensions, dtype=np.float64)[:, 0]
+        is_new, is_old = (np.allclose(lengths, boxes[:, column], atol=0.01) for column in (3, 4))
+    except (IndexError, OverflowError, TypeError, ValueError):
+        return
+    if is_old and not is_new:
+        raise DataError(
+            f"{place}: boxes_lidar begin with the width, as in OpenPCDet before 0.3, where yaw and "
+            "z also differ; convert them to centre, length, width, height, yaw"
+        )

@@ -60,7 +60,8 @@ def read_plain_pickle(path: Path) -> Any:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from error
     try:
         _check_claimed_sizes(content)
-        value = _PlainUnpickler(io.BytesIO(content)).load()
+        # Python 2 wrote the bytes of arrays as text; latin-1 keeps every byte.
+        value = _PlainUnpickler(io.BytesIO(content), encoding="latin-1").load()
         _check_expanded_size(value, 16 * len(content) + 1000)
     except _RejectedError as rejected:
         raise DataError(
@@ -191,14 +192,20 @@ def _empty_array(_kind: object, _shape: object, _dtype: object) -> np.ndarray:
     return _Array((0,), dtype=np.int8)
 
 
-def _scalar(kind: _Dtype, content: bytes) -> Any:
+def _scalar(kind: _Dtype, content: bytes | str) -> Any:
     """Return a numpy number or string."""
+    content = content.encode("latin-1") if isinstance(content, str) else content
     return np.frombuffer(content, dtype=kind.dtype, count=1)[0]
 
 
 def _array_from_buffer(content: Any, kind: _Dtype, shape: Any, order: Any) -> np.ndarray:
     """Return an array from its bytes, as protocol 5 writes it."""
     return np.frombuffer(bytes(content), dtype=kind.dtype).reshape(shape, order=order)
+
+
+def _array(shape: Any, kind: str, content: Any) -> np.ndarray:
+    """Return an array from its bytes, as curate's exports write it."""
+    return np.frombuffer(bytes(content), dtype=_Dtype(kind).dtype).reshape(shape)
 
 
 def _latin1(text: str, _encoding: str) -> bytes:
@@ -230,7 +237,8 @@ def _table() -> Mapping[str, Any]:
             for core in ("core", "_core")
             for name, function in moved.items()
         },
-        "numpy.ndarray": "numpy.ndarray",  # never called: only the first argument of _empty_array
+        # Called by curate's own exports; numpy's pickles give it to _reconstruct, which ignores it.
+        "numpy.ndarray": _array,
         "numpy.dtype": _Dtype,
         "_codecs.encode": _latin1,
         "collections.OrderedDict": collections.OrderedDict,

@@ -1,7 +1,9 @@
 """Results of one frame as a record stores them, and the check of their values."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import logging
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -10,10 +12,11 @@ import numpy as np
 from curate.datasets.kitti.labels import KittiObjects
 from curate.detections import Detections, as_categories
 from curate.detectors.scores import describe_invalid_scores
-from curate.errors import DataError, one_line
+from curate.errors import ConfigError, DataError, one_line
 from curate.frames import Calibration
 from curate.geometry.similarity import wrap_angle
 
+_log = logging.getLogger(__name__)
 # Largest valid number, in metres or radians: boxes are in the LiDAR frame, not on a map.
 LARGEST = 1e6
 
@@ -57,11 +60,42 @@ class ReadOptions:
         frame_list: a text file with one frame id per line, in the order of the results; for
             results without frame ids.
         sigmoid: whether the scores are logits, which the detector converts.
+        version: the version of mmdetection3d that computed the boxes: "0.x" or "1.x".
+        ignored: whether to "drop" or "keep" ST3D's boxes with a negative category.
+        shift: SHIFT_COOR of ST3D's data set configuration: (3,) metres that were added to x, y, z.
+        frame_name: pattern of the frame names of Argoverse 2's results.
+        frame_ids: the frames of the data set.
     """
 
     classes: Sequence[str] = ()
     frame_list: Path | None = None
     sigmoid: bool = False
+    version: str | None = None
+    ignored: str = "drop"
+    shift: Sequence[float] = (0.0, 0.0, 0.0)
+    frame_name: str | None = None
+    frame_ids: Collection[str] = ()
+
+    def __post_init__(self) -> None:
+        """Check the options.
+
+        Raises:
+            ConfigError: if one has an invalid value.
+        """
+        for name, choices in (("version", (None, "0.x", "1.x")), ("ignored", ("drop", "keep"))):
+            value = getattr(self, name)
+            if value not in choices:
+                shown = " or ".join(choice for choice in choices if choice)
+                raise ConfigError(f"detector.options.{name} {value!r}: use {shown}")
+        is_number = [isinstance(metres, int | float) for metres in self.shift]
+        if is_number != [True] * 3:
+            raise ConfigError(f"detector.options.shift {self.shift}: expected [x, y, z] in metres")
+
+
+@cache
+def warn_once(message: str) -> None:
+    """Log a warning once per process, however many stages and frames report it."""
+    _log.warning(message)
 
 
 def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections:

@@ -5,7 +5,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 from support.fatal_files import write_overflowing_model
-from support.tiny_onnx import tiny_detector
+from support.tiny_onnx import constant_model, tiny_detector
 from support.toys import toy_calibration
 
 from curate.detections import CATEGORIES
@@ -132,19 +132,19 @@ def test_user_supplied_functions_run_before_and_after_the_model(path):
     ("options", "graph", "error", "message"),
     [
         ({}, {"shape": ("n", 5)}, ModelError, "expected one tensor"),
-        ({}, {"shape": (100, 4)}, ModelError, r"the inputs are points .*free n; .*preprocess"),
+        ({}, {"shape": (100, 4)}, ModelError, r"the inputs are points .*free n, .*preprocess"),
         ({"points": "sweep"}, {}, ModelError, "there is no input sweep"),
-        (
-            {},
-            {"names": ("b", "s", "l")},
-            ModelError,
-            "the outputs are b, l, s; there is no output boxes",
-        ),
+        ({"outputs": {"boxes": "b"}}, {}, ModelError, "labels .*; there is no output b"),
         ({"outputs": {"box": "b"}}, {}, ConfigError, "box: use boxes, scores, labels"),
         ({}, {"scores": np.array([3.0, 2, -1])}, ModelError, "from -1 to 3 are not in"),
         ({}, {"labels": np.array([0, 1, 7])}, ModelError, "labels 0 to 7, but classes Car,"),
         ({}, {"labels": np.array([0, 1])}, ModelError, r"labels \[2\]; expected"),
-        ({}, {"scores": np.zeros((3, 0))}, ModelError, r"scores \[3, 0\], labels \[0\]; expected"),
+        (
+            {},
+            {"scores": np.zeros((3, 0))},
+            ModelError,
+            r"scores \[3, 0\]; expected .* scores \[n, 3\]",
+        ),
         (
             {"postprocess": f"{__name__}:summary_sentences"},
             {},
@@ -195,3 +195,110 @@ def test_a_model_that_ends_the_process_is_rejected(tmp_path, early):
     with pytest.raises(ModelError, match=r"onnxruntime ends the process \(SIGFPE\)") as caught:
         OnnxDetector(tmp_path / "a.onnx", classes=("Car",)).predict(frame())
     assert str(caught.value).startswith(f"{tmp_path / 'a.onnx'}: ")
+
+
+ROWS = np.float32([[10, 2, -1, 4, 2, 1.5, 0.3], [20, 2, -1, 1, 1, 2, 0.1]])
+
+
+def detect_constant(path, outputs, options=None, **graph):
+    """Return the detections of a model with constant outputs."""
+    constant_model(path, outputs, **graph)
+    return OnnxDetector(path, **({"classes": CATEGORIES} | (options or {}))).predict(frame())
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize("label_kind", [np.int64, np.int32, np.uint8, np.float32])
+@pytest.mark.parametrize(
+    ("boxes", "scores", "labels"),
+    [((2, 7), (2,), (2,)), ((1, 2, 7), (1, 2), (1, 2)), ((2, 7), (2, 1), (2, 1)),
+     ((1, 2, 7), (1, 2, 1), (2,))],
+)  # fmt: skip
+def test_outputs_of_any_number_type_with_or_without_a_batch_axis(
+    path, kind, label_kind, boxes, scores, labels
+):
+    """As exporters write them."""
+    outputs = {
+        "boxes": ROWS.astype(kind).reshape(boxes),
+        "scores": np.array([0.5, 0.75], kind).reshape(scores),
+        "labels": np.array([0, 2], label_kind).reshape(labels),
+    }
+    found = detect_constant(path, outputs)
+    assert found.categories.tolist() == ["Cyclist", "Car"]
+    assert found.scores.tolist() == [0.75, 0.5]
+    np.testing.assert_allclose(found.boxes, ROWS[::-1], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("pred_boxes", "pred_scores", "pred_labels"), ("bboxes_3d", "scores_3d", "labels_3d"),
+     ("output0", "output1", "output2"), ("1042", "1043", "1050")],
+)  # fmt: skip
+@pytest.mark.parametrize("free", [False, True])
+def test_outputs_are_told_apart_by_usual_names_or_by_type_and_shape(path, names, free):
+    """Integers are labels, seven columns are boxes; also where the number of boxes is free."""
+    arrays = (ROWS, np.float32([0.5, 0.75]), np.int64([0, 2]))
+    outputs = dict(zip(names, arrays, strict=True))
+    found = detect_constant(path, outputs, free=names if free else ())
+    assert found.categories.tolist() == ["Cyclist", "Car"]
+
+
+def test_outputs_that_could_be_either_are_refused_with_their_shapes(path):
+    """Scores of seven classes look like boxes of seven numbers."""
+    outputs = {"a": ROWS, "b": np.full((2, 7), 0.5, np.float32)}
+    words = (
+        r"the outputs are a tensor.float.\[2, 7\], b tensor.float.\[2, 7\]; several can be boxes"
+    )
+    with pytest.raises(ModelError, match=words):
+        detect_constant(path, outputs)
+    options = {"outputs": {"boxes": "a", "scores": "b"}, "classes": list("abcdefg")}
+    assert len(detect_constant(path, outputs, options)) == 2
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+@pytest.mark.parametrize("batched", [False, True])
+def test_scores_per_class_of_any_number_of_boxes(path, count, batched):
+    """Scores of one box, [1, classes], are not a batch of scores."""
+    scores = np.float32([[0.1, 0.2, 0.6], [0.7, 0.1, 0.1]])[:count]
+    rows = ROWS[:count]
+    outputs = {
+        "boxes": rows[None] if batched else rows,
+        "scores": scores[None] if batched else scores,
+    }
+    found = detect_constant(path, outputs)
+    assert found.categories.tolist() == ["Car", "Cyclist"][2 - count :]
+
+
+def test_one_class_needs_neither_labels_nor_columns(path):
+    """The only class is meant."""
+    for shape in ((2,), (1, 2), (2, 1)):
+        outputs = {"boxes": ROWS, "scores": np.float32([0.5, 0.25]).reshape(shape)}
+        found = detect_constant(path, outputs, {"classes": ["Car"]})
+        assert found.categories.tolist() == ["Car", "Car"]
+
+
+def test_rows_that_fill_a_fixed_size_are_dropped(path):
+    """Label -1 and no score, as a non-maximum suppression of fixed size writes them."""
+    outputs = {
+        "boxes": np.vstack([ROWS, np.zeros((3, 7), np.float32)]),
+        "scores": np.float32([0.5, 0.75, 0, 0, -1]),
+        "labels": np.int64([0, 2, -1, -1, -1]),
+    }
+    assert len(detect_constant(path, outputs)) == 2
+    outputs["scores"][2] = 0.5
+    with pytest.raises(ModelError, match="labels -1 to 2, but"):
+        detect_constant(path, outputs)
+
+
+@pytest.mark.parametrize("kind", [TensorProto.FLOAT16, TensorProto.DOUBLE])
+def test_models_of_other_precision_get_their_type(path, kind):
+    """The points are converted."""
+    outputs = {"boxes": ROWS, "scores": np.float32([0.5, 0.75]), "labels": np.int64([0, 2])}
+    inputs = {"any_name": (kind, (1, "n", 4))}
+    assert len(detect_constant(path, outputs, inputs=inputs)) == 2
+
+
+def test_a_model_without_boxes_is_refused_with_its_outputs(path):
+    """Six numbers are not a box."""
+    words = r"the outputs are a tensor.float.\[2, 6\], .*; there is no output boxes; map boxes"
+    with pytest.raises(ModelError, match=words):
+        detect_constant(path, {"a": ROWS[:, :6], "b": np.float32([0.5, 0.75])})

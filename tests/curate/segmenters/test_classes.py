@@ -33,7 +33,9 @@ def test_riders_are_not_pedestrians_if_the_classes_differ():
 
 
 def test_the_error_for_an_unknown_table_lists_the_known_ones():
-    with pytest.raises(ConfigError, match="unknown class set 'ade': use one of cityscapes, city"):
+    with pytest.raises(
+        ConfigError, match="unknown class set 'ade': use one of camvid, cityscapes, city"
+    ):
         class_map("ade")
 
 

@@ -7,6 +7,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 from onnxruntime import InferenceSession
+from support.fatal_files import write_overflowing_model
+from support.tiny_onnx import constant_model as constant_outputs
 from support.toys import toy_calibration
 
 from curate.errors import ConfigError, ModelError
@@ -251,6 +253,20 @@ def test_a_model_of_one_column_has_crops_of_one(tmp_path):
     np.testing.assert_array_equal(found, banded(8, 16, [7, 15])[..., 0])
 
 
+def test_crops_cover_an_image_whose_width_they_do_not_divide(tmp_path):
+    """Crops of 2.5 columns are rounded to 2: then more are needed than the squeeze says."""
+    path = red_channel_model(tmp_path / "a.onnx", [1, 16, 1, 3])
+    found = OnnxSegmenter(path, CLASSES).segment(frame(banded(40, 120, [7, 15]))).class_ids
+    np.testing.assert_array_equal(found, banded(40, 120, [7, 15])[..., 0])
+
+
+def test_a_model_that_would_need_endless_crops_is_rejected(tmp_path):
+    """Each column of the image would be enlarged to 24 x 65536 pixels."""
+    path = red_channel_model(tmp_path / "a.onnx", [1, 65536, 24, 3])
+    with pytest.raises(ModelError, match="an image of 120 x 40 needs 120 crops; use a model with"):
+        OnnxSegmenter(path, CLASSES).segment(frame(banded(40, 120, [7, 15])))
+
+
 def test_ids_beyond_8_bits_are_rejected(tmp_path):
     """Class 300 is not silently another class."""
     path = constant_model(tmp_path / "a.onnx", np.full((8, 8), 300))
@@ -312,3 +328,98 @@ def test_deeplab_finds_the_cars_of_a_real_frame(kitti_root):
     assert np.median(shares) > 0.6
     assert min(shares) > 0.2
     assert (class_ids[:120] == 7).mean() < 0.01
+
+
+IMAGE = np.zeros((24, 48, 3), np.uint8)
+
+
+def segment_constant(path, outputs, kind=TensorProto.FLOAT, shape=(1, 3, 24, 48), **options):
+    """Return the class ids from a model with constant outputs for an image of 48 x 24 pixels."""
+    constant_outputs(path, outputs, inputs={"pixel_values": (kind, shape)})
+    return OnnxSegmenter(path, CLASSES, **options).segment(frame(IMAGE)).class_ids
+
+
+def halves(height, width, classes=19):
+    """Return scores [1, classes, height, width]: class 7 on the left, class 15 on the right."""
+    scores = np.zeros((1, classes, height, width), np.float32)
+    scores[:, 7, :, : width // 2] = scores[:, 15, :, width // 2 :] = 1
+    return scores
+
+
+EXPECTED = np.tile(np.repeat(np.uint8([7, 15]), 24), (24, 1))
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize("size", [(24, 48), (6, 12), (3, 6), (25, 49)])
+@pytest.mark.parametrize("channels_last", [False, True])
+def test_scores_of_any_size_and_precision(tmp_path, kind, size, channels_last):
+    """SegFormer's are a quarter of the input's size, others an eighth, or padded."""
+    scores = halves(*size).astype(kind)
+    scores = scores.transpose(0, 2, 3, 1) if channels_last else scores
+    found = segment_constant(tmp_path / "a.onnx", {"logits": scores})
+    assert (found == EXPECTED).mean() > 0.97
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint8])
+@pytest.mark.parametrize("shape", [(1, 24, 48), (1, 1, 24, 48), (1, 24, 48, 1)])
+def test_class_ids_of_any_integer_type(tmp_path, kind, shape):
+    """With or without an axis of one class."""
+    found = segment_constant(tmp_path / "a.onnx", {"any": EXPECTED.astype(kind).reshape(shape)})
+    np.testing.assert_array_equal(found, EXPECTED)
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape"),
+    [(TensorProto.FLOAT16, (1, 3, 24, 48)), (TensorProto.DOUBLE, (1, 24, 48, 3)),
+     (TensorProto.UINT8, ("batch", 3, "height", "width"))],
+)  # fmt: skip
+def test_inputs_of_any_precision_name_and_order(tmp_path, kind, shape):
+    """The pixels are converted to what the model declares."""
+    found = segment_constant(tmp_path / "a.onnx", {"logits": halves(24, 48)}, kind, shape)
+    np.testing.assert_array_equal(found, EXPECTED)
+
+
+def test_the_map_of_several_outputs(tmp_path):
+    """The output `out` of torchvision beside `aux`, in any order; others are declared."""
+    path, scores = tmp_path / "a.onnx", halves(24, 48)
+    outputs = {"aux": np.roll(scores, 1, axis=1), "out": scores}
+    np.testing.assert_array_equal(segment_constant(path, outputs), EXPECTED)
+    outputs = {"hidden": np.zeros((1, 5), np.float32), "logits": scores}
+    np.testing.assert_array_equal(segment_constant(path, outputs), EXPECTED)
+    outputs = {"a": np.roll(scores, 1, axis=1), "b": scores}
+    words = r"returns a tensor.float.\[1, 19, 24, 48\], b .*; several can be the map; set segmenter"
+    with pytest.raises(ModelError, match=words):
+        segment_constant(path, outputs)
+    np.testing.assert_array_equal(segment_constant(path, outputs, output="b"), EXPECTED)
+    with pytest.raises(ModelError, match=r"there is no output c; set segmenter\.options\.output"):
+        segment_constant(path, outputs, output="c")
+
+
+def test_scores_that_can_be_read_in_two_orders_are_refused_with_both(tmp_path):
+    """Both leave a nearly square map."""
+    path = tmp_path / "a.onnx"
+    shape = (1, 3, 48, 48)
+    words = "which can be 24 classes first or 20 classes last; set segmenter.options.channels"
+    scores = np.zeros((1, 24, 22, 20), np.float32)
+    scores[0, 7] = 1
+    with pytest.raises(ModelError, match=words):
+        segment_constant(path, {"a": scores}, shape=shape)
+    found = segment_constant(path, {"a": scores}, shape=shape, channels="first")
+    assert np.unique(found).tolist() == [7]
+    with pytest.raises(ConfigError, match="channels 'middle': use first or last"):
+        segment_constant(path, {"a": scores}, shape=shape, channels="middle")
+
+
+def test_scores_out_of_proportion_are_refused(tmp_path):
+    """They cannot be a map of the image."""
+    words = r"returns float32 \[1, 19, 5, 50\] for an image of 48 x 24 pixels; expected class ids"
+    with pytest.raises(ModelError, match=words):
+        segment_constant(tmp_path / "a.onnx", {"a": halves(5, 50)})
+
+
+@pytest.mark.parametrize("early", [False, True])
+def test_a_model_that_ends_the_process_is_rejected(tmp_path, early):
+    """While it loads, or when it runs for the first time."""
+    write_overflowing_model(tmp_path / "a.onnx", early=early, shape=(1, 3, 24, 48))
+    with pytest.raises(ModelError, match=r"onnxruntime ends the process \(SIGFPE\)"):
+        OnnxSegmenter(tmp_path / "a.onnx", CLASSES, output="boxes").segment(frame(IMAGE))

@@ -235,7 +235,7 @@ def test_an_array_of_class_ids(tmp_path, kind):
         (np.zeros((5, 12, 3), np.uint8), "expected integers"),
         (np.full((5, 12), -1), "contains -1, a class id is at least 0"),
         (np.full((5, 12), 300), "class 300 with divisor 1, expected 0 to 255"),
-        (np.array([[object()]]), "expected integers"),
+        (np.array([[object()]]), "not a readable .npy array"),
     ],
 )
 def test_an_array_that_is_not_a_map_is_refused(tmp_path, values, message):

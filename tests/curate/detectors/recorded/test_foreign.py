@@ -136,7 +136,7 @@ FORMATS = {
     "openpcdet.pkl": (write_openpcdet, {}),
     "mmdetection3d.pkl": (
         write_mmdetection3d,
-        {"classes": CLASSES, "frame_list": "order.txt"},
+        {"classes": CLASSES, "frame_list": "order.txt", "version": "1.x"},
     ),
     "preds": (write_inferencer, {"classes": CLASSES}),
     "nuscenes.json": (write_nuscenes, {}),
@@ -275,15 +275,16 @@ def test_impossible_results_are_reported(tmp_path, change, message):
 def test_numbered_labels_need_class_names(tmp_path):
     """The order of classes is the model's; a wrong order would not be noticed."""
     path = write_mmdetection3d(tmp_path / "a.pkl")
+    declared = {"frame_list": "order.txt", "version": "1.x"}
     with pytest.raises(ConfigError, match=r"set detector\.options\.classes"):
         RecordedDetector(path, frame_list="order.txt")
     with pytest.raises(DataError, match="label 2, but"):
-        RecordedDetector(path, frame_list="order.txt", classes=["Pedestrian", "Cyclist"])
+        RecordedDetector(path, classes=["Pedestrian", "Cyclist"], **declared)
     with pytest.raises(ConfigError, match="frame_list"):
         RecordedDetector(path, classes=CLASSES)
     (tmp_path / "order.txt").write_text("000001\n")
     with pytest.raises(DataError, match="1 frame ids for 2"):
-        RecordedDetector(path, frame_list="order.txt", classes=CLASSES)
+        RecordedDetector(path, classes=CLASSES, **declared)
 
 
 @pytest.mark.parametrize(
@@ -294,7 +295,7 @@ def test_numbered_labels_need_class_names(tmp_path):
         ("a.json", [{"a": 1}], r"entries of an unknown format \(a\)"),
         ("a.json", [3], r"entries of an unknown format \(int\)"),
         ("a.json", [{"boxes_lidar": []}], "no frame_id, name, score"),
-        ("a.feather", [], "not a supported format of detections; expected a .csv or .parquet file"),
+        ("a.xml", [], "not a supported format of detections; expected a .csv or .parquet file"),
     ],
 )
 def test_unsupported_contents_are_rejected(tmp_path, name, content, message):
@@ -593,3 +594,58 @@ def test_result_files_of_drives_are_in_subfolders(tmp_path):
     frames = [f"{drive}_{number:010d}" for number in range(4)]
     detector = RecordedDetector(tmp_path / "results", frame_ids=frames)
     assert [len(detector.predict(frame(name))) for name in frames[1:3]] == [2, 0]
+
+
+def entry_of(**changes):
+    """Return an mmdetection3d entry of a car 4 m long and 2 m wide that points along x, in 1.x."""
+    boxes = [[10.0, 2.0, -1.0, 4.0, 2.0, 1.5, 0.0]]
+    return {"frame_id": "1", "boxes_3d": boxes, "scores_3d": [0.5], "labels_3d": [0]} | changes
+
+
+def mmdetection3d_box(path, entry, **options):
+    """Return the box of the only entry."""
+    path.write_bytes(pickle.dumps([entry]))
+    record = RecordedDetector(path, classes=["Car"], **options)
+    return record.predict(frame("1")).boxes[0].round(9).tolist()
+
+
+def test_the_version_of_mmdetection3d_is_declared_where_the_file_does_not_show_it(tmp_path):
+    """The same numbers are another box in 0.x; the message names both readings."""
+    new, old = [10, 2, -0.25, 4, 2, 1.5, 0], [10, 2, -0.25, 2, 4, 1.5, round(-np.pi / 2, 9)]
+    entry, path = entry_of(), tmp_path / "a.pkl"
+    with pytest.raises(ConfigError, match=r"1\.x \(length, width.* or 0\.x \(width, length.*; set"):
+        mmdetection3d_box(path, entry)
+    assert mmdetection3d_box(path, entry, version="1.x") == new
+    assert mmdetection3d_box(path, entry, version="0.x") == old
+    with pytest.raises(ConfigError, match=r"options\.version '2': use 0\.x or 1\.x"):
+        mmdetection3d_box(path, entry, version="2")
+    numbers = {key: entry[key] for key in ("boxes_3d", "scores_3d", "labels_3d")}
+    renamed = {key: value for key, value in entry.items() if key != "boxes_3d"}
+    for shows_it in (
+        {"frame_id": "1", "pred_instances_3d": numbers},
+        renamed | {"bboxes_3d": entry["boxes_3d"]},
+        entry | {"box_type_3d": "LiDAR"},
+    ):
+        assert mmdetection3d_box(path, shows_it) == new
+        with pytest.raises(ConfigError, match=r"which mmdetection3d 0\.x does not write; remove"):
+            mmdetection3d_box(path, shows_it, version="0.x")
+
+
+def test_boxes_of_openpcdet_before_0_3_are_rejected(tmp_path):
+    """Their sizes begin with the width; the lengths in the camera frame show it."""
+    box = [10.0, 2.0, -1.0, 4.0, 2.0, 1.5, 0.0]
+    entry = {"frame_id": "1", "name": ["Car"], "score": [0.5], "boxes_lidar": np.array([box])}
+    path = tmp_path / "result.pkl"
+    path.write_bytes(pickle.dumps([entry | {"dimensions": np.array([[4.0, 1.5, 2.0]])}]))
+    assert RecordedDetector(path).predict(frame("1")).boxes.tolist() == [box]
+    path.write_bytes(pickle.dumps([entry | {"dimensions": np.array([[2.0, 1.5, 4.0]])}]))
+    with pytest.raises(DataError, match=r"boxes_lidar begin with the width, as in OpenPCDet befo"):
+        RecordedDetector(path)
+
+
+def test_camera_boxes_without_lidar_boxes_are_rejected_with_a_way_out(tmp_path):
+    """As mmdetection3d formats results for KITTI's evaluation."""
+    entry = {"name": ["Car"], "location": [[1, 2, 3]], "rotation_y": [0.1], "score": [0.5]}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps([entry]))
+    with pytest.raises(DataError, match="without boxes_lidar; write them as KITTI result files"):
+        RecordedDetector(tmp_path / "a.pkl")

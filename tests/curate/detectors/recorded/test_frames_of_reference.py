@@ -111,6 +111,45 @@ def write_nuscenes(path: Path, found: Detections, rig: Rig) -> tuple[Path, dict]
     return path.with_suffix(".json"), {}
 
 
+def write_argoverse2(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
+    """Write Feather in the frame of the points, with quaternions and two record batches."""
+    arrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    feather = pytest.importorskip("pyarrow.feather", reason="pyarrow is not installed")
+    x, y, z, w = Rotation.from_euler("z", found.boxes[:, 6:]).as_quat().T
+    names = ("tx_m", "ty_m", "tz_m", "length_m", "width_m", "height_m")
+    table = arrow.table({
+        **dict(zip(names, found.boxes.T, strict=False)),
+        "qw": w, "qx": x, "qy": y, "qz": z, "score": found.scores,
+        "log_id": ["0a8a4cfa"] * len(found),
+        "timestamp_ns": np.full(len(found), int(FRAME)),
+        "category": found.categories.tolist(),
+    })  # fmt: skip
+    feather.write_feather(table, path.with_suffix(".feather"), chunksize=2)
+    return path.with_suffix(".feather"), {"frame_name": "{timestamp_ns:0>6}"}
+
+
+def write_st3d(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
+    """Write class numbers from 1 and scores behind the box, 1.6 m higher, as with SHIFT_COOR."""
+    numbers = [NAMES.index(name) + 1 for name in found.categories]
+    boxes = np.column_stack([np.add(found.boxes, [0, 0, 1.6, 0, 0, 0, 0]), numbers, found.scores])
+    entry = {"gt_boxes": boxes, "cls_scores": None, "iou_scores": None}
+    entry["memory_counter"] = np.zeros(len(found))
+    path.with_suffix(".pkl").write_bytes(pickle.dumps({FRAME: entry}))
+    return path.with_suffix(".pkl"), {"classes": NAMES, "shift": [0.0, 0.0, 1.6]}
+
+
+def write_old_mmdetection3d(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
+    """Write width before length, and a yaw that is 0 along -y and -pi/2 along x."""
+    boxes = [
+        [*box[:2], box[2] - box[5] / 2, box[4], box[3], box[5], -box[6] - np.pi / 2]
+        for box in found.boxes.tolist()
+    ]
+    labels = np.array([NAMES.index(name) for name in found.categories])
+    entry = {"boxes_3d": np.array(boxes), "scores_3d": found.scores, "labels_3d": labels}
+    path.with_suffix(".pkl").write_bytes(pickle.dumps([{"pts_bbox": entry, "frame_id": FRAME}]))
+    return path.with_suffix(".pkl"), {"classes": NAMES, "version": "0.x"}
+
+
 WRITERS: dict[str, Callable[[Path, Detections, Rig], tuple[Path, dict]]] = {
     "csv": write_csv,
     "parquet": write_parquet,
@@ -118,6 +157,9 @@ WRITERS: dict[str, Callable[[Path, Detections, Rig], tuple[Path, dict]]] = {
     "openpcdet": write_openpcdet,
     "mmdetection3d": write_mmdetection3d,
     "nuscenes": write_nuscenes,
+    "argoverse2": write_argoverse2,
+    "st3d": write_st3d,
+    "mmdetection3d 0.x": write_old_mmdetection3d,
 }
 
 
@@ -135,7 +177,7 @@ def assert_equal(one: Detections, other: Detections) -> None:
 
 
 def test_every_format_has_a_writer() -> None:
-    assert set(WRITERS) == set(KINDS)
+    assert {kind.split()[0] for kind in WRITERS} == set(KINDS)
 
 
 @pytest.mark.parametrize("kind", WRITERS)

@@ -10,6 +10,7 @@ import pytest
 
 from curate.detectors.recorded.plain_pickle import read_plain_pickle
 from curate.errors import DataError
+from curate.exporters.folder import write_pickle
 
 HELD = [
     {
@@ -130,3 +131,40 @@ def test_a_damaged_pickle_gives_a_one_line_error(tmp_path, content):
 def test_a_missing_file_is_reported(tmp_path):
     with pytest.raises(DataError, match=r"b\.pkl: no such file"):
         read_plain_pickle(tmp_path / "b.pkl")
+
+
+def test_arrays_of_python_2_are_read(tmp_path):
+    """Python 2 wrote the bytes of arrays and numbers as text, and knew two kinds of text."""
+    content = (
+        b"\x80\x02]q\x01(cnumpy.core.multiarray\n_reconstruct\nq\x02cnumpy\nndarray\nq\x03K\x00\x85"
+        b"U\x01b\x87Rq\x04(K\x01K\x02\x85cnumpy\ndtype\nq\x05U\x02f8K\x00K\x01\x87Rq\x06"
+        b"(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89"
+        b"U\x10" + np.array([1.5, -2.5]).tobytes() + b"tb"
+        b"cnumpy.core.multiarray\nscalar\nh\x06U\x08" + np.float64(0.75).tobytes() + b"\x86R"
+        b"U\x03Care."
+    )
+    (tmp_path / "a.pkl").write_bytes(content)
+    array, number, name = read_plain_pickle(tmp_path / "a.pkl")
+    assert array.tolist() == [1.5, -2.5]
+    assert number == 0.75
+    assert name == "Car"
+
+
+def test_our_own_exports_are_read(tmp_path):
+    """They call numpy.ndarray, which numpy before 2 has under the same name."""
+    write_pickle(tmp_path / "a.pkl", [np.arange(6.0).reshape(2, 3), np.array(["Car", "Van"])])
+    numbers, names = read_plain_pickle(tmp_path / "a.pkl")
+    assert numbers.tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert names.tolist() == ["Car", "Van"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [(10**12, "<f8", b""), ((2,), "O", b"1" * 16), ((1,), "x", b"")]
+)
+def test_an_array_that_is_claimed_is_not_allocated(tmp_path, arguments):
+    """The content decides on the size; references are not read from bytes."""
+    value = Runs(np.ndarray, *arguments)
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps(value, 2))
+    with pytest.raises(DataError):
+        read_plain_pickle(path)
