@@ -16,6 +16,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar, overload
@@ -104,23 +105,26 @@ class FrameNames(Sequence[str]):
             return _only(name, self._numbered.get(int(last), ()))
         return None
 
-    def require(self, name: str, place: object = None) -> str:
+    def require(
+        self, name: str, place: object = None, *, error_type: type[CurateError] = DataError
+    ) -> str:
         """Return the frame with a name.
 
         Args:
             name: the name.
-            place: file and line, for messages.
+            place: file and line, or the option of the command line, for messages.
+            error_type: class of the error.
 
         Raises:
-            DataError: if no frame has it, or several have.
+            CurateError: of class `error_type`, if no frame has it, or several have.
         """
         prefix = "" if place is None else f"{place}: "
         try:
             found = self.find(name)
         except DataError as error:
-            raise DataError(f"{prefix}{error}") from None
+            raise error_type(f"{prefix}{error}") from None
         if found is None:
-            raise DataError(f"{prefix}there is no frame {name[:200]!r}{self.nearest(name)}")
+            raise error_type(f"{prefix}there is no frame {name[:200]!r}{self.nearest(name)}")
         return found
 
     def match(self, names: Iterable[str], place: object) -> tuple[dict[str, str], list[str]]:
@@ -206,12 +210,14 @@ def match_frames(
     return found
 
 
-def files_by_frame(folder: Path, pattern: str, frame_ids: Sequence[str]) -> Mapping[str, Path]:
+def files_by_frame(
+    folder: Path, patterns: str | Sequence[str], frame_ids: Sequence[str]
+) -> Mapping[str, Path]:
     """Return the file of each frame in a folder; files of other frames are left out.
 
     Args:
-        folder: the folder; if no file in it matches the pattern, its subfolders are searched.
-        pattern: of the file names, such as "*.png".
+        folder: the folder; if no file in it matches the patterns, its subfolders are searched.
+        patterns: of the file names in lower case, such as "*.png".
         frame_ids: the ids of all frames; if empty, no file is matched.
 
     Raises:
@@ -220,8 +226,9 @@ def files_by_frame(folder: Path, pattern: str, frame_ids: Sequence[str]) -> Mapp
     """
     if not len(frame_ids):
         return {}
-    paths = list(folder.glob(pattern)) or list(folder.rglob(pattern))
-    by_name = {path.relative_to(folder).as_posix(): path for path in paths if path.name[0] != "."}
+    allowed = (patterns,) if isinstance(patterns, str) else patterns
+    by_name = _matching(folder.iterdir(), allowed, folder)
+    by_name = by_name or _matching(folder.rglob("*"), allowed, folder)
     frames = FrameNames.of(frame_ids)
     found, unmatched = frames.match(by_name, folder)
     if unmatched and not found:
@@ -230,6 +237,15 @@ def files_by_frame(folder: Path, pattern: str, frame_ids: Sequence[str]) -> Mapp
             f"{frames.nearest(unmatched[0])}"
         )
     return {frame: by_name[name] for name, frame in found.items()}
+
+
+def _matching(paths: Iterable[Path], patterns: Sequence[str], folder: Path) -> Mapping[str, Path]:
+    """Return the visible files that match a pattern, by their paths in the folder."""
+    return {
+        path.relative_to(folder).as_posix(): path
+        for path in paths
+        if path.name[0] != "." and any(fnmatchcase(path.name.lower(), each) for each in patterns)
+    }
 
 
 def read_frame_list(
@@ -275,9 +291,10 @@ def match_frame_list(
     for number, line in read_frame_list(path, error_type=error_type):
         for name in [line] if line in frames or line in groups else line.split():
             try:
-                found |= dict.fromkeys(groups.get(name) or [_listed(frames, name, allow_missing)])
+                listed = groups.get(name) or [_listed(frames, name, allow_missing)]
             except DataError as error:
                 raise error_type(f"{path}:{number}: {error}") from None
+            found |= dict.fromkeys(listed)
     return tuple(found)
 
 
@@ -296,10 +313,10 @@ def last_part(name: str) -> str:
 
 def _parts(name: str) -> tuple[list[str], str]:
     """Return the folders of a path of any system, and its last part without suffix."""
-    *folders, last = name.strip().replace("\\", "/").split("/")
-    while len(short := _SUFFIX.sub("", last)) < len(last) and short:
-        last = short
-    return [folder for folder in folders if folder], last
+    folders, _, last = name.strip().replace("\\", "/").rpartition("/")
+    while "." in last and (match := _SUFFIX.search(last)) and match.start():
+        last = last[: match.start()]
+    return [folder for folder in folders.split("/") if folder], last
 
 
 def _unpadded(text: str) -> str:

@@ -82,7 +82,7 @@ class Header:
         try:
             for row in reader:
                 line = first_line - 1 + reader.line_num
-                fields = [field.strip() for field in row]
+                fields = list(map(str.strip, row))
                 while len(fields) > width and not fields[-1]:
                     fields.pop()
                 if not any(fields):
@@ -108,17 +108,14 @@ def read_csv(path: Path, columns: Sequence[str]) -> Iterator[tuple[int, tuple[st
         yield line, tuple(row[place] for place in places)
 
 
-def parse_number(text: str) -> float:
-    """Return a number of a CSV file.
-
-    Raises:
-        ValueError: if the text is not a number; the message says what to do.
-    """
+def number_problem(text: str) -> str | None:
+    """Return what is wrong with a field that must be a number, and what to do, or None."""
     try:
-        return float(text)
+        float(text)
     except ValueError:
         hint = "; write a decimal point" if "," in text else ""
-        raise ValueError(f"{text[:40]!r} is not a number{hint}") from None
+        return f"{text[:40]!r} is not a number{hint}"
+    return None
 
 
 def open_lines(path: Path) -> Iterator[str]:

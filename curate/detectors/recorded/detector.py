@@ -217,7 +217,8 @@ class RecordedDetector:
         """
         names = list(self._record.frame_ids())
         if not len(frames):
-            return {name: last_part(name) for name in names}
+            parts = {name: last_part(name) for name in names}
+            return parts if len({*parts.values()}) == len(names) else {name: name for name in names}
         found, unmatched = frames.match(names, self.path)
         examples = ", ".join(unmatched[:3]) + (", ..." if len(unmatched) > 3 else "")
         if unmatched and not found:

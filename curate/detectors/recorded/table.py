@@ -25,7 +25,7 @@ from curate.detectors.recorded.results import invalid_rows
 from curate.detectors.scores import describe_invalid_scores
 from curate.errors import DataError, one_line
 from curate.files.batches import batched
-from curate.files.csv_text import Header, parse_number
+from curate.files.csv_text import Header, number_problem
 from curate.files.text import check_not_utf16
 from curate.geometry.similarity import Similarity, wrap_angle
 
@@ -270,9 +270,10 @@ def _numbers(
     numbers = np.empty((len(rows), len(_NUMBERS)))
     for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
         try:
-            numbers[index] = [parse_number(field) for field in row[2:]]
-        except ValueError as error:
-            raise DataError(f"{path}:{line}: {error}") from None
+            numbers[index] = [float(field) for field in row[2:]]
+        except ValueError:
+            problem = next(filter(None, map(number_problem, row[2:])))
+            raise DataError(f"{path}:{line}: {problem}") from None
     _check_values(path, lines, numbers, sigmoid)
     return numbers
 
