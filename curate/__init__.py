@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
     from curate.evaluation.kitti_folders import evaluate_folders, read_folders
     from curate.exporters.data_frames import read_labels
-    from curate.frames import Calibration, Frame
+    from curate.frames import Calibration, Camera, Frame
     from curate.geometry.boxes import bev_corners, box_corners
     from curate.geometry.nms import nms_bev
     from curate.geometry.overlap import bev_iou, iou_3d
@@ -74,6 +74,7 @@ __all__ = [
     "Annotations",
     "Baseline",
     "Calibration",
+    "Camera",
     "ConfigError",
     "CurateError",
     "DataError",
@@ -132,7 +133,7 @@ __all__ = [
 PUBLIC_MODULES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "Data": {
         "curate.detections": ("CATEGORIES", "Detections", "Annotations"),
-        "curate.frames": ("Frame", "Calibration"),
+        "curate.frames": ("Frame", "Camera", "Calibration"),
         "curate.datasets.kitti.dataset": ("KittiDataset",),
         "curate.datasets.kitti.raw": ("KittiRawDataset",),
         "curate.datasets.folder": ("FolderDataset",),

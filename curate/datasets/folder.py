@@ -31,7 +31,7 @@ lidar_to_camera = [[...], [...], [...]]
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -69,7 +69,7 @@ class _CameraTable:
     """The part of dataset.toml that describes one camera.
 
     Attributes:
-        name: name of the camera; "" for the only one.
+        name: name of the camera; "" without a table [cameras.NAME].
         images: its images; None if there are none.
         image_size: (width, height) in pixels of a camera without images; None if it has images.
         calibration: path of a file in KITTI's format or of a folder with a file FRAME.txt for each
@@ -214,7 +214,8 @@ class FolderDataset:
         size, content = read_optional_image(image, table.image_size, pixels=pixels)
         if size is None:
             raise DataError(f"{self._path}: the camera of frame {frame_id} has no image size")
-        return Camera(table.name, self._calibration(table.name, frame_id), size, content)
+        name = table.name if len(self._cameras) > 1 else ""
+        return Camera(name, self._calibration(table.name, frame_id), size, content)
 
     def annotations(self, frame_id: str) -> Annotations:
         """Return the frame's ground truth in the LiDAR frame.
@@ -340,7 +341,7 @@ def _cameras(path: Path, description: Mapping[str, Any]) -> Sequence[_CameraTabl
             f"{path}: cameras {', '.join(with_images)} have images, the others only an image_size; "
             "give images for all cameras, or for none"
         )
-    return cameras if len(cameras) > 1 else [replace(cameras[0], name="")]
+    return cameras
 
 
 def _camera_table(path: Path, name: str, table: Mapping[str, Any]) -> _CameraTable:

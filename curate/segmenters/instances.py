@@ -4,6 +4,7 @@ Source: COCO's data format: annotations `{images, annotations}`, a list of resul
 per frame. Where masks overlap, the mask with the higher score is on top.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -144,9 +145,11 @@ def _by_frame(
         ) from None
     if len(found) < len(names):
         raise DataError(f"{path}: two images have the same file_name; remove one")
-    several = any(Path(name).parent.name == camera for name in found) if camera else False
-    if several:
+    stems = Counter(map(last_part, found))
+    if camera and any(Path(name).parent.name == camera for name in found):
         found = {name: each for name, each in found.items() if Path(name).parent.name == camera}
+    else:  # of one camera, or not told apart by folders
+        found = {name: each for name, each in found.items() if stems[last_part(name)] == 1}
     if not len(frame_ids):
         return {last_part(name): objects for name, objects in found.items()}
     matched, unmatched = frame_ids.match(found, path)

@@ -54,7 +54,7 @@ class SavedSegmenter:
             raise DataError(f"{self.directory}: no such folder of semantic maps")
         self._frame_ids = frame_ids
         self._found: dict[str, Mapping[str, Path]] = {}
-        if next(self.directory.glob("*.png"), None):
+        if any(path.suffix.lower() == ".png" for path in self.directory.iterdir()):
             self._maps("")
 
     def _maps(self, camera: str) -> Mapping[str, Path]:

@@ -60,7 +60,7 @@ def paint_frame(frame: Frame, shown: FrameContent, kind: ImageFormat = "png") ->
     canvas = kind_of_canvas(width, above + below, shown.style.background)
     top = 0
     for camera, image, (_, height) in zip(cameras, images, sizes, strict=True):
-        title = " ".join(filter(None, (shown.title if top == 0 else "", camera.name)))
+        title = ", ".join(filter(None, (shown.title if top == 0 else "", camera.name)))
         part = canvas.part(top, height)
         paint_overlay(part, image, camera.calibration, replace(shown, title=title))
         top += height

@@ -85,7 +85,7 @@ def _swatch(
 ) -> np.ndarray:
     """Draw an outline and return its (4, 2) corners."""
     corners = np.array([[0, -10], [20, -10], [20, 1], [0, 1]])
-    outline = corners + np.array(place)
+    outline: np.ndarray = corners + np.array(place)
     if pattern is None:
         canvas.lines(outline, colour, 1.5, closed=True)
     else:

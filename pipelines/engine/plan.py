@@ -119,8 +119,10 @@ class Plan:
     @cached_property
     def _sources(self) -> dict[str, str]:
         """The fingerprints of the inputs that no stage of the round writes."""
+        dataset = self.workspace.config.dataset
+        cameras = dataset.options.get("cameras")
         return {
-            "frame": self.workspace.config.dataset.kind,
+            "frame": dataset.kind if cameras is None else f"{dataset.kind} {cameras}",
             "ground_truth": digest(sorted(self.workspace.frames("labeled"))),
             "teacher": self.context.teacher.sha256,
         }

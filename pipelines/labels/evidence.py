@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import FromClause, Select, and_, select
+from sqlalchemy import Float, FromClause, Select, and_, select, type_coerce
 
 from curate.detections import Columns, empty_boxes
 from curate.errors import WorkspaceError
@@ -115,7 +115,11 @@ def _aligned(round_number: int, tables: Mapping[str, str]) -> Select[Any]:
         if table is not label:
             same = and_(*(table.c[key] == label.c[key] for key in ("round", "frame_id", "k")))
             joined = joined.outerjoin(table, same)
-    columns = [bulk.table(table).c[name] for name, table in tables.items()]
+    # As floats, because integers cannot be null in an array.
+    columns = [
+        type_coerce(bulk.table(table).c[name], Float()).label(name)
+        for name, table in tables.items()
+    ]
     return (
         select(label.c.frame_id, label.c.k, label.c.category, *columns)
         .select_from(joined)

@@ -114,8 +114,13 @@ def prepare_stage(workspace: Workspace, source: Source) -> None:
 
 def _has_cameras(workspace: Workspace) -> bool:
     """Return whether the frames have several cameras."""
-    frames = workspace.dataset.frame_ids()
-    return len(workspace.dataset.read(frames[0], points=False).cameras) > 1
+    dataset = workspace.dataset
+    first = next(iter(dataset.frame_ids()), None)
+    if first is None:
+        return False
+    images = dataset.files(first).images
+    # A damaged image must fail its own frame, not the stage: only the paths are looked at.
+    return len(images or dataset.read(first, points=False).cameras) > 1
 
 
 def prepare_table(workspace: Workspace, source: Source) -> None:

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 
 from curate.datasets.base import Dataset, Incomplete
-from curate.errors import ConfigError
+from curate.errors import ConfigError, DataError
 from pipelines import registry
 from pipelines.workspace.config import Config
 
@@ -49,13 +49,21 @@ def why_not_segmented(config: Config, dataset: Dataset) -> str:
     first = next(iter(dataset.frame_ids()), None)
     if first is None or dataset.files(first).images:
         return ""
-    if not dataset.read(first, points=False).cameras:
+    if not _has_camera(dataset, first):
         return "the data set has no camera, so the semantic prior cannot be computed"
     name = "onnx" if config.segmenter.name == "simulated" else config.segmenter.name
     reads_images = name != "none" and getattr(registry.SEGMENTERS.load(name), "needs_image", True)
     if reads_images:
         return f"the data set has no images, which segmenter '{config.segmenter.name}' needs"
     return ""
+
+
+def _has_camera(dataset: Dataset, frame: str) -> bool:
+    """Return whether a frame has a camera; a damaged frame, which fails later, counts as one."""
+    try:
+        return bool(dataset.read(frame, points=False).cameras)
+    except DataError:
+        return True
 
 
 def report_images(config: Config, dataset: Dataset, frames: Sequence[str]) -> None:
@@ -76,7 +84,7 @@ def report_images(config: Config, dataset: Dataset, frames: Sequence[str]) -> No
     if images[frames[0]]:
         return
     pictures = "pictures show the bird's eye view alone"
-    if dataset.read(frames[0], points=False).cameras:
+    if _has_camera(dataset, frames[0]):
         _log.warning("%s: no images: %s", config.dataset.root, pictures)
         return
     crop = ""

@@ -60,6 +60,17 @@ MOUNTED = (
     Mounted("CAM_FRONT", (1.7, 0.0, 1.5), Rotation.from_euler("z", 1.5, degrees=True) * FORWARD),
     Mounted("CAM_BACK", (0.0, 0.1, 1.6), Rotation.from_euler("z", 179, degrees=True) * FORWARD),
 )
+# The angles of nuScenes' other cameras, to the left of the front.
+SIDES = tuple(
+    Mounted(
+        f"CAM_{name}",
+        (1.0, 0.0, 1.5),
+        Rotation.from_euler("z", degrees, degrees=True) * FORWARD,
+    )
+    for name, degrees in (
+        ("FRONT_LEFT", 55), ("FRONT_RIGHT", -55), ("BACK_LEFT", 110), ("BACK_RIGHT", -110),
+    )
+)  # fmt: skip
 
 
 def scalar_first(turn: Rotation) -> list[float]:
@@ -143,11 +154,13 @@ def write_nuscenes(
     scenes: tuple[str, ...] = ("scene-0061", "scene-0103"),
     steps: int = 2,
     version: str = "v1.0-mini",
+    *,
+    mounted: tuple[Mounted, ...] = MOUNTED,
 ) -> None:
     """Write two scenes of two key frames each, with sweeps between them, in nuScenes' layout."""
     tables: dict[str, list[dict]] = {
         "attribute": [{"token": token("moving"), "name": "vehicle.moving", "description": ""}],
-        "calibrated_sensor": [each.record() for each in MOUNTED],
+        "calibrated_sensor": [each.record() for each in mounted],
         "category": [
             {"token": token("category", name), "name": name, "description": ""} for name in OBJECTS
         ],
@@ -159,7 +172,7 @@ def write_nuscenes(
                 "channel": each.channel,
                 "modality": "lidar" if each.channel == "LIDAR_TOP" else "camera",
             }
-            for each in MOUNTED
+            for each in mounted
         ],
         "visibility": [
             {"token": str(i), "level": level, "description": ""}
@@ -167,7 +180,7 @@ def write_nuscenes(
         ],
     }  # fmt: skip
     for number, name in enumerate(scenes):
-        _add_scene(root, tables, number, name, steps)
+        _add_scene(root, tables, number, name, steps, mounted)
     (root / version).mkdir(parents=True)
     for table, records in tables.items():
         (root / version / f"{table}.json").write_text(json.dumps(records, indent=0))
@@ -178,7 +191,9 @@ def sample_token(scene: str, step: int) -> str:
     return token("sample", scene, step)
 
 
-def _add_scene(root: Path, tables: dict, number: int, name: str, steps: int) -> None:
+def _add_scene(
+    root: Path, tables: dict, number: int, name: str, steps: int, mounted: tuple[Mounted, ...]
+) -> None:
     log = token("log", name)
     tables["log"].append(
         {"token": log, "logfile": name, "vehicle": "n008", "date_captured": "2018-08-01",
@@ -206,13 +221,15 @@ def _add_scene(root: Path, tables: dict, number: int, name: str, steps: int) -> 
              "scene_token": token("scene", name), "prev": samples[step - 1] if step else "",
              "next": samples[step + 1] if step + 1 < steps else ""}
         )  # fmt: skip
-        _add_sensor_data(root, tables, number, name, step)
+        _add_sensor_data(root, tables, number, name, step, mounted)
         _add_annotations(tables, number, name, step, steps)
 
 
-def _add_sensor_data(root: Path, tables: dict, number: int, name: str, step: int) -> None:
+def _add_sensor_data(
+    root: Path, tables: dict, number: int, name: str, step: int, mounted: tuple[Mounted, ...]
+) -> None:
     sample = sample_token(name, step)
-    for each in MOUNTED:
+    for each in mounted:
         for key in (True, False):
             is_lidar = each.channel == "LIDAR_TOP"
             folder = f"{'samples' if key else 'sweeps'}/{each.channel}"

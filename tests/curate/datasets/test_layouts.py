@@ -14,7 +14,7 @@ from curate.datasets.formats.point_layout import PointLayout
 from curate.datasets.kitti.calibration import read_calibration, read_raw_calibration
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.datasets.kitti.raw import KittiRawDataset
-from curate.errors import DataError
+from curate.errors import ConfigError, DataError
 
 LAYOUTS = {
     "raw": (write_toy_raw, KittiRawDataset, f"{DRIVE}_0000"),
@@ -171,3 +171,96 @@ def test_real_frames_in_a_plain_folder(kitti_root: Path, tmp_path: Path):
     )
     np.testing.assert_array_equal(found.points, expected.points)
     assert found.image_size == expected.image_size
+
+
+def with_cameras(root: Path, text: str) -> FolderDataset:
+    """Write a toy folder with another description of its cameras."""
+    write_toy_folder(root)
+    shutil.copytree(root / "camera", root / "rear")
+    head = 'points = "lidar"\nlabels = "boxes"\nintensity_scale = 255\n'
+    (root / "dataset.toml").write_text(head + text)
+    return FolderDataset(root)
+
+
+MATRICES = (
+    "projection = [[60.0, 0, 60, 0], [0, 60, 20, 0], [0, 0, 1, 0]]\n"
+    "lidar_to_camera = [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]\n"
+)
+FRONT = f'[cameras.front]\nimages = "camera"\n[cameras.front.calibration]\n{MATRICES}'
+REAR = f'[cameras.rear]\nimages = "rear"\n[cameras.rear.calibration]\n{MATRICES}'
+
+
+def test_a_folder_may_have_several_cameras(tmp_path):
+    """Each with image, calibration and name; the labels are in the frame of the first."""
+    dataset = with_cameras(tmp_path, FRONT + REAR)
+    frame = dataset.read("000001", image=True)
+    assert [camera.name for camera in frame.cameras] == ["front", "rear"]
+    assert all(camera.image is not None for camera in frame.cameras)
+    assert [path.parent.name for path in dataset.files("000001").images] == ["camera", "rear"]
+    single = with_cameras(tmp_path / "one", FRONT)
+    assert single.read("000001").camera == ""
+    assert len(dataset.annotations("000001")) == len(single.annotations("000001")) == 3
+    (tmp_path / "rear" / "000001.png").unlink()
+    with pytest.raises(DataError, match=r"rear/000001\.png: no such image file"):
+        dataset.read("000001")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f'images = "camera"\n{FRONT}', r"both images and \[cameras\.NAME\]; move images"),
+        ("[cameras]\n", r"cameras must be tables \[cameras\.NAME\]"),
+        ("cameras = 3\n", r"cameras must be tables \[cameras\.NAME\]"),
+        ("[cameras]\nfront = 3\n", r"cameras\.front is not a table"),
+        (FRONT.replace("images", "imgs"), r"unknown key cameras\.front\.imgs; did you mean 'im"),
+        ('[cameras.front]\nimages = "camera"\n', r"no key cameras\.front\.calibration"),
+        (
+            FRONT + REAR.replace('images = "rear"', "image_size = [120, 40]"),
+            "cameras front have images, the others only an image_size",
+        ),
+        (FRONT.replace("[[60.0,", "[["), r"cameras\.front\.calibration\.projection must be 3 x 4"),
+        (FRONT.replace('images = "camera"\n', ""), "neither are set"),
+        (FRONT.replace("front", '"../front"'), r"'\.\./front' is not a frame id"),
+    ],
+)
+def test_a_wrong_camera_gives_a_one_line_error(tmp_path, text, message):
+    """It contains the file and the key."""
+    with pytest.raises(DataError, match=message) as caught:
+        with_cameras(tmp_path, text).read("000001")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_without_camera_needs_a_calibration_only_for_labels(tmp_path):
+    """Labels in KITTI's form are in a camera's frame of reference."""
+    write_toy_folder(tmp_path)
+    path = tmp_path / "dataset.toml"
+    path.write_text('points = "lidar"\nintensity_scale = 255\n')
+    dataset = FolderDataset(tmp_path)
+    frame = dataset.read("000001", image=True)
+    assert (frame.cameras, frame.image_size, frame.image) == ((), None, None)
+    assert dataset.files("000001").image is None
+    path.write_text('points = "lidar"\nlabels = "boxes"\n')
+    with pytest.raises(DataError, match="no key calibration"):
+        FolderDataset(tmp_path)
+
+
+def test_kittis_layout_without_images_has_no_camera(tmp_path):
+    """An image_2 without images is the same as none; a size can be declared."""
+    write_toy_kitti(tmp_path, frames=2)
+    expected = KittiDataset(tmp_path).annotations("000000")
+    for path in (tmp_path / "training" / "image_2").iterdir():
+        path.unlink()
+    for bare in (True, False):
+        dataset = KittiDataset(tmp_path)
+        assert dataset.files("000000").images == ()
+        assert dataset.read("000000", image=True).cameras == ()
+        np.testing.assert_array_equal(dataset.annotations("000000").boxes, expected.boxes)
+        if bare:
+            (tmp_path / "training" / "image_2").rmdir()
+    sized = KittiDataset(tmp_path, image_size=[120, 40]).read("000000")
+    assert sized.image_size == (120, 40)
+    for wrong in ([120], [120, 0], "large", [1.5, 2]):
+        with pytest.raises(
+            ConfigError, match=r"image_size is .* expected \[width, height\] in pix"
+        ):
+            KittiDataset(tmp_path, image_size=wrong)

@@ -1,12 +1,16 @@
 """Weighted labels as COCO annotations."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.exported import SCORES, WEIGHTS, toy_labels
+from support.exported import SCORES, WEIGHTS, toy_frame, toy_labels
+from support.toys import toy_calibration
 
+from curate.errors import ConfigError
 from curate.exporters.coco import CocoExporter
+from curate.frames import Camera
 
 
 def written(path, labels):
@@ -70,3 +74,41 @@ def test_weights_and_scores_are_stored_and_weight_0_is_a_crowd(document):
     assert [each["iscrowd"] for each in labels] == [0, 1, 1]
     assert labels[2]["bbox"] == [0, 0, 0, 0]
     assert np.all([each["area"] > 0 for each in labels[:2]])
+
+
+def test_every_camera_has_an_image_with_the_labels_that_it_shows(tmp_path):
+    """A label outside all images is with the first one, so that no label is lost."""
+    labels = toy_labels(zero_weight="ignore")
+    turned = toy_calibration().lidar_to_camera @ np.diag([-1.0, -1, 1, 1])
+
+    def read(name):
+        frame = toy_frame(name)
+        back = Camera("back", replace(frame.calibration, lidar_to_camera=turned), (120, 40))
+        return frame.with_cameras([Camera("front", frame.calibration, (120, 40)), back])
+
+    frames = [replace(each, further_images=(f"back/{each.frame}.png",)) for each in labels.frames]
+    document = written(tmp_path / "a.json", replace(labels, frames=frames, read=read))
+    assert [(image["camera"], image["file_name"]) for image in document["images"]] == [
+        ("front", "image_2/000000.png"), ("back", "back/000000.png"),
+        ("front", "image_2/000001.png"), ("back", "back/000001.png"),
+    ]  # fmt: skip
+    one = written(tmp_path / "b.json", labels)
+    camera_of = {image["id"]: image["camera"] for image in document["images"]}
+    front = [each for each in document["annotations"] if camera_of[each["image_id"]] == "front"]
+    seen = [each["bbox"] for each in one["annotations"] if each["area"] > 0]
+    assert [each["bbox"] for each in front] == seen
+    assert len(seen) < len(one["annotations"]) == len(document["annotations"])
+    assert all(
+        each["area"] > 0
+        for each in document["annotations"]
+        if camera_of[each["image_id"]] == "back"
+    )
+
+
+def test_a_data_set_without_images_is_rejected(tmp_path):
+    """The message names a frame and other formats; nothing is written."""
+    labels = toy_labels()
+    frames = [replace(each, image=None) for each in labels.frames]
+    with pytest.raises(ConfigError, match="frame 000000: COCO's annotations need images"):
+        CocoExporter().write(tmp_path / "a.json", replace(labels, frames=frames))
+    assert not (tmp_path / "a.json").exists()

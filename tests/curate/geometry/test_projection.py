@@ -1,14 +1,24 @@
 """Projection into the image: by hand, at the near plane, and on real KITTI frames."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 from support.strategies import box_arrays
 
 from curate.datasets.kitti.dataset import KittiDataset
-from curate.frames import Calibration
+from curate.frames import Calibration, Camera, Frame, calibration_without_camera
 from curate.geometry.boxes import box_corners
-from curate.geometry.projection import image_rectangles, in_view, project_points
+from curate.geometry.projection import (
+    box_rectangles,
+    camera_of_boxes,
+    image_rectangles,
+    in_camera_view,
+    in_view,
+    project_points,
+)
 
 # A camera at the LiDAR's position that looks along x: focal length 100, centre (50, 40).
 CAMERA = Calibration(
@@ -161,3 +171,87 @@ def rectangle_iou(a, b):
         return 0.0
     common = width * height
     return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
+
+
+def camera(name: str, degrees: float, size=(200, 100)) -> Camera:
+    """Return a camera at the LiDAR with a view of 90 degrees, turned to the left by an angle."""
+    turn = np.eye(4)
+    angle = np.radians(degrees)
+    turn[:2, :2] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    projection = np.array([[100.0, 0, 100, 0], [0, 100, 50, 0], [0, 0, 1, 0]])
+    ahead = calibration_without_camera().lidar_to_camera
+    return Camera(name, Calibration(projection, ahead @ turn), size)
+
+
+AROUND = [camera("front", 0), camera("left", 90), camera("back", 180), camera("right", -90)]
+
+
+def test_a_box_is_assigned_to_the_camera_that_shows_most_of_it():
+    """One that straddles a border, too; -1 for a box that no camera shows."""
+    angles = np.radians([0, 90, 180, -90, 40, 50, -130, 44.9, 45.1])
+    boxes = np.tile([0, 0, 0, 4, 1.8, 1.5, 0.3], (len(angles), 1))
+    boxes[:, 0], boxes[:, 1] = 12 * np.cos(angles), 12 * np.sin(angles)
+    assert camera_of_boxes(boxes, AROUND).tolist() == [0, 1, 2, 3, 0, 1, 3, 0, 1]
+    above = boxes[:1] + np.eye(7)[2] * 60
+    assert camera_of_boxes(above, AROUND).tolist() == [-1]
+    assert camera_of_boxes(boxes, ()).tolist() == [-1] * len(boxes)
+    front = camera_of_boxes(boxes, AROUND[:1])
+    seen = ~np.isnan(image_rectangles(boxes, AROUND[0].calibration, AROUND[0].image_size))
+    np.testing.assert_array_equal(front >= 0, seen.all(axis=1))
+
+
+def test_of_two_cameras_that_show_the_whole_box_the_closer_one_counts():
+    """The one with the longer focal length has more pixels of it."""
+    wide = camera("wide", 0)
+    scale = np.diag([2.0, 2, 1])
+    tele = Camera("tele", replace(wide.calibration, projection=scale @ wide.calibration.projection),
+                  (400, 200))  # fmt: skip
+    boxes = np.array([[20.0, 1, 0, 4, 1.8, 1.5, 0]])
+    assert camera_of_boxes(boxes, [wide, tele]).tolist() == [1]
+    assert camera_of_boxes(boxes, [tele, wide]).tolist() == [0]
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=30)
+def test_the_chosen_camera_contains_most_sampled_points_of_the_box(seed):
+    """Compared with random points inside the box."""
+    rng = np.random.default_rng(seed)
+    box = np.array([*rng.uniform(-20, 20, 2), rng.uniform(-2, 2), *rng.uniform(0.5, 6, 3),
+                    rng.uniform(-3, 3)])  # fmt: skip
+    places = rng.uniform(-0.5, 0.5, (4000, 3)) * box[3:6]
+    cos, sin = np.cos(box[6]), np.sin(box[6])
+    places[:, :2] = places[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+    shares = [in_view(places + box[:3], c.calibration, c.image_size).mean() for c in AROUND]
+    [chosen] = camera_of_boxes(box[None], AROUND)
+    assert shares[chosen] >= max(shares) - 0.08 or max(shares) == 0
+
+
+def test_the_view_of_several_cameras_is_their_union():
+    """Without a camera, every point is kept."""
+    points = np.random.default_rng(0).uniform(-20, 20, (500, 4)).astype(np.float32)
+    alone = Frame("a", points, calibration_without_camera(), None)
+    assert in_camera_view(alone).all()
+    assert alone.cameras == ()
+    both = alone.with_cameras(AROUND[:2])
+    expected = [in_view(points, each.calibration, each.image_size) for each in AROUND[:2]]
+    np.testing.assert_array_equal(in_camera_view(both), expected[0] | expected[1])
+    assert [view.camera for view in both.views()] == ["front", "left"]
+    assert all(len(view.cameras) == 1 for view in both.views())
+    boxes = np.array(
+        [[12.0, 0, 0, 4, 2, 1.5, 0], [0, 12, 0, 4, 2, 1.5, 0], [-12, 0, 0, 4, 2, 1, 0]]
+    )
+    rectangles = box_rectangles(boxes, both)
+    for i in (0, 1):
+        own = image_rectangles(boxes[i : i + 1], AROUND[i].calibration, (200, 100))[0]
+        np.testing.assert_array_equal(rectangles[i], own)
+    assert np.isnan(rectangles[2]).all()
+
+
+def test_without_an_image_nothing_is_clipped():
+    """The rectangle of a box beyond the border is that of a larger image."""
+    calibration = AROUND[0].calibration
+    boxes = np.array([[10.0, 14, 0, 4, 2, 1.5, 0], [-10, 0, 0, 4, 2, 1.5, 0]])
+    found = image_rectangles(boxes, calibration, None)
+    assert np.isnan(image_rectangles(boxes, calibration, (200, 100))).all()
+    assert found[0, 0] < 0
+    assert np.isnan(found[1]).all()

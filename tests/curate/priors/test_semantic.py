@@ -10,7 +10,8 @@ from oracles import pixels
 
 from curate.detections import Detections, as_categories
 from curate.errors import ConfigError, ModelError
-from curate.frames import Calibration, Frame
+from curate.frames import Calibration, Camera, Frame
+from curate.priors.base import check_evidence
 from curate.priors.semantic import (
     SemanticPrior,
     SemanticSettings,
@@ -181,3 +182,96 @@ def test_unknown_options_are_rejected(wrong):
     """The error lists the known ones."""
     with pytest.raises(ConfigError, match=r"choose one of"):
         SemanticSettings(**wrong)
+
+
+def several():
+    """Return a frame with the camera above and one that looks back, with other pixels."""
+    turned = CALIBRATION.lidar_to_camera @ np.diag([-1.0, -1, 1, 1])
+    cameras = [
+        Camera("front", CALIBRATION, (WIDTH, HEIGHT)),
+        Camera("back", Calibration(CALIBRATION.projection, turned), (WIDTH, HEIGHT)),
+    ]
+    return frame().with_cameras(cameras)
+
+
+@dataclass(frozen=True)
+class PaintedByCamera:
+    """A segmenter that returns the map of each camera, and records which it was asked for."""
+
+    maps: dict
+    asked: list
+    needs_image: bool = False
+
+    def segment(self, view):
+        """Return the map of the frame's only camera."""
+        assert len(view.cameras) == 1
+        self.asked.append(view.camera)
+        return SemanticMap(self.maps[view.camera], CLASSES)
+
+
+def test_a_label_counts_the_pixels_of_the_camera_that_shows_it():
+    """Labels of every direction have image evidence; the name of the camera is stored."""
+    front, back = np.zeros((2, HEIGHT, WIDTH), np.uint8)
+    front[:], back[:, :40] = 7, 7
+    segmenter = PaintedByCamera({"front": front, "back": back}, [])
+    above = [0.0, 0.0, 50.0, 2.0, 4.0, 2.0, 0.0]
+    detections = labels([AHEAD, BEHIND, above], [0.81, 0.81, 0.6])
+    found = SemanticPrior(segmenter).score(several(), detections)
+    assert list(found) == ["mask_pixels", "box_pixels", "camera", "rho_anno"]
+    assert found["camera"].tolist() == ["front", "back", None]
+    one = SemanticPrior(Painted(front)).score(frame(), labels([AHEAD], [0.81]))
+    for name in ("mask_pixels", "box_pixels", "rho_anno"):
+        assert found[name][0] == one[name][0]
+    assert found["box_pixels"][1] == found["box_pixels"][0]
+    assert 0 < found["mask_pixels"][1] < found["box_pixels"][1]
+    assert found["box_pixels"][2] == 0
+    stored = check_evidence(SemanticPrior(segmenter), found, 3)
+    assert stored["camera"] == ["front", "back", None]
+    again = SemanticPrior(None).rate(detections, {k: found[k] for k in list(found)[:3]})
+    np.testing.assert_array_equal(again["rho_anno"], found["rho_anno"])
+
+
+def test_only_images_that_count_for_a_label_are_segmented():
+    """Six images need six times as long."""
+    segmenter = PaintedByCamera({"back": np.zeros((HEIGHT, WIDTH), np.uint8)}, [])
+    SemanticPrior(segmenter).measure(several(), labels([BEHIND], [0.5]))
+    assert segmenter.asked == ["back"]
+
+
+def test_a_frame_without_camera_is_rejected():
+    """The message says which setting to change."""
+    alone = Frame("000007", np.zeros((0, 4), np.float32), CALIBRATION, None)
+    with pytest.raises(ConfigError, match=r"000007 has no camera.*leave 'semantic' out"):
+        SemanticPrior(Painted(np.zeros((1, 1)))).measure(alone, labels([AHEAD], [0.5]))
+
+
+@pytest.mark.parametrize(
+    ("outside", "rho", "rule"),
+    [
+        ("expected", 0.7 * 0.64, "rho_anno = 0.7 s^2 with s = 0.8000"),
+        ("neutral", 0.8, "rho_anno = s with s = 0.8000"),
+        ("drop", 0.0, "rho_anno = 0 with s = 0.8000"),
+    ],
+)
+def test_the_rule_for_a_label_outside_the_image_is_explained(outside, rho, rule):
+    """Never as a share of no pixels."""
+    prior = SemanticPrior(None, SemanticSettings(outside=outside))
+    nothing = {"mask_pixels": np.zeros(1, int), "box_pixels": np.zeros(1, int)}
+    found = prior.rate(labels([BEHIND], [0.8]), nothing)
+    np.testing.assert_allclose(found["rho_anno"], [rho])
+    row = {"score": "0.8000", "mask_pixels": 0, "box_pixels": 0, "rho_anno": f"{rho:.4f}"}
+    text = prior.describe(row)
+    assert rule in text
+    assert "S/A" not in text
+    seen = prior.describe(row | {"mask_pixels": 4, "box_pixels": 9, "camera": "back"})
+    assert seen.startswith("camera back: Eq. 9: rho_anno = sqrt(s S/A)")
+
+
+@given(st.floats(0, 1), st.integers(1, 500), st.integers(0, 500))
+def test_a_label_that_no_camera_shows_is_worth_less_than_a_confirmed_one(score, area, mask):
+    """Than one of the same score with the expected share of class pixels."""
+    mask = min(mask, area)
+    scores = np.array([score, score])
+    unseen, seen = semantic_trust(scores, np.array([0, mask]), np.array([0, area]))
+    assert 0 <= unseen <= 0.7
+    assert unseen <= seen or mask / area < 0.7

@@ -1,6 +1,7 @@
 """Instance masks in COCO's JSON as semantic maps, and the semantic prior on them."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,3 +163,34 @@ def test_a_folder_of_masks_is_matched_with_frames(tmp_path: Path) -> None:
     save(tmp_path / "7.json", [CAR, PERSON])
     found = InstanceSegmenter(tmp_path, COCO, frame_ids=("000006", "000007")).segment(FRAME)
     np.testing.assert_array_equal(found.class_ids, expected())
+
+
+@pytest.mark.parametrize("form", ["document", "results", "folder"])
+def test_masks_of_several_cameras_are_told_apart_by_their_file_names(
+    tmp_path: Path, form: str
+) -> None:
+    """CAMERA/FRAME; a frame with one camera does not get the masks of all."""
+    if form == "document":
+        images = [
+            {"id": 1, "file_name": "samples/front/000007.jpg"},
+            {"id": 2, "file_name": "samples/back/000007.jpg"},
+        ]
+        path = save(
+            tmp_path / "a.json",
+            {"images": images, "annotations": [CAR | {"image_id": 1}, PERSON | {"image_id": 2}]},
+        )
+    elif form == "results":
+        objects = [CAR | {"image_id": "front/000007"}, PERSON | {"image_id": "back/000007"}]
+        path = save(tmp_path / "a.json", objects)
+    else:
+        path = tmp_path / "masks"
+        for camera, each in (("front", CAR), ("back", PERSON)):
+            (path / camera).mkdir(parents=True)
+            save(path / camera / "000007.json", [each])
+    segmenter = InstanceSegmenter(path, COCO)
+    front = segmenter.segment(replace(FRAME, camera="front")).class_ids
+    back = segmenter.segment(replace(FRAME, camera="back")).class_ids
+    assert (3 in front, 1 in front) == (True, False)
+    assert (3 in back, 1 in back) == (False, True)
+    with pytest.raises(DataError):
+        segmenter.segment(FRAME)

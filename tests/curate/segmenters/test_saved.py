@@ -1,11 +1,13 @@
 """Saved semantic maps."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from support.toys import toy_calibration
 
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, ModelError
 from curate.frames import Frame
 from curate.segmenters.classes import class_map
 from curate.segmenters.saved import SavedSegmenter
@@ -116,3 +118,17 @@ def test_maps_of_no_frame_are_rejected(tmp_path):
     message = r"such as '000001\.png'; the nearest are '0000\d\d' and"
     with pytest.raises(DataError, match=message):
         SavedSegmenter(tmp_path, CLASSES, frame_ids=("000010", "000021"))
+
+
+def test_several_cameras_have_a_folder_each(tmp_path):
+    """The map of a camera is not taken for that of another, nor for that of the only one."""
+    for i, camera in enumerate(("front", "back"), start=1):
+        (tmp_path / camera).mkdir()
+        save(tmp_path / camera, np.full((5, 12), i, np.uint8))
+    segmenter = SavedSegmenter(tmp_path, CLASSES)
+    assert segmenter.segment(replace(FRAME, camera="front")).class_ids.max() == 1
+    assert segmenter.segment(replace(FRAME, camera="back")).class_ids.min() == 2
+    with pytest.raises(DataError, match=r"000001\.png: no such image"):
+        segmenter.segment(FRAME)
+    with pytest.raises(ModelError, match="000001 has no camera"):
+        segmenter.segment(replace(FRAME, image_size=None, camera="front"))

@@ -1,5 +1,7 @@
 """SPSL-3D and PSPSL-3D against their objectives, and their limit cases."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from oracles import self_paced as oracle
 from curate.detections import as_categories
 from curate.errors import ConfigError
 from curate.weighting.base import Age, Evidence
-from curate.weighting.self_paced import PSPSL, SPSL, age_parameter, easiness
+from curate.weighting.self_paced import PSPSL, SPSL, age_parameter, easiness, limit_unseen
 
 # Losses far enough from 0 that the objective's minimum can be found on a grid, and exact zeros.
 LOSSES = st.one_of(st.just(0.0), st.just(np.nan), st.floats(1e-3, 20.0))
@@ -242,3 +244,26 @@ def test_each_prior_alone(name):
         labels.frame_index, labels.category, labels.score, labels.loss, {name: np.array([0.5, 1.0])}
     )
     assert PSPSL().weigh(labels, Age(1, 1)).v.tolist() == [0.5, 0.0]
+
+
+@pytest.mark.parametrize("self_paced", [True, False])
+def test_no_label_without_image_evidence_outweighs_the_best_one_with_it(self_paced):
+    """It gets at most the same weight; the others keep theirs, and so does the order."""
+    labels = replace(
+        evidence([0.1, 0.2, 0.3, 0.1], [[0.4, 0.3, 0.9, 0.8]]),
+        unseen=np.array([False, False, True, True]),
+    )
+    policy = PSPSL(self_paced=self_paced)
+    plain = policy.weigh(replace(labels, unseen=np.zeros(4, bool)), Age(1, 2)).v
+    v = policy.weigh(labels, Age(1, 2)).v
+    np.testing.assert_array_equal(v[:2], plain[:2])
+    assert plain[2:].max() > plain[:2].max()
+    np.testing.assert_array_equal(v[2:], np.minimum(plain[2:], plain[:2].max()))
+
+
+def test_without_any_weight_on_labels_with_image_evidence_there_is_no_limit():
+    """A round in which the camera shows nothing keeps its weights."""
+    v = np.array([0.5, 0.3, 0.0])
+    np.testing.assert_array_equal(limit_unseen(v, np.array([True, True, False])), v)
+    np.testing.assert_array_equal(limit_unseen(v, np.ones(3, bool)), v)
+    assert len(limit_unseen(np.zeros(0), np.zeros(0, bool))) == 0
