@@ -82,7 +82,7 @@ class SavedSegmenter:
             raise DataError(f"{self.directory}: no such folder of semantic maps")
         self._frame_ids = frame_ids
         self._found: dict[str, Mapping[str, Path]] = {}
-        if any(path.suffix in _SUFFIXES for path in self.directory.iterdir()):
+        if any(path.suffix.lower() in _SUFFIXES for path in self.directory.iterdir()):
             self._maps("")
 
     def _maps(self, camera: str) -> Mapping[str, Path]:

@@ -87,7 +87,7 @@ def read_results(path: Path, kind: str, options: ReadOptions) -> ResultsByFrame:
 def category_names(results: ResultsByFrame) -> frozenset[str]:
     """Return the category names of all boxes of a pass."""
     if isinstance(results, KittiResults | Argoverse2Results):
-        return results.category_names()
+        return frozenset(results.category_names())
     return frozenset(
         str(name) for result in results.values() for name in np.unique(result.categories)
     )
