@@ -92,4 +92,5 @@ def ids_of_colours(pixels: np.ndarray, table: ColourTable) -> np.ndarray:
 def _codes(pixels: np.ndarray) -> np.ndarray:
     """Return each colour as one number."""
     red, green, blue = np.moveaxis(pixels[..., :3].astype(np.uint32), -1, 0)
-    return red << 16 | green << 8 | blue
+    codes: np.ndarray = red << 16 | green << 8 | blue
+    return codes
