@@ -42,9 +42,9 @@ def read_openpcdet(path: Path, entries: Sequence[Any], _reading: ReadOptions) ->
         if frame_id in found:
             raise DataError(f"{place}: frame {frame_id} occurs twice")
         place = f"{place} (frame {frame_id})"
-        boxes = as_detections(place, entry["boxes_lidar"], entry["score"], entry["name"])
-        _check_version(place, boxes.boxes, entry.get("dimensions"))
-        found[frame_id] = boxes
+        detections = as_detections(place, entry["boxes_lidar"], entry["score"], entry["name"])
+        _check_version(place, detections.boxes, entry.get("dimensions"))
+        found[frame_id] = detections
     return found
 
 
