@@ -73,10 +73,12 @@ def chosen_round(workspace: Workspace, number: int | None) -> int:
 def weighted_frame_names(
     workspace: Workspace, round_number: int, policy: str, limit: int
 ) -> list[str]:
-    """Return the names of the first `limit` frames with weights of a policy in a round.
+    """Return the names of the first `limit` frames with labels of a policy in a round.
+
+    A frame in which only a person found objects has labels, too.
 
     Raises:
-        WorkspaceError: if there are none.
+        WorkspaceError: if the policy has weighted nothing in that round.
     """
     frame, weight = bulk.table("frame"), bulk.table("weight")
     query = (
@@ -90,7 +92,15 @@ def weighted_frame_names(
     names = [row[0] for row in workspace.database.rows(query)]
     if not names:
         raise not_weighted_error(round_number, policy)
-    return names
+    human = bulk.table("human_label")
+    query = (
+        select(frame.c.frame)
+        .join(human, human.c.frame_id == frame.c.id)
+        .where(human.c.from_round <= round_number)
+        .distinct()
+    )
+    decided = {row[0] for row in workspace.database.rows(query)}
+    return sorted(decided.union(names))[:limit]
 
 
 def decided_in_frame(workspace: Workspace, name: str, round_number: int) -> DecidedLabels:

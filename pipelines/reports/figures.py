@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 
 import numpy as np
-from sqlalchemy import case, func, select
+from sqlalchemy import select, text
 
 from curate.viewing.charts import Mark, histogram
 from curate.viewing.page import ALL, Figure, Section
 from db import bulk
+from pipelines.queries.named_queries import find_query
 from pipelines.reports.totals import BANDS, SHOWN_AGES, RoundTotals, Sums
 from pipelines.stages.methods import ZERO_WEIGHT_WORDS, zero_weight_of
 from pipelines.workspace.workspace import Workspace
@@ -103,22 +104,28 @@ def by_category(totals: RoundTotals, categories: tuple[str, ...]) -> Section:
 
 def beside_others(workspace: Workspace, number: int, policy: str) -> Iterator[Section]:
     """Yield the section that compares policies, if several have weighted the same labels."""
-    weight, frame = bulk.table("weight"), bulk.table("frame")
-    above = [func.sum(case((weight.c.v > least, 1), else_=0)) for least in (0, 0.5)]
-    query = (
-        select(weight.c.policy, func.count(), *above, func.sum(weight.c.v), func.avg(weight.c.v))
-        .join(frame, frame.c.id == weight.c.frame_id)
-        .where(weight.c.round == number, frame.c.split == "unlabeled")
-        .group_by(weight.c.policy)
-        .order_by(weight.c.policy)
-    )
+    postgresql = workspace.database.url.get_backend_name() == "postgresql"
+    query = find_query("counts").filtered(None, number, postgresql=postgresql)
+    totals: dict[str, np.ndarray] = {}
+    with workspace.database.reading() as connection:
+        for _, name, _, *counts in connection.execute(text(query)):
+            totals[name] = totals.get(name, 0) + np.array(counts, dtype=np.float64)
     rows = [
-        (f"{row[0]} (this page)" if row[0] == policy else row[0], *map(int, row[1:4]), *row[4:])
-        for row in workspace.database.rows(query)
+        (
+            f"{name} (this page)" if name == policy else name,
+            *map(int, (labels, kept, trusted)),
+            *(float(weight), float(weight / labels), int(human)),
+        )
+        for name, (labels, kept, trusted, weight, human) in sorted(totals.items())
     ]
     if len(rows) > 1:
-        columns = ("policy", "labels", "weight > 0", "weight > 0.5", "sum of weights", "mean")
-        note = "The same labels with the weights of every policy that was run in this round."
+        columns = (
+            "policy", "labels", "weight > 0", "weight > 0.5", "sum of weights", "mean", "human",
+        )  # fmt: skip
+        note = (
+            "The same labels with the weights of every policy that was run in this round; human: "
+            "labels that people decided, alike under every policy."
+        )
         yield Section("Comparison with other policies", note, columns, rows)
 
 

@@ -49,6 +49,19 @@ def test_captions_start_with_k():
     assert shown.short_caption(0) == "k7"
 
 
+def test_captions_show_decisions_of_people():
+    """Without room for more, at least the decision; a score of 1 is not one of a detector."""
+    decisions = np.array(["moved", "rejected", ""])
+    shown = replace(labels(3, [1.0, 0.0, 0.5], np.array([12, 3, 4])), decisions=decisions)
+    assert shown.caption(0) == ("k0  1.00", "Car  moved by a person  12 pts")
+    assert shown.caption(1) == ("", "k1  Car 0.87  rejected by a person  3 pts")
+    assert shown.caption(2) == ("k2  0.50", "Car 0.87  4 pts")
+    assert [shown.short_caption(i) for i in range(3)] == ["k0 moved", "k1 rejected", "k2"]
+    assert shown.is_human.tolist() == [True, False, False]
+    assert shown.is_rejected.tolist() == [False, True, False]
+    assert not labels(2, [0.5, 0.0]).is_human.any()
+
+
 def test_a_caption_is_beside_its_box():
     """Near the box, but not over it."""
     covered = drawn(labels(1, [0.5]), [[180, 140, 220, 160]])

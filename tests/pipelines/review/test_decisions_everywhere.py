@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -83,6 +84,40 @@ def test_the_status_counts_decisions(curate: Curate, reviewed: Reviewed) -> None
     assert line in printed(curate, workspace, "status")
     printed(curate, workspace, "review", "clear", "--all")
     assert "review" not in printed(curate, workspace, "status")
+
+
+def test_the_report_counts_decisions(curate: Curate, reviewed: Reviewed) -> None:
+    """The comparison of policies, too: the same labels and decisions under each."""
+    workspace, _, _ = reviewed
+    assert curate("solve", "--policy", "uniform", "-w", workspace.root)[0] == 0
+    out = printed(curate, workspace, "report")
+    page = (workspace.root / "reports" / "round-01-pspsl.html").read_text()
+    assert "round-01-pspsl.html" in out
+    rows_of_table = page.split("Comparison with other policies")[1].split("</table>")[0]
+    cells = [re.findall(r"<td[^>]*>([^<]*)</td>", row) for row in rows_of_table.split("<tr>")[2:]]
+    expected = {
+        name: [str(labels), str(kept), str(trusted)]
+        for name, labels, kept, trusted in rows(
+            workspace,
+            "SELECT policy, count(*), sum(weight > 0), sum(weight > 0.5) FROM weighted_labels "
+            "GROUP BY policy",
+        )
+    }
+    assert {row[0].split()[0]: row[1:4] for row in cells} == expected
+    assert [row[-1] for row in cells] == ["4", "4"]
+
+
+def test_view_all_draws_a_frame_that_only_a_person_labeled(
+    curate: Curate, reviewed: Reviewed
+) -> None:
+    """It has labels, though no prediction."""
+    workspace, _, frame = reviewed
+    key = workspace.frames("unlabeled")[frame]
+    with workspace.database.writing() as connection:
+        for table in ("reprediction", "prediction"):
+            connection.exec_driver_sql(f"DELETE FROM {table} WHERE frame_id = {key}")
+    printed(curate, workspace, "view", "--all")
+    assert (workspace.root / "pictures" / f"round-01-{frame}-pspsl.png").is_file()
 
 
 def test_view_lists_decisions(curate: Curate, reviewed: Reviewed) -> None:
