@@ -36,6 +36,11 @@ class Columns:
         """Return the rows at `index` (integers or a mask) of every array, in that order."""
         return type(self)(*(getattr(self, column.name)[index] for column in fields(self)))
 
+    def joined(self, other: Self) -> Self:
+        """Return the rows of this object, then those of another."""
+        pairs = ((getattr(each, column.name) for each in (self, other)) for column in fields(self))
+        return type(self)(*map(np.concatenate, map(tuple, pairs)))
+
 
 @dataclass(frozen=True)
 class Detections(Columns):

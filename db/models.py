@@ -468,7 +468,9 @@ class HumanLabel(Box, Base):
     split: Mapped[str] = mapped_column(doc="always unlabeled")
     review: Mapped[str] = mapped_column(ForeignKey("review.id"), doc="review.id")
     item: Mapped[int | None] = mapped_column(
-        comment="number of the box in the review; null = added"
+        comment="number of the box in the review; null = added",
+        doc="k of the label in the reviewed round, in imports of curate 0.1 its place from 1; "
+        "null = added",
     )
     decision: Mapped[str] = mapped_column(comment="accepted | rejected | moved | added")
     category: Mapped[str] = mapped_column(doc="category of the object")

@@ -12,8 +12,9 @@ from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db.evidence import Declaration, label_columns, read_declarations
 from db.models import BOX_COLUMNS, Base, ViewDefinition
 
-# The view with its core columns, for use in a FROM clause.
+# The views with their core columns, for use in a FROM clause.
 WEIGHTED_LABELS = table("weighted_labels", *map(column, WEIGHTED_LABEL_COLUMNS))
+FAILED_FRAMES = table("failed_frames", *map(column, ("round", "stage", "frame", "split", "error")))
 _DEFINITIONS = Base.metadata.tables[ViewDefinition.__tablename__]
 
 # The evidence of a label joins by the key (round, frame_id, k) of its weight w.

@@ -10,13 +10,17 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.consistency import ConsistencySettings
+from curate.datasets.frame_names import FrameNames
 from curate.detectors.base import Detector, TrainableDetector, choose_preset
 from curate.errors import ConfigError, CurateError
+from curate.files.toml_text import toml_key
 from curate.frames import Calibration
+from curate.names import inline_table, listed, mapping
 from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
 from curate.priors.semantic import SemanticSettings
-from curate.segmenters.base import Segmenter
+from curate.segmenters.base import DeclaresClasses, Segmenter
+from curate.segmenters.renamed import RenamedSegmenter, renamed_classes
 from curate.weighting.base import Policy
 from pipelines import registry
 from pipelines.workspace.config import Config
@@ -68,7 +72,7 @@ def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:
         "device": lambda: device(config),
         "categories": lambda: config.dataset.categories,
         "threads": lambda: 1,
-        "frame_ids": lambda: open_dataset(config).frame_ids(),
+        "frame_ids": lambda: FrameNames.of_dataset(open_dataset(config)),
         "calibration": lambda: _calibrations(config),
         "wants_views": lambda: wants_views(config),
     }
@@ -157,10 +161,53 @@ def open_segmenter(config: Config) -> Segmenter:
     segmenter: Segmenter = registry.SEGMENTERS.build(
         name,
         path,
-        offered={"classes": lambda: _class_map(name, classes), "seed": lambda: config.run.seed},
+        offered={
+            "classes": lambda: _class_map(name, classes),
+            "seed": lambda: config.run.seed,
+            "frame_ids": lambda: FrameNames.of_dataset(open_dataset(config)),
+        },
         options=section.options,
     )
-    return segmenter
+    if isinstance(segmenter, DeclaresClasses):
+        _check_classes(config, segmenter.classes)
+    return RenamedSegmenter(segmenter, section.rename) if section.rename else segmenter
+
+
+def check_segmenter_names(config: Config) -> None:
+    """Check that the segmenter has classes for every category, without loading a model.
+
+    The classes of a user's own segmenter may be known only when it is opened.
+
+    Raises:
+        ConfigError: if it has none for a category.
+    """
+    section = config.segmenter
+    classes = section.options.get("classes")
+    if classes is None and section.name in {"simulated", "degraded"}:
+        classes = _class_map(section.name, "simulated")
+    elif classes is None and section.classes is not None:
+        classes = _class_map(section.name, section.classes)
+    if section.name != "none" and isinstance(classes, Mapping):
+        _check_classes(config, classes)
+
+
+def _check_classes(config: Config, classes: Mapping[str, Any]) -> None:
+    """Raise ConfigError if a segmenter's table has no classes for a category."""
+    section, categories = config.segmenter, config.dataset.categories
+    table = renamed_classes(classes, section.rename or {})
+    missing = [name for name in categories if not table.get(name)]
+    if not missing:
+        return
+    others = sorted(set(table) - set(categories))
+    similar = mapping(others, missing)
+    rename = f"segmenter.rename = {inline_table(similar)}, or " if similar else ""
+    known = [f"{toml_key(name)} = {list(table[name])}" for name in categories if table.get(name)]
+    suggested = ", ".join([*known, *(f"{toml_key(name)} = [...]" for name in missing)])
+    raise ConfigError(
+        f"segmenter '{section.name}': its table of classes has {listed(sorted(classes))}, but none "
+        f"for {listed(missing)} of dataset.categories: set {rename}segmenter.options.classes = "
+        f"{{{suggested}}} with their class ids, or leave 'semantic' out of run.priors"
+    )
 
 
 def check_segmenter(config: Config) -> None:
@@ -175,7 +222,7 @@ def check_segmenter(config: Config) -> None:
             registry.SEGMENTERS.check(
                 name,
                 segmenter_path(config),
-                offered=("classes", "seed"),
+                offered=("classes", "seed", "frame_ids"),
                 options=config.segmenter.options,
             )
 

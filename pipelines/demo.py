@@ -4,6 +4,7 @@ The demo may read the ground truth of X_u because it simulated it. It reads the 
 end, to evaluate the pseudo-labels, and stores nothing of them.
 """
 
+import math
 import os
 import subprocess
 import sys
@@ -15,11 +16,11 @@ from pathlib import Path
 
 import typer
 
-from curate.detections import CATEGORIES
 from curate.errors import CurateError, WorkspaceError
 from curate.evaluation import kitti_ap
-from curate.evaluation.kitti_rules import RELAXED_OVERLAPS
-from pipelines.assessment.evaluation import detect_val, val_objects
+from curate.evaluation.comparison import known_mean
+from curate.evaluation.kitti_rules import relaxed
+from pipelines.assessment.evaluation import configured_overlaps, detect_val, val_objects
 from pipelines.assessment.label_quality import label_quality
 from pipelines.engine.progress import Bar, as_total
 from pipelines.engine.rounds import open_round
@@ -186,18 +187,24 @@ def _print_quality(workspace: Workspace) -> None:
 
 
 def _print_detectors(workspace: Workspace) -> None:
-    rows = []
+    rows, left_out = [], set()
+    overlaps = configured_overlaps(workspace.config)
+    loose = relaxed(overlaps)
     for name, path in _detectors(workspace):
         objects = val_objects(workspace, detect_val(workspace, path, Bar()))
-        at_kitti = kitti_ap.evaluate(*objects).ap_r40[:, :, 1]
-        relaxed = kitti_ap.evaluate(*objects, min_overlaps=RELAXED_OVERLAPS).ap_r40[:, :, 1]
+        at_kitti, at_loose = (objects.evaluate(each).ap_r40[:, :, 1] for each in (overlaps, loose))
         bev, box = kitti_ap.FIGURES.index("bev"), kitti_ap.FIGURES.index("3d")
-        means = (relaxed[:, box], relaxed[:, bev], at_kitti[:, box], at_kitti[:, bev])
-        rows.append((name, *map(float, relaxed[:, box]), *(float(mean.mean()) for mean in means)))
-    columns = ("detector", *CATEGORIES, "3D mean", "BEV mean", "3D KITTI", "BEV KITTI")
+        means = (at_loose[:, box], at_loose[:, bev], at_kitti[:, box], at_kitti[:, bev])
+        by_category = at_loose[:, box].tolist()
+        left_out |= {c for c, ap in zip(overlaps, by_category, strict=True) if math.isnan(ap)}
+        rows.append((name, *by_category, *(float(known_mean(mean, 1)) for mean in means)))
+    columns = ("detector", *overlaps, "3D mean", "BEV mean", "3D KITTI", "BEV KITTI")
     print_table(columns, rows, title="AP R40, moderate, percent")
-    overlaps = ", ".join(f"{name} {overlap}" for name, overlap in RELAXED_OVERLAPS.items())
-    typer.echo(f"   IoU thresholds: {overlaps}; in the columns KITTI: 0.7, 0.5, 0.5.")
+    shown = ", ".join(f"{name} {overlap:g}" for name, overlap in loose.items())
+    at = ", ".join(f"{overlap:g}" for overlap in overlaps.values())
+    typer.echo(f"   IoU thresholds: {shown}; in the columns KITTI: {at}.")
+    if left_out:
+        typer.echo(f"   Not in the means, because no object counts: {', '.join(sorted(left_out))}.")
 
 
 def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:

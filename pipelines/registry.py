@@ -156,6 +156,7 @@ DATASETS = Registry(
     {
         "kitti": "curate.datasets.kitti.dataset:KittiDataset",
         "kitti-raw": "curate.datasets.kitti.raw:KittiRawDataset",
+        "kitti-tracking": "curate.datasets.kitti.tracking:KittiTrackingDataset",
         "folder": "curate.datasets.folder:FolderDataset",
         "nuscenes": "curate.datasets.nuscenes:NuScenesDataset",
     },

@@ -47,6 +47,15 @@ class Sequenced(Protocol):
 
 
 @runtime_checkable
+class FileNamed(Protocol):
+    """A data set whose files are not named like their frames."""
+
+    def file_names(self) -> Mapping[str, str]:
+        """Return the frame of each name of a file without suffix."""
+        ...
+
+
+@runtime_checkable
 class Incomplete(Protocol):
     """A data set that skips frames with missing files."""
 

@@ -8,10 +8,13 @@ images = "camera"             # folder of FRAME.png or .jpg; if there are no ima
 labels = "label_2"            # optional: folder of KITTI label files of the labeled frames
 splits = "lists"              # optional: folder of train.txt, val.txt
 sequence_separator = "_"      # optional: frames are named SEQUENCE_NUMBER; the last one separates
-columns = 4                   # columns of .bin and .npy files
+columns = 4                   # number of columns of .bin and .npy files
+column_names = ["x", "y", "z", "intensity", "ring"]   # optional: their names, in any order
+intensity_field = "intensity" # optional: the column of the intensity, where several may be it
 intensity_scale = 255.0       # the value of full intensity in the files
 
-[calibration]                 # or calibration = "calib.txt", a file in KITTI's format
+[calibration]                 # or calibration = "calib.txt", a file in KITTI's format,
+                              # or calibration = "calib", a folder of such files FRAME.txt
 projection = [[...], [...], [...]]             # 3 x 4, camera (z forward) to pixels
 lidar_to_camera = [[...], [...], [...]]        # 3 x 4 or 4 x 4, LiDAR (x forward) to camera
 
@@ -37,27 +40,29 @@ import numpy as np
 
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES, read_cloud
 from curate.datasets.formats.containment import Boundary, check_frame_id
+from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder
 from curate.datasets.formats.images import check_image_size, read_optional_image
-from curate.datasets.kitti.dataset import (
-    IMAGE_SUFFIXES,
-    read_bytes,
-    read_calibration,
-    read_frame_lists,
-    visible_files,
-)
-from curate.datasets.kitti.labels import read_objects, to_annotations
+from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
+from curate.datasets.kitti.calibration import read_calibration
+from curate.datasets.kitti.dataset import checked_frames, read_frame_lists
+from curate.datasets.kitti.labels import read_annotations
+from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
+from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
 from curate.frames import Calibration, Camera, Frame, FrameFiles, calibration_without_camera
+from curate.geometry.mounting import RotationY, check_lidar_to_camera, check_rotation_y
 from curate.spelling import did_you_mean
 
 DESCRIPTION = "dataset.toml"
 _FOLDERS = ("points", "images", "labels", "splits")
 _TEXTS = (*_FOLDERS, "sequence_separator")
 _OF_CAMERA = ("images", "image_size", "calibration")
-_KEYS = (*_TEXTS, "image_size", "columns", "intensity_scale", "calibration", "cameras")
+# The keys that describe the point files; the settings in [dataset] have the same names.
+_LAYOUT = ("columns", "column_names", "intensity_field", "intensity_scale")
+_KEYS = (*_TEXTS, *_LAYOUT, "image_size", "calibration", "cameras")
 
 
 @dataclass(frozen=True)
@@ -66,22 +71,20 @@ class _CameraTable:
 
     Attributes:
         name: name of the camera; "" without a table [cameras.NAME].
-        images: folder of its images; None if there are none.
+        images: its images; None if there are none.
         image_size: (width, height) in pixels of a camera without images; None if it has images.
-        calibration: path of a file in KITTI's format, or a table of matrices.
+        calibration: path of a file in KITTI's format or of a folder with a file FRAME.txt for each
+            frame, or a table of matrices.
     """
 
     name: str
-    images: Path | None
+    images: FrameFolder | None
     image_size: tuple[int, int] | None
     calibration: Path | Mapping[str, Any]
 
     def image(self, frame_id: str) -> Path | None:
         """Return the path of a frame's image, whether it exists or not; None without images."""
-        if self.images is None:
-            return None
-        paths = [self.images / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
-        return next((path for path in paths if path.exists()), paths[0])
+        return None if self.images is None else self.images.path(frame_id)
 
 
 class FolderDataset:
@@ -89,36 +92,60 @@ class FolderDataset:
 
     Args:
         root: the folder with dataset.toml.
+        layout: the declared layout of the point files, in place of the keys of dataset.toml.
         follow_links: whether links and paths in dataset.toml may lead out of the folder.
+        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
     Raises:
+        ConfigError: if `rotation_y` is unknown.
         DataError: if dataset.toml is missing or malformed.
+        ConfigError: if the layout and dataset.toml contradict each other.
     """
 
     name = "folder"
 
-    def __init__(self, root: StrPath, *, follow_links: bool = False) -> None:
+    def __init__(
+        self,
+        root: StrPath,
+        *,
+        layout: PointLayout = UNDECLARED,
+        follow_links: bool = False,
+        rotation_y: RotationY = "calibration",
+    ) -> None:
+        check_rotation_y(rotation_y)
+        self._rotation_y = rotation_y
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._path = self.root / DESCRIPTION
         self._boundary.check(self._path)
+        if not self._path.exists():
+            raise DataError(
+                f"{self._path}: no such description file{layout_hint(self.root, self.name)}"
+            )
         self._description = _read_description(self._path)
+        self._layout = _merged(_described_layout(self._path, self._description), layout, self._path)
         self._cameras = _cameras(self._path, self._description)
         paths = [self._description[key] for key in _FOLDERS if key in self._description]
-        paths += [camera.images for camera in self._cameras if camera.images]
+        paths += [camera.images.folder for camera in self._cameras if camera.images]
         paths += [each.calibration for each in self._cameras if isinstance(each.calibration, Path)]
         self._boundary.check(*(self.root / path for path in paths))
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return the ids of all frames with a point file, sorted."""
-        return tuple(self._points)
+        """Return the ids of all frames with a point file, sorted.
+
+        Raises:
+            DataError: if there are none, or a frame has two point files or two images of a camera.
+        """
+        return self._frame_ids
 
     @cached_property
-    def _points(self) -> Mapping[str, Path]:
-        """The path of the point file of each frame."""
-        files = visible_files(self.root / self._description["points"], "*")
-        paths = sorted(path for path in files if path.suffix.lower() in CLOUD_SUFFIXES)
-        return {path.stem: path for path in paths}
+    def _frame_ids(self) -> tuple[str, ...]:
+        images = [each.images for each in self._cameras if each.images is not None]
+        return checked_frames(self._points, images, self.root, self.name)
+
+    @cached_property
+    def _points(self) -> FrameFolder:
+        return FrameFolder(self.root / self._description["points"], CLOUD_SUFFIXES, "point")
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in the folder `splits`, by file name without suffix.
@@ -130,7 +157,7 @@ class FolderDataset:
         if "splits" not in self._description:
             return {}
         folder = self.root / self._description["splits"]
-        lists = read_frame_lists(folder, self._boundary)
+        lists = read_frame_lists(folder, self._boundary, self.frame_ids())
         if not lists:
             raise DataError(
                 f"{self._path}: splits: {folder} contains no frame list such as train.txt"
@@ -138,24 +165,27 @@ class FolderDataset:
         return lists
 
     def files(self, frame_id: str) -> FrameFiles:
-        """Return the paths of the frame's files; all frames share the calibration.
+        """Return the paths of the frame's files.
 
-        Image paths are returned even if there are no such files.
+        The paths of images and calibration are returned even if there are no such files.
 
         Raises:
-            DataError: if there is no such frame.
+            DataError: if there is no such frame, or it has two point files or two images.
         """
         check_frame_id(frame_id)
+        points = self._points.path(frame_id)
         if frame_id not in self._points:
-            folder = self.root / self._description["points"]
-            raise DataError(f"{folder}: no point file for frame {frame_id}")
+            raise DataError(f"{self._points.folder}: no point file for frame {frame_id}")
         images = [each.image(frame_id) for each in self._cameras]
         calibration = self._description.get("calibration")
+        path = self._path
+        if isinstance(calibration, str):
+            path = _of_frame(self.root / calibration, frame_id)
         label = self._label(frame_id)
         files = FrameFiles(
-            points=self._points[frame_id],
+            points=points,
             image=images[0] if images else None,
-            calibration=self.root / calibration if isinstance(calibration, str) else self._path,
+            calibration=path,
             label=label if label is not None and label.exists() else None,
             further_images=tuple(image for image in images[1:] if image is not None),
         )
@@ -178,9 +208,8 @@ class FolderDataset:
         files = self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            scale = float(self._description.get("intensity_scale", 1.0))
-            sweep = read_cloud(files.points, int(self._description.get("columns", 4)), scale)
-        found = Frame(frame_id, sweep, self._calibration, None)
+            sweep = read_cloud(files.points, self._layout)
+        found = Frame(frame_id, sweep, self._label_calibration(frame_id), None)
         if not self._cameras:
             return found
         return found.with_cameras([self._camera(each, frame_id, image) for each in self._cameras])
@@ -192,7 +221,7 @@ class FolderDataset:
         if size is None:
             raise DataError(f"{self._path}: the camera of frame {frame_id} has no image size")
         name = table.name if len(self._cameras) > 1 else ""
-        return Camera(name, self._calibrations[table.name], size, content)
+        return Camera(name, self._calibration(table.name, frame_id), size, content)
 
     def annotations(self, frame_id: str) -> Annotations:
         """Return the frame's ground truth in the LiDAR frame.
@@ -209,23 +238,39 @@ class FolderDataset:
                     "to the folder of label files"
                 )
             raise DataError(f"{expected}: no such label file")
-        return to_annotations(read_objects(label, categories=None), self._calibration)
+        return read_annotations(
+            label,
+            self._label_calibration(frame_id),
+            categories=None,
+            rotation_y=self._rotation_y,
+        )
 
-    @property
-    def _calibration(self) -> Calibration:
-        """The calibration that the labels refer to: that of the first camera."""
-        return next(iter(self._calibrations.values()))
+    def _label_calibration(self, frame_id: str) -> Calibration:
+        """Return the calibration that the labels refer to: that of the first camera."""
+        if not self._calibrations:
+            return calibration_without_camera()
+        return self._calibration(next(iter(self._calibrations)), frame_id)
+
+    def _calibration(self, camera: str, frame_id: str) -> Calibration:
+        """Return the calibration of a camera in a frame."""
+        found = self._calibrations[camera]
+        return read_calibration(_of_frame(found, frame_id)) if isinstance(found, Path) else found
 
     @cached_property
-    def _calibrations(self) -> Mapping[str, Calibration]:
-        """The calibration of each camera by name; without a camera, that of the labels."""
+    def _calibrations(self) -> Mapping[str, Calibration | Path]:
+        """The calibration of each camera by name; without a camera, that of the labels.
+
+        A folder stands for a file per frame. Calibrations that all frames share are read once.
+        """
         tables = {each.name: each.calibration for each in self._cameras}
         if not tables and "calibration" in self._description:
             tables = {"": _calibration_of(self._path.parent, self._description["calibration"])}
         return {
-            name: _read_calibration(self._path, _place(name, "calibration"), calibration)
+            name: calibration
+            if isinstance(calibration, Path) and calibration.is_dir()
+            else _read_calibration(self._path, _place(name, "calibration"), calibration)
             for name, calibration in tables.items()
-        } or {"": calibration_without_camera()}
+        }
 
     def _label(self, frame_id: str) -> Path | None:
         if "labels" not in self._description:
@@ -240,12 +285,15 @@ def _read_description(path: Path) -> Mapping[str, Any]:
         DataError: if the file is missing or not TOML, or a key is missing, unknown or invalid.
     """
     try:
-        content = parse_toml(read_bytes(path, "description").decode("utf-8"))
+        content = parse_toml(read_text(path, "description"))
     except (RecursionError, ValueError) as error:  # ValueError also for very long integers
         raise DataError(f"{path}: not TOML: {' '.join(str(error).split())[:200]}") from None
     unknown = sorted(set(content) - set(_KEYS))
     if unknown:
-        raise DataError(f"{path}: unknown key {unknown[0]}; use one of {', '.join(_KEYS)}")
+        raise DataError(
+            f"{path}: unknown key {unknown[0]}; use one of {', '.join(_KEYS)}"
+            f"{did_you_mean(unknown[0], _KEYS)}"
+        )
     if "points" not in content:
         raise DataError(f"{path}: no key points")
     has_camera = not content.keys().isdisjoint(("images", "image_size"))
@@ -256,15 +304,12 @@ def _read_description(path: Path) -> Mapping[str, Any]:
     ):
         raise DataError(f"{path}: no key calibration")
     invalid = [key for key in _TEXTS if not isinstance(content.get(key, ""), str)]
-    invalid += [key for key in ("columns", "intensity_scale") if not _positive(content.get(key, 1))]
-    if (
-        invalid
-        or not isinstance(content.get("calibration", ""), str | dict)
-        or content.get("columns", 4) < 3
-    ):
+    if not isinstance(content.get("calibration", ""), str | dict):
+        invalid.append("calibration")
+    if invalid:
         raise DataError(
-            f"{path}: invalid value of {(invalid or ['calibration or columns'])[0]}; folders and "
-            "separators are strings, sizes and scales positive numbers, columns at least 3"
+            f"{path}: invalid value of {invalid[0]}; folders and separators are strings, and "
+            "calibration is a table, a file or a folder"
         )
     return content
 
@@ -330,7 +375,7 @@ def _camera_table(path: Path, name: str, table: Mapping[str, Any]) -> _CameraTab
         raise DataError(f"{path}: {error}") from None
     return _CameraTable(
         name,
-        None if images is None else path.parent / images,
+        None if images is None else FrameFolder(path.parent / images, IMAGE_SUFFIXES, "image"),
         image_size,
         _calibration_of(path.parent, calibration),
     )
@@ -353,9 +398,67 @@ def _read_calibration(path: Path, place: str, calibration: Path | Mapping[str, A
     extrinsic = np.eye(4)
     rows = _matrix(path, place, calibration, "lidar_to_camera", ((3, 4), (4, 4)))
     extrinsic[: len(rows)] = rows
-    if abs(np.linalg.det(extrinsic)) < 1e-6:
-        raise DataError(f"{path}: {place}.lidar_to_camera cannot be inverted")
+    check_lidar_to_camera(extrinsic, f"{path}: {place}.lidar_to_camera")
     return Calibration(projection, extrinsic)
+
+
+def _described_layout(path: Path, description: Mapping[str, Any]) -> PointLayout:
+    """Return the layout of the point files in dataset.toml.
+
+    Raises:
+        DataError: if a value is invalid, or two of them contradict each other.
+    """
+    values = {key: description[key] for key in _LAYOUT if key in description}
+    names = values.get("column_names", ())
+    valid = {
+        "columns": _is_integer(values.get("columns", 4)),
+        "column_names": isinstance(names, list | tuple) and all(isinstance(n, str) for n in names),
+        "intensity_field": isinstance(values.get("intensity_field", ""), str),
+        "intensity_scale": _positive(values.get("intensity_scale", 1)),
+    }
+    invalid = [key for key, is_valid in valid.items() if not is_valid]
+    if invalid:
+        raise DataError(
+            f"{path}: invalid value of {invalid[0]}; columns is an integer from 3, column_names a "
+            "list of strings, intensity_field a string, and intensity_scale a positive number"
+        )
+    if names:
+        values["column_names"] = tuple(names)
+    try:
+        return PointLayout(**values)
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def _merged(described: PointLayout, declared: PointLayout, path: Path) -> PointLayout:
+    """Return the layout of dataset.toml with the settings of the workspace.
+
+    Raises:
+        ConfigError: if they contradict each other.
+    """
+    for key in _LAYOUT:
+        one, other = getattr(described, key), getattr(declared, key)
+        if None not in (one, other) and one != other:
+            raise ConfigError(
+                f"dataset.{key} is {other!r}, but {path} has {key} = {one!r}; remove one of them"
+            )
+    values = {
+        key: getattr(described if getattr(declared, key) is None else declared, key)
+        for key in _LAYOUT
+    }
+    try:
+        return PointLayout(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{error} (settings in [dataset] and {path})") from None
+
+
+def _is_integer(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _of_frame(path: Path, frame_id: str) -> Path:
+    """Return a path of a calibration, or of the frame's file in it if it is a folder."""
+    return path / f"{frame_id}.txt" if path.is_dir() else path
 
 
 def _positive(value: object) -> bool:

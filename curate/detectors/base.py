@@ -42,6 +42,15 @@ class RecordedViews(Protocol):
         ...
 
 
+@runtime_checkable
+class NamesCategories(Protocol):
+    """A detector that knows the category names of its boxes before it sees a frame."""
+
+    def category_names(self) -> Collection[str]:
+        """Return all names that its boxes can have."""
+        ...
+
+
 @dataclass(frozen=True)
 class Sample:
     """One training frame with its weighted labels.

@@ -15,8 +15,9 @@ import numpy as np
 
 from curate.detections import Detections, as_categories
 from curate.detectors.conventions import BoxConvention
-from curate.errors import ConfigError, ModelError, first_line
-from curate.files.onnx_session import is_numeric_array, open_session, runtime_errors
+from curate.detectors.scores import describe_invalid_scores, to_probabilities
+from curate.errors import ConfigError, ModelError
+from curate.files.onnx_session import OnnxModel, is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
@@ -80,10 +81,14 @@ class OnnxDetector:
         self.nms_iou = nms_iou
         self._preprocess = _import_function(preprocess) if preprocess else None
         self._postprocess = _import_function(postprocess) if postprocess else None
-        self._session = open_session(self.model, threads, "detector")
+        self._network = OnnxModel(self.model, threads, "detector")
         if not self._preprocess:
             self._input, self._shape = self._find_input(points)
         self._names = {} if self._postprocess else self._find_outputs(outputs or {})
+
+    def category_names(self) -> tuple[str, ...]:
+        """See `curate.detectors.base.NamesCategories`."""
+        return self.classes
 
     def predict(self, frame: Frame) -> Detections:
         """See `curate.detectors.base.Detector`; a sweep without points has no boxes.
@@ -93,7 +98,7 @@ class OnnxDetector:
         """
         if len(frame.points) == 0:
             return Detections.empty()
-        outputs = self._run(self._inputs(frame.points))
+        outputs = self._network.run(self._inputs(frame.points))
         if self._postprocess:
             named = _call(self._postprocess, outputs, self.model)
         else:
@@ -113,14 +118,6 @@ class OnnxDetector:
         columns = self._shape[-1] if isinstance(self._shape[-1], int) else 4
         rows = np.ascontiguousarray(scaled[:, :columns])
         return {self._input: rows[None] if len(self._shape) == 3 else rows}
-
-    def _run(self, inputs: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-        """Return the model's outputs by name."""
-        names = [output.name for output in self._session.get_outputs()]
-        try:
-            return dict(zip(names, self._session.run(None, dict(inputs)), strict=True))
-        except runtime_errors() as error:
-            raise ModelError(f"{self.model}: {first_line(error)}") from error
 
     def _detections(self, named: Mapping[str, np.ndarray]) -> Detections:
         """Return the outputs as detections; raise ModelError if their shapes do not fit."""
@@ -147,8 +144,7 @@ class OnnxDetector:
                 "scores [n] and labels [n], or scores [n, classes]"
             )
         scores = scores.astype(np.float64)
-        if self.sigmoid:
-            scores = 0.5 * (1 + np.tanh(scores / 2))  # does not overflow
+        scores = to_probabilities(scores, sigmoid=self.sigmoid)
         self._check_values(scores, labels)
         boxes = self.convention.to_boxes(boxes)
         index = labels.astype(np.int64) - self.first_label
@@ -158,11 +154,8 @@ class OnnxDetector:
         """Raise ModelError if a score is not in [0, 1] or a label is not a configured class."""
         if len(scores) == 0:
             return
-        if not (scores.min() >= 0 and scores.max() <= 1):
-            raise ModelError(
-                f"{self.model}: scores from {scores.min():.3g} to {scores.max():.3g} are not in "
-                "[0, 1]; set detector.options.sigmoid = true if they are logits"
-            )
+        if problem := describe_invalid_scores(scores.min(), scores.max()):
+            raise ModelError(f"{self.model}: {problem}")
         last = self.first_label + len(self.classes) - 1
         within = labels.min() >= self.first_label and labels.max() <= last
         if not within or (labels != np.floor(labels)).any():
@@ -174,8 +167,8 @@ class OnnxDetector:
 
     def _find_input(self, name: str | None) -> tuple[str, Sequence[int | str | None]]:
         """Return name and shape of the input that takes the points."""
-        inputs = self._session.get_inputs()
-        described = ", ".join(f"{each.name} {each.type}{each.shape}" for each in inputs)
+        inputs = self._network.inputs
+        described = ", ".join(map(str, inputs))
         chosen = next((each for each in inputs if name in {None, each.name}), None)
         if chosen is None:
             raise ModelError(
@@ -205,7 +198,7 @@ class OnnxDetector:
         unknown = sorted(set(mapping) - set(_KEYS))
         if unknown:
             raise ConfigError(f"detector.options.outputs: {unknown[0]}: use {', '.join(_KEYS)}")
-        available = {output.name for output in self._session.get_outputs()}
+        available = {output.name for output in self._network.outputs}
         names = {key: mapping.get(key, key) for key in _KEYS}
         if "labels" not in mapping and "labels" not in available:
             del names["labels"]

@@ -13,12 +13,14 @@ from typing import Self
 
 import numpy as np
 
+from curate.evaluation.counts import Counts
 from curate.evaluation.evaluated_labels import ALL, WHOLE, EvaluatedLabels, Slice, slices
 from curate.evaluation.reliability import (
     ReliabilityBins,
     auroc,
     average_precision,
     expected_calibration_error,
+    rank_labels,
     reliability_bins,
     weighted_precision,
     weighted_recall,
@@ -111,12 +113,16 @@ class Audit:
     Attributes:
         frames: number of audited frames.
         level: coverage of the intervals.
+        counts: which objects count, and why the others do not.
+        label_counts: the same for the labels.
         figures: the figures by category, slice and policy.
         comparisons: the comparison of every two policies, by category.
     """
 
     frames: int
     level: float
+    counts: Counts
+    label_counts: Counts
     figures: tuple[Figures, ...]
     comparisons: tuple[Comparison, ...]
 
@@ -152,7 +158,7 @@ def audit(
 
     Args:
         labels: see `EvaluatedLabels`.
-        weights: (n,) weights in [0, 1], by policy.
+        weights: (n,) weights in [0, 1], by policy; all NaN if they could not be measured.
         categories: the categories to audit, each by itself and all together.
         generator: random generator for the bootstrap.
         replicates: number of bootstrap draws.
@@ -171,7 +177,8 @@ def audit(
                 figures.append(found)
             if part == WHOLE:
                 comparisons += _comparisons(figures[-len(weights) :], aurocs, level)
-    return Audit(labels.frames, level, tuple(figures), tuple(comparisons))
+    counts = labels.counts(categories)
+    return Audit(labels.frames, level, *counts, tuple(figures), tuple(comparisons))
 
 
 @dataclass(frozen=True)
@@ -222,7 +229,7 @@ def _figures(
     v, correct = weights[sample.index], sample.correct
     frames = draws.shape[1]
     objects = 0 if sample.objects is None else int(sample.objects.sum())
-    ranked = ranked_replicates(v, correct, sample.frame_index, draws)
+    values, ranked = _ranked(v, sample, draws)
     counts, found, weight, trusted = (
         draws @ np.bincount(sample.frame_index, column, minlength=frames)
         for column in (np.ones(len(v)), correct, v, v * correct)
@@ -242,13 +249,24 @@ def _figures(
         right=int(correct.sum()),
         objects=None if sample.objects is None else objects,
         share_right=estimate(_mean(correct), _ratio(found, counts)),
-        auroc=estimate(auroc(v, correct), ranked[0]),
-        average_precision=estimate(average_precision(v, correct), ranked[1]),
+        auroc=estimate(values[0], ranked[0]),
+        average_precision=estimate(values[1], ranked[1]),
         weighted_precision=estimate(weighted_precision(v, correct), _ratio(trusted, weight)),
         weighted_recall=estimate(weighted_recall(v, correct, objects), _ratio(trusted, of_objects)),
         calibration_error=estimate(expected_calibration_error(v, correct, bins), error),
         bins=reliability_bins(v, correct, objects, bins),
     ), ranked[0]
+
+
+def _ranked(
+    v: np.ndarray, sample: _Sample, draws: np.ndarray
+) -> tuple[tuple[float, float], tuple[np.ndarray, np.ndarray]]:
+    """Return AUROC and average precision, and their replicates; NaN if the weights rank nothing."""
+    if not rank_labels(v):
+        undefined = np.full(len(draws), np.nan)
+        return (np.nan, np.nan), (undefined, undefined)
+    values = auroc(v, sample.correct), average_precision(v, sample.correct)
+    return values, ranked_replicates(v, sample.correct, sample.frame_index, draws)
 
 
 def _calibration_replicates(

@@ -39,6 +39,7 @@ def as_numbers(audit: Audit) -> dict[str, Any]:
     return {
         "frames": audit.frames,
         "level": audit.level,
+        "counts": {"objects": audit.counts.as_dict(), "labels": audit.label_counts.as_dict()},
         "figures": [_plain(_flat(found)) for found in audit.figures],
         "comparisons": [
             _plain({**asdict(found), "beyond_chance": found.beyond_chance})
@@ -99,7 +100,7 @@ def _caveats(audit: Audit, some: Figures) -> Iterator[str]:
     if some.neutral:
         yield (
             f"{some.neutral} more are neither correct nor wrong, because they lie on an object of "
-            "a neighbour category (van, sitting person) or in a DontCare region."
+            "a neighbour category (Van, Person_sitting) or in a DontCare region."
         )
     if some.labels and audit.frames < FEW_FRAMES:
         yield (

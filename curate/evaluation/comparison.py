@@ -44,6 +44,21 @@ class PairedDifference:
     count: int
 
 
+def known_mean(values: Float[np.ndarray, " *shape"], axes: int) -> Float[np.ndarray, " *rest"]:
+    """Return the mean over the last axes without NaN; NaN where all values are NaN.
+
+    Args:
+        values: NaN for figures that cannot be computed.
+        axes: number of axes to average over.
+    """
+    over = tuple(range(values.ndim - axes, values.ndim))
+    known = ~np.isnan(values)
+    counts = known.sum(axis=over)
+    sums = np.sum(values, axis=over, where=known)
+    means: np.ndarray = sums / np.where(counts > 0, counts, np.nan)
+    return means
+
+
 def spread(values: Float[np.ndarray, " n"]) -> Spread:
     """Return the mean and standard deviation of (n,) values; NaN values are skipped."""
     values = values[~np.isnan(values)]

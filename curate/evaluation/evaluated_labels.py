@@ -8,6 +8,9 @@ from typing import Self
 import numpy as np
 
 from curate.detections import Annotations, Detections, as_categories
+from curate.evaluation.counts import Counts, tally
+from curate.evaluation.difficulties import REASONS
+from curate.evaluation.kitti_rules import neighbours_of
 from curate.evaluation.reliability import MatchSettings, match_to_ground_truth
 from curate.shapes import Bool, Float, Int, Shaped
 
@@ -28,13 +31,13 @@ class AuditedFrame:
         labels: n labels in the LiDAR frame.
         truth: the ground truth annotations.
         rectangles: (n, 4) left, top, right, bottom of the labels in the image, in pixels; NaN for
-            labels outside the image.
+            labels outside the image. None for a frame without an image.
         points: (n,) LiDAR points in each label, NaN where they were not counted.
     """
 
     labels: Detections
     truth: Annotations
-    rectangles: Float[np.ndarray, "n 4"]
+    rectangles: Float[np.ndarray, "n 4"] | None
     points: Float[np.ndarray, " n"]
 
 
@@ -50,9 +53,12 @@ class EvaluatedLabels:
         points: (n,) float64, NaN where unknown.
         correct: (n,) bool.
         counted: (n,) bool, False for neutral labels, which are neither correct nor wrong.
+        neutral: (n,) str, why a label is neutral; "" for counted labels.
         object_frame: (m,) int64 frame of each object.
         object_category: (m,) str.
         object_distance: (m,) metres on the ground.
+        other_category: (o,) str, the annotations that are not evaluated: other categories,
+            neighbours, and DontCare regions.
     """
 
     frames: int
@@ -62,9 +68,11 @@ class EvaluatedLabels:
     points: Float[np.ndarray, " n"]
     correct: Bool[np.ndarray, " n"]
     counted: Bool[np.ndarray, " n"]
+    neutral: Shaped[np.ndarray, " n"]
     object_frame: Int[np.ndarray, " m"]
     object_category: Shaped[np.ndarray, " m"]
     object_distance: Float[np.ndarray, " m"]
+    other_category: Shaped[np.ndarray, " o"]
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -93,7 +101,27 @@ class EvaluatedLabels:
         """Return an instance without labels and objects."""
         floats, names = np.zeros(0), as_categories([])
         integers, flags = floats.astype(np.int64), floats.astype(bool)
-        return cls(0, integers, names, floats, floats, flags, flags, integers, names, floats)
+        return cls(
+            *(0, integers, names, floats, floats, flags, flags, names),
+            *(integers, names, floats, names),
+        )
+
+    def counts(self, categories: Sequence[str]) -> tuple[Counts, Counts]:
+        """Return how many objects and labels count, and why the others do not.
+
+        Every object of the categories counts, whatever its 2D box, occlusion or truncation.
+
+        Args:
+            categories: the evaluated categories.
+        """
+        names = np.concatenate([self.object_category, self.other_category])
+        neighbours = tuple(neighbours_of(categories).values())
+        counts = np.full(len(names), REASONS[0])
+        reasons = np.where(self.counted, REASONS[0], self.neutral)
+        return (
+            tally(("all",), names, [counts], categories, neighbours),
+            tally(("all",), self.category, [reasons], categories),
+        )
 
 
 @dataclass(frozen=True)
@@ -155,7 +183,9 @@ def _evaluate_frame(frame: AuditedFrame, settings: MatchSettings) -> EvaluatedLa
         points=np.asarray(frame.points, dtype=np.float64),
         correct=matches.correct,
         counted=matches.counted,
+        neutral=as_categories(matches.neutral),
         object_frame=np.zeros(m, dtype=np.int64),
         object_category=as_categories(frame.truth.categories[objects]),
         object_distance=np.hypot(*frame.truth.boxes[objects, :2].T),
+        other_category=as_categories(frame.truth.categories[~objects]),
     )

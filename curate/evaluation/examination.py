@@ -1,38 +1,35 @@
-"""Checks of a frame's data and of the conventions of a detector's boxes, for `curate doctor`.
+"""Checks of a frame's data, of its labels and of a detector's boxes, for `curate doctor`."""
 
-To find a wrong box convention, the boxes are converted as each common mistake would require. If the
-converted boxes contain more LiDAR points than can be expected of correct boxes, compared with the
-points that they lose, the mistake is reported.
-"""
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from curate.detections import Detections
-from curate.frames import Calibration, Frame
-from curate.geometry.points_in_boxes import count_points_in_boxes, points_in_box_mask
-from curate.geometry.projection import box_rectangles, in_camera_view
-from curate.geometry.similarity import wrap_angle
+from curate.detections import Annotations, Detections
+from curate.evaluation.box_conventions import BoxesInSweep, suspect_convention
+from curate.frames import Frame
+from curate.geometry.ground import GroundMap
+from curate.geometry.mounting import Mounting, defines_headings
+from curate.geometry.points_in_boxes import count_points_in_boxes
+from curate.geometry.projection import box_rectangles, image_rectangles, in_camera_view
 
-# Limits of the ratio gained points / lost points, above which a conversion is reported. Measured on
-# 24 KITTI frames with the boxes of a weak detector: in the correct convention the ratio stayed
-# below these limits; in a wrong one it exceeded the first limit in all frames, the second in 90 %,
-# the third in 75 % (lowered boxes gain points of the ground), and the last in about a third.
-_TURNED_LIMIT, _RAISED_LIMIT, _LOWERED_LIMIT, _NEGATED_LIMIT = 1.0, 0.75, 2.25, 2.5
-# At this multiple of the limit the finding is "wrong", not only "suspect".
-_CERTAIN = 1.3
-# Added to gained and lost points, because the ratio of a few points is noise.
-_PRIOR_POINTS = 3
-_MIN_POINTS = 20
-# Limits the influence of a single near box.
-_MAX_POINTS_PER_BOX = 100
 _TOP_BOXES = 20
+# The height of the sensors is measured on the ground this near, by the points up to this height
+# above the lowest ones.
+_NEAR_METRES, _GROUND_METRES = 15.0, 0.3
+# A principal point is near the middle of the image. If it is off by the first factor on both axes,
+# the image may have another scale than the calibration; the second factor leaves no doubt.
+_SCALE_LIMIT, _CERTAIN_SCALE = 1.2, 1.4
+# Shares of boxes without points that are suspect. Labels of KITTI and of simulated frames have
+# 1 in 70 or less.
+_EMPTY_SHARE, _EMPTY_LABELS_SHARE = 0.5, 0.25
+# 2D boxes of labels may exceed the image by rounding; smaller ones say little about the scale.
+_BORDER_PIXELS, _MIN_HEIGHT_PIXELS = 2.0, 10.0
+_MIN_RECTANGLES = 3
+_RECTANGLE_LIMIT = 1.25
+_RESIZED = "was the image resized, but not the calibration's projection?"
 # Share of boxes outside the image above which they are reported: some are cut by its border.
 _OUTSIDE_LIMIT = 0.1
-
-_Conversion = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -83,6 +80,7 @@ def examine_frame(frame: Frame) -> list[Finding]:
             "calibration", "wrong", f"{seen:.1%} of the points appear in the image: is x forward, "
             "and does the calibration belong to these sensors?",
         ),
+        *(finding for view in frame.views() for finding in (_mounting(view), _scale(view))),
     ]  # fmt: skip
 
 
@@ -123,7 +121,7 @@ def _points(frame: Frame, found: Detections) -> Finding:
     summary = f"{empty} of {len(found)} boxes contain no points"
     if empty == len(found):
         return Finding("boxes", "wrong", f"{summary}: they are not in the LiDAR frame")
-    return Finding("boxes", "suspect" if empty > len(found) / 2 else "ok", summary)
+    return Finding("boxes", "suspect" if empty > _EMPTY_SHARE * len(found) else "ok", summary)
 
 
 def _projections(frame: Frame, found: Detections) -> Finding:
@@ -139,91 +137,137 @@ def _projections(frame: Frame, found: Detections) -> Finding:
 
 
 def _convention(frame: Frame, found: Detections) -> Finding:
-    """Return the mistake that explains the points best, if its ratio is above its limit."""
-    top = found.boxes[np.argsort(-found.scores, kind="stable")[:_TOP_BOXES]]
-    inside = sum(int(_inside(frame.points, box).sum()) for box in top)
-    summary = f"{inside} points in the {len(top)} boxes with the highest scores"
-    best, best_ratio = "", 0.0
-    for mistake, (convert, limit) in _conversions(frame.calibration).items():
-        gained, lost = _exchanged(frame.points, top, convert(top))
-        ratio = (gained + _PRIOR_POINTS) / (lost + _PRIOR_POINTS) / limit
-        if gained >= _MIN_POINTS and ratio > max(best_ratio, 1):
-            best, best_ratio = f"{summary}; {gained} more and {lost} fewer if {mistake}", ratio
-    if best:
-        return Finding("convention", "wrong" if best_ratio > _CERTAIN else "suspect", best)
-    if inside < _MIN_POINTS:
-        return Finding("convention", "suspect", f"{summary}: too few to decide; try another frame")
-    return Finding("convention", "ok", f"{summary}; no other convention explains them better")
+    top = found.select(np.argsort(-found.scores, kind="stable")[:_TOP_BOXES])
+    sweep = BoxesInSweep(frame.points, top.boxes, top.categories, frame.calibration)
+    where = f"the {len(top)} boxes with the highest scores"
+    return _judged("convention", [sweep], where, labels=False)
 
 
-def _exchanged(points: np.ndarray, boxes: np.ndarray, others: np.ndarray) -> tuple[int, int]:
-    """Return how many points are only in `others` (gained) and only in `boxes` (lost)."""
-    gained = lost = 0
-    for box, other in zip(boxes, others, strict=True):
-        before, after = _inside(points, box), _inside(points, other)
-        gained += min(int((after & ~before).sum()), _MAX_POINTS_PER_BOX)
-        lost += min(int((before & ~after).sum()), _MAX_POINTS_PER_BOX)
-    return gained, lost
+def _judged(check: str, sweeps: Sequence[BoxesInSweep], where: str, *, labels: bool) -> Finding:
+    """Return the finding on the convention of boxes."""
+    found = suspect_convention(sweeps, labels=labels)
+    summary = f"{found.inside} points in {where}"
+    if found.mistake:
+        state = "wrong" if found.certain else "suspect"
+        return Finding(check, state, f"{summary}; {found.mistake}")
+    if found.undecided:
+        state = "ok" if labels else "suspect"
+        return Finding(check, state, f"{summary}: too few to decide; try another frame")
+    return Finding(check, "ok", f"{summary}; no other convention explains them better")
 
 
-def _inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Return (p,) bool, True for points in the upper four fifths of a box, without the ground."""
-    upper = box + np.array([0, 0, 0.1 * box[5], 0, 0, -0.2 * box[5], 0])
-    return points_in_box_mask(points, upper)
+def examine_labels(labeled: Sequence[tuple[Frame, Annotations]]) -> list[Finding]:
+    """Check the ground truth of some frames together.
+
+    Args:
+        labeled: frames with all their points, and their ground truth.
+    """
+    sweeps = []
+    for frame, truth in labeled:
+        objects = truth.select(~np.isnan(truth.boxes).any(axis=1))
+        sweeps.append(
+            BoxesInSweep(frame.points, objects.boxes, objects.categories, frame.calibration)
+        )
+    count = sum(len(each.boxes) for each in sweeps)
+    names = f"{len(labeled)} frames" if len(labeled) > 1 else f"frame {labeled[0][0].frame_id}"
+    where = f"the {count} labeled boxes of {names}"
+    # With several cameras, 2D boxes are projections.
+    pictured = [(frame, truth) for frame, truth in labeled if len(frame.cameras) == 1]
+    if count == 0:
+        return [Finding("labels", "ok", f"no labeled objects in {names}")]
+    return [
+        _label_points(sweeps, count, names),
+        _judged("label boxes", sweeps, where, labels=True),
+        *([_label_rectangles(pictured)] if pictured else []),
+    ]
 
 
-def _conversions(calibration: Calibration) -> Mapping[str, tuple[_Conversion, float]]:
-    """Return the conversion that corrects each common mistake, and its limit."""
-    to_lidar = np.linalg.inv(calibration.lidar_to_camera)
-
-    def turned(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, yaw=boxes[:, 6] + np.pi / 2)
-
-    def mirrored(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, yaw=-boxes[:, 6])
-
-    def rotation_y(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, yaw=-boxes[:, 6] - np.pi / 2)
-
-    def raised(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, centres=boxes[:, :3] + np.outer(boxes[:, 5] / 2, [0, 0, 1]))
-
-    def lowered(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, centres=boxes[:, :3] - np.outer(boxes[:, 5] / 2, [0, 0, 1]))
-
-    def from_camera(boxes: np.ndarray) -> np.ndarray:
-        centres = boxes[:, :3] - np.outer(boxes[:, 5] / 2, [0, 1, 0])
-        return _with(rotation_y(boxes), centres=centres @ to_lidar[:3, :3].T + to_lidar[:3, 3])
-
-    return {
-        "turned by 90 degrees: yaw is measured from y, or length and width are swapped": (
-            turned,
-            _TURNED_LIMIT,
-        ),
-        "yaw is negated: it grows clockwise": (mirrored, _NEGATED_LIMIT),
-        "yaw is KITTI's rotation_y, but must be -rotation_y - pi/2": (rotation_y, _TURNED_LIMIT),
-        "raised by half their height: z is the bottom of the box, not its centre": (
-            raised,
-            _RAISED_LIMIT,
-        ),
-        "lowered by half their height: z is the top of the box, not its centre": (
-            lowered,
-            _LOWERED_LIMIT,
-        ),
-        "converted from the camera frame, as in KITTI's label files": (
-            from_camera,
-            _TURNED_LIMIT,
-        ),
-    }
+def _label_points(sweeps: Sequence[BoxesInSweep], count: int, names: str) -> Finding:
+    empty = sum(int(np.sum(count_points_in_boxes(each.points, each.boxes) == 0)) for each in sweeps)
+    summary = f"{empty} of {count} labeled boxes contain no points ({names})"
+    if empty == count:
+        return Finding("labels", "wrong", f"{summary}: do labels and calibration belong together?")
+    suspect = empty > max(1, _EMPTY_LABELS_SHARE * count)
+    return Finding("labels", "suspect" if suspect else "ok", summary)
 
 
-def _with(
-    boxes: np.ndarray, yaw: np.ndarray | None = None, centres: np.ndarray | None = None
-) -> np.ndarray:
-    """Return a copy of the boxes with another yaw or other centres."""
-    changed = boxes.copy()
-    if yaw is not None:
-        changed[:, 6] = wrap_angle(yaw)
-    if centres is not None:
-        changed[:, :3] = centres
-    return changed
+def _label_rectangles(labeled: Sequence[tuple[Frame, Annotations]]) -> Finding:
+    """Compare the 2D boxes of labels with the image and with the projected 3D boxes."""
+    ratios: list[float] = []
+    for frame, truth in labeled:
+        size = np.asarray(frame.image_size)
+        reach = truth.boxes_2d[:, 2:].max(axis=0, initial=0)
+        if (reach > size + _BORDER_PIXELS).any():
+            message = (
+                f"frame {frame.frame_id}: 2D boxes reach x {reach[0]:.0f}, y {reach[1]:.0f}, the "
+                f"image is {size[0]} x {size[1]}: was it resized after it was labeled?"
+            )
+            return Finding("label image", "wrong", message)
+        ratios += _height_ratios(frame, truth)
+    if len(ratios) < _MIN_RECTANGLES:
+        return Finding("label image", "ok", "2D boxes lie within the image")
+    ratio = float(np.median(ratios))
+    summary = f"2D boxes are {ratio:.2f} times as high as the projected 3D boxes (median)"
+    if max(ratio, 1 / ratio) > _RECTANGLE_LIMIT:
+        return Finding(
+            "label image", "suspect", f"{summary}: do labels and calibration belong to this image?"
+        )
+    return Finding("label image", "ok", summary)
+
+
+def _height_ratios(frame: Frame, truth: Annotations) -> list[float]:
+    """Return height of the 2D box / height of the projected 3D box, of objects with both."""
+    objects = truth.select(~np.isnan(truth.boxes).any(axis=1) & (truth.truncated <= 0))
+    if len(np.unique(objects.boxes_2d, axis=0)) < len(objects):
+        return []  # placeholders of a data set without 2D boxes
+    rectangles = image_rectangles(objects.boxes, frame.calibration, frame.image_size)
+    heights = np.nan_to_num(rectangles[:, 3] - rectangles[:, 1])
+    labeled = objects.boxes_2d[:, 3] - objects.boxes_2d[:, 1]
+    both = (heights > _MIN_HEIGHT_PIXELS) & (labeled > _MIN_HEIGHT_PIXELS)
+    found: list[float] = (labeled[both] / heights[both]).tolist()
+    return found
+
+
+def _mounting(frame: Frame) -> Finding:
+    """Describe how the camera of a view is mounted, and how high the sensors are."""
+    found = Mounting.of(frame.calibration)
+    angles = np.rad2deg([found.yaw_rad, found.pitch_rad, found.roll_rad]) + 0.0
+    yaw, pitch, roll = (f"{angle:.1f}" for angle in angles)
+    name = f"{frame.camera}: " if frame.camera else ""
+    message = f"{name}yaw {yaw}, pitch {pitch}, roll {roll} degrees against the LiDAR"
+    ground = _ground_height(frame.points)
+    if np.isfinite(ground):
+        camera = np.linalg.inv(frame.calibration.lidar_to_camera)[2, 3]
+        message += f"; {camera - ground:.2f} m above the ground, the LiDAR {-ground:.2f} m"
+    else:
+        message += "; no ground found near it"
+    if not defines_headings(frame.calibration):
+        return Finding("camera", "suspect", f"{message}: KITTI's rotation_y is undefined under it")
+    return Finding("camera", "ok", message)
+
+
+def _ground_height(points: np.ndarray) -> float:
+    """Return z of the ground around the LiDAR, the median of the lowest points; NaN if none."""
+    near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR_METRES]
+    heights = GroundMap.of(near).lowered(near)[:, 2]
+    ground = near[heights < _GROUND_METRES, 2]
+    return float(np.median(ground)) if len(ground) else np.nan
+
+
+def _scale(frame: Frame) -> Finding:
+    """Compare the principal point of a view with the middle of its image."""
+    width, height = frame.cameras[0].image_size
+    projection = frame.calibration.projection
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = (projection[:2, 2] / projection[2, 2]).tolist()
+    summary = f"principal point ({x:.0f}, {y:.0f}) in an image of {width} x {height}"
+    factors = np.array([x / (width / 2), y / (height / 2)])
+    larger = float(factors.min())
+    smaller = float(1 / np.maximum(factors.max(), 1e-9))
+    off = max(larger, smaller)
+    inside = ((factors > 0) & (factors < 2)).all()
+    if off < _SCALE_LIMIT and inside:
+        return Finding("scale", "ok", summary)
+    state = "wrong" if off > _CERTAIN_SCALE else "suspect"
+    middle = f"expected near ({width / 2:.0f}, {height / 2:.0f})"
+    return Finding("scale", state, f"{summary}, {middle}: {_RESIZED}")

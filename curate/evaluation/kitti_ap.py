@@ -8,8 +8,11 @@ The kit samples the precision at 41 scores, one for each 1/40 of recall. With fe
 there are fewer scores, and the kit sets the precision at the remaining positions to 0: a perfect
 detector then gets only 2.5 per object. Here the scores are placed at their true recall instead, and
 a perfect detector gets 100 with any number of objects. `kit_sampling=True` gives the kit's figure.
-Both are the same from 41 objects on. Without objects the average precision is 0, as in the kit;
-check `objects` to see whether there were any.
+Both are the same from 41 objects on.
+
+A figure that cannot be computed is NaN, and None in `as_dict`: that of a category and level in
+which no object counts (the kit prints 0), or in which no detection has a 2D box, and those in the
+image for levels that need no image.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +23,8 @@ import numpy as np
 
 from curate.datasets.kitti.labels import KittiObjects
 from curate.errors import DataError
+from curate.evaluation.counts import Counts
+from curate.evaluation.difficulties import KITTI, Difficulty
 from curate.evaluation.kitti_matching import (
     Candidates,
     MatchInputs,
@@ -30,13 +35,8 @@ from curate.evaluation.kitti_matching import (
     match_results,
     true_positive_scores,
 )
-from curate.evaluation.kitti_rules import (
-    COUNTED,
-    DIFFICULTIES,
-    MIN_OVERLAPS,
-    label_states,
-    result_states,
-)
+from curate.evaluation.kitti_rules import COUNTED, MIN_OVERLAPS
+from curate.evaluation.kitti_states import Rules
 from curate.shapes import Float, Int
 
 FIGURES = ("image", "aos", "bev", "3d")
@@ -48,61 +48,77 @@ _UNKNOWN_ALPHA = -10.0
 
 @dataclass(frozen=True)
 class KittiEvaluation:
-    """The result of evaluating detections against labels; c categories, 3 difficulties.
+    """The result of evaluating detections against labels; c categories, d levels of difficulty.
 
     Attributes:
         min_overlaps: the evaluated categories and the overlap that a true positive must exceed.
-        curves: (c, 4, 3, 41) precision in [0, 1] by category, figure of `FIGURES`, difficulty, and
-            recall 0, 1/40, ..., 1. Each value is the best precision at this or a higher recall.
-        objects: (c, 3) int64 counted objects.
+        difficulty: the levels; KITTI's are easy, moderate and hard.
+        curves: (c, 4, d, 41) precision in [0, 1] by category, figure of `FIGURES`, level, and
+            recall 0, 1/40, ..., 1. Each value is the best precision at this or a higher recall. NaN
+            if it cannot be computed.
+        objects: (c, d) int64 counted objects.
         recall_overlaps: (r,) 3D overlaps of `recall_3d`.
-        recall_3d: (c, r, 3) share of the counted objects that a detection of any score matches.
+        recall_3d: (c, r, d) share of the counted objects that a detection of any score matches; NaN
+            if it cannot be computed.
         has_orientation: whether all detections have an observation angle; aos needs it.
+        counts: which objects of the ground truth count, and why the others do not.
+        result_counts: the same for the detections.
     """
 
     min_overlaps: Mapping[str, float]
-    curves: Float[np.ndarray, "c 4 3 41"]
-    objects: Int[np.ndarray, "c 3"]
+    difficulty: Difficulty
+    curves: Float[np.ndarray, "c 4 d 41"]
+    objects: Int[np.ndarray, "c d"]
     recall_overlaps: tuple[float, ...]
-    recall_3d: Float[np.ndarray, "c r 3"]
+    recall_3d: Float[np.ndarray, "c r d"]
     has_orientation: bool
+    counts: Counts
+    result_counts: Counts
 
     @property
-    def ap_r11(self) -> Float[np.ndarray, "c 4 3"]:
-        """(c, 4, 3) mean precision at recall 0, 0.1, ..., 1, in percent."""
+    def ap_r11(self) -> Float[np.ndarray, "c 4 d"]:
+        """(c, 4, d) mean precision at recall 0, 0.1, ..., 1, in percent."""
         return _percent(self.curves[..., ::4])
 
     @property
-    def ap_r40(self) -> Float[np.ndarray, "c 4 3"]:
-        """(c, 4, 3) mean precision at recall 1/40, 2/40, ..., 1, in percent."""
+    def ap_r40(self) -> Float[np.ndarray, "c 4 d"]:
+        """(c, 4, d) mean precision at recall 1/40, 2/40, ..., 1, in percent."""
         return _percent(self.curves[..., 1:])
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON, in percent: `AP_R40` and `AP_R11` by category and figure.
 
-        Each value is a list over the difficulties; "aos" is None without orientations.
+        Each value is a list over the levels, with None for a value that cannot be computed. "image"
+        is None for levels that need no image, "aos" also without orientations.
         """
         recalls = [f"{overlap:g}" for overlap in self.recall_overlaps]
         return {
             "AP_R40": self._by_figure(self.ap_r40),
             "AP_R11": self._by_figure(self.ap_r11),
             "thresholds": dict(self.min_overlaps),
-            "difficulties": list(DIFFICULTIES),
+            "difficulty": self.difficulty.kind,
+            "difficulties": list(self.difficulty.levels),
+            "limits": dict(zip(self.difficulty.levels, self.difficulty.limits(), strict=True)),
             "objects": dict(zip(self.min_overlaps, self.objects.tolist(), strict=True)),
             "recall_3d": {
-                category: dict(zip(recalls, (100 * table).tolist(), strict=True))
+                category: dict(zip(recalls, map(_known, (100 * table).tolist()), strict=True))
                 for category, table in zip(self.min_overlaps, self.recall_3d, strict=True)
             },
+            "counts": {"objects": self.counts.as_dict(), "results": self.result_counts.as_dict()},
         }
 
-    def _by_figure(self, averages: np.ndarray) -> dict[str, dict[str, list[float] | None]]:
+    def _by_figure(self, averages: np.ndarray) -> dict[str, dict[str, list[float | None] | None]]:
         return {
             category: {
-                figure: None if figure == "aos" and not self.has_orientation else values
+                figure: _known(values) if self._is_measured(figure) else None
                 for figure, values in zip(FIGURES, table, strict=True)
             }
             for category, table in zip(self.min_overlaps, averages.tolist(), strict=True)
         }
+
+    def _is_measured(self, figure: str) -> bool:
+        in_image = self.difficulty.in_image or figure not in ("image", "aos")
+        return in_image and (figure != "aos" or self.has_orientation)
 
 
 def evaluate(
@@ -112,6 +128,8 @@ def evaluate(
     min_overlaps: Mapping[str, float] = MIN_OVERLAPS,
     recall_overlaps: Sequence[float] = (0.3, 0.5, 0.7),
     kit_sampling: bool = False,
+    difficulty: Difficulty = KITTI,
+    points: Sequence[Int[np.ndarray, " n"]] | None = None,
 ) -> KittiEvaluation:
     """Return KITTI's average precision of detections: image, aos, BEV and 3D, R11 and R40.
 
@@ -124,21 +142,29 @@ def evaluate(
         min_overlaps: the categories to evaluate, and the overlap that a true positive must exceed.
         recall_overlaps: 3D overlaps at which to compute the recall.
         kit_sampling: with fewer than 41 objects, sample the recall as KITTI's program does.
+        difficulty: the levels of difficulty; those by points or distance need no 2D boxes.
+        points: for levels by points, the LiDAR points in each object of each frame.
 
     Raises:
         DataError: if the numbers of frames differ, or a detection has no score.
+        ConfigError: if the levels need points, and there are none.
     """
     check_frames(labels, results)
     pooled_labels, pooled_results = PooledFrames.of(labels), PooledFrames.of(results)
-    match = _Match(pooled_labels, pooled_results)
-    shape = (len(min_overlaps), len(DIFFICULTIES))
-    curves = np.zeros((shape[0], len(FIGURES), shape[1], _POSITIONS))
+    rules = Rules.of(
+        difficulty, min_overlaps, pooled_labels.objects, pooled_results.objects, points
+    )
+    match = _Match(pooled_labels, pooled_results, in_image=difficulty.in_image)
+    shape = (len(min_overlaps), len(difficulty.levels))
+    curves = np.full((shape[0], len(FIGURES), shape[1], _POSITIONS), np.nan)
     objects = np.zeros(shape, dtype=np.int64)
-    recalls = np.zeros((shape[0], len(recall_overlaps), shape[1]))
+    recalls = np.full((shape[0], len(recall_overlaps), shape[1]), np.nan)
     for c, (category, min_overlap) in enumerate(min_overlaps.items()):
-        for d in range(len(DIFFICULTIES)):
-            states = match.states(category, d)
+        for d in range(len(difficulty.levels)):
+            states = rules.states(category, d)
             objects[c, d] = count = int(np.sum(states[0] == COUNTED))
+            if count == 0 or rules.lacks_boxes(category, d):
+                continue
             for metric in match.candidates:
                 precision, similarity = match.curves(metric, *states, min_overlap)
                 if not kit_sampling:
@@ -147,10 +173,19 @@ def evaluate(
                 curves[c, FIGURES.index(metric), d] = precision
                 if metric == "image":
                     curves[c, FIGURES.index("aos"), d] = similarity
-            recalls[c, :, d] = [match.recall_3d(*states, overlap) for overlap in recall_overlaps]
+            recalls[c, :, d] = [
+                match.recall_3d(*states[:2], overlap) for overlap in recall_overlaps
+            ]
     has_orientation = bool(np.all(pooled_results.objects.alpha != _UNKNOWN_ALPHA))
     return KittiEvaluation(
-        dict(min_overlaps), curves, objects, tuple(recall_overlaps), recalls, has_orientation
+        dict(min_overlaps),
+        difficulty,
+        curves,
+        objects,
+        tuple(recall_overlaps),
+        recalls,
+        has_orientation,
+        *rules.counts(),
     )
 
 
@@ -176,8 +211,8 @@ def check_frames(labels: Sequence[KittiObjects], results: Sequence[KittiObjects]
 class _Match:
     """The overlapping pairs of all frames, and the counts over them."""
 
-    def __init__(self, labels: PooledFrames, results: PooledFrames) -> None:
-        self.candidates = candidates_by_metric(labels, results)
+    def __init__(self, labels: PooledFrames, results: PooledFrames, *, in_image: bool) -> None:
+        self.candidates = candidates_by_metric(labels, results, in_image=in_image)
         self._labels, self._results = labels.objects, results.objects
         self._dont_care = dont_care_shares(labels, results)
         self._gains = {
@@ -185,15 +220,13 @@ class _Match:
             for metric, pairs in self.candidates.items()
         }
 
-    def states(self, category: str, difficulty: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the states of the labels and of the results."""
-        return (
-            label_states(self._labels, category, difficulty),
-            result_states(self._results, category, difficulty),
-        )
-
     def curves(
-        self, metric: str, of_labels: np.ndarray, of_results: np.ndarray, min_overlap: float
+        self,
+        metric: str,
+        of_labels: np.ndarray,
+        of_results: np.ndarray,
+        spared: np.ndarray,
+        min_overlap: float,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (41,) precision and (41,) orientation similarity at the kit's thresholds."""
         candidates = self.candidates[metric]
@@ -203,7 +236,7 @@ class _Match:
         # DontCare regions are 2D boxes, so they apply to the image metric only.
         in_dont_care = (self._dont_care > min_overlap) & (metric == "image")
         totals = count_at_thresholds(
-            candidates, inputs, thresholds, in_dont_care, self._gains[metric]
+            candidates, inputs, thresholds, in_dont_care | spared, self._gains[metric]
         )
         positives = np.maximum(totals[:, 0] + totals[:, 1], 1)
         return _running_maximum(totals[:, 0] / positives), _running_maximum(
@@ -217,7 +250,7 @@ class _Match:
         counted = of_labels == COUNTED
         found = counted & (matches >= 0)
         found[found] = of_results[matches[found]] == COUNTED
-        return float(np.sum(found) / max(np.sum(counted), 1))
+        return float(np.sum(found) / np.sum(counted))
 
     def _orientation_gains(self, pairs: Candidates) -> np.ndarray:
         """Return (pairs,) (1 + cos of the difference of the observation angles) / 2."""
@@ -248,6 +281,11 @@ def score_thresholds(scores: Float[np.ndarray, " n"], count: int) -> Float[np.nd
         chosen.append(score)
         recall += 1 / (_POSITIONS - 1)
     return np.array(chosen)
+
+
+def _known(values: Sequence[float]) -> list[float | None]:
+    """Return the values with None for NaN."""
+    return [None if np.isnan(value) else value for value in values]
 
 
 def _percent(precision: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from numba import njit
 
 from curate.datasets.kitti.labels import DONT_CARE, KittiObjects
 from curate.geometry.overlap import overlapping_pairs
-from curate.shapes import Bool, Float, Int
+from curate.shapes import Bool, Float, Int, Shaped
 
 METRICS = ("image", "bev", "3d")
 
@@ -92,20 +92,30 @@ class MatchInputs(NamedTuple):
     min_overlap: float
 
 
-def candidates_by_metric(labels: PooledFrames, results: PooledFrames) -> dict[str, Candidates]:
-    """Return the pairs that overlap within a frame, for each metric of `METRICS`."""
+def candidates_by_metric(
+    labels: PooledFrames, results: PooledFrames, *, in_image: bool = True
+) -> dict[str, Candidates]:
+    """Return the pairs that overlap within a frame, for each metric of `METRICS`.
+
+    Args:
+        labels: the objects.
+        results: the detections.
+        in_image: whether to include the metric "image", which needs 2D boxes.
+    """
     count = len(labels.objects)
-    on_image = _image_pairs(
-        labels.objects.boxes_2d, labels.starts, results.objects.boxes_2d, results.starts
-    )
     rows, columns, bev, volumes = overlapping_pairs(
         camera_boxes(labels.objects), labels.starts, camera_boxes(results.objects), results.starts
     )
-    return {
-        "image": _by_label(count, *on_image),
+    found = {
         "bev": _by_label(count, rows, columns, bev),
         "3d": _by_label(count, rows, columns, volumes),
     }
+    if not in_image:
+        return found
+    on_image = _image_pairs(
+        labels.objects.boxes_2d, labels.starts, results.objects.boxes_2d, results.starts
+    )
+    return {"image": _by_label(count, *on_image), **found}
 
 
 def dont_care_shares(labels: PooledFrames, results: PooledFrames) -> Float[np.ndarray, " results"]:
@@ -125,6 +135,36 @@ def camera_boxes(objects: KittiObjects) -> Float[np.ndarray, "n 7"]:
     x, y, z = objects.locations.T
     height, width, length = objects.dimensions.T
     return np.stack([x, z, height / 2 - y, length, width, height, -objects.rotations_y], axis=1)
+
+
+def objects_in_lidar_frame(
+    boxes: Float[np.ndarray, "n 7"],
+    categories: Shaped[np.ndarray, " n"],
+    scores: Float[np.ndarray, " n"] | None = None,
+) -> KittiObjects:
+    """Return boxes as KITTI objects of a camera at the LiDAR's origin that looks along x.
+
+    This frame has the LiDAR's axes: overlaps and distances are those in the LiDAR frame. The
+    objects have no 2D box, occlusion or truncation.
+
+    Args:
+        boxes: (n, 7) in the LiDAR frame; NaN for DontCare regions, which get no extent.
+        categories: (n,) category of each.
+        scores: (n,) score of each; None for ground truth.
+    """
+    x, y, z, length, width, height, yaw = np.nan_to_num(boxes, nan=0.0).T
+    unknown = np.zeros(len(boxes))
+    return KittiObjects(
+        categories,
+        unknown,
+        unknown.astype(np.int64),
+        unknown,
+        np.zeros((len(boxes), 4)),
+        np.stack([height, width, length], axis=1),
+        np.stack([-y, height / 2 - z, x], axis=1),
+        -yaw - np.pi / 2,
+        np.full(len(boxes), np.nan) if scores is None else scores,
+    )
 
 
 def _by_label(

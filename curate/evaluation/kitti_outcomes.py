@@ -9,6 +9,7 @@ import numpy as np
 from curate.datasets.kitti.labels import KittiObjects
 from curate.detections import Columns
 from curate.errors import ConfigError
+from curate.evaluation.difficulties import KITTI, Difficulty
 from curate.evaluation.kitti_ap import check_frames
 from curate.evaluation.kitti_matching import (
     METRICS,
@@ -19,14 +20,8 @@ from curate.evaluation.kitti_matching import (
     dont_care_shares,
     match_results,
 )
-from curate.evaluation.kitti_rules import (
-    ABSENT,
-    DIFFICULTIES,
-    IGNORED,
-    MIN_OVERLAPS,
-    label_states,
-    result_states,
-)
+from curate.evaluation.kitti_rules import ABSENT, IGNORED, MIN_OVERLAPS
+from curate.evaluation.kitti_states import Rules
 from curate.shapes import Float, Int, Shaped
 
 TRUE_POSITIVE, FALSE_POSITIVE, FALSE_NEGATIVE, LEFT_OUT = "tp", "fp", "fn", "ignored"
@@ -71,9 +66,11 @@ def object_outcomes(
     results: Sequence[KittiObjects],
     *,
     metric: str = "3d",
-    difficulty: str = "hard",
+    difficulty: Difficulty = KITTI,
+    level: str | None = None,
     score_threshold: float = -np.inf,
     min_overlaps: Mapping[str, float] = MIN_OVERLAPS,
+    points: Sequence[Int[np.ndarray, " n"]] | None = None,
 ) -> tuple[Outcomes, Outcomes]:
     """Return the outcomes of the labels and of the results.
 
@@ -81,37 +78,41 @@ def object_outcomes(
         labels: the objects of each frame.
         results: the detections of each frame, in the same order.
         metric: the overlap to match by, "image", "bev" or "3d".
-        difficulty: "easy", "moderate" or "hard"; harder objects are ignored.
+        difficulty: the levels of difficulty.
+        level: name of the level; objects beyond it are ignored. None for the one with the most
+            objects: KITTI's "hard", the last level by points, all distances.
         score_threshold: detections with a lower score take no part.
         min_overlaps: the categories to evaluate, and the overlap that a true positive must exceed.
+        points: for levels by points, the LiDAR points in each object of each frame.
 
     Raises:
-        ConfigError: if the metric or the difficulty is unknown.
+        ConfigError: if the metric or the level is unknown.
         DataError: if the numbers of frames differ, or a detection has no score.
     """
-    if metric not in METRICS or difficulty not in DIFFICULTIES:
+    if metric not in METRICS or level not in (None, *difficulty.levels):
         raise ConfigError(
-            f"unknown metric {metric!r} or difficulty {difficulty!r}: "
-            f"choose a metric from {', '.join(METRICS)}, a difficulty from "
-            f"{', '.join(DIFFICULTIES)}"
+            f"unknown metric {metric!r} or level {level!r}: "
+            f"choose a metric from {', '.join(METRICS)}, a level from "
+            f"{', '.join(difficulty.levels)}"
         )
     check_frames(labels, results)
     pooled = PooledFrames.of(labels), PooledFrames.of(results)
     candidates = candidates_by_metric(*pooled)[metric]
     shares = dont_care_shares(*pooled) * (metric == "image")
-    level = DIFFICULTIES.index(difficulty)
+    if level is None:
+        difficulty, d = difficulty.whole()
+    else:
+        d = difficulty.levels.index(level)
+    rules = Rules.of(difficulty, min_overlaps, pooled[0].objects, pooled[1].objects, points)
     pairs = []
     for category, min_overlap in min_overlaps.items():
-        inputs = MatchInputs(
-            label_states(pooled[0].objects, category, level),
-            result_states(pooled[1].objects, category, level),
-            pooled[1].objects.scores,
-            min_overlap,
-        )
+        of_labels, of_results, spared = rules.states(category, d)
+        inputs = MatchInputs(of_labels, of_results, pooled[1].objects.scores, min_overlap)
         inputs.result_states[inputs.scores < score_threshold] = ABSENT
-        pairs.append(_outcomes(category, pooled, inputs, candidates, shares > min_overlap))
-    of_labels, of_results = zip(*pairs, strict=True)
-    return Outcomes.joined(of_labels), Outcomes.joined(of_results)
+        in_dont_care = (shares > min_overlap) | spared
+        pairs.append(_outcomes(category, pooled, inputs, candidates, in_dont_care))
+    label_rows, result_rows = zip(*pairs, strict=True)
+    return Outcomes.joined(label_rows), Outcomes.joined(result_rows)
 
 
 def _outcomes(

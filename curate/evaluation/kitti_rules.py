@@ -4,12 +4,13 @@ Source: the KITTI object development kit (Geiger et al., CVPR 2012), readme.txt 
 program. An ignored object is neither a true positive if it is found nor a miss if it is not.
 """
 
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
 import numpy as np
 
-from curate.datasets.kitti.labels import KittiObjects
-from curate.shapes import Int
+from curate.errors import ConfigError
+from curate.spelling import did_you_mean
 
 DIFFICULTIES = ("easy", "moderate", "hard")
 MIN_HEIGHTS = (40.0, 25.0, 25.0)
@@ -20,8 +21,8 @@ MAX_TRUNCATIONS = (0.15, 0.3, 0.5)
 MIN_OVERLAPS = MappingProxyType({"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5})
 """KITTI's IoU thresholds: the overlap that a true positive must exceed, in image, BEV and 3D."""
 
-RELAXED_OVERLAPS = MappingProxyType({"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25})
-"""Relaxed IoU thresholds, for detectors trained on few labels with boxes that are not precise."""
+OTHER_OVERLAP = 0.5
+"""IoU threshold of the categories that KITTI does not evaluate, unless another one is given."""
 
 NEIGHBOURS = MappingProxyType({"Car": "Van", "Pedestrian": "Person_sitting"})
 """The neighbour category of a category: its objects look alike and are ignored."""
@@ -30,39 +31,53 @@ COUNTED, IGNORED, ABSENT = 0, 1, -1
 """States of an object in the evaluation of one category and difficulty; ABSENT takes no part."""
 
 
-def label_states(labels: KittiObjects, category: str, difficulty: int) -> Int[np.ndarray, " n"]:
-    """Return (n,) int8 state of each labeled object.
+def overlaps_of(
+    categories: Collection[str], given: Mapping[str, float] | None = None
+) -> dict[str, float]:
+    """Return the IoU threshold of each category: the given one, KITTI's, or `OTHER_OVERLAP`.
 
     Args:
-        labels: n objects.
-        category: the evaluated category.
-        difficulty: index into `DIFFICULTIES`.
+        categories: the evaluated categories.
+        given: IoU thresholds by category; None for none.
+
+    Raises:
+        ConfigError: if a threshold is given for a category that is not evaluated, or is not above 0
+            and below 1.
     """
-    heights = labels.boxes_2d[:, 3] - labels.boxes_2d[:, 1]
-    too_hard = (
-        (labels.occluded > MAX_OCCLUSIONS[difficulty])
-        | (labels.truncated > MAX_TRUNCATIONS[difficulty])
-        | (heights <= MIN_HEIGHTS[difficulty])
-    )
-    states = np.full(len(labels), ABSENT, dtype=np.int8)
-    states[labels.categories == NEIGHBOURS.get(category, category)] = IGNORED
-    states[labels.categories == category] = COUNTED
-    states[(labels.categories == category) & too_hard] = IGNORED
-    return states
+    given = given or {}
+    for category, overlap in given.items():
+        if category not in categories:
+            meant = did_you_mean(category, categories)
+            raise ConfigError(
+                f"{category!r} is not one of the evaluated categories "
+                f"({', '.join(categories)}){meant}"
+            )
+        if not 0 < overlap < 1:
+            raise ConfigError(f"the IoU of {category} must be above 0 and below 1, not {overlap:g}")
+    return {
+        category: float(given.get(category, MIN_OVERLAPS.get(category, OTHER_OVERLAP)))
+        for category in categories
+    }
 
 
-def result_states(results: KittiObjects, category: str, difficulty: int) -> Int[np.ndarray, " n"]:
-    """Return (n,) int8 state of each detection.
+def relaxed(overlaps: Mapping[str, float]) -> dict[str, float]:
+    """Return relaxed IoU thresholds, for detectors trained on few labels with imprecise boxes.
 
-    A detection with a 2D box that is too low is ignored, whatever its category. It can therefore
-    match an object of another category, which is then not counted. KITTI's program does the same.
-
-    Args:
-        results: n detections.
-        category: the evaluated category.
-        difficulty: index into `DIFFICULTIES`.
+    0.7 becomes 0.5 and 0.5 becomes 0.25, as is usual for KITTI; other thresholds are interpolated
+    between these, 0 and 1.
     """
-    heights = np.abs(results.boxes_2d[:, 3] - results.boxes_2d[:, 1])
-    states = np.where(results.categories == category, COUNTED, ABSENT).astype(np.int8)
-    states[heights < MIN_HEIGHTS[difficulty]] = IGNORED
-    return states
+    known = ((0.0, 0.5, 0.7, 1.0), (0.0, 0.25, 0.5, 1.0))
+    return {category: float(np.interp(overlap, *known)) for category, overlap in overlaps.items()}
+
+
+RELAXED_OVERLAPS = MappingProxyType(relaxed(MIN_OVERLAPS))
+"""Relaxed IoU thresholds of KITTI's categories."""
+
+
+def neighbours_of(categories: Collection[str]) -> dict[str, str]:
+    """Return the neighbour of each category that has one, unless it is itself evaluated."""
+    return {
+        category: neighbour
+        for category, neighbour in NEIGHBOURS.items()
+        if category in categories and neighbour not in categories
+    }

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from curate.datasets.kitti.labels import KittiObjects
-from curate.evaluation.kitti_rules import COUNTED, DIFFICULTIES, MAX_TRUNCATIONS, label_states
+from curate.evaluation.difficulties import KITTI
+from curate.evaluation.kitti_rules import MAX_TRUNCATIONS
 
 QUANTILES = (0.1, 0.5, 0.9)
 
@@ -18,8 +19,8 @@ class ObjectStatistics:
     Attributes:
         objects: number of labeled objects.
         per_frame: objects per frame.
-        counted: objects per frame that count at each difficulty of `DIFFICULTIES`; each difficulty
-            includes the easier ones.
+        counted: objects per frame that count at each of KITTI's levels; each level includes
+            the easier ones.
         occluded: share with occlusion level 1 or more.
         mostly_occluded: share with occlusion level 2 or more.
         truncated: share that is truncated more than KITTI allows for "easy".
@@ -52,8 +53,8 @@ def _of_category(frames: Sequence[KittiObjects], category: str) -> ObjectStatist
     count = len(occluded)
     frame_count = max(len(frames), 1)
     counted = [
-        sum(int((label_states(each, category, level) == COUNTED).sum()) for each in selected)
-        for level in range(len(DIFFICULTIES))
+        sum(int((KITTI.object_reasons(each, level, None) == 0).sum()) for each in selected)
+        for level in range(len(KITTI.levels))
     ]
     return ObjectStatistics(
         objects=count,

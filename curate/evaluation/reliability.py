@@ -1,7 +1,8 @@
 """The reliability of label weights: how well they separate correct labels from wrong ones.
 
 Correct and wrong are decided by matching the labels to ground truth. A figure is NaN where it is
-undefined: without labels, without weight, or if all labels are correct or all are wrong.
+undefined: without labels, without weight, or if all labels are correct or all are wrong. Weights
+that were not measured are NaN, and so is every figure of them.
 """
 
 from collections.abc import Mapping
@@ -12,13 +13,17 @@ import numpy as np
 
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError
+from curate.evaluation.kitti_rules import MIN_OVERLAPS, NEIGHBOURS
 from curate.geometry.overlap import bev_iou, iou_3d
-from curate.shapes import Bool, Float, Int
+from curate.shapes import Bool, Float, Int, Shaped
 
 Overlap = Literal["bev", "3d"]
 Neighbors = Literal["neutral", "correct"]
 
 DONT_CARE = "DontCare"
+
+NEUTRAL = ("neighbour", "DontCare region")
+"""Why a label is neither correct nor wrong."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +42,9 @@ class MatchSettings:
     """
 
     overlap: Overlap = "bev"
-    minimum_iou: Mapping[str, float] = field(
-        default_factory=lambda: {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
-    )
+    minimum_iou: Mapping[str, float] = field(default_factory=lambda: dict(MIN_OVERLAPS))
     neighbors: Mapping[str, tuple[str, ...]] = field(
-        default_factory=lambda: {"Car": ("Van",), "Pedestrian": ("Person_sitting",)}
+        default_factory=lambda: {name: (other,) for name, other in NEIGHBOURS.items()}
     )
     neighbors_are: Neighbors = "neutral"
     dont_care_share: float = 0.5
@@ -68,6 +71,7 @@ class LabelMatches:
     Attributes:
         correct: (n,) bool.
         counted: (n,) bool, False for neutral labels. A correct label is always counted.
+        neutral: (n,) str, why a label is neutral, one of `NEUTRAL`; "" for counted labels.
         matched: (n,) int64 index of the matched annotation, -1 for none.
         iou: (n,) largest IoU with an annotation of the category or a neighbour, 0 without any.
         ground_truths: number of annotations to find, per category.
@@ -75,6 +79,7 @@ class LabelMatches:
 
     correct: Bool[np.ndarray, " n"]
     counted: Bool[np.ndarray, " n"]
+    neutral: Shaped[np.ndarray, " n"]
     matched: Int[np.ndarray, " n"]
     iou: Float[np.ndarray, " n"]
     ground_truths: Mapping[str, int]
@@ -107,7 +112,7 @@ def match_to_ground_truth(
         ConfigError: if a label's category has no minimum IoU.
     """
     n = len(detections)
-    correct, neutral = np.zeros((2, n), dtype=bool)
+    correct, on_neighbor, in_region = np.zeros((3, n), dtype=bool)
     matched, best = np.full(n, -1, dtype=np.int64), np.zeros(n)
     ground_truths = dict.fromkeys(settings.minimum_iou, 0)
     for category in sorted({str(name) for name in detections.categories} | set(ground_truths)):
@@ -122,11 +127,12 @@ def match_to_ground_truth(
         taken = _take_by_score(iou, detections.select(k), minimum)
         correct[k] = taken >= 0
         matched[k[taken >= 0]] = targets[taken[taken >= 0]]
-        neutral[k] = (neighbor_iou > minimum).any(axis=1)
+        on_neighbor[k] = (neighbor_iou > minimum).any(axis=1)
         best[k] = np.concatenate([iou, neighbor_iou, np.zeros((len(k), 1))], axis=1).max(axis=1)
     if rectangles is not None:
-        neutral |= _in_dont_care(rectangles, annotations, settings.dont_care_share)
-    return LabelMatches(correct, correct | ~neutral, matched, best, ground_truths)
+        in_region = _in_dont_care(rectangles, annotations, settings.dont_care_share)
+    neutral = np.select([correct, on_neighbor, in_region], ["", *NEUTRAL], default="")
+    return LabelMatches(correct, neutral == "", neutral, matched, best, ground_truths)
 
 
 def weighted_precision(weights: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
@@ -141,8 +147,22 @@ def weighted_recall(
     return _ratio(float(weights[correct].sum()), ground_truths)
 
 
+def rank_labels(weights: Float[np.ndarray, " n"]) -> bool:
+    """Return whether weights rank labels: they were measured, and some are not 0.
+
+    The AUROC of weights that are all 0 is 1/2 by its definition, which says nothing about a policy
+    that trusts no label. Reports leave it out.
+    """
+    return bool(weights.any()) and not bool(np.isnan(weights).any())
+
+
 def auroc(weights: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
-    """Return the probability that a correct label weighs more than a wrong one; ties count half."""
+    """Return the probability that a correct label weighs more than a wrong one; ties count half.
+
+    NaN if no label is correct, none is wrong, or weights were not measured.
+    """
+    if np.isnan(weights).any():
+        return float("nan")
     value, inverse, count = np.unique(weights, return_inverse=True, return_counts=True)
     correct_per_value = np.bincount(inverse[correct], minlength=len(value))
     wrong_per_value = count - correct_per_value
@@ -155,8 +175,10 @@ def average_precision(weights: Float[np.ndarray, " n"], correct: Bool[np.ndarray
     """Return the average precision of the labels ranked by falling weight.
 
     This is the mean precision over the steps in recall; labels of equal weight form one step. NaN
-    if no label is correct.
+    if no label is correct, or weights were not measured.
     """
+    if np.isnan(weights).any():
+        return float("nan")
     value, inverse, count = np.unique(-weights, return_inverse=True, return_counts=True)
     found = np.bincount(inverse[correct], minlength=len(value))
     precision = np.cumsum(found) / np.cumsum(count)
@@ -188,7 +210,13 @@ def reliability_bins(
     ground_truths: int,
     bins: int = 10,
 ) -> ReliabilityBins:
-    """Return the precision and recall of the labels in bins of equal width over [0, 1]."""
+    """Return the precision and recall of the labels in bins of equal width over [0, 1].
+
+    Labels with a weight of NaN are in no bin, and the recall is then NaN.
+    """
+    measured = ~np.isnan(weights)
+    if not measured.all():
+        weights, correct, ground_truths = weights[measured], correct[measured], 0
     # Unlike np.linspace, this gives the floats nearest to 0.1, 0.2, 0.3.
     edges = np.arange(bins + 1) / bins
     member = np.clip(np.searchsorted(edges, weights, side="right") - 1, 0, bins - 1)
@@ -208,6 +236,8 @@ def expected_calibration_error(
     weights: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"], bins: int = 10
 ) -> float:
     """Return the mean |weight - precision| over the bins, by number of labels; NaN without any."""
+    if np.isnan(weights).any():
+        return float("nan")
     table = reliability_bins(weights, correct, 0, bins)
     gap = np.abs(table.precision - table.mean_weight)
     return _ratio(float(np.nansum(gap * table.labels)), float(table.labels.sum()))

@@ -2,8 +2,8 @@
 
 Source: the COCO data format (Lin et al., "Microsoft COCO", ECCV 2014): `bbox` is left, top, width,
 height in pixels. Each annotation has additional keys: `weight` (v), `score` (pseudo-labels only),
-`box_3d` (the box in the LiDAR frame), `frame` and `k`. Images of X_l have their ground truth with
-weight 1.
+`box_3d` (the box in the LiDAR frame), `frame`, `k`, and `provenance` (detector, human if a person
+decided, or ground_truth). Images of X_l have their ground truth with weight 1.
 
 `zero_weight` in `info` gives the meaning of weight 0. A label to ignore has `iscrowd` 1, which COCO
 readers ignore. A background label is not in `annotations` but in `background`, in the same form,
@@ -132,7 +132,8 @@ def _annotations(
             "weight": float(objects.weights[k]),
             "box_3d": found.boxes[k].tolist(),
             "frame": objects.frame_id,
-            "k": k,
+            "k": int(objects.numbers[k]),
+            "provenance": str(objects.provenance[k]),
         }
         scored = {} if objects.labeled else {"score": float(found.scores[k])}
         yield k, annotation | scored

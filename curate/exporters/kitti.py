@@ -10,6 +10,10 @@ that have no line in label_2. The line contains category, weight, score, and the
 frame (x, y, z of its centre, length, width, height in metres, yaw in radians). Labels of weight 0
 have their category and 3D box only in this file.
 
+DIRECTORY/provenance/FRAME.txt exists for frames that people decided about. It has a line for each
+of these labels with its k and its provenance: detector, or human if a person decided. A label that
+a person rejected has weight 0 and no line in label_2.
+
 DIRECTORY/export.json marks the folder as an export; its `zero_weight` gives the meaning of weight
 0. Only a previous export is overwritten.
 """
@@ -48,6 +52,8 @@ class WeightedFrame:
             weight 0 are background.
         calibration: calibration of the frame.
         image_size: (width, height) in pixels; None without a camera.
+        numbers: (n,) k of each label; None for 0 to n - 1.
+        provenance: (n,) str, detector or human; None for detector.
     """
 
     frame_id: str
@@ -56,6 +62,8 @@ class WeightedFrame:
     ignored: np.ndarray
     calibration: Calibration
     image_size: tuple[int, int] | None
+    numbers: np.ndarray | None = None
+    provenance: np.ndarray | None = None
 
 
 class KittiExporter:
@@ -116,6 +124,8 @@ def _weighted_frames(labels: LabelSet) -> Iterator[WeightedFrame]:
             objects.ignored,
             frame.calibration,
             frame.image_size,
+            objects.numbers,
+            objects.provenance,
         )
 
 
@@ -155,3 +165,9 @@ def _write_frame(folder: Path, frame: WeightedFrame, last_field: str) -> None:
         )
     ]
     (folder / "weight" / name).write_text("".join(lines), encoding="utf-8")
+    if frame.provenance is None or not (frame.provenance == "human").any():
+        return
+    numbers = np.arange(len(labels)) if frame.numbers is None else frame.numbers
+    lines = [f"{k} {each}\n" for k, each in zip(numbers, frame.provenance, strict=True)]
+    (folder / "provenance").mkdir(exist_ok=True)
+    (folder / "provenance" / name).write_text("".join(lines), encoding="utf-8")

@@ -2,7 +2,8 @@
 
 Source: nuScenes' detection task (nuscenes.org). The file is a JSON object with `meta` and
 `results`. The results are lists of boxes by sample token: in the map frame, size as width, length,
-height, rotation as w, x, y, z. Each box has the additional keys `weight` (v) and `k`.
+height, rotation as w, x, y, z. Each box has the additional keys `weight` (v), `k` and
+`provenance` (detector, or human if a person decided).
 
 Labels of weight 0 are not in `results` but, in the same form, in `ignored` or `background`, which
 nuScenes' tools do not read. `zero_weight` in `meta` gives the meaning of weight 0. Velocities are
@@ -91,7 +92,8 @@ def _boxes(objects: FrameObjects, calibration: Calibration) -> list[dict[str, An
             "detection_score": float(found.scores[k]),
             "attribute_name": "",
             "weight": float(objects.weights[k]),
-            "k": k,
+            "k": int(objects.numbers[k]),
+            "provenance": str(objects.provenance[k]),
         }
         for k in range(len(found))
     ]

@@ -28,6 +28,8 @@ class FrameObjects:
         points: (n,) int64 LiDAR points in each box; -1 if unknown.
         truncated: (n,) share outside the image; -1 if unknown.
         occluded: (n,) int64, KITTI's levels 0 to 3; -1 if unknown.
+        numbers: (n,) int64 k of each label, or of each object of the ground truth.
+        provenance: (n,) str, detector, or human if a person decided; ground_truth for X_l.
     """
 
     frame_id: str
@@ -39,6 +41,8 @@ class FrameObjects:
     points: np.ndarray
     truncated: np.ndarray
     occluded: np.ndarray
+    numbers: np.ndarray
+    provenance: np.ndarray
 
     @property
     def images(self) -> tuple[str, ...]:
@@ -117,6 +121,8 @@ def _true_objects(files: FrameFiles, rows: Columns) -> FrameObjects:
         points=np.full(count, UNKNOWN, dtype=np.int64),
         truncated=np.array(rows["truncated"], dtype=np.float64),
         occluded=np.array(rows["occluded"], dtype=np.int64),
+        numbers=np.array(rows["k"], dtype=np.int64),
+        provenance=as_categories(["ground_truth"] * count),
     )
 
 
@@ -124,7 +130,7 @@ def _weighted_objects(files: FrameFiles, rows: Columns, labels: LabelSet) -> Fra
     count = len(rows["category"])
     weights = np.array(rows["weight"], dtype=np.float64)
     # A label that a person rejected is background, whatever weight 0 means for the policy.
-    by_detector = [each != "human" for each in rows["provenance"]]
+    provenance = as_categories(rows["provenance"])
     ignoring = labels.description.zero_weight == "ignore"
     return FrameObjects(
         files.frame,
@@ -132,10 +138,12 @@ def _weighted_objects(files: FrameFiles, rows: Columns, labels: LabelSet) -> Fra
         files=(files.points, *files.images),
         detections=_detections(rows, rows["score"]),
         weights=weights,
-        ignored=(weights == 0) & ignoring & np.array(by_detector, dtype=bool),
+        ignored=(weights == 0) & ignoring & (provenance != "human"),
         points=np.array([UNKNOWN if m is None else m for m in rows["points"]], dtype=np.int64),
         truncated=np.full(count, float(UNKNOWN)),
         occluded=np.full(count, UNKNOWN, dtype=np.int64),
+        numbers=np.array(rows["k"], dtype=np.int64),
+        provenance=provenance,
     )
 
 

@@ -7,15 +7,18 @@ Source: OpenPCDet's KITTI data set (github.com/open-mmlab/OpenPCDet). DIRECTORY 
     kitti_dbinfos_train.pkl  the objects of X_l by category, for OpenPCDet's GT sampling
     gt_database/*.bin        the points of these objects, relative to the box centre
 
-`annos` has additional arrays: `weight` (v; 1 for ground truth), `category`, and `ignored` (True for
-labels of weight 0 that are regions to ignore, False for those that are background). The `name` of
+`annos` has additional arrays: `weight` (v; 1 for ground truth), `category`, `k`, `provenance`
+(detector, human if a person decided, or ground_truth), and `ignored` (True for labels of weight 0
+that are regions to ignore, False for those that are background). The `name` of
 a label of weight 0 is DontCare, which OpenPCDet skips: a trainer that does not read the weights
 treats all these labels as background, never as objects. `zero_weight` of export.json gives the
 meaning of weight 0.
 
 Annos are in the rectified camera frame (`location` is the bottom centre, `dimensions` are length,
-height, width). `gt_boxes_lidar` is (n, 7) at the box centre in the LiDAR frame. R0_rect is the
-identity, and Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera.
+height, width; `rotation_y` by OpenPCDet's formula, so that its own conversion gives the same boxes
+in the LiDAR frame for every mounting of the camera). `gt_boxes_lidar` is (n, 7) at the box centre
+in the LiDAR frame. R0_rect is the identity, and Tr_velo_to_cam is the complete transform from the
+LiDAR to the rectified camera.
 """
 
 from collections.abc import Mapping
@@ -82,7 +85,9 @@ def _info(objects: FrameObjects, frame: Frame) -> Info:
         )
     width, height = frame.image_size
     last_row = np.array([[0.0, 0, 0, 1]])
-    in_camera = from_detections(objects.detections, frame.calibration, frame.image_size)
+    in_camera = from_detections(
+        objects.detections, frame.calibration, frame.image_size, "openpcdet"
+    )
     return {
         "point_cloud": {"num_features": 4, "lidar_idx": objects.frame_id},
         "image": {
@@ -105,6 +110,8 @@ def _annos(objects: FrameObjects, in_camera: KittiObjects) -> Info:
     return {
         "name": names,
         "category": found.categories,
+        "k": objects.numbers,
+        "provenance": objects.provenance,
         "weight": objects.weights,
         "ignored": objects.ignored,
         "truncated": objects.truncated,

@@ -11,6 +11,7 @@ SELF_TRAIN.INIT_PS, is a dict by frame id of X_u:
     iou_scores      None
     memory_counter  (n,) zeros: no round has missed the label yet
     weight          (n,) v, for a loss that uses it
+    k, provenance   (n,) number of the label; detector, or human if a person decided
 
 Background labels of weight 0 are omitted, like the labels that ST3D itself drops. `zero_weight` of
 export.json gives the meaning of weight 0.
@@ -83,4 +84,6 @@ def _pseudo_labels(objects: FrameObjects, categories: tuple[str, ...]) -> dict[s
         "iou_scores": None,
         "memory_counter": np.zeros(len(found)),
         "weight": weights,
+        "k": objects.numbers[kept],
+        "provenance": objects.provenance[kept],
     }

@@ -42,14 +42,14 @@ class Decision:
     """A person's decision about one object.
 
     Attributes:
-        number: of the shown box, from 1; None for an added box.
+        k: number of the shown label; None for an added box.
         decision: accepted, rejected, moved or added.
         category: of the object.
         box: (7,) in the LiDAR frame; the shown box if it was rejected.
         seen: (7,) the box as shown; None for an added box.
     """
 
-    number: int | None
+    k: int | None
     decision: str
     category: str
     box: tuple[float, ...]
@@ -83,7 +83,7 @@ def compare_frame(
     Args:
         shown: the frame as exported.
         edited: its boxes after editing.
-        explicit: decisions from the review table by box number: accepted or rejected.
+        explicit: decisions from the review table by k: accepted or rejected.
         accept_rest: accept unchanged boxes without an explicit decision.
 
     Raises:
@@ -93,24 +93,24 @@ def compare_frame(
     unchanged, moved = _pairs(shown, edited)
     decisions, untouched = [], 0
     for place, box in enumerate(shown.boxes):
-        decision = explicit.get(place + 1)
+        decision = explicit.get(box.k)
         if place in moved:
             now = edited[moved[place]]
             if decision == REJECTED:
                 raise DataError(
-                    f"{now.place}: box {place + 1} of frame {shown.frame} is moved and also marked "
+                    f"{now.place}: label {box.k} of frame {shown.frame} is moved and also marked "
                     "as rejected; undo one of the two"
                 )
-            found = Decision(place + 1, MOVED, now.category, now.box, box.box)
+            found = Decision(box.k, MOVED, now.category, now.box, box.box)
         elif decision == REJECTED or (place not in unchanged and decision is None):
-            found = Decision(place + 1, REJECTED, box.category, box.box, box.box)
+            found = Decision(box.k, REJECTED, box.category, box.box, box.box)
         elif place not in unchanged:
             raise DataError(
-                f"frame {shown.frame}: box {place + 1} is marked as accepted but deleted; undo one "
+                f"frame {shown.frame}: label {box.k} is marked as accepted but deleted; undo one "
                 "of the two"
             )
         elif not box.human and (decision == ACCEPTED or accept_rest):
-            found = Decision(place + 1, ACCEPTED, box.category, box.box, box.box)
+            found = Decision(box.k, ACCEPTED, box.category, box.box, box.box)
         else:
             untouched += 1
             continue

@@ -13,7 +13,7 @@ from curate.viewing.tags import ShownLabels
 
 @dataclass(frozen=True)
 class NumberedLabels(ShownLabels):
-    """Labels with their number as the first part of their caption.
+    """Labels with their k as the first part of their caption, and a mark on requested ones.
 
     Attributes:
         requested: (n,) bool, labels for which a decision is requested; they are highlighted.
@@ -27,14 +27,11 @@ class NumberedLabels(ShownLabels):
         return np.where(self._is_requested, 1.0, 0.25 + 0.25 * self.weights)
 
     def caption(self, index: int) -> tuple[str, str]:
-        """Return the number, with a mark if a decision is requested, and category, s and v."""
+        """Return k, with a mark if a decision is requested, and category, s and v."""
         score, weight = self.scores[index], self.weights[index]
         mark = " ?" if self._is_requested[index] else ""
-        return f"{index + 1}{mark}", f"{self.categories[index]} s {score:.2f} v {weight:.2f}"
-
-    def short_caption(self, index: int) -> str:
-        """Return the number alone."""
-        return str(index + 1)
+        name = f"k{self.number(index)}{mark}"
+        return name, f"{self.categories[index]} s {score:.2f} v {weight:.2f}"
 
     @property
     def _is_requested(self) -> np.ndarray:
@@ -43,12 +40,13 @@ class NumberedLabels(ShownLabels):
 
 def draw_review(frame: Frame, shown: ShownFrame, *, title: str = "") -> np.ndarray:
     """Draw the numbered boxes, human labels dashed; return (height, width, 3) uint8 RGB."""
-    human = np.array([box.human for box in shown.boxes], dtype=bool)
     labels = NumberedLabels(
         shown.array,
         as_categories([box.category for box in shown.boxes]),
         np.array([box.score for box in shown.boxes], dtype=np.float64),
         np.array([box.weight for box in shown.boxes], dtype=np.float64),
+        numbers=np.array([box.k for box in shown.boxes], dtype=np.int64),
+        decisions=np.array(["human" if box.human else "" for box in shown.boxes], dtype="U8"),
         requested=np.array([box.asked for box in shown.boxes], dtype=bool),
     )
-    return draw_frame(frame, labels, human_boxes=shown.array[human], title=title)
+    return draw_frame(frame, labels, title=title)

@@ -1,4 +1,7 @@
-"""review.csv: one row per box, in which a person may write a decision.
+"""review.csv: one row per label, in which a person may write a decision.
+
+A label has the number k that it has everywhere else: in pictures, `curate explain` and queries. In
+tables of curate 0.1 the column `box` counts the labels of a frame from 1; they are read, too.
 
 The column `decision` takes `accept` or `reject`. `accept` in the row `all` of a frame accepts every
 unchanged box of the frame that has no decision of its own. An unchanged box without a decision
@@ -10,14 +13,17 @@ import io
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from curate.datasets.frame_names import FrameNames
 from curate.errors import DataError
 from curate.files.atomic import replace_file
+from curate.files.csv_text import column_names, read_csv
 from curate.review.human_labels import ACCEPTED, REJECTED
-from curate.review.sheet import Sheet
+from curate.review.sheet import Sheet, ShownFrame
 
 TABLE = "review.csv"
-COLUMNS = ("frame", "box", "asked", "category", "score", "weight", "decision")
+COLUMNS = ("frame", "k", "asked", "category", "score", "weight", "decision")
 ALL = "all"
+_OLD_NUMBER = "box"
 _WORDS = {"accept": ACCEPTED, "accepted": ACCEPTED, "reject": REJECTED, "rejected": REJECTED}
 
 
@@ -26,7 +32,7 @@ class ExplicitDecisions:
     """The decisions written in the table for one frame.
 
     Attributes:
-        boxes: accepted or rejected, by box number.
+        boxes: accepted or rejected, by k.
         accept_rest: whether all other unchanged boxes are accepted.
     """
 
@@ -41,10 +47,10 @@ def write_table(folder: Path, sheet: Sheet) -> None:
     writer.writerow(COLUMNS)
     for frame in sheet.frames:
         writer.writerow((frame.frame, ALL, "", "", "", "", ""))
-        for number, box in enumerate(frame.boxes, start=1):
+        for box in frame.boxes:
             asked = "yes" if box.asked else "human" if box.human else ""
             numbers = (f"{box.score:.3f}", f"{box.weight:.3f}")
-            writer.writerow((frame.frame, number, asked, box.category, *numbers, ""))
+            writer.writerow((frame.frame, box.k, asked, box.category, *numbers, ""))
     replace_file(folder / TABLE, text.getvalue().encode())
 
 
@@ -58,48 +64,37 @@ def read_table(folder: Path, sheet: Sheet) -> dict[str, ExplicitDecisions]:
     path = folder / TABLE
     if not path.is_file():
         return {}
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a UTF-8 text file (byte {error.start})") from None
-    # In some languages spreadsheets save CSV with semicolons.
-    delimiter = ";" if ";" in text.partition("\n")[0] else ","
-    rows = csv.DictReader(io.StringIO(text), delimiter=delimiter)
-    if not {"frame", "box", "decision"} <= set(rows.fieldnames or ()):
-        raise DataError(f"{path}:1: the columns frame, box and decision are required")
+    shown = {frame.frame: frame for frame in sheet.frames}
+    frames = FrameNames(shown)
+    column = _OLD_NUMBER if _OLD_NUMBER in column_names(path) else "k"
     found: dict[str, ExplicitDecisions] = {}
-    for row in rows:
-        word = (row["decision"] or "").strip().lower()
-        if word:
-            _add_decision(row, word, f"{path}:{rows.line_num}", sheet, found)
+    for line, (name, label, decision) in read_csv(path, ("frame", column, "decision")):
+        if decision:
+            place = f"{path}:{line}"
+            frame = frames.require(name, place)
+            words = found.setdefault(frame, ExplicitDecisions())
+            _add_decision(shown[frame], (column, label.lower()), decision.lower(), place, words)
     return found
 
 
 def _add_decision(
-    row: dict[str, str], word: str, place: str, sheet: Sheet, found: dict[str, ExplicitDecisions]
+    shown: ShownFrame, label: tuple[str, str], word: str, place: str, words: ExplicitDecisions
 ) -> None:
+    """Add the decision of a row; `label` is the name of its column of numbers, and the number."""
+    column, number = label
     if word not in _WORDS:
         raise DataError(f"{place}: invalid decision {word!r}; write accept, reject or nothing")
-    name = _frame(row["frame"], place, sheet)
-    words = found.setdefault(name, ExplicitDecisions())
-    if (row["box"] or "").strip().lower() == ALL:
+    if number == ALL:
         if _WORDS[word] == REJECTED:
             raise DataError(f"{place}: a whole frame cannot be rejected; reject its boxes")
         words.accept_rest = True
         return
-    count = len(next(frame for frame in sheet.frames if frame.frame == name).boxes)
-    number = int(row["box"]) if (row["box"] or "").strip().isdigit() else 0
-    if not 1 <= number <= count:
-        raise DataError(f"{place}: frame {name} has boxes 1 to {count}, not {row['box']!r}")
-    words.boxes[number] = _WORDS[word]
-
-
-def _frame(name: str, place: str, sheet: Sheet) -> str:
-    """Return the frame of a row; spreadsheets remove leading zeros."""
-    names = [frame.frame for frame in sheet.frames]
-    matches = [each for each in names if each.lstrip("0") == name.strip().lstrip("0")]
-    if name in names:
-        return name
-    if len(matches) != 1:
-        raise DataError(f"{place}: frame '{name}' is not in this review")
-    return matches[0]
+    known = {str(each.k): each.k for each in shown.boxes}
+    if column == _OLD_NUMBER:
+        known = {str(place): each.k for place, each in enumerate(shown.boxes, start=1)}
+    if number not in known:
+        raise DataError(
+            f"{place}: {column} {number!r} is not in frame {shown.frame} of this review; it has "
+            f"{', '.join(known) or 'no labels'}"
+        )
+    words.boxes[known[number]] = _WORDS[word]

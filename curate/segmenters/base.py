@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -51,3 +51,14 @@ class Segmenter(Protocol):
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's semantic map, of the same size as its image."""
         ...
+
+
+@runtime_checkable
+class DeclaresClasses(Protocol):
+    """A segmenter that has the same classes in every frame, and knows them before the first.
+
+    Attributes:
+        classes: for each category, the class ids that count as its pixels.
+    """
+
+    classes: Mapping[str, tuple[int, ...]]

@@ -2,8 +2,8 @@
 
 A cyclist is the rider and the bicycle; a pedestrian is a person on foot. If a class set has one
 class for all people, it counts for both. The ids are those that each data set defines: the classes
-of Pascal VOC, the train ids or label ids of Cityscapes, the category ids of COCO with 0 as
-background, and the 80 classes of COCO counted from 0.
+of Pascal VOC, the train ids or label ids of Cityscapes, CamVid's eleven classes, the category ids
+of COCO with 0 as background, and the 80 classes of COCO counted from 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,6 +23,7 @@ CLASS_MAPS: Mapping[str, ClassMap] = MappingProxyType(
         "voc": {"Car": (7,), "Pedestrian": (15,), "Cyclist": (2, 15)},
         "cityscapes": {"Car": (13,), "Pedestrian": (11,), "Cyclist": (12, 18)},
         "cityscapes-label-ids": {"Car": (26,), "Pedestrian": (24,), "Cyclist": (25, 33)},
+        "camvid": {"Car": (8,), "Pedestrian": (9,), "Cyclist": (10,)},
         "coco": {"Car": (3,), "Pedestrian": (1,), "Cyclist": (1, 2)},
         "coco-from-0": {"Car": (2,), "Pedestrian": (0,), "Cyclist": (0, 1)},
         "simulated": {"Car": (1,), "Pedestrian": (2,), "Cyclist": (3,)},
@@ -35,6 +36,7 @@ _VALID_IDS = {
     "voc": range(21),
     "cityscapes": range(19),
     "cityscapes-label-ids": range(34),
+    "camvid": range(11),
     "simulated": range(4),
 }
 _UNLABELED = 255

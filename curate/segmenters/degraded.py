@@ -96,6 +96,7 @@ class DegradedSegmenter:
             )
         self.errors = ErrorModel(**rates)
         self._truth = SavedSegmenter(directory, class_map("simulated"))
+        self.classes = self._truth.classes
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's degraded map; it depends on seed, frame id and camera only.

@@ -4,15 +4,15 @@ Source: COCO's data format: annotations `{images, annotations}`, a list of resul
 per frame. Where masks overlap, the mask with the higher score is on top.
 """
 
-import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from curate.errors import ConfigError, DataError, one_line
+from curate.datasets.frame_names import FrameNames, files_by_frame, last_part
+from curate.errors import ConfigError, DataError
+from curate.files.json_text import read_json
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap, image_size_of
@@ -32,6 +32,8 @@ class InstanceSegmenter:
             are CAMERA/FRAME.
         classes: the COCO category ids that count for each category.
         minimum_score: masks below it are dropped; a mask without a score counts as score 1.
+        frame_ids: the frames of the data set, with which the names of files and images are matched
+            in the spellings of `curate.datasets.frame_names`; without them, names are frame ids.
 
     Raises:
         DataError: if the path is missing, or contains no instance masks.
@@ -41,14 +43,38 @@ class InstanceSegmenter:
     needs_image = False
 
     def __init__(
-        self, path: StrPath, classes: Mapping[str, Sequence[int]], *, minimum_score: float = 0.5
+        self,
+        path: StrPath,
+        classes: Mapping[str, Sequence[int]],
+        *,
+        minimum_score: float = 0.5,
+        frame_ids: Sequence[str] = (),
     ) -> None:
         if not 0 <= minimum_score <= 1:
             raise ConfigError(f"segmenter minimum_score {minimum_score}: expected 0 to 1")
         self.path = Path(path)
         self.classes = checked_classes(classes)
         self.minimum_score = minimum_score
-        self._frames = None if self.path.is_dir() else _by_frame(self.path)
+        self._frame_ids = frame_ids
+        self._files: dict[str, Mapping[str, Path]] = {}
+        self._frames: dict[str, Mapping[str, Objects]] = {}
+        if not self.path.is_dir():
+            self._objects_by_frame("")
+        elif next(self.path.glob("*.json"), None):
+            self._file_by_frame("")
+
+    def _file_by_frame(self, camera: str) -> Mapping[str, Path]:
+        """Return the file of each frame from a camera; "" for the only one."""
+        if camera not in self._files:
+            folder = self.path / camera
+            self._files[camera] = files_by_frame(folder, (".json",), self._frame_ids)
+        return self._files[camera]
+
+    def _objects_by_frame(self, camera: str) -> Mapping[str, Objects]:
+        """Return the objects of each frame from a camera; "" for the only one."""
+        if camera not in self._frames:
+            self._frames[camera] = _by_frame(self.path, FrameNames.of(self._frame_ids), camera)
+        return self._frames[camera]
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's masks as a semantic map.
@@ -80,50 +106,62 @@ class InstanceSegmenter:
 
     def _objects(self, frame_id: str, camera: str) -> tuple[str, Objects]:
         """Return the place of a frame's objects, for error messages, and the objects."""
-        if self._frames is None:
-            path = self.path / camera / f"{frame_id}.json"
-            return str(path), _object_list(path, _read(path))
         name = f"{camera}/{frame_id}" if camera else frame_id
-        number = int(frame_id) if frame_id.isdecimal() and not camera else None
-        for key in (name, number):
-            if key in self._frames:
-                return f"{self.path}: frame {name}", self._frames[key]
+        if self.path.is_dir():
+            default = self.path / camera / f"{frame_id}.json"
+            path = self._file_by_frame(camera).get(frame_id, default)
+            return str(path), _object_list(path, read_json(path, "instance mask"))
+        frames = self._objects_by_frame(camera)
+        names = (frame_id, str(int(frame_id))) if frame_id.isdecimal() else (frame_id,)
+        for each in names:
+            if each in frames:
+                return f"{self.path}: frame {name}", frames[each]
         raise DataError(
             f"{self.path}: no masks for frame {name}; list a frame without objects in `images`: "
             f'{{"images": [{{"id": 1, "file_name": "{name}.png"}}], "annotations": [...]}}'
         )
 
 
-def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
-    """Return the objects of each frame, by its name or by the `image_id` of a list of results."""
-    document = _read(path)
+def _by_frame(
+    path: Path, frame_ids: FrameNames, camera: str
+) -> Mapping[str, list[Mapping[str, Any]]]:
+    """Return the objects of each frame of the data set, or of each image without `frame_ids`.
+
+    With several cameras, images are those in a folder with the name of the camera.
+    """
+    document = read_json(path, "instance mask")
     images = document.get("images", ()) if isinstance(document, dict) else ()
     try:
-        keys = _keys({image["id"]: Path(image["file_name"]) for image in images})
-        frames: dict[str | int, list[Mapping[str, Any]]] = {
-            key: [] for of_image in keys.values() for key in of_image
-        }
+        names = {image["id"]: str(image["file_name"]) for image in images}
+        found: dict[str, list[Mapping[str, Any]]] = {name: [] for name in names.values()}
         for entry in _object_list(path, document):
-            for key in keys[entry["image_id"]] if keys else (entry["image_id"],):
-                frames.setdefault(key, []).append(entry)
+            key = entry["image_id"]
+            found.setdefault(names[key] if names else str(key), []).append(entry)
     except (KeyError, TypeError) as error:
         words = f"no {error.args[0]!s:.80}" if isinstance(error, KeyError) else str(error)
         raise DataError(
             f"{path}: not COCO's format of images and masks: {' '.join(words.split())}"
         ) from None
-    return frames
-
-
-def _keys(files: Mapping[Any, Path]) -> dict[Any, list[str]]:
-    """Return the names of each image: CAMERA/FRAME, and FRAME if no other image has that name."""
-    stems = Counter(file.stem for file in files.values())
-    return {
-        number: [
-            *([file.stem] if stems[file.stem] == 1 else []),
-            *([f"{file.parent.name}/{file.stem}"] if file.parent.name else []),
-        ]
-        for number, file in files.items()
-    }
+    if len(found) < len(names):
+        raise DataError(f"{path}: two images have the same file_name; remove one")
+    several = any(Path(name).parent.name == camera for name in found) if camera else False
+    if several:
+        found = {name: each for name, each in found.items() if Path(name).parent.name == camera}
+    if not len(frame_ids):
+        by_name = {last_part(name): objects for name, objects in found.items()}
+        if len(by_name) < len(found):
+            raise DataError(
+                f"{path}: several images of one frame, as of several cameras; keep those of the "
+                "camera that the data set reads"
+            )
+        return by_name
+    matched, unmatched = frame_ids.match(found, path)
+    if unmatched and not matched:
+        raise DataError(
+            f"{path}: no image is of a frame of the data set, such as {unmatched[0][:200]!r}"
+            f"{frame_ids.nearest(unmatched[0])}"
+        )
+    return {frame: found[name] for name, frame in matched.items()}
 
 
 def _object_list(path: Path, document: Any) -> list[Mapping[str, Any]]:
@@ -141,12 +179,3 @@ def _score(source: str, number: int, entry: Mapping[str, Any]) -> float:
     if not isinstance(score, int | float) or not 0 <= score <= 1:
         raise DataError(f"{source}: object {number}: the score is not a number from 0 to 1")
     return float(score)
-
-
-def _read(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file of instance masks") from None
-    except (OSError, RecursionError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None

@@ -124,7 +124,7 @@ class OnnxSegmenter:
         shrinks = target[0] < width or target[1] < height
         interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         pixels = cv2.resize(image, target, interpolation=interpolation)
-        (output,) = self._model.run(pixels, [self._output])
+        output = self._model.run(pixels, [self._output])[self._output]
         class_ids = _class_ids(output, target, self._model.path)
         return cv2.resize(class_ids, (width, height), interpolation=cv2.INTER_NEAREST)
 

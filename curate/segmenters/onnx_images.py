@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from curate.datasets.formats.images import MAX_PIXELS
-from curate.errors import ConfigError, ModelError, first_line
-from curate.files.onnx_session import open_session, runtime_errors
+from curate.errors import ConfigError, ModelError
+from curate.files.onnx_session import ModelValue, OnnxModel
 from curate.frames import Frame
 
 # Mean and standard deviation of ImageNet's RGB, as used to train most published models.
@@ -66,7 +66,7 @@ class ImageModel:
 
     Attributes:
         input: the image input, see `ImageInput`.
-        outputs: ONNX Runtime's descriptions of the outputs.
+        outputs: the declared outputs.
 
     Raises:
         ConfigError: if there is no such scaling.
@@ -78,23 +78,17 @@ class ImageModel:
             raise ConfigError(f"segmenter scaling {scaling!r}: use one of {', '.join(SCALINGS)}")
         self.path = Path(path)
         self._scaling = scaling
-        self._session = open_session(self.path, threads, "segmenter")
-        self.input = _image_input(self._session, self.path, single=single)
-        self.outputs = self._session.get_outputs()
+        self._model = OnnxModel(self.path, threads, "segmenter")
+        self.input = _image_input(self._model.inputs, self.path, single=single)
+        self.outputs = self._model.outputs
 
-    def run(self, pixels: np.ndarray, outputs: Sequence[str]) -> list[Any]:
+    def run(self, pixels: np.ndarray, outputs: Sequence[str]) -> dict[str, Any]:
         """Return the named outputs for (height, width, 3) uint8 RGB pixels of the input size.
 
         Raises:
             ModelError: if the model fails.
         """
-        try:
-            values: list[Any] = self._session.run(
-                list(outputs), self.input.feed(pixels, self._scaling)
-            )
-        except runtime_errors() as error:
-            raise ModelError(f"{self.path}: {first_line(error)}") from error
-        return values
+        return self._model.run(self.input.feed(pixels, self._scaling), outputs)
 
 
 def image_of(frame: Frame) -> np.ndarray:
@@ -108,14 +102,13 @@ def image_of(frame: Frame) -> np.ndarray:
     return frame.image
 
 
-def _image_input(session: Any, model: Path, *, single: bool) -> ImageInput:
+def _image_input(inputs: Sequence[ModelValue], model: Path, *, single: bool) -> ImageInput:
     """Return the image input of a model.
 
     Raises:
         ModelError: if the model has other inputs, or its image has an invalid size.
     """
-    inputs = session.get_inputs()
-    shown = ", ".join(f"{value.name} {value.type}{value.shape}" for value in inputs)
+    shown = ", ".join(map(str, inputs))
     invalid = ModelError(f"{model}: takes {shown}; {_EXPECTED}")
     if len(inputs) != 1 or len(inputs[0].shape) not in ({3, 4} if single else {4}):
         raise invalid

@@ -125,8 +125,8 @@ class OnnxInstanceSegmenter:
 
     def _run_model(self, pixels: np.ndarray) -> dict[str, np.ndarray]:
         """Return the model's outputs by their meaning."""
-        outputs = self._model.run(pixels, tuple(self._outputs.values()))
-        values_of = dict(zip(self._outputs, outputs, strict=True))
+        values = self._model.run(pixels, tuple(self._outputs.values()))
+        values_of = {meaning: values[name] for meaning, name in self._outputs.items()}
         for name, values in values_of.items():
             if not is_numeric_array(values):
                 raise ModelError(f"{self._model.path}: output {name} is not an array of numbers")

@@ -14,6 +14,7 @@ from curate.viewing.legend import (
     TITLE_HEIGHT,
     TRUTH_DOTS,
     UNSEEN_STROKE,
+    draw_cross,
     draw_title,
 )
 from curate.viewing.overlay import FrameContent
@@ -133,8 +134,10 @@ def paint_bird_eye(canvas: Canvas, points: np.ndarray, shown: FrameContent, regi
             canvas.lines(footprints[index][[[0, 2], [1, 3]]], colour, UNSEEN_STROKE)
     if shown.repredictions is not None:
         _draw_repredictions(canvas, region, shown.repredictions, style)
-    if shown.human_boxes is not None:
-        canvas.dashes(_sides(shown.human_boxes, region), style.human, 2.0, HUMAN_DASHES)
+    for footprint in footprints[labels.is_rejected]:
+        draw_cross(canvas, footprint, style)
+    human = labels.boxes[labels.is_human]
+    canvas.dashes(_sides(human, region), style.human, 2.0, HUMAN_DASHES)
     canvas.dashes(_sides(shown.valid_truth, region), style.ground_truth, 1.5, TRUTH_DOTS)
     anchors = np.concatenate([footprints.min(axis=1), footprints.max(axis=1)], axis=1)
     bounds = np.array([0, TITLE_HEIGHT, width, TITLE_HEIGHT + height])

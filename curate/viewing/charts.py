@@ -254,7 +254,12 @@ def _draw_aurocs(axes: "Axes", found: Sequence[Figures], level: float) -> None:
     axes.spines["left"].set_visible(False)
     if not defined:
         axes.set(xlim=(0.5, 1), yticks=[])
-        axes.text(0.75, 0.5, "undefined: all labels are\ncorrect, or all are wrong", ha="center")
+        axes.text(
+            0.75,
+            0.5,
+            "undefined: all labels are correct,\nor all are wrong, or nothing\nwas measured",
+            ha="center",
+        )
         return
     for row, each in enumerate(defined):
         value, low, high = each.auroc.value, each.auroc.low, each.auroc.high

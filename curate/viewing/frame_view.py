@@ -20,7 +20,6 @@ def draw_frame(
     truth_boxes: np.ndarray | None = None,
     repredictions: ShownRepredictions | None = None,
     *,
-    human_boxes: np.ndarray | None = None,
     title: str = "",
 ) -> np.ndarray:
     """Return the drawn frame in the dark style, (height, width, 3) uint8 RGB.
@@ -30,10 +29,9 @@ def draw_frame(
         labels: labels, coloured by weight.
         truth_boxes: (m, 7) ground truth in the LiDAR frame; None if unknown.
         repredictions: repredictions; None to draw none.
-        human_boxes: (h, 7) boxes that people decided on; None for none.
         title: text at the top.
     """
-    shown = FrameContent(labels, truth_boxes, repredictions, human_boxes, title)
+    shown = FrameContent(labels, truth_boxes, repredictions, title)
     return paint_frame(frame, shown).finish()
 
 
@@ -53,7 +51,6 @@ def paint_frame(frame: Frame, shown: FrameContent, kind: ImageFormat = "png") ->
     sizes = [overlay_size(image) for image in images]
     width = max((size[0] for size in sizes), default=Region().size[0])
     boxes = [shown.labels.boxes, shown.valid_truth]
-    boxes += [] if shown.human_boxes is None else [shown.human_boxes]
     region = region_around(boxes, width)
     below, above = bird_eye_size(region)[1], sum(height for _, height in sizes)
     kind_of_canvas = Canvas if kind == "png" else VectorCanvas

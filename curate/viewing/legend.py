@@ -37,6 +37,7 @@ def draw_legend(
     repredictions: bool = False,
     unweighted: bool = False,
     human: bool = False,
+    rejected: bool = False,
     unseen: bool = False,
     style: Style = DARK,
 ) -> None:
@@ -51,17 +52,26 @@ def draw_legend(
         (repredictions, "prediction", style.text, None),
         (repredictions, "reprediction", style.text, REPREDICTION_DASHES),
         (human, "human", style.human, HUMAN_DASHES),
+        (rejected, "rejected by a person", style.zero_weight, None),
         (truth, "ground truth", style.ground_truth, TRUTH_DOTS),
     ]
     for shown, name, colour, pattern in entries:
         if shown:
-            _swatch(canvas, (left, baseline), colour, pattern)
+            outline = _swatch(canvas, (left, baseline), colour, pattern)
+            if name.startswith("rejected"):
+                draw_cross(canvas, outline, style)
             canvas.text(left + 28, baseline, name, style.text)
             left += 28 + canvas.text_width(name) + _GAP
     if unseen:
         outline = _swatch(canvas, (left, baseline), style.text, None)
         canvas.lines(outline[[[0, 2], [1, 3]]], style.text, UNSEEN_STROKE)
         canvas.text(left + 28, baseline, "no image evidence", style.text)
+
+
+def draw_cross(canvas: Canvas, corners: np.ndarray, style: Style = DARK) -> None:
+    """Draw both diagonals of a (4, 2) quadrilateral: a person rejected this label."""
+    canvas.lines(corners[[0, 2]], style.human, 1.5)
+    canvas.lines(corners[[1, 3]], style.human, 1.5)
 
 
 def _weight_bar(canvas: Canvas, left: float, top: float, baseline: float, style: Style) -> float:

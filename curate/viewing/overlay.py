@@ -15,6 +15,7 @@ from curate.viewing.legend import (
     STRIP_HEIGHT,
     TITLE_HEIGHT,
     TRUTH_DOTS,
+    draw_cross,
     draw_legend,
     draw_title,
 )
@@ -41,7 +42,6 @@ class FrameContent:
         labels: labels, coloured by weight, with captions.
         truth_boxes: (m, 7) ground truth in the LiDAR frame, dotted; None if unknown.
         repredictions: repredictions, dashed, each in the colour of its matched label.
-        human_boxes: (h, 7) boxes that people decided on, with long dashes; None for none.
         title: text at the top.
         style: colours.
     """
@@ -49,7 +49,6 @@ class FrameContent:
     labels: ShownLabels
     truth_boxes: np.ndarray | None = None
     repredictions: ShownRepredictions | None = None
-    human_boxes: np.ndarray | None = None
     title: str = ""
     style: Style = DARK
 
@@ -69,7 +68,8 @@ class FrameContent:
             truth=self.truth_boxes is not None,
             repredictions=self.repredictions is not None,
             unweighted=bool(np.isnan(self.labels.weights).any()),
-            human=self.human_boxes is not None and len(self.human_boxes) > 0,
+            human=bool(self.labels.is_human.any()),
+            rejected=bool(self.labels.is_rejected.any()),
             unseen=self.labels.unseen is not None and bool(self.labels.unseen.any()),
             style=self.style,
         )
@@ -142,8 +142,11 @@ def paint_overlay(
         _draw_strokes(
             within, strokes_of[index] * factor, labels.colour(index, style), weight, style
         )
-    if shown.human_boxes is not None:
-        dash(shown.human_boxes, [style.human] * len(shown.human_boxes), 2.0, HUMAN_DASHES)
+    for index in np.flatnonzero(labels.is_rejected):
+        if len(strokes_of[index]) == len(_STARTS):
+            draw_cross(within, strokes_of[index][:_FRONT_EDGES, 0] * factor, style)
+    human = labels.boxes[labels.is_human]
+    dash(human, [style.human] * len(human), 2.0, HUMAN_DASHES)
     anchors = image_rectangles(labels.boxes, calibration, size) * factor
     bounds = np.array([0, 0, width * factor, height * factor])
     draw_tags(within, labels, anchors, bounds, style)

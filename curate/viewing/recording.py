@@ -38,7 +38,7 @@ class RecordedFrame:
 
     Attributes:
         frame: a frame with or without its image.
-        labels: the predictions, coloured by weight.
+        labels: the labels, coloured by weight; those of people in their own colour.
         evidence: (n,) numbers per prediction, by name; NaN if unknown.
         repredictions: repredictions, each in the colour of its matched label.
         truth_boxes: (m, 7) ground truth in the LiDAR frame; None if unknown.
@@ -158,7 +158,9 @@ def _log_frame(rerun: ModuleType, stream: Any, recorded: RecordedFrame) -> None:
         _log_camera(rerun, stream, camera)
     if len(labels):
         words = captions(labels, recorded.evidence)
-        boxes = _boxes(rerun, PREDICTIONS, labels.boxes, weight_colours(labels.weights), words)
+        colours = weight_colours(labels.weights)
+        colours[labels.is_human] = DARK.human
+        boxes = _boxes(rerun, PREDICTIONS, labels.boxes, colours, words)
         numbers = {"weight": labels.weights, "score": labels.scores, **recorded.evidence}
         stream.log(PREDICTIONS, boxes, rerun.AnyValues(**numbers))
     else:

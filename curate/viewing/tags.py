@@ -34,6 +34,8 @@ class ShownLabels:
         points: (n,) LiDAR points inside each box; None if they were not counted.
         zero_weight: the meaning of weight 0, for the legend.
         numbers: (n,) k of each label in its frame; None for 0 to n - 1.
+        decisions: (n,) str, what a person decided about each label: accepted, moved, added,
+            rejected, or ""; None if nobody decided.
         unseen: (n,) bool, labels that no camera of the frame shows; None if there is no camera.
     """
 
@@ -44,6 +46,7 @@ class ShownLabels:
     points: np.ndarray | None = None
     zero_weight: ZeroWeight = "background"
     numbers: np.ndarray | None = None
+    decisions: np.ndarray | None = None
     unseen: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -59,25 +62,43 @@ class ShownLabels:
         """(n,) in [0, 1], how strongly to draw each label: its weight, or 0.5 without one."""
         return np.where(np.isnan(self.weights), 0.5, self.weights)
 
+    @property
+    def is_rejected(self) -> np.ndarray:
+        """(n,) bool, labels that a person rejected; they are crossed out."""
+        return self._decided == "rejected"
+
+    @property
+    def is_human(self) -> np.ndarray:
+        """(n,) bool, objects that a person accepted, moved or added; they have long dashes."""
+        return (self._decided != "") & ~self.is_rejected
+
+    @property
+    def _decided(self) -> np.ndarray:
+        none = np.full(len(self), "", dtype="U8")
+        return none if self.decisions is None else self.decisions
+
     def number(self, index: int) -> int:
         """Return the k of a label."""
         return index if self.numbers is None else int(self.numbers[index])
 
     def details(self, index: int) -> str:
-        """Return category, score and LiDAR points of a label."""
+        """Return category, score and LiDAR points of a label, and the decision of a person."""
         points = "" if self.points is None else f"  {self.points[index]} pts"
-        return f"{self.categories[index]} {self.scores[index]:.2f}{points}"
+        decision = self._decided[index]
+        score = "" if self.is_human[index] else f" {self.scores[index]:.2f}"
+        person = f"  {decision} by a person" if decision else ""
+        return f"{self.categories[index]}{score}{person}{points}"
 
     def caption(self, index: int) -> tuple[str, str]:
         """Return the two lines of a caption; the first is empty unless the weight is above 0."""
-        name = self.short_caption(index)
+        name = f"k{self.number(index)}"
         if self.weights[index] > 0:
             return f"{name}  {self.weights[index]:.2f}", self.details(index)
         return "", f"{name}  {self.details(index)}"
 
     def short_caption(self, index: int) -> str:
         """Return the caption to use if there is no room for the full one."""
-        return f"k{self.number(index)}"
+        return f"k{self.number(index)} {self._decided[index]}".rstrip()
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,14 @@ from curate.detections import Detections
 from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.audit import Audit, audit
 from curate.evaluation.audit_summary import summary_sentences
+from curate.evaluation.counts import describe_others
 from curate.evaluation.evaluated_labels import AuditedFrame, EvaluatedLabels, evaluate_frames
-from curate.evaluation.kitti_rules import MIN_OVERLAPS
-from curate.evaluation.reliability import MatchSettings, Overlap
-from curate.geometry.projection import image_rectangles
+from curate.evaluation.reliability import Overlap
 from curate.weighting.base import Evidence
 from db import bulk
 from pipelines.assembly import check_executor, open_policy
 from pipelines.assessment.audit_folds import open_folds
+from pipelines.assessment.evaluation import match_settings, rectangles_in_image
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import is_trainable
@@ -31,7 +31,6 @@ from pipelines.engine.runner import Report, open_executor, run_first, run_frames
 from pipelines.engine.stage import RoundContext
 from pipelines.labels.evidence import read_evidence
 from pipelines.round import graph_of, open_plan
-from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
 POLICIES = ("pspsl", "spsl", "threshold", "uniform")
@@ -41,7 +40,6 @@ EVIDENCE: Mapping[str, Callable[[Evidence], np.ndarray]] = {
     "consistency": lambda evidence: np.where(evidence.matched, np.exp(-evidence.loss), 0.0),
 }
 """Evidence to audit like a weight, each in [0, 1]; no training uses it as a weight directly."""
-OTHER_IOU = 0.5  # for categories that KITTI does not evaluate
 
 ReportCallback = Callable[[Report], None]
 
@@ -91,12 +89,14 @@ class AuditedRound:
         context: the audited round; with folds, the round of the first fold.
         figures: the figures of the audit.
         reports: the reports of the stages.
+        unmeasured: the names in the request with weights that could not be measured.
     """
 
     request: AuditRequest
     context: RoundContext
     figures: Audit
     reports: tuple[Report, ...]
+    unmeasured: tuple[str, ...] = ()
 
 
 def run_audit(
@@ -138,13 +138,29 @@ def run_audit(
         np.random.default_rng([workspace.config.run.seed, contexts[0].number]),
         replicates=request.replicates,
     )
-    return AuditedRound(request, contexts[0], figures, tuple(reports))
+    unmeasured = tuple(name for name, v in weights.items() if np.isnan(v).any())
+    return AuditedRound(request, contexts[0], figures, tuple(reports), unmeasured)
 
 
 def describe_audit(found: AuditedRound) -> list[str]:
     """Return a summary of the audit in sentences, with its limitations."""
     request = found.request
     sentences = summary_sentences(found.figures, request.policies, request.evidence)
+    without_priors = [name for name in found.unmeasured if name == "rho_det"]
+    without_copies = [name for name in found.unmeasured if name != "rho_det"]
+    if without_copies:
+        sentences.append(
+            f"Not measured: {', '.join(without_copies)}, because no augmented copy of these frames "
+            "was predicted."
+        )
+    if without_priors:
+        sentences.append("Not measured: rho_det, because run.priors is empty.")
+    if not found.figures.counts.counted:
+        sentences.append(
+            "No object counts: the ground truth of these frames has "
+            + (", ".join(describe_others(found.figures.counts)) or "no objects")
+            + ". Check dataset.categories."
+        )
     if request.split == "labeled" and not request.folds:
         sentences.append(
             "The thresholds of the point prior were computed from the audited frames, so its "
@@ -156,8 +172,14 @@ def describe_audit(found: AuditedRound) -> list[str]:
 def picture_path(workspace: Workspace, found: AuditedRound, suffix: str = "png") -> Path:
     """Return the path of the reliability diagram."""
     frames = found.request.frames.replace(" ", "-")
-    name = f"audit-round-{found.context.number:02d}-{frames}-{found.request.overlap}.{suffix}"
-    return workspace.root / "reports" / name
+    names = found.request.names
+    parts = (
+        f"audit-round-{found.context.number:02d}",
+        frames,
+        found.request.overlap,
+        *(() if names == AuditRequest.names else names),
+    )
+    return workspace.root / "reports" / f"{'-'.join(parts)}.{suffix}"
 
 
 def _check(workspace: Workspace, request: AuditRequest) -> None:
@@ -224,25 +246,47 @@ def _evaluate(
     )
     complete = plan.complete_frames(plan.graph.round_stage("solve"), split)
     _, evidence = read_evidence(workspace, context.number, complete)
+    repredicted = _is_repredicted(workspace, context.number, complete)
     labels = evaluate_frames(
         _frames(workspace, context, split, frames, complete),
         match_settings(workspace.config, request.overlap),
     )
     return labels, {
-        name: EVIDENCE[name](evidence)
-        if name in EVIDENCE
-        else open_policy(workspace.config, name).weigh(evidence, context.age).v
+        name: _weights(workspace, name, evidence, context, repredicted=repredicted)
         for name in request.names
     }
 
 
-def match_settings(config: Config, overlap: Overlap) -> MatchSettings:
-    """Return the settings to match labels: KITTI's IoU thresholds for the configured categories."""
-    categories = config.dataset.categories
-    return MatchSettings(
-        overlap=overlap,
-        minimum_iou={name: MIN_OVERLAPS.get(name, OTHER_IOU) for name in categories},
+def _weights(
+    workspace: Workspace,
+    name: str,
+    evidence: Evidence,
+    context: RoundContext,
+    *,
+    repredicted: bool,
+) -> np.ndarray:
+    """Return the weights of a policy, or evidence; NaN if what it rests on was not measured."""
+    unmeasured = np.full(len(evidence), np.nan)
+    if name == "rho_det" and not workspace.config.run.priors:
+        return unmeasured
+    if name in EVIDENCE:
+        return unmeasured if name == "consistency" and not repredicted else EVIDENCE[name](evidence)
+    policy = open_policy(workspace.config, name)
+    v: np.ndarray = policy.weigh(evidence, context.age).v
+    if repredicted or v.any():
+        return v
+    # Without repredictions, weights of 0 say something only if perfect ones would not change them.
+    consistent = replace(evidence, loss=np.zeros(len(evidence)))
+    return unmeasured if policy.weigh(consistent, context.age).v.any() else v
+
+
+def _is_repredicted(workspace: Workspace, round_number: int, frames: Sequence[int]) -> bool:
+    """Return whether an augmented copy of one of the frames has been predicted."""
+    table = bulk.table("consistency")
+    query = select(table.c.frame_id).where(
+        table.c.round == round_number, table.c.views > 0, table.c.frame_id.in_(frames)
     )
+    return bool(workspace.database.rows(query.limit(1)))
 
 
 def _frames(
@@ -262,7 +306,7 @@ def _frames(
         yield AuditedFrame(
             found,
             truth[name],
-            image_rectangles(found.boxes, frame.calibration, frame.image_size),
+            rectangles_in_image(found.boxes, frame),
             np.array([points.get((key, k), np.nan) for k in range(len(found))], dtype=np.float64),
         )
 

@@ -46,7 +46,7 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
         if (root / CONFIG_NAME).exists() and read_config(root / CONFIG_NAME) != config:
             # The workspace's settings have changed; the results that depend on them become stale.
             write_config(root / CONFIG_NAME, config)
-        yield initialise(root, config, *map(str, lists))
+        yield initialise(root, config, *map(str, lists), compare=False)
 
 
 def _split_folds(

@@ -6,14 +6,24 @@ import numpy as np
 
 from curate.detectors.base import RecordedViews
 from curate.errors import ConfigError, CurateError
-from curate.evaluation.examination import Finding, examine_detections, examine_frame
+from curate.evaluation.examination import (
+    Finding,
+    examine_detections,
+    examine_frame,
+    examine_labels,
+)
 from curate.frames import Frame
+from curate.names import NameFinding, renamed
 from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
+from pipelines.category_names import detector_differences, find_differences
 from pipelines.engine.rounds import newest_checkpoint
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
-from pipelines.workspace.workspace import Workspace
+from pipelines.workspace.workspace import Workspace, read_truth
+
+# Labeled frames whose labels are checked together.
+_LABELED_FRAMES = 5
 
 
 def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Finding]]:
@@ -36,7 +46,8 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
         frame = workspace.dataset.read(name, image=semantic)
     except CurateError as error:
         return name, [Finding("data set", "wrong", str(error))]
-    findings = examine_frame(frame)
+    findings = [*_names(find_differences(workspace)), *examine_frame(frame)]
+    findings += _guarded("labels", lambda: _labels(workspace, frame))
     findings += _guarded("detector", lambda: _detector(workspace, frame))
     if semantic:
         findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
@@ -51,13 +62,29 @@ def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Find
         return [Finding(name, "wrong", str(error))]
 
 
+def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
+    """Check the labels of some labeled frames, with those of the frame itself if it has any."""
+    others = [name for name in workspace.frames("labeled", "val") if name != frame.frame_id]
+    own = len(others) < len(workspace.frames("labeled", "val"))
+    dataset = workspace.dataset
+    frames = [frame] if own else []
+    frames += [dataset.read(name) for name in others[: _LABELED_FRAMES - len(frames)]]
+    if not frames:
+        return []
+    truth = (read_truth(workspace.config, dataset, each.frame_id) for each in frames)
+    return examine_labels(list(zip(frames, truth, strict=True)))
+
+
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     config = workspace.config
     detector = open_detector(config, newest_checkpoint(workspace))
     seen = visible(frame, config)
-    found = detector.predict(seen)
-    findings = examine_detections(seen, found, config.dataset.categories)
-    checked(found, config)
+    found = renamed(detector.predict(seen), config.detector.rename)
+    findings = [
+        *_names(detector_differences(config, detector)),
+        *examine_detections(seen, found, config.dataset.categories),
+    ]
+    checked(found, config, detector)
     if isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
         findings.append(
@@ -73,6 +100,13 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
                 if finding.check == "boxes" and finding.state == "wrong"
             ]
     return findings
+
+
+def _names(differences: Sequence[NameFinding]) -> list[Finding]:
+    """Return differences between category names as findings."""
+    return [
+        Finding("names", "wrong" if each.wrong else "suspect", each.message) for each in differences
+    ]
 
 
 def _no_views(config: Config) -> Finding:

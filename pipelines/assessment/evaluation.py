@@ -1,14 +1,22 @@
 """Evaluate a detector on the val split, which is never trained on."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from curate.datasets.kitti.labels import KittiObjects, from_annotations, from_detections
-from curate.detections import Detections
+from curate.detections import Annotations, Detections
 from curate.errors import FramesFailed, WorkspaceError
+from curate.evaluation.difficulties import Difficulty, open_difficulty
+from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
+from curate.evaluation.kitti_matching import objects_in_lidar_frame
+from curate.evaluation.kitti_rules import neighbours_of, overlaps_of
+from curate.evaluation.missing_boxes import ProjectedBoxes, with_projected_boxes
+from curate.evaluation.reliability import MatchSettings, Overlap
+from curate.frames import Frame
+from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.geometry.projection import box_rectangles
 from pipelines.engine.executors.base import FrameJob
 from pipelines.engine.plan import Plan
@@ -17,10 +25,64 @@ from pipelines.engine.rounds import stored_round
 from pipelines.engine.runner import open_executor
 from pipelines.round import graph_of
 from pipelines.stages.predict import Predict, as_detections
+from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
-ValObjects = tuple[list[KittiObjects], list[KittiObjects]]
-"""Ground truth and detections of the val frames, frame by frame."""
+
+@dataclass(frozen=True)
+class ValObjects:
+    """Ground truth and detections of the val frames, frame by frame, and the rules for them.
+
+    Attributes:
+        labels: the ground truth objects of each frame.
+        results: the detections of each frame.
+        difficulty: the levels of difficulty.
+        overlaps: the IoU threshold of each category.
+        points: the LiDAR points in each object of each frame; None if they are not needed.
+        notes: what differs from KITTI's evaluation, one sentence each.
+    """
+
+    labels: list[KittiObjects]
+    results: list[KittiObjects]
+    difficulty: Difficulty
+    overlaps: Mapping[str, float]
+    points: list[np.ndarray] | None = None
+    notes: tuple[str, ...] = ()
+
+    def evaluate(
+        self,
+        overlaps: Mapping[str, float] | None = None,
+        recall_overlaps: Sequence[float] = (0.3, 0.5, 0.7),
+    ) -> KittiEvaluation:
+        """Return the evaluation, by default at the configured IoU thresholds."""
+        return evaluate(
+            self.labels,
+            self.results,
+            min_overlaps=self.overlaps if overlaps is None else overlaps,
+            recall_overlaps=recall_overlaps,
+            difficulty=self.difficulty,
+            points=self.points,
+        )
+
+
+def configured_overlaps(config: Config) -> dict[str, float]:
+    """Return the IoU threshold of each configured category."""
+    return overlaps_of(config.dataset.categories, config.evaluation.overlaps)
+
+
+def match_settings(config: Config, overlap: Overlap) -> MatchSettings:
+    """Return the settings to match labels of the configured categories to ground truth."""
+    categories = config.dataset.categories
+    return MatchSettings(
+        overlap=overlap,
+        minimum_iou=configured_overlaps(config),
+        neighbors={name: (other,) for name, other in neighbours_of(categories).items()},
+    )
+
+
+def rectangles_in_image(boxes: np.ndarray, frame: Frame) -> np.ndarray | None:
+    """Return (n, 4) projected boxes, see `box_rectangles`; None for a frame without an image."""
+    return None if frame.image_size is None else box_rectangles(boxes, frame)
 
 
 def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str, Detections]:
@@ -68,7 +130,10 @@ def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]
 
 
 def val_objects(workspace: Workspace, found: Mapping[str, Detections]) -> ValObjects:
-    """Return ground truth and detections of the val frames as KITTI objects, sorted by frame name.
+    """Return ground truth and detections of the val frames, sorted by frame name.
+
+    With KITTI's levels, ground truth without 2D boxes gets the projected 3D boxes. If a frame has
+    no image, the levels by distance replace KITTI's, because they need no 2D boxes.
 
     Raises:
         WorkspaceError: if there are no val frames.
@@ -76,12 +141,73 @@ def val_objects(workspace: Workspace, found: Mapping[str, Detections]) -> ValObj
     truth = workspace.ground_truth("val")
     if not truth:
         raise WorkspaceError("no val frames; set some aside with `curate init --val`")
-    labels: list[KittiObjects] = []
+    section = workspace.config.evaluation
+    kind, notes = section.difficulty, []
+    frames = {name: workspace.dataset.read(name, points=False) for name in truth}
+    without_image = [name for name, frame in frames.items() if frame.image_size is None]
+    if kind == "kitti" and without_image:
+        kind = "distance"
+        notes.append(
+            f"{len(without_image)} of {len(frames)} frames have no image, and KITTI's levels need "
+            "one: evaluated by distance instead (evaluation.difficulty)"
+        )
+    difficulty = open_difficulty(kind, section.minimum_points, section.distance_limits)
+    overlaps = configured_overlaps(workspace.config)
+    if difficulty.in_image:
+        labels, results, projected = _in_camera_frame(frames, truth, found)
+        notes += projection_notes(projected, (0, 0))
+        return ValObjects(labels, results, difficulty, overlaps, None, tuple(notes))
+    points = None
+    if difficulty.kind == "points":
+        points = [
+            count_points_in_boxes(workspace.dataset.read(name).points, annotations.boxes)
+            for name, annotations in truth.items()
+        ]
+    labels = [objects_in_lidar_frame(each.boxes, each.categories) for each in truth.values()]
+    results = [
+        objects_in_lidar_frame(found[name].boxes, found[name].categories, found[name].scores)
+        for name in truth
+    ]
+    return ValObjects(labels, results, difficulty, overlaps, points, tuple(notes))
+
+
+def kitti_objects(annotations: Annotations, frame: Frame) -> ProjectedBoxes:
+    """Return ground truth as KITTI objects; missing 2D boxes are the projected 3D boxes."""
+    objects = from_annotations(annotations, frame.calibration)
+    return with_projected_boxes(objects, frame.calibration.projection, frame.image_size)
+
+
+def projection_notes(labels: tuple[int, int], results: tuple[int, int]) -> list[str]:
+    """Return a sentence if missing 2D boxes were replaced by projected 3D boxes.
+
+    Args:
+        labels: the number of objects without a 2D box, and of those that have one now.
+        results: the same for the detections.
+    """
+    if not labels[1] + results[1]:
+        return []
+    sides = ((labels, "objects"), (results, "results"))
+    parts = [
+        f"{projected} of {missing} {side} without one"
+        for (missing, projected), side in sides
+        if missing
+    ]
+    return [f"2D boxes from the projected 3D boxes: {' and '.join(parts)}"]
+
+
+def _in_camera_frame(
+    frames: Mapping[str, Frame],
+    truth: Mapping[str, Annotations],
+    found: Mapping[str, Detections],
+) -> tuple[list[KittiObjects], list[KittiObjects], tuple[int, int]]:
+    """Return ground truth, detections, and the numbers of missing and of projected 2D boxes."""
+    sides: list[ProjectedBoxes] = []
     results: list[KittiObjects] = []
     for name, annotations in truth.items():
-        frame = workspace.dataset.read(name, points=False)
-        labels.append(from_annotations(annotations, frame.calibration))
+        frame = frames[name]
+        sides.append(kitti_objects(annotations, frame))
         objects = from_detections(found[name], frame.calibration, frame.image_size)
         rectangles = box_rectangles(found[name].boxes, frame)
         results.append(replace(objects, boxes_2d=np.where(np.isnan(rectangles), -1.0, rectangles)))
-    return labels, results
+    totals = sum(each.missing for each in sides), sum(each.projected for each in sides)
+    return [each.objects for each in sides], results, totals

@@ -3,6 +3,7 @@
 The results are not stored, because ground truth of X_u must never enter the database.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,12 +12,13 @@ from sqlalchemy import select
 from curate.evaluation.reliability import (
     auroc,
     match_to_ground_truth,
+    rank_labels,
     weighted_precision,
     weighted_recall,
 )
-from curate.geometry.projection import image_rectangles
 from db import bulk
-from pipelines.workspace.workspace import Workspace
+from pipelines.assessment.evaluation import match_settings, rectangles_in_image
+from pipelines.workspace.workspace import Workspace, read_truth
 
 
 def label_quality(
@@ -26,17 +28,21 @@ def label_quality(
 
     Returns:
         Rows of policy, number of labels, number of labels with a weight above 0, weighted precision
-        and weighted recall in percent, and AUROC.
+        and weighted recall in percent, and AUROC; NaN for a figure that cannot be computed.
     """
     keys = workspace.frames("unlabeled")
     found = workspace.predictions(round_number, list(keys.values()))
     correct: dict[tuple[int, int], bool] = {}
     objects = 0
+    settings = match_settings(workspace.config, "bev")
     for name, key in keys.items():
         frame = workspace.dataset.read(name, points=False)
-        rectangles = image_rectangles(found[key].boxes, frame.calibration, frame.image_size)
+        rectangles = rectangles_in_image(found[key].boxes, frame)
         matches = match_to_ground_truth(
-            found[key], workspace.dataset.annotations(name), rectangles=rectangles
+            found[key],
+            read_truth(workspace.config, workspace.dataset, name),
+            settings,
+            rectangles,
         )
         objects += sum(matches.ground_truths.values())
         for k in np.flatnonzero(matches.counted):
@@ -55,7 +61,7 @@ def label_quality(
                 above_zero,
                 100 * weighted_precision(v, is_correct),
                 100 * weighted_recall(v, is_correct, objects),
-                auroc(v, is_correct),
+                auroc(v, is_correct) if rank_labels(v) else math.nan,
             )
         )
     return rows

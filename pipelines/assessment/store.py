@@ -12,7 +12,6 @@ from curate.evaluation.audit import Estimate, Figures
 from curate.evaluation.evaluated_labels import WHOLE
 from curate.evaluation.kitti_ap import KittiEvaluation
 from curate.evaluation.kitti_outcomes import Outcomes, object_outcomes
-from curate.evaluation.kitti_rules import DIFFICULTIES
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.assessment.audit import AuditedRound
@@ -27,7 +26,7 @@ ESTIMATES = (
     "weighted_recall",
     "calibration_error",
 )
-OVERLAP, DIFFICULTY = "3d", "hard"
+OVERLAP = "3d"
 
 Row = dict[str, Any]
 
@@ -71,7 +70,7 @@ def store_evaluation(
         workspace: see `Workspace`.
         source: name of the evaluated detections, for queries.
         found: detections of the val frames.
-        objects: ground truth and the same detections as KITTI objects.
+        objects: ground truth and the same detections, with the rules of the evaluation.
         figures: the evaluation of the detections.
 
     Returns:
@@ -79,18 +78,22 @@ def store_evaluation(
     """
     keys = workspace.frames("val")
     of_objects, of_detections = object_outcomes(
-        *objects,
+        objects.labels,
+        objects.results,
         metric=OVERLAP,
-        difficulty=DIFFICULTY,
+        difficulty=objects.difficulty,
         min_overlaps=figures.min_overlaps,
+        points=objects.points,
     )
+    difficulty, level = objects.difficulty.whole()
+    levels = {"overlap": OVERLAP, "difficulty": difficulty.levels[level]}
     truth = [annotations.boxes for annotations in workspace.ground_truth("val").values()]
     predicted = [found[name].boxes for name in keys]
     frame_ids = list(keys.values())
     rows = {
         "evaluation_object": [
-            *_outcomes("object", of_objects, frame_ids, truth),
-            *_outcomes("detection", of_detections, frame_ids, predicted),
+            *(row | levels for row in _outcomes("object", of_objects, frame_ids, truth)),
+            *(row | levels for row in _outcomes("detection", of_detections, frame_ids, predicted)),
         ],
         "evaluation_ap": list(_averages(figures)),
     }
@@ -159,8 +162,6 @@ def _outcomes(
             "matched_k": None if match < 0 else match,
             "iou": iou,
             "score": None if math.isnan(score) else score,
-            "overlap": OVERLAP,
-            "difficulty": DIFFICULTY,
         }
         yield row | dict(zip(BOX_COLUMNS, boxes[frame][k].tolist(), strict=True))
 
@@ -171,14 +172,14 @@ def _averages(figures: KittiEvaluation) -> Iterator[Row]:
     for category, by_figure in plain["AP_R40"].items():
         for figure, r40 in by_figure.items():
             r11 = plain["AP_R11"][category][figure]
-            for d, difficulty in enumerate(DIFFICULTIES):
+            for d, difficulty in enumerate(figures.difficulty.levels):
                 yield {
                     "category": category,
                     "figure": figure,
                     "difficulty": difficulty,
                     "objects": plain["objects"][category][d],
                     "ap_r40": None if r40 is None else r40[d],
-                    "ap_r11": None if r40 is None else r11[d],
+                    "ap_r11": None if r11 is None else r11[d],
                 }
 
 

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import curate
-from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
+from curate.evaluation.kitti_ap import KittiEvaluation
+from curate.evaluation.kitti_rules import relaxed
 from pipelines.assembly import device
 from pipelines.assessment.evaluation import detect_val, val_objects
 from pipelines.assessment.label_quality import label_quality
 from pipelines.bench.grid import Job, looks_at_unlabeled
 from pipelines.bench.metered import Metered
-from pipelines.bench.results import JobResult, LabelFigures, write_result
+from pipelines.bench.results import JobResult, LabelFigures, Levels, write_result
 from pipelines.bench.settings import Bench
-from pipelines.bench.tables import RULES
 from pipelines.engine.rounds import newest_checkpoint
 from pipelines.engine.runner import Report, open_executor, run_first, run_frames
 from pipelines.engine.schedule import run_all
@@ -37,8 +37,10 @@ DATABASE = "curate.db"
 class Evaluated:
     """The figures of a detector, in the form of `JobResult`."""
 
-    ap: dict[str, dict[str, dict[str, tuple[float, float, float]]]]
-    recall: dict[str, tuple[float, float, float]]
+    ap: dict[str, dict[str, dict[str, Levels]]]
+    recall: dict[str, Levels]
+    thresholds: dict[str, dict[str, float]]
+    difficulties: tuple[str, ...]
 
 
 def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
@@ -59,6 +61,8 @@ def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
         frames={split: len(workspace.frames(split)) for split in SPLITS},
         ap=found.ap,
         recall=found.recall,
+        thresholds=found.thresholds,
+        difficulties=found.difficulties,
         labels=_labels(workspace, METHODS[job.method].policy)
         if job.method is not None and bench.simulated
         else (),
@@ -119,22 +123,22 @@ def _copy_database(source: Path, target: Path) -> None:
 
 
 def _evaluate(workspace: Workspace, checkpoint: Path, progress: Metered) -> Evaluated:
-    """Evaluate a detector on val, at KITTI's and at the relaxed IoU thresholds."""
+    """Evaluate a detector on val, at the configured and at the relaxed IoU thresholds."""
     objects = val_objects(workspace, detect_val(workspace, checkpoint, progress))
-    categories = workspace.config.dataset.categories
+    thresholds = {"kitti": dict(objects.overlaps), "loose": relaxed(objects.overlaps)}
     figures = {
-        name: evaluate(
-            *objects, min_overlaps={each: rule[each] for each in categories if each in rule}
-        )
-        for name, rule in RULES.items()
+        name: objects.evaluate(overlaps, recall_overlaps=sorted(set(overlaps.values())))
+        for name, overlaps in thresholds.items()
     }
     return Evaluated(
         {name: _averages(evaluation) for name, evaluation in figures.items()},
         _recalls(figures["kitti"]),
+        thresholds,
+        objects.difficulty.levels,
     )
 
 
-def _averages(evaluation: KittiEvaluation) -> dict[str, dict[str, tuple[float, float, float]]]:
+def _averages(evaluation: KittiEvaluation) -> dict[str, dict[str, Levels]]:
     """Return AP R40 by figure and category."""
     plain = evaluation.as_dict()["AP_R40"]
     return {
@@ -143,7 +147,7 @@ def _averages(evaluation: KittiEvaluation) -> dict[str, dict[str, tuple[float, f
     }
 
 
-def _recalls(evaluation: KittiEvaluation) -> dict[str, tuple[float, float, float]]:
+def _recalls(evaluation: KittiEvaluation) -> dict[str, Levels]:
     """Return the recall by category, at the IoU threshold of its AP."""
     plain = evaluation.as_dict()["recall_3d"]
     return {

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from curate.datasets.kitti.labels import from_annotations
 from curate.evaluation.comparison import PairedDifference
 from curate.evaluation.object_statistics import QUANTILES, object_statistics
 from curate.files.atomic import replace_file
 from curate.viewing.chart_style import Chart, ImageFormat
 from curate.viewing.charts import Curve, CurvePanel, curves_chart
+from pipelines.assessment.evaluation import kitti_objects
 from pipelines.bench.results import OVERLAPS, JobResult, read_results
 from pipelines.bench.settings import SYNTHETIC, Bench
 from pipelines.bench.tables import Entry, Finished, Table, Value, all_tables, signed
 from pipelines.stages.methods import METHODS
-from pipelines.workspace.workspace import open_dataset
+from pipelines.workspace.workspace import open_dataset, read_truth
 
 MARKDOWN, NUMBERS = "results.md", "results.json"
 
@@ -124,6 +124,9 @@ class BenchReport:
             "KITTI AP, 40 recall positions, in percent; mean is over categories and difficulties; "
             "± is the standard deviation over n seeds, (+) the gain over the baseline"
         )
+        missing = finished.without_objects("kitti", "3d")
+        if missing:
+            yield f"-, and not in any mean, because no object counts: {', '.join(missing)}"
         yield "the student of the last round is evaluated on val; val is not used to select models"
         for about in {tuple(sorted(result.about.items())) for result in self.results}:
             versions = dict(about)
@@ -178,9 +181,9 @@ class BenchReport:
         dataset = open_dataset(config)
         names = dataset.splits()["val"]
         frames = [
-            from_annotations(
-                dataset.annotations(name), dataset.read(name, points=False).calibration
-            )
+            kitti_objects(
+                read_truth(config, dataset, name), dataset.read(name, points=False)
+            ).objects
             for name in names
         ]
         rows: list[tuple[Value, ...]] = []
@@ -190,8 +193,10 @@ class BenchReport:
                 (
                     *(category, found.objects, f"{found.per_frame:.2f}"),
                     *(f"{number:.2f}" for number in found.counted),
-                    *(f"{100 * share:.0f} %" for share in shares),
-                    " / ".join(f"{distance:.0f}" for distance in found.distances),
+                    *("-" if math.isnan(share) else f"{100 * share:.0f} %" for share in shares),
+                    " / ".join(f"{distance:.0f}" for distance in found.distances)
+                    if found.objects
+                    else "-",
                 )
             )
         quantiles = "/".join(f"{100 * share:.0f}" for share in QUANTILES)

@@ -4,14 +4,17 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from curate.errors import DataError
+from curate.evaluation.comparison import known_mean
+from curate.evaluation.kitti_rules import DIFFICULTIES, MIN_OVERLAPS, RELAXED_OVERLAPS
 from curate.files.atomic import replace_file
 from pipelines.bench.grid import RESULT_FILE, Job
 from pipelines.workspace.config import Section
 
-Levels = tuple[float, float, float]
+Levels = tuple[float | None, ...]
+"""A figure by level of difficulty; None where it cannot be computed."""
 OVERLAPS = ("kitti", "loose")
 
 
@@ -23,8 +26,8 @@ class LabelFigures(Section):
         labels: number of pseudo-labels.
         trusted: number of pseudo-labels with a weight above 0.
         precision: share of the weight that is on correct labels, percent; None without weight.
-        recall: weight on correct labels per object, percent.
-        auroc: probability that a correct label weighs more than a wrong one.
+        recall: weight on correct labels per object, percent; None without objects.
+        auroc: probability that a correct label weighs more than a wrong one; None without both.
     """
 
     round: int
@@ -41,9 +44,11 @@ class JobResult(Section):
     Attributes:
         ratio, seed, method: see `Job`.
         frames: number of frames by split: labeled, unlabeled, val.
-        ap: AP R40 in percent by IoU thresholds ("kitti", or "loose" for the relaxed ones), figure
-            ("3d", "bev") and category; easy, moderate, hard.
-        recall: recall in percent by category at KITTI's 3D IoU thresholds; easy, moderate, hard.
+        ap: AP R40 in percent by IoU thresholds ("kitti" for the configured ones, KITTI's by
+            default, or "loose" for the relaxed ones), figure ("3d", "bev"), category and level.
+        recall: recall in percent by category, at the 3D IoU thresholds "kitti", and level.
+        thresholds: IoU thresholds by name and category.
+        difficulties: names of the levels of difficulty.
         labels: quality of the labels by round.
         failed_frames: number of results of frames that failed and are not included.
         seconds: duration of the run that finished the job.
@@ -58,6 +63,10 @@ class JobResult(Section):
     frames: dict[str, int]
     ap: dict[str, dict[str, dict[str, Levels]]]
     recall: dict[str, Levels]
+    thresholds: dict[str, dict[str, float]] = Field(
+        default={"kitti": dict(MIN_OVERLAPS), "loose": dict(RELAXED_OVERLAPS)}
+    )
+    difficulties: tuple[str, ...] = DIFFICULTIES
     labels: tuple[LabelFigures, ...] = ()
     failed_frames: int = 0
     seconds: float
@@ -75,8 +84,9 @@ class JobResult(Section):
         return self.recall if figure == "recall" else self.ap[overlaps][figure]
 
     def mean(self, overlaps: str, figure: str) -> float:
-        """Return the mean over categories and difficulties."""
-        return float(np.mean(list(self.table(overlaps, figure).values())))
+        """Return the mean over the categories and levels with a figure; NaN without any."""
+        values = np.array(list(self.table(overlaps, figure).values()), dtype=np.float64)
+        return float(known_mean(values, 2))
 
 
 def write_result(root: Path, result: JobResult) -> None:

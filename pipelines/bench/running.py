@@ -1,6 +1,7 @@
 """Run the grid: several jobs at once, shared jobs first; a failed job does not stop the others."""
 
 import fcntl
+import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -134,10 +135,10 @@ class _GridRun:
         if error is None:
             result = read_result(self.bench.root, job)
             self.costs.learn(result)
-            kitti, relaxed = (result.mean(overlaps, "3d") for overlaps in ("kitti", "loose"))
+            kitti, relaxed = (_points(result.mean(name, "3d")) for name in ("kitti", "loose"))
             notes = f", {result.failed_frames} frame results failed" if result.failed_frames else ""
             self.say(
-                f"{job}: mean 3D AP {kitti:.1f}, at relaxed IoU thresholds {relaxed:.1f}, in "
+                f"{job}: mean 3D AP {kitti}, at relaxed IoU thresholds {relaxed}, in "
                 f"{_minutes(result.seconds)}{notes}"
             )
             return
@@ -149,6 +150,10 @@ class _GridRun:
             self._bar.finish(other)
         without = f" (so {len(dependent)} cells cannot run)" if dependent else ""
         self.say(f"{job}: failed{without}: {error}")
+
+
+def _points(percent: float) -> str:
+    return "-" if math.isnan(percent) else f"{percent:.1f}"
 
 
 class _GridBar:

@@ -6,15 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from curate.evaluation.comparison import PairedDifference, Spread, paired_difference, spread
-from curate.evaluation.kitti_rules import DIFFICULTIES, MIN_OVERLAPS, RELAXED_OVERLAPS
+from curate.evaluation.comparison import (
+    PairedDifference,
+    Spread,
+    known_mean,
+    paired_difference,
+    spread,
+)
+from curate.evaluation.kitti_rules import DIFFICULTIES
 from pipelines.bench.grid import Job
 from pipelines.bench.results import JobResult, Levels
 from pipelines.stages.methods import METHODS
 
 BASELINE = "baseline"
 TEACHER = "teacher"
-RULES = {"kitti": MIN_OVERLAPS, "loose": RELAXED_OVERLAPS}
 NAMES = {"3d": "3D AP", "bev": "BEV AP", "recall": "recall, 3D"}
 # The tables of each ratio: IoU thresholds and figure.
 PER_RATIO = (
@@ -106,18 +111,35 @@ class Finished:
         """The evaluated categories."""
         return tuple(next(iter(self.results)).recall) if self.results else ()
 
+    @property
+    def levels(self) -> tuple[str, ...]:
+        """The levels of difficulty."""
+        return next(iter(self.results)).difficulties if self.results else DIFFICULTIES
+
+    def without_objects(self, overlaps: str, figure: str) -> list[str]:
+        """Return the categories and levels without a figure in every result, such as "Car easy"."""
+        tables = [result.table(overlaps, figure) for result in self.results]
+        return [
+            f"{category} {level}"
+            for category in self.categories
+            for d, level in enumerate(self.levels)
+            if all(table[category][d] is None for table in tables)
+        ]
+
     def values(self, method: str | None, ratio: float, overlaps: str, figure: str) -> np.ndarray:
-        """Return (seeds, categories, 3) percent; NaN where a cell is not finished."""
-        missing: dict[str, Levels] = dict.fromkeys(self.categories, (math.nan,) * 3)
+        """Return (seeds, categories, levels) percent.
+
+        NaN where a cell is not finished or the figure cannot be computed.
+        """
+        missing: dict[str, Levels] = dict.fromkeys(self.categories, (None,) * len(self.levels))
         results = [self.result(method, ratio, seed) for seed in self.seeds]
         tables = [missing if each is None else each.table(overlaps, figure) for each in results]
         values = [[table[category] for category in self.categories] for table in tables]
-        return np.array(values, dtype=np.float64).reshape(len(self.seeds), -1, len(DIFFICULTIES))
+        return np.array(values, dtype=np.float64).reshape(len(self.seeds), -1, len(self.levels))
 
     def means(self, method: str | None, ratio: float, overlaps: str, figure: str) -> np.ndarray:
-        """Return (seeds,) means over categories and difficulties."""
-        means: np.ndarray = self.values(method, ratio, overlaps, figure).mean(axis=(1, 2))
-        return means
+        """Return (seeds,) means over the categories and levels with a figure."""
+        return known_mean(self.values(method, ratio, overlaps, figure), 2)
 
 
 def all_tables(finished: Finished) -> list[Table]:
@@ -151,11 +173,14 @@ def _of_ratio(finished: Finished, ratio: float, overlaps: str, figure: str) -> T
             _entry(value, base, compared=compared)
             for value, base in zip(columns[0].T, columns[1].T, strict=True)
         ]
-        mean = _entry(values.mean(axis=(1, 2)), baseline.mean(axis=(1, 2)), compared=compared)
+        mean = _entry(known_mean(values, 2), known_mean(baseline, 2), compared=compared)
         gain = "" if math.isnan(mean.gain) else signed(mean.gain)
         rows.append((method or TEACHER, mean.spread.count, *entries, mean, gain))
-    levels = ("easy", "mod.", "hard")
-    names = [f"{category[:3]}\n{level}" for category in finished.categories for level in levels]
+    names = [
+        f"{category[:3]}\n{level.replace('moderate', 'mod.')}"
+        for category in finished.categories
+        for level in finished.levels
+    ]
     overlap = _overlaps(finished, overlaps)
     return Table(
         f"{NAMES[figure]}, IoU {overlap}: {_ratio(finished, ratio)}",
@@ -274,7 +299,10 @@ def _numbers(values: Sequence[float | None]) -> np.ndarray:
 
 
 def _overlaps(finished: Finished, overlaps: str) -> str:
-    return "/".join(f"{RULES[overlaps][category]:g}" for category in finished.categories)
+    if not finished.results:
+        return "-"
+    thresholds = next(iter(finished.results)).thresholds[overlaps]
+    return "/".join(f"{thresholds[category]:g}" for category in finished.categories)
 
 
 def _ratio(finished: Finished, ratio: float) -> str:

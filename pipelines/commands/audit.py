@@ -20,6 +20,8 @@ from pipelines.commands.options import (
 from pipelines.reports.terminal import print_json, print_line, print_report, print_table
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from curate.evaluation.audit import Audit, Estimate, Figures
     from pipelines.assessment.audit import AuditedRound
 
@@ -61,11 +63,11 @@ def audit(
     """Measure how many pseudo-labels are correct and how well each policy's weights rank them.
 
     Frames with ground truth that the teacher was not trained on are treated as unlabeled, and their
-    labels are then compared with the ground truth. A label is correct with an IoU above 0.7 (Car)
-    or 0.5 (others). With --folds K, K teachers are each trained without one fold. The chart is
-    reports/audit-*.png. The tables audit, audit_slice (by distance and points) and audit_bin (by
-    weight) contain the numbers: curate query "SELECT policy, category, auroc, auroc_low, auroc_high
-    FROM audit"
+    labels are then compared with the ground truth. A label is correct with an IoU above 0.7 (Car),
+    0.5 (others) or evaluation.overlaps. With --folds K, K teachers are each trained without one
+    fold. The chart is reports/audit-*.png. The tables audit, audit_slice (by distance and points)
+    and audit_bin (by weight) contain the numbers: curate query "SELECT policy, category, auroc,
+    auroc_low, auroc_high FROM audit"
 
     Example: curate audit --policy pspsl --policy threshold --policy score
     """
@@ -77,7 +79,9 @@ def audit(
     from curate.viewing.chart_style import check_format
     from curate.viewing.charts import audit_chart
     from pipelines.assessment.audit import AuditRequest, describe_audit, picture_path, run_audit
+    from pipelines.assessment.evaluation import configured_overlaps
     from pipelines.assessment.store import store_audit
+    from pipelines.category_names import check_names
     from pipelines.engine.progress import Bar
 
     kind = check_format(image_format or "png")
@@ -93,6 +97,7 @@ def audit(
         **options,
     )
     opened = open_workspace(workspace, executor, workers, threads)
+    check_names(opened)
     found = run_audit(opened, request, Bar(), (lambda _: None) if as_json else print_report)
     store_audit(opened, found)
     picture = picture_path(opened, found, kind)
@@ -104,12 +109,14 @@ def audit(
             "rounds": found.context.rounds,
             "audited": request.frames,
             "overlap": overlap,
+            "thresholds": configured_overlaps(opened.config),
+            "unmeasured": list(found.unmeasured),
             "summary": summary,
             "picture": str(picture),
         }
         print_json({**header, **as_numbers(found.figures)})
     else:
-        _print(found.figures, _title(found))
+        _print(found.figures, _title(found), configured_overlaps(opened.config))
         print_line("\n".join(summary), indent=2)
         print_line(f"picture: {picture}")
     end(found.reports, as_json=False)
@@ -124,10 +131,16 @@ def _title(found: "AuditedRound") -> str:
     )
 
 
-def _print(figures: "Audit", title: str) -> None:
+def _print(figures: "Audit", title: str, overlaps: "Mapping[str, float]") -> None:
     """Print all policies, their AUROC by slice, and the weight bins of the first one."""
+    from pipelines.reports.count_table import print_counts
+
     by_policy = figures.whole()
-    print_line(f"{title}; {100 * figures.level:.0f} % intervals over {figures.frames} frames\n")
+    thresholds = ", ".join(f"{name} {overlap:g}" for name, overlap in overlaps.items())
+    print_line(
+        f"{title} (IoU above: {thresholds}); {100 * figures.level:.0f} % intervals over "
+        f"{figures.frames} frames\n"
+    )
     print_table(
         ("weight of", "AUROC", "interval", "AP", "precision", "interval", "recall", "calib. error"),
         [
@@ -148,6 +161,8 @@ def _print(figures: "Audit", title: str) -> None:
         title="AUROC by category, distance and points in the label",
     )
     first = next(iter(by_policy.values()))
+    print_counts({"objects": figures.counts, "labels": figures.label_counts})
+    print_line("every object of a category counts, whatever its 2D box, occlusion or truncation\n")
     print_table(
         ("weight", "labels", "precision", "recall"),
         [
@@ -176,14 +191,14 @@ def _parts(figures: "Audit") -> Iterator[tuple[Any, ...]]:
             name,
             first.right,
             first.labels,
-            "" if first.objects is None else first.objects,
+            "-" if first.objects is None else first.objects,
             *(_shown(each.auroc.value) for each in policies),
         )
 
 
 def _interval(estimate: "Estimate") -> str:
-    return "" if math.isnan(estimate.low) else f"{estimate.low:.2f} - {estimate.high:.2f}"
+    return "-" if math.isnan(estimate.low) else f"{estimate.low:.2f} - {estimate.high:.2f}"
 
 
 def _shown(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.3f}"
+    return "-" if math.isnan(value) else f"{value:.3f}"

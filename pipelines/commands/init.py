@@ -94,10 +94,12 @@ def init(
     Example: curate init work --root data/simulated --labeled 0.06 --segmenter simulated
     """
     from curate.errors import ConfigError
+    from curate.names import listed
     from pipelines.assembly import check_extensions
+    from pipelines.category_names import check_before_init, stored_names
     from pipelines.workspace.config import change_setting, make_config
     from pipelines.workspace.images import fit_priors, report_images
-    from pipelines.workspace.setup import initialise
+    from pipelines.workspace.setup import check_files, initialise
     from pipelines.workspace.workspace import open_dataset
 
     if not root.is_dir():
@@ -123,18 +125,26 @@ def init(
         change_setting(document, setting)
     config = make_config(document, "curate init")
     check_extensions(config)
+    check_files(config)
+    check_before_init(config)
     chosen = any(setting.partition("=")[0].strip() == "run.priors" for setting in settings or ())
     config = fit_priors(config, open_dataset(config), explicit=chosen)
     workspace = initialise(directory, config, labeled, val)
     report_images(config, workspace.dataset, list(workspace.frames(*SPLITS)))
     counts = {split: len(workspace.frames(split)) for split in SPLITS}
+    objects = stored_names(workspace)
     if as_json:
-        print_json({"workspace": str(workspace.root), "frames": counts})
+        print_json({"workspace": str(workspace.root), "frames": counts, "objects": objects})
         return
     print_line(
         f"{workspace.root}: {counts['labeled']} labeled, {counts['unlabeled']} unlabeled and "
         f"{counts['val']} val frames; settings in curate.toml"
     )
+    used = {name: count for name, count in objects.items() if name in config.dataset.categories}
+    others = {name: count for name, count in objects.items() if name not in used}
+    if objects:
+        tail = f"; not in dataset.categories: {listed(others)}" if others else ""
+        print_line(f"objects in the label files: {listed(used)}{tail}")
 
 
 def _option(text: str) -> tuple[str, Any]:

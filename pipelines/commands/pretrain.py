@@ -23,12 +23,14 @@ def pretrain(
     Example: curate pretrain
     """
     from curate.errors import ConfigError
+    from pipelines.category_names import check_names
     from pipelines.engine.preview import preview_first
     from pipelines.engine.progress import Bar
     from pipelines.engine.runner import run_first
     from pipelines.round import graph_of
 
     opened = open_workspace(workspace, threads=threads)
+    check_names(opened)
     firsts = list(graph_of(opened).first_stages)
     if not firsts:
         raise ConfigError(

@@ -48,6 +48,7 @@ def run(
     """
     from dataclasses import replace
 
+    from pipelines.category_names import check_names
     from pipelines.engine.preview import preview_all
     from pipelines.engine.progress import Bar
     from pipelines.engine.schedule import check_stages, run_all
@@ -57,6 +58,7 @@ def run(
     opened = open_workspace(workspace, executor, workers)
     if method is not None:
         opened = replace(opened, config=with_method(opened.config, method))
+    check_names(opened)
     if dry_run:
         graph = graph_of(opened)
         check_stages(opened, graph, opened.config.run.method)

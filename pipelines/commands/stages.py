@@ -1,6 +1,7 @@
 """Shared code of the commands that run a single stage."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,7 @@ def run_frame_command(
     """Run frame stages on a split; None for the stages of the configured priors."""
     from curate.errors import ConfigError
     from pipelines.assembly import check_executor
+    from pipelines.category_names import check_names
     from pipelines.engine.plan import Plan
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
@@ -43,6 +45,7 @@ def run_frame_command(
     if unknown:
         raise ConfigError(f"--prior {unknown[0]}: not in run.priors {list(priors)}")
     check_executor(workspace.config)
+    check_names(workspace)
     graph = graph_of(workspace)
     selected = [graph.frames_stage(name) for name in names]
     for stage in selected:
@@ -72,8 +75,20 @@ def run_round_command(
     *,
     as_json: bool,
     dry_run: bool = False,
+    missing: tuple[str, ...] = (),
 ) -> None:
-    """Run a stage of a round for a policy; None for the configured policy."""
+    """Run a stage of a round for a policy; None for the configured policy.
+
+    Args:
+        name: name of the stage.
+        workspace: the workspace.
+        round_number: None for the first round without a student.
+        policy: None for the configured policy.
+        as_json: whether to print JSON.
+        dry_run: whether to print only what would run.
+        missing: failed frames that the export lacks, also if it is up to date.
+    """
+    from pipelines.category_names import check_names
     from pipelines.engine.plan import Plan
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
@@ -86,6 +101,7 @@ def run_round_command(
     stage = graph.round_stage(name)
     if stage.check:
         stage.check(workspace, chosen)
+    check_names(workspace)
     if dry_run:
         context = preview_round(workspace, round_number)
         plan = Plan(workspace, context, graph)
@@ -96,6 +112,7 @@ def run_round_command(
         return
     plan = Plan(workspace, open_round(workspace, round_number), graph)
     report = run_round(plan, name, chosen, Bar())
+    report = replace(report, missing=report.missing or missing)
     if not as_json:
         print_report(report)
     end([report], as_json=as_json)

@@ -17,9 +17,11 @@ def status(
 ) -> None:
     """Show which stages of each round are done, stale or waiting, and how many frames failed.
 
+    The row `review` counts the frames that people decided about; it is there if there are any.
+
     Example: curate status --failed
     """
-    from pipelines.reports.status import failed_frames, overview
+    from pipelines.reports.status import decisions, failed_frames, overview
 
     opened = open_workspace(workspace)
     if failed:
@@ -36,3 +38,5 @@ def status(
         splits = {split: len(opened.frames(split)) for split in ("labeled", "unlabeled", "val")}
         counts = ", ".join(f"{count} {split}" for split, count in splits.items())
         print_table(columns, rows, title=f"{opened.root}: {counts} frames")
+        for line in decisions(opened):
+            print_line(line, indent=4)

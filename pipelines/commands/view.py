@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from pipelines.commands.options import JsonOption, PolicyOption, WorkspaceOption, open_workspace
-from pipelines.reports.terminal import print_json
+from pipelines.reports.terminal import print_json, print_line
 
 if TYPE_CHECKING:
     from curate.viewing.chart_style import ImageFormat
@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 def view(
     frames: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Argument(metavar="FRAME...", help="Frame ids, e.g. 000008.", show_default=False),
+        typer.Argument(
+            metavar="FRAME...", help="Frame ids, e.g. 000008, or numbers.", show_default=False
+        ),
     ] = None,
     every: Annotated[
         bool,
@@ -54,16 +56,23 @@ def view(
     """Draw frames: camera image and bird's eye view with all boxes, coloured by weight.
 
     Predictions are solid, repredictions dashed, ground truth dotted. Ground truth is drawn for
-    labeled and val frames only. Each label shows its k, the K of `curate explain FRAME K`, and if
-    there is room, its weight, score and LiDAR points. In PDF and SVG files, boxes and texts are
-    vectors. A recording holds points, image, boxes and the evidence of each label, frame by frame;
-    open it with `rerun FILE` (pip install 'curate-pseudo-labels[rerun]').
+    labeled and val frames only. Objects that people accepted, moved or added have long dashes, and
+    labels that they rejected are crossed out; the output lists these decisions. Each label shows
+    its k, the K of `curate explain FRAME K`, and if there is room, its weight, score and LiDAR
+    points. In PDF and SVG files, boxes and texts are vectors. A recording holds points, image,
+    boxes and the evidence of each label, frame by frame; open it with `rerun FILE`
+    (pip install 'curate-pseudo-labels[rerun]').
 
     Example: curate view 000008 --round 1 --policy pspsl --style paper --output 000008.pdf
     """
     from curate.errors import ConfigError
     from curate.viewing.palette import find_style
-    from pipelines.labels.of_one_frame import chosen_round, weighted_frame_names
+    from pipelines.labels.of_one_frame import (
+        chosen_round,
+        decided_in_frame,
+        find_frame,
+        weighted_frame_names,
+    )
     from pipelines.reports.pictures import draw_view
 
     colours, kind = find_style(style), _image_format(image_format, output)
@@ -72,7 +81,10 @@ def view(
         raise ConfigError("give the ids of the frames to draw, or --all")
     number = chosen_round(opened, round_number)
     method = policy or opened.config.run.method
-    names = frames or weighted_frame_names(opened, number, method, limit)
+    if frames:
+        names = list(dict.fromkeys(find_frame(opened, name) for name in frames))
+    else:
+        names = weighted_frame_names(opened, number, method, limit)
     if output is not None and (recording is not None or len(names) > 1):
         raise ConfigError("--output is for the image of one frame; leave it out")
     if recording is not None:
@@ -86,11 +98,21 @@ def view(
             for name in names
         ]
         found = {"picture": str(paths[0])} if len(paths) == 1 else {"pictures": paths}
+    decided = {name: decided_in_frame(opened, name, number).by_k for name in names}
     if as_json:
+        found["decisions"] = [
+            {"frame": name, "k": k, "decision": decision}
+            for name, by_k in decided.items()
+            for k, decision in sorted(by_k.items())
+        ]
         print_json(found)
-    else:
-        for path in paths:
-            typer.echo(f"{'recording' if recording else 'picture'}: {path}")
+        return
+    for path in paths:
+        typer.echo(f"{'recording' if recording else 'picture'}: {path}")
+    for name, by_k in decided.items():
+        if by_k:
+            listed = ", ".join(f"k{k} {decision}" for k, decision in sorted(by_k.items()))
+            print_line(f"frame {name}: decisions of people: {listed}", indent=4)
 
 
 def _image_format(name: str | None, output: Path | None) -> "ImageFormat":

@@ -123,9 +123,15 @@ class Plan:
         cameras = dataset.options.get("cameras")
         return {
             "frame": dataset.kind if cameras is None else f"{dataset.kind} {cameras}",
-            "ground_truth": digest(sorted(self.workspace.frames("labeled"))),
+            "ground_truth": digest([*sorted(self.workspace.frames("labeled")), *self._renamed]),
             "teacher": self.context.teacher.sha256,
         }
+
+    @property
+    def _renamed(self) -> Sequence[Any]:
+        """The setting `dataset.rename`, if it has a value."""
+        rename = self.workspace.config.dataset.rename
+        return [rename] if rename else []
 
     @cached_property
     def _of_frames(self) -> dict[str, str]:

@@ -57,6 +57,7 @@ class Report:
         seconds: wall-clock time.
         summary: summary of a round stage's result; "" for a stage of frames.
         errors: (frame name, error) of the failed frames.
+        missing: failed frames that are not in an export.
     """
 
     stage: str
@@ -69,6 +70,7 @@ class Report:
     seconds: float = 0.0
     summary: str = ""
     errors: tuple[tuple[str, str], ...] = ()
+    missing: tuple[str, ...] = ()
 
 
 @contextmanager
@@ -197,7 +199,14 @@ def _run_once(
             "seconds": seconds,
         }
         bulk.insert_rows(connection, "task", [task])
-    return Report(key.stage, key.round, done=1, seconds=seconds, summary=product.summary)
+    return Report(
+        key.stage,
+        key.round,
+        done=1,
+        seconds=seconds,
+        summary=product.summary,
+        missing=product.missing,
+    )
 
 
 def _outcomes(

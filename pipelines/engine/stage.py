@@ -74,11 +74,13 @@ class Product:
         summary: the result in a few words, for the report.
         write: function that stores its rows, in the transaction that records the stage as done.
         keys_known: see `db.session.Database.writing`.
+        missing: failed frames that are not in an export.
     """
 
     summary: str
     write: Callable[[Connection], None]
     keys_known: bool = False
+    missing: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,45 @@ class StoredLabels:
     labels: HumanLabels
 
 
+@dataclass(frozen=True)
+class HumanObject:
+    """An object that a person accepted, moved or added.
+
+    Attributes:
+        k: its number in `weighted_labels`.
+        decision: accepted, moved or added.
+        category: its category.
+        box: x, y, z, length, width, height, yaw in the LiDAR frame.
+    """
+
+    k: int
+    decision: str
+    category: str
+    box: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class DecidedLabels:
+    """The decisions of people about one frame, as they change its labels in a round.
+
+    Attributes:
+        rejected: k of the predictions that a person rejected: weight 0.
+        replaced: k of the predictions that an object replaces.
+        objects: the objects, by k: weight 1.
+    """
+
+    rejected: frozenset[int]
+    replaced: frozenset[int]
+    objects: tuple[HumanObject, ...]
+
+    @property
+    def by_k(self) -> Mapping[int, str]:
+        """The decision about each label of `weighted_labels` that a person decided about."""
+        return dict.fromkeys(self.rejected, REJECTED) | {
+            each.k: each.decision for each in self.objects
+        }
+
+
 def read_human_labels(
     connection: Connection,
     frame_ids: Collection[int] | None = None,
@@ -118,21 +157,48 @@ def counts(workspace: Workspace, round_number: int) -> dict[str, int]:
     return {name: found.count(name) for name in sorted(set(found))}
 
 
-def human_boxes(workspace: Workspace, round_number: int, frame_id: int) -> np.ndarray:
-    """Return the (n, 7) boxes of a frame's human labels, in the LiDAR frame, without rejected ones.
+def decided_frames(workspace: Workspace, round_number: int) -> int:
+    """Return the number of frames with human labels that are valid in a round."""
+    table = bulk.table("human_label")
+    query = select(table.c.frame_id).where(table.c.from_round <= round_number).distinct()
+    return len(workspace.database.rows(query))
+
+
+def decided_labels(workspace: Workspace, round_number: int, frame_id: int) -> DecidedLabels:
+    """Return what people decided about a frame, as far as it is valid in a round.
 
     Args:
         workspace: the workspace.
-        round_number: number of a round; only the labels that are valid in it are returned.
+        round_number: number of the round.
         frame_id: key of the frame.
     """
+    match = bulk.table("human_match").c
+    query = select(match.k, match.n, match.leads).where(
+        match.round == round_number, match.frame_id == frame_id
+    )
     with workspace.database.reading() as connection:
-        found = read_human_labels(connection, [frame_id], until_round=round_number)
-    if frame_id not in found:
-        return np.zeros((0, 7))
-    labels = found[frame_id].labels
-    boxes: np.ndarray = labels.boxes[labels.decisions != REJECTED]
-    return boxes
+        found = read_human_labels(connection, [frame_id], until_round=round_number).get(frame_id)
+        matches = bulk.select(connection, query)
+    if found is None:
+        return DecidedLabels(frozenset(), frozenset(), ())
+    decisions = dict(zip(found.n.tolist(), found.labels.decisions.tolist(), strict=True))
+    rejected = {k for k, n, _ in matches if decisions[n] == REJECTED}
+    lead = {n: k for k, n, leads in matches if leads}
+    objects = [
+        HumanObject(lead.get(n, FIRST_K + n), decision, category, tuple(box))
+        for n, decision, category, box in zip(
+            found.n.tolist(),
+            found.labels.decisions.tolist(),
+            found.labels.categories.tolist(),
+            found.labels.boxes.tolist(),
+            strict=True,
+        )
+        if decision != REJECTED
+    ]
+    replaced = {k for k, _, _ in matches} - rejected
+    return DecidedLabels(
+        frozenset(rejected), frozenset(replaced), tuple(sorted(objects, key=lambda each: each.k))
+    )
 
 
 def _stored(rows: Sequence[bulk.Row]) -> StoredLabels:

@@ -1,18 +1,20 @@
 """The stored boxes of one frame in a round: labels, repredictions, ground truth outside X_u."""
 
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 
 import numpy as np
 from sqlalchemy import func, select
 
-from curate.detections import Annotations, Detections
+from curate.detections import Annotations, Detections, as_categories
 from curate.errors import ConfigError, WorkspaceError
-from curate.review.human_labels import REJECTED
+from curate.spelling import did_you_mean
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.labels.by_frame import check_weights, not_weighted_error
-from pipelines.labels.human_labels import human_boxes
+from pipelines.labels.human_labels import DecidedLabels, decided_labels
+from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace
 
 
@@ -22,22 +24,24 @@ class FrameBoxes:
 
     Attributes:
         split: split of the frame.
-        labels: the n predictions, without those that a human label replaces.
+        labels: the n labels by k: predictions, and in place of those that a human label replaces,
+            the objects that people accepted, moved or added, with score 1.
         numbers: (n,) k of each label.
-        weights: (n,) weights of one policy; 0 for labels that it dropped or a person rejected, NaN
-            if it has weighted none of the frame's labels.
+        weights: (n,) weights of one policy; 0 for labels that it dropped or a person rejected, 1
+            for objects of people, NaN if it has weighted none of the frame's labels.
+        decisions: (n,) str, what a person decided about each label: accepted, moved, added,
+            rejected, or "".
         repredictions: the repredictions of all views, each with the weight of its matched label.
         truth: ground truth, with NaN boxes for DontCare; None for frames of X_u.
-        human_boxes: (h, 7) boxes of the human labels, in the LiDAR frame.
     """
 
     split: str
     labels: Detections
     numbers: np.ndarray
     weights: np.ndarray
+    decisions: np.ndarray
     repredictions: ShownRepredictions
     truth: Annotations | None
-    human_boxes: np.ndarray
 
     @property
     def truth_boxes(self) -> np.ndarray | None:
@@ -89,6 +93,11 @@ def weighted_frame_names(
     return names
 
 
+def decided_in_frame(workspace: Workspace, name: str, round_number: int) -> DecidedLabels:
+    """Return what people decided about a frame, as far as it is valid in a round."""
+    return decided_labels(workspace, round_number, _find(workspace, name)[1])
+
+
 def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) -> FrameBoxes:
     """Return the stored boxes of a frame, with the weights of a policy.
 
@@ -100,25 +109,53 @@ def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) 
     labels = workspace.predictions(round_number, [key])[key]
     weights = _weights(workspace, round_number, (key, name), policy, len(labels))
     truth = None if split == "unlabeled" else workspace.ground_truth(split)[name]
-    rejected, replaced = _decided(workspace, round_number, key, len(labels))
-    weights[rejected] = 0.0
-    return FrameBoxes(
-        split,
-        labels.select(~replaced),
-        np.flatnonzero(~replaced),
-        weights[~replaced],
-        _repredictions(workspace, round_number, key, weights),
-        truth,
-        human_boxes(workspace, round_number, key),
+    decided = decided_labels(workspace, round_number, key)
+    weights[list(decided.rejected)] = 0.0
+    repredictions = _repredictions(workspace, round_number, key, weights)
+    return FrameBoxes(split, *_with_decisions(labels, weights, decided), repredictions, truth)
+
+
+def _with_decisions(
+    labels: Detections, weights: np.ndarray, decided: DecidedLabels
+) -> tuple[Detections, np.ndarray, np.ndarray, np.ndarray]:
+    """Return labels, k, weights and decisions, with the objects of people among the predictions."""
+    kept = np.array([k for k in range(len(labels)) if k not in decided.replaced], dtype=np.int64)
+    objects = Detections.from_rows(
+        [(each.category, 1.0, *each.box, None) for each in decided.objects]
     )
+    every = labels.select(kept).joined(objects)
+    numbers = np.array([*kept.tolist(), *(each.k for each in decided.objects)], dtype=np.int64)
+    weights = np.concatenate([weights[kept], np.ones(len(objects))])
+    decisions = as_categories([decided.by_k.get(k, "") for k in numbers.tolist()])
+    order = np.argsort(numbers, kind="stable")
+    return every.select(order), numbers[order], weights[order], decisions[order]
+
+
+def find_frame(workspace: Workspace, name: str) -> str:
+    """Return the id of a frame that is named by its id, its number, or the name of a file of it.
+
+    Raises:
+        ConfigError: if no frame has that name, or several could have it.
+    """
+    frames = workspace.frames(*SPLITS)
+    if name in frames:
+        return name
+    stem = PurePosixPath(name.replace("\\", "/")).stem
+    fitting = [each for each in frames if each == stem or each.lstrip("0") == stem.lstrip("0")]
+    if len(fitting) > 1:
+        raise ConfigError(
+            f"'{name}' could be frame {' or '.join(fitting[:2])}; write the whole frame id"
+        )
+    if not fitting:
+        hint = did_you_mean(stem, frames) or "; the table frame lists all frames"
+        raise ConfigError(f"no frame is named '{name}'{hint}")
+    return fitting[0]
 
 
 def _find(workspace: Workspace, name: str) -> tuple[str, int]:
     table = bulk.table("frame")
-    query = select(table.c.split, table.c.id).where(table.c.frame == name)
+    query = select(table.c.split, table.c.id).where(table.c.frame == find_frame(workspace, name))
     found = workspace.database.rows(query)
-    if not found:
-        raise ConfigError(f"no frame is named '{name}'; the table frame lists all frames")
     return found[0][0], found[0][1]
 
 
@@ -136,21 +173,6 @@ def _weights(
     for k, v in found:
         weights[k] = v
     return weights
-
-
-def _decided(
-    workspace: Workspace, round_number: int, key: int, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return two (count,) bool by k: rejected by a person, and replaced by a human label."""
-    match, label = bulk.table("human_match"), bulk.table("human_label")
-    same = (label.c.frame_id == match.c.frame_id, label.c.n == match.c.n)
-    query = select(match.c.k, label.c.decision).where(
-        *same, match.c.round == round_number, match.c.frame_id == key
-    )
-    rejected, replaced = np.zeros((2, count), dtype=bool)
-    for k, decision in workspace.database.rows(query):
-        (rejected if decision == REJECTED else replaced)[k] = True
-    return rejected, replaced
 
 
 def _repredictions(

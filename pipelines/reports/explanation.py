@@ -115,7 +115,8 @@ def _human(workspace: Workspace, label: dict[str, Any]) -> Explanation:
     decision = describe_decision(workspace, label)
     if label["weight"] == 0 and decision.policy_weight is not None:
         computed = _computed(workspace, {**label, "weight": decision.policy_weight})
-        return replace(computed, label=label, lines=(*computed.lines, decision.lines[0]))
+        lines = (line.replace("  weight       ", "  policy weight", 1) for line in computed.lines)
+        return replace(computed, label=label, lines=(*lines, decision.lines[0]))
     lines = (*_head(_numbers(label)), *decision.lines)
     no_evidence = Recomputed(None, {}, math.nan)
     return Explanation(label, (), None, no_evidence, None, lines)
@@ -149,12 +150,29 @@ def _label(
         query = select(view).where(*(labels[name] == key[name] for name in key))
         row = connection.execute(query).fetchone()
     if row is None:
-        raise WorkspaceError(
+        raise _replaced(workspace, frame, k, round_number or 1) or WorkspaceError(
             f"round {round_number or 1}: {policy} gave no weight to label {k} of frame {frame}; "
             "there is no such label, or the policy dropped it. The view weighted_labels lists all "
             "weighted labels, see `curate query --help`"
         )
     return dict(row._mapping)  # noqa: SLF001 - its public name
+
+
+def _replaced(workspace: Workspace, frame: str, k: int, number: int) -> WorkspaceError | None:
+    """Return the error for a prediction that an object of a person replaces; None for others."""
+    match, frames = bulk.table("human_match"), bulk.table("frame")
+    key = select(frames.c.id).where(frames.c.frame == frame).scalar_subquery()
+    here = (match.c.round == number, match.c.frame_id == key)
+    label = select(match.c.n).where(*here, match.c.k == k).scalar_subquery()
+    leading = workspace.database.rows(
+        select(match.c.k).where(*here, match.c.n == label, match.c.leads == 1)
+    )
+    if not leading:
+        return None
+    return WorkspaceError(
+        f"round {number}: label {k} of frame {frame} is replaced by label {leading[0][0]}, which a "
+        f"person decided; run `curate explain {frame} {leading[0][0]}`"
+    )
 
 
 def _stored_config(workspace: Workspace, round_number: int) -> Config:

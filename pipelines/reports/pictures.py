@@ -89,6 +89,7 @@ def shown_labels(workspace: Workspace, frame: Frame, found: FrameBoxes, policy: 
         count_points_in_boxes(frame.points, labels.boxes),
         zero_weight_of(workspace.config, policy),
         found.numbers,
+        found.decisions,
         unseen=camera_of_boxes(labels.boxes, frame.cameras) < 0 if frame.cameras else None,
     )
 
@@ -100,7 +101,7 @@ def draw_labels(workspace: Workspace, round_number: int, name: str) -> list[Path
     found = read_frame(workspace, name, round_number, policy)
     labels = shown_labels(workspace, frame, found, policy)
     title = f"frame {name}, round {round_number}, weights by {policy}"
-    stem = f"round-{round_number:02d}-{name}"
+    stem = f"round-{round_number:02d}-{name}-{policy}"
     pictures = {
         f"{stem}-bird-eye.png": draw_bird_eye(frame.points, labels, title=title),
     }
@@ -130,7 +131,6 @@ def _painted(
         shown_labels(workspace, frame, found, policy),
         found.truth_boxes,
         found.repredictions,
-        found.human_boxes,
         picture_title(name, found, number, policy),
         style,
     )

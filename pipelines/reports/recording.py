@@ -74,6 +74,6 @@ def evidence_of_labels(
         table = np.full((len(numbers), len(columns)), np.nan)
         rows = {k: row for row, k in enumerate(numbers.tolist())}
         for k, *values in bulk.select(connection, query):
-            if k in rows:  # the others are objects that people added
+            if k in rows:
                 table[rows[k]] = values
     return dict(zip(columns, table.T, strict=True))

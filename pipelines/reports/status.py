@@ -10,6 +10,7 @@ from db import bulk
 from pipelines.engine.plan import Plan
 from pipelines.engine.rounds import find_teacher, is_student_trained, stored_round
 from pipelines.engine.stage import FirstStage, FramesStage, RoundStage
+from pipelines.labels.human_labels import counts, decided_frames
 from pipelines.round import graph_of
 from pipelines.workspace.workspace import Workspace
 
@@ -38,7 +39,23 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
                 rows += _frame_rows(plan, stage)
             elif isinstance(stage, RoundStage) and (trained or "student" not in stage.writes):
                 rows += _round_rows(plan, stage)
+        decided = decided_frames(workspace, number)
+        if decided:
+            rows.append((number, "review", "unlabeled", "", "done", decided, 0, 0, 0))
     return COLUMNS, rows
+
+
+def decisions(workspace: Workspace) -> list[str]:
+    """Return a line per round with the decisions of people that are valid in it."""
+    table = bulk.table("round").c.number
+    numbers = [row[0] for row in workspace.database.rows(select(table).order_by(table))]
+    found = {number: counts(workspace, number) for number in numbers}
+    return [
+        f"round {number}: decisions of people: "
+        + ", ".join(f"{count:,} {name}" for name, count in decided.items())
+        for number, decided in found.items()
+        if decided
+    ]
 
 
 def failed_frames(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]]:

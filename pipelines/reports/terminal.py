@@ -12,7 +12,7 @@ import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
-from math import isfinite
+from math import isfinite, isnan
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -248,6 +248,18 @@ def _rendered(renderable: "RenderableType", width: int) -> str:
     return "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines())
 
 
+def print_missing(frames: Sequence[str]) -> None:
+    """Print one line about the failed frames that are not in an export; nothing without any."""
+    from curate.exporters.base import named
+
+    if frames:
+        print_line(
+            f"failed frames that are missing from the export: {len(frames)} ({named(frames)}); "
+            "see `curate status --failed`",
+            indent=4,
+        )
+
+
 def print_report(report: "Report") -> None:
     """Print one line about a stage, and the first errors of its failed frames."""
     line = f"round {report.round}  {report.stage:<11} "
@@ -259,6 +271,7 @@ def print_report(report: "Report") -> None:
         line += "".join(f", {n} {state}" for state, n in states.items() if n)
         line += f", {report.kept} already done" if report.kept else ""
     print_line(f"{line}  ({report.seconds:.1f} s)", indent=4)
+    print_missing(report.missing)
     for frame, error in report.errors[:5]:
         typer.echo(f"  failed {frame}: {error}", err=True)
     if len(report.errors) > 5:
@@ -266,16 +279,20 @@ def print_report(report: "Report") -> None:
 
 
 def _cell(value: Any) -> str:
-    """Return a value as text, with control characters escaped."""
+    """Return a value as text, with control characters escaped; "-" for NaN."""
     if value is None:
         return ""
     if isinstance(value, float):
+        if isnan(value):
+            return "-"
         return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in str(value))
 
 
 def _is_number(text: str) -> bool:
-    """Return whether a value is a number, to be right-aligned; 000012 is a frame id."""
+    """Return whether a value is a number or "-", to be right-aligned; 000012 is a frame id."""
+    if text == "-":
+        return True
     if text[:1] == "0" and text[1:2].isdigit():
         return False
     try:

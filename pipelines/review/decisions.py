@@ -47,12 +47,11 @@ def describe_decision(workspace: Workspace, label: dict[str, Any]) -> LabelDecis
             human.c.frame_id == key,
             human.c.n == (label["k"] - FIRST_K if number is None else number),
         )
-        names = ("decision", "reviewer", "decided_at", "review", "item")
+        names = ("decision", "reviewer", "decided_at", "review")
         row = connection.execute(
             select(*(human.c[name] for name in names)).where(*this_label)
         ).one()
-    box = "a new box" if row.item is None else f"box {row.item}"
-    who = f"by {row.reviewer} at {row.decided_at}, {box} of review {row.review}"
+    who = f"by {row.reviewer} at {row.decided_at}, in review {row.review}"
     lines = [f"  human          {row.decision} {who}: weight {label['weight']:g}"]
     if policy_weight is not None:
         lines.append(

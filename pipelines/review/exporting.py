@@ -19,10 +19,10 @@ PICTURES = "pictures"
 _HOW_TO = """Review {id}: round {round}, weights by {policy}, {frames} frames, {asked} of {boxes} \
 boxes to review.
 
-pictures/FRAME.png shows a frame with its numbered boxes; the boxes to review are marked "?".
+pictures/FRAME.png shows a frame; each box has its k, and the boxes to review are marked "?".
 {editor}
-review.csv: write accept or reject into the column decision of a box. accept in the row `all` of a
-frame accepts all its boxes that you leave unchanged.
+review.csv: write accept or reject into the column decision of a label k. accept in the row `all` of
+a frame accepts all its boxes that you leave unchanged.
 
 A box that you leave unchanged without a decision counts as not reviewed, and so do the boxes of a
 frame if you delete its file. A box that you delete is rejected; one that you move, turn, resize or
@@ -31,7 +31,7 @@ rename is corrected; one that you draw is added.
 Then run: curate review import THIS_FOLDER --dry-run
 """
 _EDITORS = {
-    "kitti": "label_2/FRAME.txt has the boxes as KITTI label lines; line i is box i.\n",
+    "kitti": "label_2/FRAME.txt has the boxes as KITTI label lines, in the order of review.csv.\n",
     "labelcloud": (
         "Start `labelCloud` in this folder: it finds pointclouds/ and labels/ there. The labels "
         "have the\nformat centroid_abs.\n"

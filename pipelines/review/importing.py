@@ -188,7 +188,7 @@ def _check_overlaps(edits: Sequence[FrameEdits]) -> None:
 
 
 def _name(decision: Decision) -> str:
-    number = "new box" if decision.number is None else f"box {decision.number}"
+    number = "new box" if decision.k is None else f"label {decision.k}"
     return f"{number} ({decision.category})"
 
 
@@ -199,7 +199,7 @@ def _as_shown(shown: ShownFrame) -> list[EditedBox]:
 def _row(frame_id: int, decision: Decision, from_round: int) -> LabelRow:
     """Return the columns `_SHARED`."""
     seen = decision.seen or (None,) * len(SEEN_COLUMNS)
-    what = (frame_id, decision.number, decision.decision, decision.category, from_round)
+    what = (frame_id, decision.k, decision.decision, decision.category, from_round)
     return dict(zip(_SHARED, (*what, *decision.box, *seen), strict=True))
 
 

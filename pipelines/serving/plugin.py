@@ -149,7 +149,8 @@ class CuratePlugin:
         return shown, numbers["k"]
 
     def _explanation(self, shown: ShownFrame, k: int | None) -> str | None:
-        weighted = {row[0] for row in shown.labels if row[-1] is not None}
+        weights = shown.columns.index("v")
+        weighted = {row[0] for row in shown.labels if row[weights] is not None}
         if k is None or k not in weighted or shown.split != "unlabeled":
             return None
         return self._pages.explanation(shown, k)

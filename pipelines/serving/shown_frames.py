@@ -2,6 +2,7 @@
 
 import threading
 from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,8 @@ from curate.priors.base import Column
 from curate.viewing.canvas import jpeg
 from db import bulk
 from db.evidence import OWN_TABLES, evidence_table, label_columns, read_declarations
+from db.models import BOX_COLUMNS
+from pipelines.labels.human_labels import DecidedLabels, decided_labels
 from pipelines.labels.of_one_frame import chosen_round
 from pipelines.reports.pictures import frame_picture
 from pipelines.workspace.workspace import Workspace
@@ -29,7 +32,8 @@ class ShownFrame:
         round: number.
         policy: policy of the weights.
         columns: names of the columns of the labels.
-        labels: a row per label.
+        labels: a row per label, as in `weighted_labels`: objects of people replace predictions.
+        decisions: what a person decided about a label, by k.
         choices: (round, policy) of all weights that the frame has.
         before: the previous frame of the same split; None at the start.
         after: the next frame of the same split; None at the end.
@@ -40,7 +44,8 @@ class ShownFrame:
     round: int
     policy: str
     columns: tuple[str, ...]
-    labels: tuple[bulk.Row, ...]
+    labels: tuple[tuple[Any, ...], ...]
+    decisions: Mapping[int, str]
     choices: tuple[tuple[int, str], ...]
     before: str | None
     after: str | None
@@ -57,7 +62,7 @@ class FramePages:
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
-        self._pictures: OrderedDict[tuple[str, int, str], bytes] = OrderedDict()
+        self._pictures: OrderedDict[tuple[Any, ...], bytes] = OrderedDict()
         self._drawing = threading.Lock()
 
     def find(
@@ -82,15 +87,20 @@ class FramePages:
         if choices and (number, policy) not in choices:
             raise ConfigError(f"frame {name} has no weights by {policy} in round {number}")
         before, after = (self._neighbour(name, split, step) for step in (-1, 1))
+        decided = decided_labels(self._workspace, number, found)
         columns, labels = self._labels(found, number, policy)
-        return ShownFrame(name, split, number, policy, columns, labels, choices, before, after)
+        columns, labels = _with_decisions(columns, labels, decided)
+        return ShownFrame(
+            name, split, number, policy, columns, labels, decided.by_k, choices, before, after
+        )
 
     def picture(self, shown: ShownFrame) -> bytes:
         """Return the image of a frame as JPEG."""
-        key = (shown.name, shown.round, shown.policy)
+        drawn = (shown.name, shown.round, shown.policy)
+        key = (*drawn, shown.labels)  # new weights and decisions are drawn again
         with self._drawing:
             if key not in self._pictures:
-                self._pictures[key] = jpeg(frame_picture(self._workspace, *key), quality=88)
+                self._pictures[key] = jpeg(frame_picture(self._workspace, *drawn), quality=88)
             self._pictures.move_to_end(key)
             if len(self._pictures) > _KEPT_PICTURES:
                 self._pictures.popitem(last=False)
@@ -166,6 +176,26 @@ class FramePages:
 
     def _execute(self, query: Any) -> list[bulk.Row]:
         return list(self._workspace.database.rows(query))
+
+
+def _with_decisions(
+    names: tuple[str, ...], rows: Sequence[bulk.Row], decided: DecidedLabels
+) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
+    """Return columns and rows with the decisions of people, in a column `decision` if any."""
+    if not decided.by_k:
+        return names, tuple(tuple(row) for row in rows)
+    found = [dict(zip(names, row, strict=True)) for row in rows if row[0] not in decided.replaced]
+    for label in found:
+        if label["k"] in decided.rejected:
+            label["v"] = 0.0
+    for each in decided.objects:
+        box = dict(zip(BOX_COLUMNS, each.box, strict=True))
+        found.append({"k": each.k, "category": each.category, **box, "score": 1.0, "v": 1.0})
+    names = (*names[:2], "decision", *names[2:])
+    labels = sorted(found, key=lambda label: int(label["k"]))
+    for label in labels:
+        label["decision"] = decided.by_k.get(label["k"])
+    return names, tuple(tuple(map(label.get, names)) for label in labels)
 
 
 def _is_evidence(column: Column, tables: list[Table]) -> bool:

@@ -20,10 +20,11 @@ from curate.exporters.base import (
     LabelSet,
 )
 from curate.exporters.sqlite import SqliteExporter, check_label_file_place
+from curate.files.batches import batched
 from curate.priors.base import Column
 from db import bulk
 from db.evidence import read_declarations, weighted_label_columns
-from db.views import WEIGHTED_LABELS
+from db.views import FAILED_FRAMES, WEIGHTED_LABELS
 from pipelines.assembly import open_policy
 from pipelines.engine.progress import Progress
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
@@ -34,6 +35,8 @@ from pipelines.workspace.workspace import Workspace, sha256
 
 CURRENT = "labels.sqlite"
 _CHUNK = 10_000
+# SQLite limits the number of parameters of a statement.
+_FRAMES_PER_QUERY = 400
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
@@ -58,8 +61,35 @@ def _further_columns(workspace: Workspace) -> list[str]:
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
-    """Return the path of the exported file of a round and policy."""
-    return workspace.root / "exports" / f"round-{context.number:02d}-{policy}.sqlite"
+    """Return the path of the exported SQLite file of a round and policy."""
+    return default_path(workspace, context.number, policy, SqliteExporter())
+
+
+def default_path(workspace: Workspace, round_number: int, policy: str, exporter: Exporter) -> Path:
+    """Return the path of an export in the workspace: exports/round-01-pspsl.csv, for example.
+
+    Folders, and files with a suffix that several formats share, have the format in their name:
+    round-01-pspsl-kitti, round-01-pspsl-coco.json.
+    """
+    own_suffix = exporter.suffix == f".{exporter.name}"
+    name = f"round-{round_number:02d}-{policy}" + ("" if own_suffix else f"-{exporter.name}")
+    return workspace.root / "exports" / f"{name}{exporter.suffix}"
+
+
+def missing_frames(workspace: Workspace, round_number: int, policy: str) -> tuple[str, ...]:
+    """Return the unlabeled frames that failed in a round and therefore have no exported label."""
+    if not open_policy(workspace.config, policy).uses_unlabeled:
+        return ()
+    failed, labels = FAILED_FRAMES.c, WEIGHTED_LABELS.c
+    query = select(failed.frame).where(failed.round == round_number, failed.split == "unlabeled")
+    with workspace.database.reading() as connection:
+        missing = set(connection.execute(query.distinct()).scalars())
+        for batch in batched(sorted(missing), _FRAMES_PER_QUERY):
+            with_labels = select(labels.frame).where(
+                labels.round == round_number, labels.policy == policy, labels.frame.in_(batch)
+            )
+            missing.difference_update(connection.execute(with_labels).scalars())
+    return tuple(sorted(missing))
 
 
 def guard(workspace: Workspace, context: RoundContext, policy: str) -> None:
@@ -95,7 +125,9 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
         for each in written:
             register_label_file(connection, workspace, each, job.context.number, job.policy)
 
-    return Product(f"{labels} labels in {workspace.relative(path)}", write)
+    summary = f"{labels} labels in {workspace.relative(path)}"
+    missing = missing_frames(workspace, job.context.number, job.policy)
+    return Product(summary, write, missing=missing)
 
 
 def register_label_file(

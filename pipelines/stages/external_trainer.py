@@ -80,12 +80,11 @@ def _filled(argument: str, values: dict[str, str]) -> str:
 
 def _labels(workspace: Workspace, job: RoundJob) -> Path:
     """Return the path of the labels in the configured format; export them if it is not SQLite."""
-    path = export.file(workspace, job.context, job.policy)
     name = workspace.config.train.labels_format
     if name == "sqlite":
-        return path
+        return export.file(workspace, job.context, job.policy)
     exporter = EXPORTERS.build(name, offered={}, options={})
-    path = path.with_name(f"{path.stem}-{exporter.name}{exporter.suffix}")
+    path = export.default_path(workspace, job.context.number, job.policy, exporter)
     export.export_as(workspace, exporter, job.context.number, job.policy, path)
     return path
 

@@ -10,14 +10,17 @@ from typing import Any
 import numpy as np
 
 from curate.detections import Detections
+from curate.detectors.base import Detector, NamesCategories
 from curate.errors import ModelError
 from curate.frames import Frame
 from curate.geometry.projection import in_camera_view
+from curate.names import renamed
 from db.models import BOX_COLUMNS
 from pipelines.assembly import check_detector, open_detector
+from pipelines.category_names import check_detector_names
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
-from pipelines.workspace.config import Config
+from pipelines.workspace.config import Config, DetectorSection, SegmenterSection
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256
 
 _log = logging.getLogger(__name__)
@@ -39,6 +42,7 @@ class Predict:
         """Open the data set and load the detector."""
         self.dataset = open_dataset(self.config)
         self.detector = open_detector(self.config, self.teacher)
+        check_detector_names(self.config, self.detector)
 
     def __call__(self, job: FrameJob) -> FrameRows:
         """Return the rows of `prediction`."""
@@ -48,7 +52,7 @@ class Predict:
     def detect(self, frame_id: str) -> Detections:
         """Return the detections of a frame, by descending score."""
         frame = visible(self.dataset.read(frame_id), self.config)
-        return checked(self.detector.predict(frame), self.config)
+        return checked(self.detector.predict(frame), self.config, self.detector)
 
 
 def visible(frame: Frame, config: Config) -> Frame:
@@ -60,15 +64,23 @@ def visible(frame: Frame, config: Config) -> Frame:
     return frame.with_points(np.compress(inside, frame.points, axis=0))
 
 
-def checked(found: Detections, config: Config) -> Detections:
+def checked(found: Detections, config: Config, detector: Detector | None = None) -> Detections:
     """Return the detections with configured categories and sufficient scores, by descending score.
+
+    Names are renamed by `detector.rename` first.
+
+    Args:
+        found: what the detector returned.
+        config: the configuration.
+        detector: the detector; if it knows its names, they have been compared already.
 
     Raises:
         ModelError: if a box is not finite or has no size, or a category differs from a configured
             one only in upper and lower case.
     """
+    found = renamed(found, config.detector.rename)
     configured = np.isin(found.categories, config.dataset.categories)
-    if not configured.all():
+    if not configured.all() and not isinstance(detector, NamesCategories):
         _report_unexpected(np.unique(found.categories[~configured]).tolist(), config)
     found = found.select(configured & (found.scores >= config.detector.minimum_score))
     numbers = np.column_stack([found.boxes, found.scores])
@@ -93,7 +105,7 @@ def _report_unexpected(unexpected: Sequence[str], config: Config) -> None:
         if category := categories.get(name.lower()):
             raise ModelError(
                 f"the detector returns '{name}', but the data set's category is '{category}':"
-                f' set detector.options.rename = {{"{name}" = "{category}"}}, or '
+                f' set detector.rename = {{"{name}" = "{category}"}}, or '
                 "dataset.categories"
             )
         _warn_once(name, config.dataset.categories)
@@ -104,7 +116,7 @@ def _warn_once(name: str, categories: tuple[str, ...]) -> None:
     """Log the warning once per process and name."""
     _log.warning(
         "the detector returns '%s', which is not a category of the data set (%s): such boxes are "
-        "left out; detector.options.rename of a recorded detector translates names",
+        "left out; detector.rename maps names",
         name,
         ", ".join(categories),
     )
@@ -135,10 +147,17 @@ def settings(workspace: Workspace, _context: RoundContext) -> Settings:
     """Return what predictions depend on besides the frames and the teacher."""
     config = workspace.config
     return {
-        "detector": config.detector.model_dump(mode="json", exclude={"path"}),
+        "detector": config.detector.model_dump(
+            mode="json", exclude={"path", *unset_rename(config.detector)}
+        ),
         "files": option_files(config),
         "categories": config.dataset.categories,
     }
+
+
+def unset_rename(section: DetectorSection | SegmenterSection) -> tuple[str, ...]:
+    """Return the key of `rename` if it is unset: results from before the setting stay valid."""
+    return ("rename",) if section.rename is None else ()
 
 
 def option_files(config: Config) -> dict[str, str]:

@@ -3,9 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, func, select
 
-from curate.errors import WorkspaceError
+from curate.errors import ConfigError, WorkspaceError
+from curate.names import listed
+from db import bulk
 from pipelines.assembly import trained_detector
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import register_checkpoint
@@ -37,7 +39,9 @@ def settings(workspace: Workspace) -> Any:
             "no labeled frames to train from; choose some with `curate init --labeled`"
         )
     trained = trained_detector(config)
+    renamed = [config.dataset.rename] if config.dataset.rename else []
     return [
+        *renamed,
         config.train.model_dump(mode="json", exclude=_LATER_SETTINGS) | {"preset": trained.preset},
         sorted(labeled),
         config.run.seed,
@@ -55,14 +59,30 @@ def file(workspace: Workspace) -> Path:
 
 
 def guard(workspace: Workspace) -> None:
-    """Check the leakage firewall.
+    """Check the leakage firewall, and that there is something to learn.
 
     Raises:
         LeakageError: if ground truth of unlabeled or val frames would be trained on.
+        ConfigError: if there is no object of any category to learn from.
     """
     from pipelines.firewall.rules import enforce
 
     enforce(workspace, file=_labels(workspace))
+    _check_objects(workspace)
+
+
+def _check_objects(workspace: Workspace) -> None:
+    """Raise ConfigError if X_l has no object of any category."""
+    truth, categories = bulk.table("ground_truth"), workspace.config.dataset.categories
+    query = select(truth.c.category, func.count()).where(truth.c.split == "labeled")
+    found = dict(sorted(workspace.database.rows(query.group_by(truth.c.category))))
+    if not any(name in categories for name in found):
+        frames = len(workspace.frames("labeled"))
+        raise ConfigError(
+            f"no object to learn from: the label files of the {frames} labeled frames have "
+            f"{listed(found) or 'no objects'}, and dataset.categories are {listed(categories)}; "
+            "label other frames, or map names with dataset.rename"
+        )
 
 
 def run(workspace: Workspace, progress: Progress) -> Product:

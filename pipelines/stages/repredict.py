@@ -64,10 +64,12 @@ class Repredict(Predict):
                 (a, self.detector.predict(frame.with_points(a.apply_to_points(frame.points))))
                 for a in drawn
             ]
-        return [
-            (a, checked(replace(found, boxes=a.invert_boxes(found.boxes)), self.config))
-            for a, found in views
-        ]
+        return [(a, self._checked(a, found)) for a, found in views]
+
+    def _checked(self, similarity: Similarity, found: Detections) -> Detections:
+        """Return the detections of an augmented copy in the frame's own frame of reference."""
+        boxes = similarity.invert_boxes(found.boxes)
+        return checked(replace(found, boxes=boxes), self.config, self.detector)
 
 
 def draw(

@@ -7,6 +7,7 @@ from the fields of these classes.
 import math
 import tomllib
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,7 +22,10 @@ from pydantic import (
 
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, one_line
+from curate.evaluation.kitti_rules import overlaps_of
+from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
+from curate.names import check_rename
 from pipelines import registry
 from pipelines.workspace.config_errors import describe_errors
 from pipelines.workspace.names import KnownClassSet, KnownName
@@ -30,6 +34,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Scale = Annotated[float, Field(gt=0, le=100)]
+Overlaps = dict[str, Annotated[float, Field(gt=0, lt=1)]]
 AtLeastOne = Annotated[int, Field(ge=1)]
 Count = Annotated[int, Field(ge=0)]
 PointCount = Annotated[float, Field(ge=1, allow_inf_nan=False)]
@@ -65,6 +70,42 @@ def _rising(limits: tuple[float, float]) -> tuple[float, float]:
     return limits
 
 
+def _final_names(rename: dict[str, str] | None) -> dict[str, str] | None:
+    try:
+        check_rename(rename or {})
+    except ConfigError as error:  # pydantic collects ValueError
+        raise ValueError(str(error)) from error
+    return rename
+
+
+Rename = Annotated[dict[str, str] | None, AfterValidator(_final_names)]
+
+
+def _own_rename(section: Any, key: str, name: str) -> Any:
+    """Move `options.rename`, as 0.1 had it for one class, to the setting of all classes."""
+    if not isinstance(section, Mapping) or section.get(key) != name:
+        return section
+    options = section.get("options")
+    if not isinstance(options, Mapping) or "rename" not in options:
+        return section
+    if section.get("rename") is not None:
+        raise ValueError("both rename and options.rename are set; remove options.rename")
+    kept = {each: value for each, value in options.items() if each != "rename"}
+    return {**section, "options": kept, "rename": options["rename"]}
+
+
+def _falling(numbers: tuple[int, ...]) -> tuple[int, ...]:
+    if any(a <= b for a, b in pairwise(numbers)):
+        raise ValueError("the largest number must come first, each only once")
+    return numbers
+
+
+def _strictly_rising(limits: tuple[float, ...]) -> tuple[float, ...]:
+    if any(a >= b for a, b in pairwise(limits)):
+        raise ValueError("the smallest distance must come first, each only once")
+    return limits
+
+
 class Section(BaseModel):
     """A table of settings; unknown keys are rejected."""
 
@@ -82,10 +123,42 @@ class DatasetSection(Section):
         default=CATEGORIES,
         description="Categories to detect. Labels of all others are not used.",
     )
+    rename: Rename = Field(
+        default=None,
+        description="Category for names in the label files; other names stay as they are.",
+        examples=[{"car": "Car"}],
+    )
     split_by: Literal["sequence", "frame"] = Field(
         default="sequence",
         description="Unit of the split: whole sequences or single frames. With 'frame', "
         "near-duplicate frames of a sequence end up in several splits.",
+    )
+    columns: Annotated[int, Field(ge=3, le=64)] | None = Field(
+        default=None,
+        description="Number of float32 columns of point files without a header (.bin, .npy). "
+        "Without it, the number of the data set's format; a file that looks like another number "
+        "is rejected.",
+        json_schema_extra=_unit("columns"),
+        examples=[5],
+    )
+    column_names: Annotated[tuple[str, ...], Field(min_length=3)] | None = Field(
+        default=None,
+        description="Names of these columns, in the order of the file. x, y and z are needed, an "
+        "intensity is not. Without it, x, y, z, intensity and columns that are not read.",
+        examples=[["x", "y", "z", "intensity", "ring"]],
+    )
+    intensity_field: str | None = Field(
+        default=None,
+        description="Column or field of the intensity. It is only needed where several may be it, "
+        "such as intensity and reflectivity in one file.",
+        examples=["reflectivity"],
+    )
+    intensity_scale: Positive | None = Field(
+        default=None,
+        description="Value of full intensity in the point files. Without it, that of the data "
+        "set's format (1; nuScenes 255). Files with larger values are rejected.",
+        json_schema_extra=_unit("1"),
+        examples=[255.0],
     )
     follow_links: bool = Field(
         default=False, description="Whether links in the data set may lead out of its folder."
@@ -93,6 +166,11 @@ class DatasetSection(Section):
     options: Options = Field(
         default={}, description="Further arguments of the data set's class; see docs/datasets.md."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _move_rename(cls, section: Any) -> Any:
+        return _own_rename(section, "kind", "nuscenes")
 
 
 class DetectorSection(Section):
@@ -121,9 +199,19 @@ class DetectorSection(Section):
         default=True,
         description="Whether the detector gets only the points that the camera sees.",
     )
+    rename: Rename = Field(
+        default=None,
+        description="Category for names that the detector returns; other names stay as they are.",
+        examples=[{"car": "Car"}],
+    )
     options: Options = Field(
         default={}, description="Further arguments of the detector's class; see docs/detectors.md."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _move_rename(cls, section: Any) -> Any:
+        return _own_rename(section, "name", "recorded")
 
 
 class SegmenterSection(Section):
@@ -144,6 +232,12 @@ class SegmenterSection(Section):
         description="Class set that gives the segmenter's class ids their meaning; see "
         "docs/segmenters.md.",
         examples=["cityscapes"],
+    )
+    rename: Rename = Field(
+        default=None,
+        description="Category for names in the segmenter's table of classes; other names stay as "
+        "they are.",
+        examples=[{"car": "Car"}],
     )
     options: Options = Field(
         default={},
@@ -392,6 +486,38 @@ class RunSection(Section):
     )
 
 
+class EvaluationSection(Section):
+    """When a detection or label counts as correct, and which objects count, in evaluate and audit.
+
+    The settings change no label and no weight.
+    """
+
+    overlaps: Overlaps = Field(
+        default={},
+        description="IoU that a detection or label must exceed to be correct, by category, such as "
+        "{Bus = 0.7}. Without an entry: 0.7 for Car, 0.5 for all others.",
+    )
+    difficulty: Literal["kitti", "points", "distance"] = Field(
+        default="kitti",
+        description="Levels of difficulty of curate evaluate: KITTI's easy, moderate and hard, "
+        "which need 2D boxes; levels by LiDAR points in the object; or ranges of distance.",
+    )
+    minimum_points: Annotated[
+        tuple[AtLeastOne, ...], Field(min_length=1), AfterValidator(_falling)
+    ] = Field(
+        default=(6, 1),
+        description="LiDAR points that an object of each level has at least, the largest first, "
+        "for difficulty = 'points'. Each level includes those before it.",
+        json_schema_extra=_unit("points"),
+    )
+    distance_limits: Annotated[tuple[Positive, ...], AfterValidator(_strictly_rising)] = Field(
+        default=(30.0, 50.0),
+        description="Distances between two ranges, the smallest first, for difficulty = "
+        "'distance'.",
+        json_schema_extra=_unit("m"),
+    )
+
+
 class Config(Section):
     """The settings of a workspace."""
 
@@ -404,6 +530,7 @@ class Config(Section):
     solve: SolveSection = SolveSection()
     train: TrainSection = TrainSection()
     run: RunSection = RunSection()
+    evaluation: EvaluationSection = EvaluationSection()
 
 
 def read_config(path: Path) -> Config:
@@ -414,17 +541,13 @@ def read_config(path: Path) -> Config:
     """
     if path.exists() and not path.is_file():
         raise ConfigError(f"{path}: is not a file but a folder, a pipe or a device; remove it")
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file; `curate init` creates a workspace")
+    text = read_text(path, "configuration", error_type=ConfigError)
     try:
-        document = parse_toml(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; `curate init` creates a workspace") from error
-    except (
-        RecursionError,
-        ValueError,
-    ) as error:  # ValueError also covers numbers that are too long
+        document = parse_toml(text)
+    except (RecursionError, ValueError) as error:  # ValueError also for numbers that are too long
         raise ConfigError(f"{path}: invalid TOML: {one_line(error, 200)}") from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     return make_config(document, str(path))
 
 
@@ -435,9 +558,14 @@ def make_config(document: Mapping[str, Any], source: str) -> Config:
         ConfigError: if settings are invalid; the message lists all of them, after the source.
     """
     try:
-        return Config.model_validate(document)
+        config = Config.model_validate(document)
     except ValidationError as error:
         raise ConfigError(f"{source}: {describe_errors(error, Config)}") from error
+    try:
+        overlaps_of(config.dataset.categories, config.evaluation.overlaps)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: evaluation.overlaps: {error}") from error
+    return config
 
 
 def change_setting(document: dict[str, Any], setting: str) -> None:

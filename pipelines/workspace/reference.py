@@ -122,9 +122,9 @@ def _accepted(annotation: Any, metadata: Sequence[Any] = ()) -> Accepted:
 
 def _accepted_list(arguments: Sequence[Any]) -> Accepted:
     item = _accepted(arguments[0])
-    if arguments[-1] is Ellipsis:
-        return Accepted(f"list of {item.type}s", choices=item.choices, open=item.open)
     limits = f"{item.range} each" if item.range else ""
+    if arguments[-1] is Ellipsis:
+        return Accepted(f"list of {item.type}s", limits, item.choices, item.open)
     return Accepted(f"list of {_COUNTS[len(arguments)]} {item.type}s", limits)
 
 

@@ -1,7 +1,8 @@
 """Set-up of a workspace: the split of the frames, and the ground truth of labeled frames."""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,23 +12,30 @@ from sqlalchemy import func, select
 
 from curate.datasets.base import Dataset, sequences_of
 from curate.datasets.formats.containment import check_frame_id
+from curate.datasets.frame_names import FrameNames, match_frame_list
+from curate.datasets.kitti.labels import KITTI_CATEGORIES
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
 from curate.files.batches import batched
 from curate.firewall.sequences import choose_sequences, group_by_sequence, shared_sequences
+from curate.names import NamedSide, compare_names, inline_table
 from curate.segmenters.classes import CLASS_MAPS
+from curate.spelling import closest, did_you_mean
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
 from pipelines.workspace.config import Config
+from pipelines.workspace.samples import check_samples
 from pipelines.workspace.split_record import split_rows
 from pipelines.workspace.splits import SPLITS
-from pipelines.workspace.workspace import Workspace, open_dataset
+from pipelines.workspace.workspace import Workspace, open_dataset, with_final_names
 
 _log = logging.getLogger(__name__)
 
 FRAMES_AT_ONCE = 1024
+# "Person" is the name of KITTI's tracking benchmark for Person_sitting.
+_BENCHMARK_NAMES = KITTI_CATEGORIES | {"Person"}
 
 
 @dataclass(frozen=True)
@@ -46,7 +54,9 @@ class Split:
                 raise LeakageError(f"frames in both {one} and {other}: {', '.join(shared[:5])}")
 
 
-def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
+def initialise(
+    root: Path, config: Config, labeled: str, val: str, *, compare: bool = True
+) -> Workspace:
     """Return a workspace with its frames and the ground truth of X_l and val.
 
     Everything is read before anything is written: a damaged file leaves no incomplete workspace.
@@ -56,16 +66,22 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
         config: its settings.
         labeled: share of the training frames, e.g. "0.04", or a file with a frame name per line.
         val: the same for val frames; "" for the data set's own val list.
+        compare: whether to compare the names in the label files with `dataset.categories`.
 
     Raises:
-        ConfigError: if a share or a list is invalid, or a class or file is missing.
-        DataError: if a label or calibration file of X_l or val is damaged.
+        ConfigError: if a share or a list is invalid, a class or file is missing, or the label files
+            have no name of `dataset.categories`.
+        DataError: if a label or calibration file of X_l or val is damaged, or has an unknown name.
         WorkspaceError: if the workspace exists with other frames or settings.
     """
-    _check_files(config)
+    check_files(config)
     dataset = open_dataset(config)
     split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
+    check_samples(dataset, sorted((*split.labeled, *split.unlabeled, *split.val)))
     truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
+    if compare:
+        _compare_names(config, dataset, truth)
+    truth = {name: with_final_names(config, found) for name, found in truth.items()}
     workspace = Workspace.create(root, config)
     stored = Split(*(tuple(workspace.frames(name)) for name in ("labeled", "unlabeled", "val")))
     if stored == split:
@@ -80,7 +96,59 @@ def initialise(root: Path, config: Config, labeled: str, val: str) -> Workspace:
     return workspace
 
 
-def _check_files(config: Config) -> None:
+def label_names(config: Config, names: Mapping[str, int]) -> NamedSide:
+    """Return the names in the label files of X_l and val, for a comparison.
+
+    Args:
+        config: the configuration.
+        names: number of objects by name, before or after renaming.
+    """
+    kind = config.dataset.kind
+    # nuScenes' classes are a fixed list, of which a user chooses some.
+    accepted = set(names) if kind == "nuscenes" else _BENCHMARK_NAMES
+    return NamedSide(
+        "the label files", names, "dataset.rename", config.dataset.rename or {}, accepted
+    )
+
+
+def _compare_names(config: Config, dataset: Dataset, truth: Mapping[str, Annotations]) -> None:
+    """Compare the names in the label files with `dataset.categories`, and warn of differences.
+
+    Raises:
+        ConfigError: if no name is the same, or one differs only in its letters.
+        DataError: if the data set is in KITTI's layout, and a name is neither KITTI's nor declared:
+            it may be a typing error.
+    """
+    names = Counter(name for found in truth.values() for name in found.categories.tolist())
+    side = label_names(config, dict(sorted(names.items())))
+    findings = compare_names(side, config.dataset.categories)
+    if wrong := [finding.message for finding in findings if finding.wrong]:
+        raise ConfigError("; ".join(wrong))
+    known = {*config.dataset.categories, *side.accepted, *side.rename}
+    if config.dataset.kind.startswith("kitti"):
+        for frame, found in truth.items():
+            for name in found.categories.tolist():
+                if name not in known:
+                    raise _unknown_name(dataset, frame, name, known)
+    for finding in findings:
+        _log.warning("%s", finding.message)
+
+
+def _unknown_name(dataset: Dataset, frame: str, name: str, known: Collection[str]) -> DataError:
+    """Return the error for a name in the label file of a frame."""
+    path = dataset.files(frame).label
+    lines = path.read_bytes().splitlines() if path else []
+    line = next((i for i, text in enumerate(lines, 1) if text.split()[:1] == [name.encode()]), 1)
+    similar = closest(name, known)
+    verb = "map it with" if similar else "leave it out with"
+    return DataError(
+        f"{path}:{line}: unknown category {name[:40]!r}{did_you_mean(name, known)}; known are "
+        f"{', '.join(sorted(known))}; add it to dataset.categories, or {verb} --set "
+        f"'dataset.rename={inline_table({name: similar or name})}'"
+    )
+
+
+def check_files(config: Config) -> None:
     """Check the files of detector and segmenter.
 
     Raises:
@@ -123,7 +191,7 @@ def choose_split(
     lists = dataset.splits()
     frames = lists.get("train") or dataset.frame_ids()
     if not frames:
-        raise DataError("the data set has no frames; --root must contain velodyne/ or training/")
+        raise DataError("the data set has no frames; check --root, and --dataset for its layout")
     all_sequences = sequences_of(dataset, {*frames, *lists.get("val", ())})
     sequences = all_sequences if split_by == "sequence" else {}
     if all_sequences and not sequences:
@@ -205,19 +273,19 @@ def _choose(
 
 def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
     """Return the frames that a file lists, without repetition; a sequence means all its frames."""
-    try:
-        names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--{split} {path}: is not a list of frame ids: {error}") from error
     groups = group_by_sequence(sequences_of(dataset, pool), pool)
-    names = [frame for name in names for frame in groups.get(name, (name,))]
-    unknown = sorted(set(names) - set(pool))
-    if unknown:
-        raise ConfigError(f"--{split} {path}: frame {unknown[0]} is not among the training frames")
+    frames = FrameNames.of_dataset(dataset)
+    try:
+        names = match_frame_list(path, frames, groups=groups, error_type=ConfigError)
+    except ConfigError as error:
+        raise ConfigError(f"--{split} {error}") from None
+    outside = sorted(set(names) - set(pool))
+    if outside:
+        raise ConfigError(f"--{split} {path}: frame {outside[0]} is not among the training frames")
     without_label = [name for name in names if not dataset.files(name).label]
     if without_label:
         raise ConfigError(f"--{split} {path}: frame {without_label[0]} has no label file")
-    return names
+    return list(names)
 
 
 def _store(

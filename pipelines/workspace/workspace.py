@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,11 @@ import numpy as np
 from sqlalchemy import select
 
 from curate.datasets.base import Dataset
+from curate.datasets.formats.point_layout import PointLayout
+from curate.datasets.kitti.labels import DONT_CARE
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError, WorkspaceError
+from curate.names import renamed
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from db.session import Database
@@ -20,6 +23,8 @@ from pipelines import registry
 from pipelines.workspace.config import Config, make_config, read_config
 from pipelines.workspace.config_file import write_config, write_schema
 from pipelines.workspace.location import CONFIG_NAME, find_workspace, url_of
+
+_LAYOUT_SETTINGS = tuple(field.name for field in fields(PointLayout))
 
 
 @dataclass(frozen=True)
@@ -124,15 +129,50 @@ class Workspace:
 
 
 def open_dataset(config: Config) -> Dataset:
-    """Return the data set that a configuration specifies."""
+    """Return the data set that a configuration specifies.
+
+    Raises:
+        ConfigError: if a setting is invalid, or the class of the data set does not accept it.
+        DataError: if the root does not contain such a data set.
+    """
     section = config.dataset
+    settings = {key: getattr(section, key) for key in _LAYOUT_SETTINGS}
+    given = [key for key, value in settings.items() if value is not None]
+    if given and not registry.DATASETS.takes(section.kind, "layout"):
+        raise ConfigError(
+            f"dataset.{given[0]}: data set '{section.kind}' has no argument layout, which would "
+            "receive this setting; remove it"
+        )
+    try:
+        layout = PointLayout(**settings)
+    except ConfigError as error:
+        raise ConfigError(f"dataset.{error}") from None
     dataset: Dataset = registry.DATASETS.build(
         section.kind,
         section.root,
-        offered={"follow_links": lambda: section.follow_links},
+        offered={
+            "follow_links": lambda: section.follow_links,
+            "layout": lambda: layout,
+            # Names are renamed after reading. A class with a mapping of its own must not use it.
+            **({} if section.rename is None else {"rename": dict}),
+        },
         options=section.options,
     )
     return dataset
+
+
+def read_truth(config: Config, dataset: Dataset, frame: str) -> Annotations:
+    """Return the ground truth of a frame with the names of `dataset.rename`."""
+    return with_final_names(config, dataset.annotations(frame))
+
+
+def with_final_names(config: Config, truth: Annotations) -> Annotations:
+    """Return ground truth with the names of `dataset.rename`; DontCare regions lose their box."""
+    found = renamed(truth, config.dataset.rename)
+    if found is truth:
+        return truth
+    region = (found.categories == DONT_CARE)[:, None]
+    return replace(found, boxes=np.where(region, np.nan, found.boxes))
 
 
 def sha256(path: Path) -> str:

@@ -9,7 +9,7 @@ from benchmarks.measuring import cpu_seconds, measure
 from benchmarks.scenes import SIDES, sweep
 from support import rounds
 
-from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.calibration import write_calibration
 from curate.datasets.kitti.labels import from_annotations, write_objects
 from curate.detections import CATEGORIES, Annotations, Detections, as_categories
 from curate.frames import Calibration

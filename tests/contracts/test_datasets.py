@@ -3,13 +3,15 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from contracts.samples import assert_one_line, assert_same, sample_of
-from support.dataset_layouts import write_toy_folder, write_toy_raw
+from support.dataset_layouts import write_toy_folder, write_toy_raw, write_toy_tracking
 from support.nuscenes_scenes import write_nuscenes
 from support.toys import write_toy_kitti
 
+from curate.datasets.formats.point_layout import PointLayout
 from curate.errors import DataError
 from curate.frames import Frame
 from pipelines.registry import DATASETS
@@ -18,6 +20,7 @@ from pipelines.registry import DATASETS
 SAMPLES: Mapping[str, Callable[[Path], None]] = {
     "kitti": lambda root: write_toy_kitti(root, frames=4, val=1),
     "kitti-raw": write_toy_raw,
+    "kitti-tracking": write_toy_tracking,
     "folder": write_toy_folder,
     "nuscenes": write_nuscenes,
 }
@@ -136,6 +139,81 @@ def test_a_frame_without_a_label_file_can_be_read(dataset, root: Path) -> None:
     assert dataset.files(name).label is None
     assert name in dataset.frame_ids()
     assert len(dataset.read(name).points) > 0
+
+
+def test_two_point_files_or_images_of_a_frame_are_refused(
+    request: pytest.FixtureRequest, dataset, root: Path
+) -> None:
+    """When the frames are listed, so at init; both files are in the message."""
+    kind = request.node.callspec.params["root"]
+    if kind == "nuscenes":
+        pytest.skip("its tables contain the file of each frame")
+    files = dataset.files(dataset.frame_ids()[1])
+    others = {files.points: (".npy", ".pcd", ".BIN"), files.image: (".jpg", ".JPEG", ".PNG")}
+    for path, suffixes in others.items():
+        for suffix in suffixes:
+            second = path.with_suffix(suffix)
+            if second.exists():
+                continue
+            second.write_bytes(path.read_bytes())
+            with pytest.raises(DataError) as caught:
+                DATASETS.build(kind, root, offered={}, options={}).frame_ids()
+            assert_one_line(caught.value)
+            assert path.name in str(caught.value)
+            assert second.name in str(caught.value)
+            second.unlink()
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".JPG", ".PNG"])
+def test_images_may_be_png_or_jpeg_in_any_letters(
+    request: pytest.FixtureRequest, dataset, root: Path, suffix: str
+) -> None:
+    """Also a mixture of them."""
+    kind = request.node.callspec.params["root"]
+    if kind == "nuscenes":
+        pytest.skip("its tables contain the file of each frame")
+    names = dataset.frame_ids()
+    for name in names[1:3]:
+        path = dataset.files(name).image
+        found, content = cv2.imencode(suffix.lower(), cv2.imread(str(path)))
+        assert found
+        path.unlink()
+        path.with_suffix(suffix).write_bytes(content.tobytes())
+    again = DATASETS.build(kind, root, offered={}, options={})
+    assert again.frame_ids() == names
+    for name in names:
+        size = dataset.read(names[0]).image_size
+        assert again.read(name, image=True).image.shape[1::-1] == size
+
+
+def test_the_layout_of_the_points_can_be_declared(
+    request: pytest.FixtureRequest, dataset, root: Path
+) -> None:
+    """Columns in another order, with another scale of the intensities."""
+    kind = request.node.callspec.params["root"]
+    name = next(each for each in dataset.frame_ids() if dataset.files(each).points.suffix == ".bin")
+    path, points = dataset.files(name).points, dataset.read(name).points
+    if kind == "nuscenes":
+        points[:, :2] = np.column_stack([-points[:, 1], points[:, 0]])  # its LiDAR looks along y
+    if kind == "folder":
+        description = root / "dataset.toml"
+        description.write_text(description.read_text().replace("intensity_scale = 255", ""))
+    scaled = points * np.float32([1, 1, 1, 50])
+    np.column_stack([np.arange(len(points)), scaled[:, ::-1]]).astype("<f4").tofile(path)
+    columns = ("ring", "intensity", "z", "y", "x")
+    layout = PointLayout(column_names=columns, intensity_scale=50)
+    declared = DATASETS.build(kind, root, offered={"layout": lambda: layout}, options={})
+    found, expected = declared.read(name).points, in_lidar_frame(points, kind)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    with pytest.raises(DataError):
+        DATASETS.build(kind, root, offered={}, options={}).read(name)
+
+
+def in_lidar_frame(points: np.ndarray, kind: str) -> np.ndarray:
+    """Return points of a file in the LiDAR frame of the data set."""
+    if kind != "nuscenes":
+        return points
+    return np.column_stack([points[:, 1], -points[:, 0], points[:, 2:]])
 
 
 def test_a_folder_without_a_dataset_is_rejected(

@@ -17,15 +17,16 @@ from curate.datasets.folder import FolderDataset
 from curate.datasets.formats.clouds import read_cloud
 from curate.datasets.formats.containment import check_frame_id
 from curate.datasets.formats.images import read_image, read_image_size
-from curate.datasets.kitti.dataset import (
+from curate.datasets.frame_names import read_frame_list
+from curate.datasets.kitti.calibration import (
     read_calibration,
-    read_drives,
-    read_frame_list,
-    read_points,
+    read_raw_calibration,
     write_calibration,
 )
-from curate.datasets.kitti.labels import read_objects, to_annotations, to_detections
-from curate.datasets.kitti.raw import read_raw_calibration
+from curate.datasets.kitti.dataset import read_drives, read_points
+from curate.datasets.kitti.labels import parse_rows, read_objects, to_annotations, to_detections
+from curate.datasets.kitti.tracking import rows_by_frame
+from curate.datasets.kitti.tracklets import TrackletTable
 from curate.detectors.recorded.formats import read_results
 from curate.detectors.recorded.results import ReadOptions
 from curate.detectors.recorded.table import TableRecord
@@ -37,6 +38,7 @@ LABELS = (
     b"Car 0.00 0 1.55 614.24 181.78 727.31 284.77 1.57 1.73 4.15 1.00 1.75 13.22 1.62\n"
     b"DontCare -1 -1 -10 5.00 229.89 214.12 367.61 -1 -1 -1 -1000 -1000 -1000 -10\n"
 )
+POSE = {"tx": 20, "ty": 0, "tz": -1.7, "rx": 0, "ry": 0, "rz": 0.5, "occlusion": 0, "truncation": 0}
 DESCRIPTION = """points = "lidar"
 images = "camera"
 columns = 4
@@ -134,6 +136,32 @@ def _read_labels(path: Path) -> None:
 
 def _read_results(path: Path) -> None:
     to_detections(read_objects(path, scored=True, categories=None), toy_calibration())
+
+
+def _tracking_labels(path: Path) -> None:
+    car = "Car 0 0 -1.5 60 17 64 20 1.5 1.6 3.9 1.0 1.7 20.0 -1.57"
+    path.write_text(
+        f"0 3 {car}\n0 -1 DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1 -1 -1 -1\n1 3 {car} 0.5\n"
+    )
+
+
+def _read_tracking_labels(path: Path) -> None:
+    for rows in rows_by_frame(path).values():
+        to_annotations(parse_rows(path, rows, categories=None), toy_calibration())
+
+
+def _tracklets(path: Path) -> None:
+    pose = "".join(f"<{key}>{value}</{key}>\n" for key, value in POSE.items())
+    path.write_text(
+        '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n<!DOCTYPE boost_serialization>\n'
+        "<boost_serialization>\n<tracklets>\n<count>1</count>\n<item>\n<objectType>Car</objectType>\n"
+        "<h>1.5</h>\n<w>1.6</w>\n<l>4</l>\n<first_frame>0</first_frame>\n<poses>\n<count>1</count>\n"
+        f"<item>\n{pose}</item>\n</poses>\n</item>\n</tracklets>\n</boost_serialization>\n"
+    )
+
+
+def _read_tracklets(path: Path) -> None:
+    TrackletTable(path).read(0, toy_frame())
 
 
 def _raw_calibration(path: Path) -> None:
@@ -303,6 +331,8 @@ TARGETS: Mapping[str, Target] = {
     "png": Target("a.png", _image, _read_image),
     "jpg": Target("a.jpg", _image, _read_image),
     "saved map": Target("000000.png", _map, _read_map),
+    "tracking labels": Target("a.txt", _tracking_labels, _read_tracking_labels),
+    "tracklets": Target("tracklet_labels.xml", _tracklets, _read_tracklets),
     "bin": Target("a.bin", _cloud, read_cloud),
     "npy": Target("a.npy", _npy, read_cloud),
     "pcd": Target("a.pcd", _cloud, read_cloud),

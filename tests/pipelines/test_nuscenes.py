@@ -125,7 +125,7 @@ def test_recorded_results_become_weights_and_results(
 
     code, out, err = curate("export", "--format", "nuscenes", "-w", work)
     assert code == 0, err
-    found = json.loads((work / "exports" / "nuscenes.json").read_text())
+    found = json.loads((work / "exports" / "round-01-pspsl-nuscenes.json").read_text())
     given = json.loads(plain.read_text())["results"]
     assert len(found["results"]) == 6
     for token, kept in found["results"].items():

@@ -28,9 +28,11 @@ def six_labels(points=(5, 60, 300, 5, 60, 20)):
         points=np.array(points, dtype=np.float64),
         correct=np.array([True, True, False, False, False, False]),
         counted=np.array([True, True, True, True, False, True]),
+        neutral=as_categories(["", "", "", "", "neighbour", ""]),
         object_frame=np.array([0, 0, 1, 1, 2]),
         object_category=as_categories(["Car", "Car", "Car", "Car", "Cyclist"]),
         object_distance=np.array([10.0, 30, 10, 60, 12]),
+        other_category=as_categories(["Van", "Tram", "DontCare"]),
     )
 
 
@@ -59,9 +61,11 @@ def many_labels(frames=60, seed=0):
         points=generator.integers(0, 400, n).astype(float),
         correct=right,
         counted=np.full(n, True),
+        neutral=np.full(n, ""),
         object_frame=frame,
         object_category=as_categories(["Car"] * n),
         object_distance=generator.uniform(0, 60, n),
+        other_category=as_categories([]),
     )
     noise = generator.random((3, n))
     weights = {

@@ -34,6 +34,38 @@ def write_toy_raw(root: Path, frames: int = 4) -> None:
     )
 
 
+def write_toy_tracking(root: Path, frames: int = 4) -> None:
+    """Write KITTI tracking below ROOT: the same frames in two sequences, half of them in each."""
+    write_toy_kitti(root / "made", frames)
+    made, home = root / "made" / "training", root / "training"
+    labels: dict[str, list[str]] = {}
+    for i in range(frames):
+        sequence, number = f"{2 * i // frames:04d}", i % (frames // 2)
+        for source, target in (("velodyne", "velodyne"), ("image_2", "image_02")):
+            (home / target / sequence).mkdir(parents=True, exist_ok=True)
+            (path,) = (made / source).glob(f"{i:06d}.*")
+            path.rename(home / target / sequence / f"{number:06d}{path.suffix}")
+        lines = (made / "label_2" / f"{i:06d}.txt").read_text().splitlines()
+        labels.setdefault(sequence, []).extend(
+            f"{number} {track} {_with_level(line)}" for track, line in enumerate(lines)
+        )
+    for folder in ("calib", "label_02"):
+        (home / folder).mkdir()
+    calibration = toy_calibration()
+    for sequence, lines in labels.items():
+        (home / "label_02" / f"{sequence}.txt").write_text("".join(f"{each}\n" for each in lines))
+        (home / "calib" / f"{sequence}.txt").write_text(
+            f"P2: {_text(calibration.projection)}\nR_rect {_text(np.eye(3))}\n"
+            f"Tr_velo_cam {_text(calibration.lidar_to_camera[:3])}\n"
+        )
+
+
+def _with_level(line: str) -> str:
+    """Return a label line with an integer level of truncation, as KITTI tracking has it."""
+    category, truncated, *rest = line.split()
+    return " ".join((category, str(int(float(truncated))), *rest))
+
+
 def write_toy_folder(root: Path, frames: int = 4) -> None:
     """Write a plain folder, each frame's points in another format."""
     write_toy_kitti(root / "made", frames)

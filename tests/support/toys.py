@@ -9,7 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from curate.datasets.kitti.dataset import KittiDataset, write_calibration
+from curate.datasets.kitti.calibration import write_calibration
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.datasets.kitti.labels import from_annotations, write_objects
 from curate.detections import Annotations, Detections
 from curate.frames import Calibration, Frame

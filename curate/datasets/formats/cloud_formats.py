@@ -2,7 +2,9 @@
 
 Sources: the PCD file format of the Point Cloud Library (v0.7) and Turk's PLY. The readers of common
 libraries trust the header, so damaged files crash them. Here the header gives a numpy type and a
-row count, and both are checked against the size of the file before anything is allocated.
+row count, and both are checked against the size of the file before anything is allocated. Which
+columns are x, y, z and the intensity follows from their names (see `PointLayout`). Padding is
+skipped: PCD's fields "_", and fields of any name with COUNT 0, which take no bytes.
 
 Example: the PCD header "FIELDS x y z rgb / SIZE 4 4 4 4 / TYPE F F F U / COUNT 1 1 1 1 /
 POINTS 2 / DATA binary" becomes rows of [("0", "<f4", (1,)), ("1", "<f4", (1,)), ("2", "<f4",
@@ -10,17 +12,23 @@ POINTS 2 / DATA binary" becomes rows of [("0", "<f4", (1,)), ("1", "<f4", (1,)),
 are x, y and z. Fields are numbered because their names may repeat.
 """
 
+import logging
 import struct
-from collections.abc import Sequence
+from codecs import BOM_UTF8
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.errors import DataError
+
+_log = logging.getLogger(__name__)
 
 # Number of bytes in which a header must end; real ones are a dozen lines.
 _MAX_HEADER = 1 << 16
+_COMMENTS = (b"#", b"comment", b"obj_info")
 # LZF, the compression of PCD, expands 3 bytes to at most 264.
 _LZF_RATIO = 90
 _PLY_TYPES = {
@@ -31,7 +39,8 @@ _PLY_TYPES = {
 }  # fmt: skip
 _PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _PCD_SIZES = {"F": "48", "I": "1248", "U": "1248"}
-_COLUMNS = ("x", "y", "z", "intensity")
+_PCD_PADDING = "_"
+_PCD_IDENTITY = [0.0, 0, 0, 1, 0, 0, 0]  # position, and rotation as a quaternion, w first
 
 
 @dataclass
@@ -44,91 +53,158 @@ class _Element:
     has_list: bool = False
 
 
-def read_pcd(path: Path, content: bytes) -> np.ndarray:
+@dataclass(frozen=True)
+class _PcdHeader:
+    """The header of a PCD file.
+
+    Attributes:
+        encoding: ascii, binary or binary_compressed.
+        points: number of points.
+        names: name of each field; "" for padding.
+        row: numpy type of one point; its fields are numbered, because names may repeat.
+    """
+
+    encoding: str
+    points: int
+    names: list[str]
+    row: np.dtype
+
+
+def read_pcd(path: Path, content: bytes, layout: PointLayout = UNDECLARED) -> np.ndarray:
     """Return (n, 3) x, y, z, or (n, 4) with intensity if there is one, of a PCD file.
 
+    An organised cloud is returned row after row. VIEWPOINT, the pose of the sensor, is not applied:
+    the points are returned as they are stored, and a pose other than the identity is logged.
+
     Raises:
-        DataError: if the file is malformed, truncated, or has no x, y, z.
+        DataError: if the file is malformed, truncated, or has no x, y, z, or several fields may be
+            the intensity.
     """
-    lines, start = _header(path, content, "DATA ")
-    try:
-        encoding, points, counts, row, columns = _pcd_layout(lines)
-    except (KeyError, IndexError, ValueError):
-        raise DataError(f"{path}: malformed PCD header, or no fields x, y, z") from None
-    if encoding == "ascii":
+    lines, start = _header(path, content, "DATA")
+    header = _pcd_header(path, lines)
+    columns = layout.indices(path, header.names)
+    if header.encoding == "ascii":
+        counts = [header.row[name].shape[0] for name in header.row.names or ()]
         offsets = np.cumsum([0, *counts])
-        table = _parse_numbers(path, content[start:], points, sum(counts))
+        table = _parse_numbers(path, content[start:], header.points, sum(counts))
         return table[:, [offsets[column] for column in columns]]
-    if encoding == "binary_compressed":
-        fields = _decompress_fields(path, content[start:], points, row)
+    if header.encoding == "binary_compressed":
+        fields = _decompress_fields(path, content[start:], header.points, header.row)
         return np.column_stack([fields[column] for column in columns])
-    if encoding != "binary":
+    if header.encoding != "binary":
         raise DataError(
-            f"{path}: DATA is {encoding[:20]!r}, expected ascii, binary or binary_compressed"
+            f"{path}: DATA is {header.encoding[:20]!r}, expected ascii, binary or binary_compressed"
         )
-    table = _rows(path, content, row, points, start)
+    table = _rows(path, content, header.row, header.points, start)
     return np.column_stack([table[f"{column}"][:, 0] for column in columns])
 
 
-def read_ply(path: Path, content: bytes) -> np.ndarray:
+def read_ply(path: Path, content: bytes, layout: PointLayout = UNDECLARED) -> np.ndarray:
     """Return (n, 3) x, y, z, or (n, 4) with intensity if there is one, of a PLY file's vertices.
 
     Raises:
-        DataError: if the file is malformed, truncated, or has no vertices with x, y, z.
+        DataError: if the file is malformed, truncated, or has no vertices with x, y, z, or several
+            properties may be the intensity.
     """
     lines, start = _header(path, content, "end_header")
     try:
         order, vertex, before, types = _ply_layout(lines)
     except (KeyError, IndexError, ValueError):
-        raise DataError(f"{path}: malformed PLY header, or no vertices with x, y, z") from None
-    columns = [name for name in _COLUMNS if name in dict(vertex.properties)]
+        raise DataError(
+            f"{path}: malformed PLY header, or no vertices of a fixed number of properties"
+        ) from None
+    names = [name for name, _ in vertex.properties]
+    columns = layout.indices(path, names)
     if not order:
         skip = sum(element.count * len(element.properties) for element in before)
-        table = _parse_numbers(path, content[start:], vertex.count, len(vertex.properties), skip)
-        return table[:, [list(dict(vertex.properties)).index(name) for name in columns]]
+        table = _parse_numbers(path, content[start:], vertex.count, len(names), skip)
+        return table[:, columns]
     start += sum(
         element.count * row_type.itemsize for element, row_type in zip(before, types, strict=False)
     )
     rows = _rows(path, content, types[-1], vertex.count, start)
-    return np.column_stack([rows[name] for name in columns])
+    return np.column_stack([rows[names[column]] for column in columns])
 
 
 def _header(path: Path, content: bytes, last: str) -> tuple[list[str], int]:
-    """Return the header lines up to the one that starts with `last`, and the offset of the data."""
+    """Return the header lines up to the one that begins with `last`, and the offset of the data.
+
+    Only comments may contain other characters than ASCII.
+    """
     lines: list[str] = []
-    start = 0
+    start = len(BOM_UTF8) if content.startswith(BOM_UTF8) else 0
     while (end := content.find(b"\n", start, _MAX_HEADER)) >= 0:
-        line = content[start:end]
+        line = content[start:end].strip()
         start = end + 1
-        if not line.isascii():
+        if not line.isascii() and not line.startswith(_COMMENTS):
             break
-        lines.append(line.decode("ascii").strip())
-        if lines[-1].startswith(last):
+        lines.append(line.decode("ascii", "replace"))
+        if lines[-1].casefold().split()[:1] == [last.casefold()]:
             return lines, start
-    raise DataError(
-        f"{path}: not a {path.suffix} file: there is no header that ends with {last.strip()}"
-    )
+    raise DataError(f"{path}: not a {path.suffix} file: there is no header that ends with {last}")
 
 
-def _pcd_layout(lines: Sequence[str]) -> tuple[str, int, list[int], np.dtype, list[int]]:
-    """Return encoding, number of points, numbers per field, row type, and the fields to read.
+def _pcd_header(path: Path, lines: Sequence[str]) -> _PcdHeader:
+    """Return the content of a PCD header.
 
     Raises:
-        KeyError: if an entry or a type is missing or unknown.
-        IndexError: if an entry has no value.
-        ValueError: if a value is malformed, or x, y or z is missing.
+        DataError: if an entry is missing or malformed, or entries contradict each other.
     """
-    entries = {words[0]: words[1:] for words in map(str.split, lines) if words}
-    names = entries["FIELDS"]
-    counts = [_natural(count) for count in entries.get("COUNT", ["1"] * len(names))]
-    parts = zip(entries["TYPE"], entries["SIZE"], counts, strict=True)
-    row = np.dtype(
-        [(f"{i}", f"<{_pcd_type(kind, size)}", (n,)) for i, (kind, size, n) in enumerate(parts)]
-    )
-    if len(counts) != len(names) or min(counts) < 1 or not {"x", "y", "z"} <= set(names):
-        raise ValueError("fields")
-    columns = [names.index(name) for name in _COLUMNS if name in names]
-    return entries["DATA"][0], _natural(entries["POINTS"][0]), counts, row, columns
+    entries = {words[0].upper(): words[1:] for words in map(str.split, lines) if words}
+    try:
+        names = entries["FIELDS"] if "FIELDS" in entries else entries["COLUMNS"]  # COLUMNS in v.5
+        counts = [_natural(count) for count in entries.get("COUNT", ["1"] * len(names))]
+        parts = zip(names, entries["TYPE"], entries["SIZE"], counts, strict=True)
+        row = np.dtype(
+            [
+                (f"{i}", f"<{_pcd_type(kind.upper(), size)}", (count,))
+                for i, (_, kind, size, count) in enumerate(parts)
+            ]
+        )
+        points = _pcd_points(path, entries)
+        encoding = entries["DATA"][0].lower()
+        pose = [float(number) for number in entries.get("VIEWPOINT", _PCD_IDENTITY)]
+    except (KeyError, IndexError, ValueError):
+        raise DataError(
+            f"{path}: malformed PCD header; FIELDS, SIZE, TYPE and COUNT need one value for each "
+            "field, and POINTS and DATA are needed"
+        ) from None
+    if pose != _PCD_IDENTITY:
+        _warn_of_pose(path, " ".join(entries["VIEWPOINT"])[:80])
+    readable = [
+        "" if name == _PCD_PADDING or not count else name
+        for name, count in zip(names, counts, strict=True)
+    ]
+    return _PcdHeader(encoding, points, readable, row)
+
+
+_folders_with_poses: set[Path] = set()
+
+
+def _warn_of_pose(path: Path, pose: str) -> None:
+    """Log a pose that is not applied, once per folder."""
+    if path.parent not in _folders_with_poses:
+        _folders_with_poses.add(path.parent)
+        _log.warning(
+            "%s: VIEWPOINT is %s and is not applied; the points must be in the frame of reference "
+            "of the LiDAR, as the calibration assumes",
+            path,
+            pose,
+        )
+
+
+def _pcd_points(path: Path, entries: Mapping[str, list[str]]) -> int:
+    """Return the number of points: POINTS, or WIDTH times HEIGHT, which must be equal."""
+    size = [_natural(entries[key][0]) for key in ("WIDTH", "HEIGHT") if key in entries]
+    if "POINTS" not in entries and len(size) == 2:
+        return size[0] * size[1]
+    points = _natural(entries["POINTS"][0])
+    if len(size) == 2 and size[0] * size[1] != points:
+        raise DataError(
+            f"{path}: POINTS is {points}, but WIDTH {size[0]} times HEIGHT {size[1]} is "
+            f"{size[0] * size[1]}; write the file again"
+        )
+    return points
 
 
 def _ply_layout(lines: Sequence[str]) -> tuple[str, _Element, list[_Element], list[np.dtype]]:
@@ -137,15 +213,13 @@ def _ply_layout(lines: Sequence[str]) -> tuple[str, _Element, list[_Element], li
     Raises:
         KeyError: if a format or a type is unknown.
         IndexError: if a property comes before the first element.
-        ValueError: if the header is malformed, or has no vertices of a fixed size with x, y, z.
+        ValueError: if the header is malformed, or has no vertices of a fixed size.
     """
     order, elements = _elements(lines)
     index = [element.name for element in elements].index("vertex")
     needed = elements[: index + 1]
     if any(element.has_list for element in needed):
         raise ValueError("list")
-    if not {"x", "y", "z"} <= set(dict(elements[index].properties)):
-        raise ValueError("vertex")
     # numpy raises ValueError if a property name repeats.
     types = [
         np.dtype([(name, f"{order or '<'}{kind}") for name, kind in element.properties])
@@ -233,7 +307,7 @@ def _decompress_fields(path: Path, content: bytes, points: int, row: np.dtype) -
     for name in row.names or ():
         field_type = row[name]
         end = start + points * field_type.itemsize
-        values = unpacked[start:end].view(field_type.base)
-        fields.append(values.reshape(points, *field_type.shape)[:, 0])
+        values = unpacked[start:end].view(field_type.base).reshape(points, *field_type.shape)
+        fields.append(values[:, 0] if values.shape[1] else np.zeros(points))  # COUNT 0: no bytes
         start = end
     return fields

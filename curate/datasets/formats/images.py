@@ -37,9 +37,9 @@ def read_image_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: if the file is missing or not an image.
     """
-    header = _read_bytes(path, PNG_HEADER_BYTES)
+    header = read_bytes(path, PNG_HEADER_BYTES)
     if not header.startswith(PNG_START):
-        header = _read_bytes(path)
+        header = read_bytes(path)
     return _claimed_size(header, path)
 
 
@@ -82,9 +82,13 @@ def decode_image(path: Path, mode: int) -> np.ndarray:
         DataError: if the file is missing, truncated, not a PNG or JPEG, or has more than
             `MAX_PIXELS` pixels.
     """
+    return decode_content(read_bytes(path), path, mode)
+
+
+def decode_content(content: bytes, path: Path, mode: int) -> np.ndarray:
+    """Return the pixels of an image file with this content; see `decode_image`."""
     import cv2
 
-    content = _read_bytes(path)
     _claimed_size(content, path)
     if content.startswith(PNG_SIGNATURE) and not _has_end(content):
         raise DataError(f"{path}: the PNG is truncated (no end chunk); fetch the file again")
@@ -157,7 +161,12 @@ def _unreadable(content: bytes, path: Path) -> DataError:
     )
 
 
-def _read_bytes(path: Path, limit: int = -1) -> bytes:
+def read_bytes(path: Path, limit: int = -1) -> bytes:
+    """Return the content of an image file, or its first `limit` bytes.
+
+    Raises:
+        DataError: if the file is missing or cannot be read.
+    """
     try:
         with path.open("rb") as file:
             return file.read(limit)

@@ -3,56 +3,68 @@
 Source: Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the readme of its
 object development kit. Two layouts are supported:
 ROOT/training/{velodyne,image_2,calib,label_2} and ROOT/{velodyne,image_2,calib,label_2}. image_2,
-label_2 and ROOT/ImageSets/*.txt are optional.
+label_2 and ROOT/ImageSets/*.txt are optional. Converters of the Waymo Open Dataset write the same
+layout with image_0 to image_4, label_0 to label_4 or label_all, and a Tr_velo_to_cam_N for each
+camera.
 """
 
-import io
 import logging
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from fnmatch import fnmatchcase
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.formats.binary import read_bytes
+from curate.datasets.formats.clouds import CLOUD_SUFFIXES, read_cloud
 from curate.datasets.formats.containment import Boundary, check_frame_id
+from curate.datasets.formats.frame_files import (
+    IMAGE_SUFFIXES,
+    FrameFolder,
+    visible_files,
+    visible_names,
+)
 from curate.datasets.formats.images import check_image_size, read_optional_image
-from curate.datasets.kitti.labels import read_objects, to_annotations
+from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
+from curate.datasets.frame_names import FrameNames, match_frame_list
+from curate.datasets.kitti.calibration import read_calibration
+from curate.datasets.kitti.labels import read_annotations
+from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
-from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
-from curate.frames import Calibration, Frame, FrameFiles
-from curate.shapes import Float, Float32
+from curate.files.text import read_lines, read_text
+from curate.frames import Frame, FrameFiles
+from curate.geometry.mounting import RotationY, check_rotation_y
+from curate.shapes import Float32
 
 _log = logging.getLogger(__name__)
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-POINT_BYTES = 16  # x, y, z, intensity, float32 each
-# Beyond the range of any LiDAR. Farther points would make grids over the points too large.
-MAX_RANGE_METRES = 2000.0
+_WAYMO_NAME = re.compile(r"\d{7}")
 # The folder of KITTI's development kit that says which drive each frame of training/ is from.
 _MAPPINGS = ("mapping", "devkit_object/mapping", "devkit/mapping")
 _MAPPING_FILES = ("train_mapping.txt", "train_rand.txt")
-# Focal lengths are thousands of pixels; the last column of P2 is at most a million.
-_MAX_ENTRY = 1e9
-CALIBRATION_SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
 class KittiDataset:
-    """A `Dataset` in KITTI's layout; every velodyne file is a frame.
+    """A `Dataset` in KITTI's layout; every point file is a frame.
 
     Args:
         root: the folder that contains training/velodyne or velodyne.
+        layout: the declared layout of the point files.
+        camera: number of the camera, for image_N and PN. The default is the left colour camera 2;
+            camera 0, the front camera, if each camera has a Tr_velo_to_cam_N of its own, as
+            converters of the Waymo Open Dataset write; or the first camera with a folder image_N.
         image_size: width and height in pixels of the calibrated camera's image, for a data set
             without images; without it, such a data set has no camera.
         follow_links: whether links may lead out of the root.
+        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
     Raises:
         DataError: if the root contains neither.
-        ConfigError: if the image size is invalid, or given for a data set with images.
+        ConfigError: if `rotation_y` is unknown, there is no folder of images of the camera, or the
+            image size is invalid, or given for a data set with images.
     """
 
     name = "kitti"
@@ -61,9 +73,14 @@ class KittiDataset:
         self,
         root: StrPath,
         *,
+        layout: PointLayout = UNDECLARED,
+        camera: int | None = None,
         image_size: Sequence[int] | None = None,
         follow_links: bool = False,
+        rotation_y: RotationY = "calibration",
     ) -> None:
+        check_rotation_y(rotation_y)
+        self._rotation_y = rotation_y
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         homes = [self.root / "training", self.root]
@@ -71,20 +88,44 @@ class KittiDataset:
         if home is None:
             raise DataError(
                 f"{self.root}: contains neither training/velodyne nor velodyne; "
-                "set the root to a data set in KITTI's layout"
+                f"set the root to a data set in KITTI's layout{layout_hint(self.root, self.name)}"
             )
         self._home = home
-        self._folders = [home / name for name in ("velodyne", "image_2", "calib", "label_2")]
-        self._has_images = contains_images(home / "image_2")
-        self._image_size = image_size_option(image_size, self._has_images, home / "image_2")
+        self._layout = layout
+        self._boundary.check(home / "calib")
+        # Converters of data with several cameras write all labels in the frame of camera 0.
+        self._front = _has_own_extrinsics(home / "calib")
+        self.camera = _camera(home, camera, front=self._front)
+        folder = home / f"image_{self.camera}"
+        self._has_images = contains_images(folder)
+        self._image_size = image_size_option(image_size, self._has_images, folder)
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return the ids of all frames with a velodyne file, sorted."""
+        """Return the ids of all frames with a point file, sorted.
+
+        Raises:
+            DataError: if there are none, or a frame has two point files or two images.
+        """
         return self._frame_ids
 
     @cached_property
     def _frame_ids(self) -> tuple[str, ...]:
-        return tuple(sorted(path.stem for path in visible_files(self._home / "velodyne", "*.bin")))
+        return checked_frames(self._points, [self._images], self.root, self.name)
+
+    @cached_property
+    def _points(self) -> FrameFolder:
+        return FrameFolder(self._home / "velodyne", CLOUD_SUFFIXES, "point")
+
+    @cached_property
+    def _images(self) -> FrameFolder:
+        return FrameFolder(self._home / f"image_{self.camera}", IMAGE_SUFFIXES, "image")
+
+    @cached_property
+    def _labels(self) -> Path:
+        """The folder of labels: those of the camera, or else those that are there."""
+        names = (f"label_{self.camera}", "label_2", "label_all")
+        folders = [self._home / name for name in names]
+        return next((folder for folder in folders if folder.is_dir()), folders[1])
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the lists in ROOT/ImageSets by file name; they may contain missing frames.
@@ -95,41 +136,41 @@ class KittiDataset:
         Raises:
             DataError: if a list contains an invalid frame id.
         """
-        lists = {
-            path.stem: path for path in sorted(visible_files(self.root / "ImageSets", "*.txt"))
-        }
-        if self._home != self.root and "test" in lists:
-            _log.info("%s: skipped, it lists frames of testing/", lists.pop("test"))
-        self._boundary.check(*lists.values())
-        return {name: read_frame_list(path) for name, path in lists.items()}
+        lists = dict(read_frame_lists(self.root / "ImageSets", self._boundary, self.frame_ids()))
+        if self._home != self.root and lists.pop("test", None) is not None:
+            _log.info("%s/ImageSets/test.txt: skipped, it lists frames of testing/", self.root)
+        return lists
 
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; `label` is None if there is no label file.
 
         Raises:
-            DataError: if the frame id is invalid, or a link leads out of the data set.
+            DataError: if the frame id is invalid, a link leads out of the data set, or the frame
+                has two point files or two images.
         """
         check_frame_id(frame_id)
-        velodyne, image_2, calib, label_2 = self._folders
-        images = [image_2 / f"{frame_id}{suffix}" for suffix in IMAGE_SUFFIXES]
-        label = label_2 / f"{frame_id}.txt"
+        label = self._labels / f"{frame_id}.txt"
         files = FrameFiles(
-            points=velodyne / f"{frame_id}.bin",
-            image=next((image for image in images if image.exists()), images[0])
-            if self._has_images
-            else None,
-            calibration=calib / f"{frame_id}.txt",
+            points=self._points.path(frame_id),
+            image=self._images.path(frame_id) if self._has_images else None,
+            calibration=self._home / "calib" / f"{frame_id}.txt",
             label=label if label.exists() else None,
         )
         self._boundary.check(*files.paths())
         return files
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """Return the drive of a frame if the root contains the mapping of KITTI's development kit.
+        """Return the drive of a frame, if it is known.
+
+        It is known from the mapping of KITTI's development kit, if the root contains it, and from
+        the names that converters of the Waymo Open Dataset give: a digit for the split, three for
+        the segment, and three for the frame.
 
         Raises:
             DataError: if the mapping is malformed, or a link to it leads out of the data set.
         """
+        if self._front and _WAYMO_NAME.fullmatch(frame_id):
+            return frame_id[:4]
         return self._drives.get(frame_id)
 
     @cached_property
@@ -149,8 +190,10 @@ class KittiDataset:
             DataError: if a file is missing, damaged or malformed.
         """
         files = self.files(frame_id)
-        sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
-        calibration = read_calibration(files.calibration)
+        sweep = np.zeros((0, 4), dtype=np.float32)
+        if points:
+            sweep = read_points(files.points, self._layout)
+        calibration = read_calibration(files.calibration, self.camera)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
@@ -162,117 +205,95 @@ class KittiDataset:
         """
         files = self.files(frame_id)
         if files.label is None:
-            raise DataError(f"{self._home / 'label_2' / frame_id}.txt: no such label file")
-        return to_annotations(read_objects(files.label), read_calibration(files.calibration))
+            raise DataError(f"{self._labels / frame_id}.txt: no such label file")
+        camera = 0 if self._front else self.camera
+        return read_annotations(
+            files.label,
+            read_calibration(files.calibration, camera),
+            categories=None,
+            rotation_y=self._rotation_y,
+        )
 
 
-def read_points(path: Path) -> Float32[np.ndarray, "n 4"]:
-    """Return the (n, 4) float32 points of a velodyne file: x, y, z in metres, intensity.
+def read_points(path: Path, layout: PointLayout = UNDECLARED) -> Float32[np.ndarray, "n 4"]:
+    """Return the (n, 4) float32 points of a velodyne file: x, y, z in metres, intensity in [0, 1].
 
     An empty file has no points.
 
     Raises:
-        DataError: if the file is missing or truncated, or contains NaN, infinite numbers, or points
-            beyond `MAX_RANGE_METRES`.
+        DataError: if `read_cloud` raises it, or a .bin file contains NaN or infinite numbers.
     """
-    with open_unbuffered(path, "velodyne") as file:
-        size = os.fstat(file.fileno()).st_size
-        points = np.empty((size // POINT_BYTES, 4), dtype="<f4")
-        if size % POINT_BYTES or file.readinto(points.reshape(-1).view(np.uint8).data) != size:
-            raise DataError(
-                f"{path}: {size} bytes are not a multiple of {POINT_BYTES} "
-                "(x, y, z, intensity as float32); the file is truncated, fetch it again"
-            )
-    # Fast path: the minimum and maximum over all columns reveal NaN and infinite numbers as well.
-    low, high = points.min(initial=0), points.max(initial=0)
-    if low >= -MAX_RANGE_METRES and high <= MAX_RANGE_METRES:
-        return points
-    finite = np.isfinite(points)
-    if not finite.all():
-        bad = np.flatnonzero(~finite.all(axis=1))
-        raise DataError(
-            f"{path}: {len(bad)} of {len(points)} points are NaN or infinite, "
-            f"the first is point {bad[0]}; remove them from the file"
-        )
-    check_point_range(path, points)
-    return points
+    return read_cloud(path, layout, drop_missing=False)
 
 
-def check_point_range(path: Path, points: Float[np.ndarray, "n _"]) -> None:
-    """Raise DataError if a point of (n, >=3) has a coordinate beyond `MAX_RANGE_METRES`."""
-    far = np.abs(points[:, :3]).max(initial=0)
-    if far > MAX_RANGE_METRES:
-        k = int(np.abs(points[:, :3]).max(axis=1).argmax())
-        raise DataError(
-            f"{path}: point {k} is {far:.4g} m away; points must be in metres from the LiDAR, "
-            f"remove those beyond {MAX_RANGE_METRES:g} m"
-        )
-
-
-def read_calibration(path: Path) -> Calibration:
-    """Return the calibration of the left colour camera (P2, R0_rect, Tr_velo_to_cam).
-
-    Raises:
-        DataError: if the file or one of the three matrices is missing, or a matrix has a wrong
-            number of entries, entries that are not finite, or no inverse.
-    """
-    matrices: dict[str, np.ndarray] = {}
-    text = read_bytes(path, "calibration").decode("utf-8", errors="replace")
-    for number, line in enumerate(text.splitlines(), start=1):
-        key, _, entries = line.partition(":")
-        if key in CALIBRATION_SHAPES:
-            matrices[key] = parse_matrix(entries, CALIBRATION_SHAPES[key], f"{path}:{number}")
-    missing = [key for key in CALIBRATION_SHAPES if key not in matrices]
-    if missing:
-        raise DataError(f"{path}: no line {' and no line '.join(f'{key}:' for key in missing)}")
-    rectify, extrinsic = np.eye(4), np.eye(4)
-    rectify[:3, :3] = matrices["R0_rect"]
-    extrinsic[:3] = matrices["Tr_velo_to_cam"]
-    lidar_to_camera = rectify @ extrinsic
-    if abs(np.linalg.det(lidar_to_camera)) < 1e-6:
-        raise DataError(f"{path}: the product of R0_rect and Tr_velo_to_cam cannot be inverted")
-    return Calibration(matrices["P2"], lidar_to_camera)
-
-
-def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration file that `read_calibration` reads back exactly.
-
-    Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera, and R0_rect is
-    the identity. P0, P1 and P3 repeat P2, for readers that expect P2 on the third line.
-    """
-    matrices = dict.fromkeys(("P0", "P1", "P2", "P3"), calibration.projection)
-    matrices["R0_rect"] = np.eye(3)
-    matrices["Tr_velo_to_cam"] = calibration.lidar_to_camera[:3]
-    matrices["Tr_imu_to_velo"] = np.eye(4)[:3]
-    lines = [
-        f"{key}: {' '.join(f'{entry:.16e}' for entry in matrix.ravel())}\n"
-        for key, matrix in matrices.items()
-    ]
-    replace_file(path, "".join(lines).encode())
-
-
-def parse_matrix(entries: str, shape: tuple[int, int], location: str) -> np.ndarray:
-    """Parse the numbers of a calibration line as a matrix.
+def checked_frames(
+    points: FrameFolder, images: Iterable[FrameFolder], root: Path, kind: str
+) -> tuple[str, ...]:
+    """Return the frames with a point file, after a check that their files are unambiguous.
 
     Args:
-        entries: the part of the line after the key.
-        shape: rows and columns of the matrix.
-        location: file and line, for error messages.
+        points: the point files.
+        images: the images of each camera.
+        root: root of the data set.
+        kind: name of the data set, for the message that there are no frames.
 
     Raises:
-        DataError: if an entry is not a finite number of sane size, or their count is wrong.
+        DataError: if there are none, or a frame has two point files or two images.
     """
-    try:
-        numbers = np.array([float(entry) for entry in entries.split()])
-    except ValueError as error:
-        raise DataError(f"{location}: {error}; a calibration line holds only numbers") from None
-    if len(numbers) != shape[0] * shape[1]:
-        raise DataError(f"{location}: {len(numbers)} numbers, expected {shape[0]} x {shape[1]}")
-    if not np.isfinite(numbers).all():
-        raise DataError(f"{location}: contains NaN or infinite numbers")
-    if np.abs(numbers).max() > _MAX_ENTRY:
-        raise DataError(f"{location}: contains numbers beyond {_MAX_ENTRY:g}")
-    return numbers.reshape(shape)
+    frames = points.frames()
+    if not frames:
+        raise DataError(
+            f"{points.folder}: no point files ({', '.join(CLOUD_SUFFIXES)}); "
+            f"{points.content()}{layout_hint(root, kind)}"
+        )
+    points.check(frames)
+    for camera in images:
+        camera.check(frames)
+    return frames
+
+
+def frame_number(stem: str, path: Path) -> int:
+    """Return the number of a frame within its sequence, from the name of its point file.
+
+    Raises:
+        DataError: if the name is not a number.
+    """
+    if not (stem.isascii() and stem.isdecimal()):
+        raise DataError(
+            f"{path}: the name is not the number of the frame, to which the labels refer"
+        )
+    return int(stem)
+
+
+def describe_skipped(kept: int, count: int) -> str:
+    """Return how many frames are skipped because they have no image; "" if none is."""
+    return f"{count - kept} of {count} frames have no image and are skipped" if kept < count else ""
+
+
+def _has_own_extrinsics(calib: Path) -> bool:
+    """Return whether each camera has a transform of its own, from one of the calibration files."""
+    path = next(visible_files(calib, "*.txt"), None)
+    return path is not None and b"Tr_velo_to_cam_0" in read_bytes(path, "calibration")
+
+
+def _camera(home: Path, camera: int | None, *, front: bool) -> int:
+    """Return the number of the camera; see `KittiDataset`.
+
+    Raises:
+        ConfigError: if the camera is given but has no folder of images.
+    """
+    names = (path.name.removeprefix("image_") for path in visible_files(home, "image_*"))
+    present = sorted(int(name) for name in names if name.isdecimal())
+    if camera is None:
+        first = 0 if front else 2
+        return first if first in present or not present else present[0]
+    if present and camera not in present:
+        listed = ", ".join(f"{number} (image_{number})" for number in present) or "none"
+        raise ConfigError(
+            f"dataset.options.camera = {camera!r}: {home} has no folder image_{camera}; its "
+            f"cameras are {listed}"
+        )
+    return camera
 
 
 def read_drives(folder: Path) -> Mapping[str, str]:
@@ -286,10 +307,10 @@ def read_drives(folder: Path) -> Mapping[str, str]:
         DataError: if a file is missing or malformed.
     """
     mapping, path = (folder / name for name in _MAPPING_FILES)
-    lines = read_bytes(mapping, "mapping").decode("utf-8", "replace")
-    drives = [line.split()[1] for line in lines.splitlines() if len(line.split()) == 3]
+    lines = map(str.split, read_lines(mapping, "mapping"))
+    drives = [line[1] for line in lines if len(line) == 3]
+    text = read_text(path, "mapping")
     try:
-        text = read_bytes(path, "mapping").decode("utf-8", "replace")
         numbers = [int(number) for number in text.replace(",", " ").split()]
     except ValueError as error:
         raise DataError(f"{path}: {error}; the file must contain only line numbers") from None
@@ -298,19 +319,9 @@ def read_drives(folder: Path) -> Mapping[str, str]:
     return {f"{i:06d}": drives[number - 1] for i, number in enumerate(numbers)}
 
 
-def visible_files(folder: Path, pattern: str) -> Iterator[Path]:
-    """Yield the files of a folder that match a pattern, without hidden ones such as macOS' ._*."""
-    if not folder.is_dir():
-        return
-    with os.scandir(folder) as entries:  # `glob` would keep an object per file in memory
-        for entry in entries:
-            if not entry.name.startswith(".") and fnmatchcase(entry.name, pattern):
-                yield folder / entry.name
-
-
 def contains_images(folder: Path) -> bool:
     """Return whether a folder exists and contains a PNG or JPEG."""
-    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in visible_files(folder, "*"))
+    return any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in visible_names(folder))
 
 
 def image_size_option(
@@ -331,63 +342,22 @@ def image_size_option(
     return check_image_size(size, "dataset.options.image_size")
 
 
-def read_frame_lists(folder: Path, boundary: Boundary) -> Mapping[str, tuple[str, ...]]:
+def read_frame_lists(
+    folder: Path, boundary: Boundary, frame_ids: Sequence[str] = ()
+) -> Mapping[str, tuple[str, ...]]:
     """Return the frame lists of a folder by file name; empty if the folder does not exist.
+
+    The lists may contain frames without files; their names stay as they are.
 
     Args:
         folder: the folder of the lists.
         boundary: the boundary of the data set.
+        frame_ids: the frames of the data set.
 
     Raises:
         DataError: if a list contains an invalid frame id, or is a link out of the data set.
     """
     paths = sorted(visible_files(folder, "*.txt"))
     boundary.check(*paths)
-    return {path.stem: read_frame_list(path) for path in paths}
-
-
-def read_frame_list(path: Path) -> tuple[str, ...]:
-    """Return the frame ids of a text file, one per line.
-
-    Raises:
-        DataError: if the file is missing or not text, or a line is not a valid frame id.
-    """
-    names: list[str] = []
-    try:
-        text = read_bytes(path, "frame list").decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from None
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.strip():
-            try:
-                check_frame_id(line.strip())
-            except DataError as error:
-                raise DataError(f"{path}:{number}: {error}") from None
-            names.append(line.strip())
-    return tuple(names)
-
-
-def read_bytes(path: Path, kind: str) -> bytes:
-    """Return the content of a file; `kind` is e.g. "velodyne", for error messages.
-
-    Raises:
-        DataError: if the file is missing or cannot be read.
-    """
-    with open_unbuffered(path, kind) as file:
-        return file.read()
-
-
-@contextmanager
-def open_unbuffered(path: Path, kind: str) -> Iterator[io.FileIO]:
-    """Open a file for one large read, which needs no buffer.
-
-    Raises:
-        DataError: if the file is missing or cannot be read.
-    """
-    try:
-        with path.open("rb", buffering=0) as file:
-            yield file
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such {kind} file") from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
+    frames = FrameNames.of(frame_ids)
+    return {path.stem: match_frame_list(path, frames, allow_missing=True) for path in paths}

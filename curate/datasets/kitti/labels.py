@@ -5,15 +5,15 @@ line: category, truncated, occluded, alpha, left, top, right, bottom (pixels), h
 (metres), x, y, z of the bottom centre in the rectified camera frame (metres), rotation_y (radians),
 and in result files a 16th field, the score.
 
-The LiDAR's z axis and the camera's y axis point in opposite directions and differ by less than one
-degree. As is usual with KITTI, they are treated as the same axis: yaw = -rotation_y - pi/2. The
-bottom centre is raised by half the height along the camera's y axis (which points down), and then
-transformed to the LiDAR frame. Example: a car 1.5 m high at (2, 1.7, 20) in the camera frame, which
-drives away from the camera, has rotation_y = -pi/2. Its centre is (2, 0.95, 20) in the camera
-frame, about (20, -2, -0.95) in the frame of a LiDAR at the camera, and its yaw is 0.
+An object stands upright in the LiDAR frame, on its bottom centre, which the calibration carries
+from the camera frame into the LiDAR frame. The box centre is half the height above it, along the
+LiDAR's z axis, whichever way the camera is tilted. `curate.geometry.mounting` defines the heading.
+Example: a car 1.5 m high at (2, 1.7, 20) in the camera frame, which drives away from the camera,
+has rotation_y -pi/2. If a level camera is at the LiDAR's origin, the car stands at (20, -2, -1.7),
+its centre is (20, -2, -0.95), and its yaw is 0.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -24,9 +24,16 @@ from curate.detections import Annotations, Columns, Detections, as_categories
 from curate.errors import DataError
 from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
+from curate.files.text import read_lines
 from curate.frames import Calibration
+from curate.geometry.mounting import (
+    RotationY,
+    bottom_centres_in_camera,
+    observation_angles,
+    rotations_y_of_yaws,
+    yaws_of_rotations_y,
+)
 from curate.geometry.projection import image_rectangles
-from curate.geometry.similarity import wrap_angle
 from curate.shapes import Float, Int, Shaped
 
 DONT_CARE = "DontCare"
@@ -77,8 +84,9 @@ def read_objects(
 ) -> KittiObjects:
     """Return the objects of a KITTI label file, or of a result file if `scored`.
 
-    Label files have 15 fields per line, result files 16. Empty lines are skipped. An empty file
-    contains no objects.
+    Every reader of KITTI's format uses this function. Label files have 15 fields per line; a 16th,
+    which some converters write, is left out. Result files have 16. Empty lines are skipped. An
+    empty file contains no objects.
 
     Args:
         path: the text file.
@@ -87,28 +95,58 @@ def read_objects(
 
     Raises:
         DataError: if the file is missing or not text, or if a line has a wrong number of fields, a
-            field that is not a finite number, an unknown category, or a negative dimension (unless
-            it is a DontCare region).
+            field that is not a finite number, an unknown category, or a size that is not positive
+            (unless it is a DontCare region).
+    """
+    path = Path(path)
+    return parse_rows(path, read_rows(path), scored=scored, categories=categories)
+
+
+def parse_rows(
+    path: Path,
+    numbered: Sequence[tuple[int, Sequence[str]]],
+    *,
+    scored: bool = False,
+    categories: Collection[str] | None = KITTI_CATEGORIES,
+) -> KittiObjects:
+    """Return the objects of lines in KITTI's format, which are split into fields.
+
+    Args:
+        path: the file, for error messages.
+        numbered: line number and fields of each object.
+        scored: see `read_objects`.
+        categories: see `read_objects`.
+
+    Raises:
+        DataError: as `read_objects`.
     """
     fields = RESULT_FIELDS if scored else LABEL_FIELDS
-    path = Path(path)
-    lines = _read_lines(path)
-    rows = [row for row in map(str.split, lines) if row]
+    rows = [row[:fields] for _, row in numbered]
     names = [row[0] for row in rows]
     # All lines are parsed and checked at once for speed; the bad line is searched only on failure.
     try:
         values = np.array([float(field) for row in rows for field in row[1:]])
         values = values.reshape(len(rows), fields - 1)
     except ValueError:  # a field that is not a number, or a wrong number of fields
-        raise _first_error(path, lines, fields, categories) from None
+        raise _first_error(path, numbered, categories, scored=scored) from None
     if (
-        any(len(row) != fields for row in rows)
+        any(not fields <= len(row) <= RESULT_FIELDS for _, row in numbered)
         or not (np.abs(values) <= _MAX_VALUE).all()
         or (categories is not None and not frozenset(categories).issuperset(names))
-        or _has_negative_dimension(names, values[:, 7:10])
+        or _has_no_size(names, values[:, 7:10])
     ):
-        raise _first_error(path, lines, fields, categories)
+        raise _first_error(path, numbered, categories, scored=scored)
     return KittiObjects(as_categories(names), *_columns(values))
+
+
+def read_rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Return line number and fields of each line of a label or result file that is not empty.
+
+    Raises:
+        DataError: if the file is missing or not text.
+    """
+    lines = enumerate(read_lines(path, "label"), start=1)
+    return [(number, row) for number, line in lines if (row := line.split())]
 
 
 def write_objects(path: StrPath, objects: KittiObjects) -> None:
@@ -135,9 +173,40 @@ def write_objects(path: StrPath, objects: KittiObjects) -> None:
     replace_file(path, "".join(f"{line}\n" for line in lines).encode())
 
 
-def to_annotations(objects: KittiObjects, calibration: Calibration) -> Annotations:
-    """Return the objects as ground truth in the LiDAR frame; boxes of DontCare regions are NaN."""
-    boxes = _boxes_lidar(objects, calibration)
+def read_annotations(
+    path: StrPath,
+    calibration: Calibration,
+    *,
+    categories: Collection[str] | None = KITTI_CATEGORIES,
+    rotation_y: RotationY = "calibration",
+) -> Annotations:
+    """Return the ground truth of a label file; see `read_objects` and `to_annotations`.
+
+    Raises:
+        DataError: if the file is missing or malformed, or the mounting of the camera does not
+            define the headings.
+    """
+    objects = read_objects(path, categories=categories)
+    try:
+        return to_annotations(objects, calibration, rotation_y)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def to_annotations(
+    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY = "calibration"
+) -> Annotations:
+    """Return the objects as ground truth in the LiDAR frame; boxes of DontCare regions are NaN.
+
+    Args:
+        objects: objects in the camera frame.
+        calibration: calibration of the frame.
+        rotation_y: the meaning of rotation_y; see `curate.geometry.mounting.RotationY`.
+
+    Raises:
+        DataError: if the mounting of the camera does not define the headings.
+    """
+    boxes = _boxes_lidar(objects, calibration, rotation_y)
     boxes[objects.categories == DONT_CARE] = np.nan
     return Annotations(
         boxes,
@@ -149,18 +218,28 @@ def to_annotations(objects: KittiObjects, calibration: Calibration) -> Annotatio
     )
 
 
-def to_detections(objects: KittiObjects, calibration: Calibration) -> Detections:
-    """Return the objects as detections in the LiDAR frame, without DontCare regions."""
+def to_detections(
+    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY = "calibration"
+) -> Detections:
+    """Return the objects as detections in the LiDAR frame, without DontCare regions.
+
+    Arguments and errors are those of `to_annotations`.
+    """
     kept = objects.select(objects.categories != DONT_CARE)
-    return Detections(_boxes_lidar(kept, calibration), kept.scores, kept.categories)
+    return Detections(_boxes_lidar(kept, calibration, rotation_y), kept.scores, kept.categories)
 
 
 def from_annotations(annotations: Annotations, calibration: Calibration) -> KittiObjects:
     """Return ground truth as KITTI objects, the inverse of `to_annotations`.
 
     DontCare regions get KITTI's placeholders: dimensions -1, location -1000, rotation_y -10.
+
+    Raises:
+        DataError: if the mounting of the camera does not define the headings.
     """
-    dimensions, locations, rotations_y = _boxes_camera(annotations.boxes, calibration)
+    dimensions, locations, rotations_y = _boxes_camera(
+        annotations.boxes, calibration, "calibration"
+    )
     region = annotations.categories == DONT_CARE
     dimensions[region], locations[region], rotations_y[region] = -1, -1000, -10
     return KittiObjects(
@@ -177,7 +256,10 @@ def from_annotations(annotations: Annotations, calibration: Calibration) -> Kitt
 
 
 def from_detections(
-    detections: Detections, calibration: Calibration, image_size: tuple[int, int] | None
+    detections: Detections,
+    calibration: Calibration,
+    image_size: tuple[int, int] | None,
+    rotation_y: RotationY = "calibration",
 ) -> KittiObjects:
     """Return detections as KITTI objects, in the same order.
 
@@ -190,15 +272,20 @@ def from_detections(
         calibration: calibration of the frame.
         image_size: (width, height) of the image in pixels; None if there is no image, so that
             nothing is clipped.
+        rotation_y: the meaning of rotation_y; see `curate.geometry.mounting.RotationY`. alpha
+            always follows the calibration.
+
+    Raises:
+        DataError: if the mounting of the camera does not define the headings.
     """
-    dimensions, locations, rotations_y = _boxes_camera(detections.boxes, calibration)
+    dimensions, locations, rotations_y = _boxes_camera(detections.boxes, calibration, rotation_y)
     boxes_2d = image_rectangles(detections.boxes, calibration, image_size)
     count = len(detections)
     return KittiObjects(
         detections.categories,
         np.full(count, -1.0),
         np.full(count, -1, dtype=np.int64),
-        wrap_angle(rotations_y - np.arctan2(locations[:, 0], locations[:, 2])),
+        observation_angles(detections.boxes, calibration),
         np.where(np.isnan(boxes_2d), -1.0, boxes_2d),
         dimensions,
         locations,
@@ -207,31 +294,27 @@ def from_detections(
     )
 
 
-def _boxes_lidar(objects: KittiObjects, calibration: Calibration) -> np.ndarray:
+def _boxes_lidar(
+    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY
+) -> np.ndarray:
     """Return the (n, 7) boxes in the LiDAR frame."""
     height, width, length = objects.dimensions.T
-    centres = objects.locations.copy()
-    centres[:, 1] -= height / 2  # the camera's y points down
     to_lidar = np.linalg.inv(calibration.lidar_to_camera)
-    return np.column_stack(
-        [
-            centres @ to_lidar[:3, :3].T + to_lidar[:3, 3],
-            length,
-            width,
-            height,
-            wrap_angle(-objects.rotations_y - np.pi / 2),
-        ]
-    )
+    centres = objects.locations @ to_lidar[:3, :3].T + to_lidar[:3, 3]
+    centres[:, 2] += height / 2
+    yaws = yaws_of_rotations_y(objects.rotations_y, calibration, rotation_y)
+    return np.column_stack([centres, length, width, height, yaws])
 
 
 def _boxes_camera(
-    boxes: np.ndarray, calibration: Calibration
+    boxes: np.ndarray, calibration: Calibration, rotation_y: RotationY
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (n, 3) height, width, length; (n, 3) bottom centres; (n,) rotation_y, as in KITTI."""
-    to_camera = calibration.lidar_to_camera
-    locations = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
-    locations[:, 1] += boxes[:, 5] / 2
-    return boxes[:, [5, 4, 3]], locations, wrap_angle(-boxes[:, 6] - np.pi / 2)
+    return (
+        boxes[:, [5, 4, 3]],
+        bottom_centres_in_camera(boxes, calibration),
+        rotations_y_of_yaws(boxes[:, 6], calibration, rotation_y),
+    )
 
 
 def _columns(values: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -262,50 +345,55 @@ def _format(objects: KittiObjects, index: int) -> str:
     )
 
 
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return path.read_bytes().decode("utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such label file") from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a text file (byte {error.start})") from error
-
-
-def _has_negative_dimension(categories: Sequence[str], dimensions: np.ndarray) -> bool:
-    """Return whether an object other than a DontCare region has a negative dimension."""
-    if dimensions.min(initial=0) >= 0:
+def _has_no_size(categories: Sequence[str], dimensions: np.ndarray) -> bool:
+    """Return whether an object other than a DontCare region has a size that is not positive."""
+    if dimensions.min(initial=1) > 0:
         return False
-    rows = np.flatnonzero((dimensions < 0).any(axis=1)).tolist()
+    rows = np.flatnonzero((dimensions <= 0).any(axis=1)).tolist()
     return any(categories[row] != DONT_CARE for row in rows)
 
 
 def _first_error(
-    path: Path, lines: Sequence[str], fields: int, categories: Collection[str] | None
+    path: Path,
+    rows: Iterable[tuple[int, Sequence[str]]],
+    categories: Collection[str] | None,
+    *,
+    scored: bool,
 ) -> DataError:
     """Return the error for the first invalid line of a file with at least one."""
-    rows = [(number, line.split()) for number, line in enumerate(lines, start=1)]
-    problems = ((number, _line_problem(row, fields, categories)) for number, row in rows if row)
+    problems = ((number, _line_problem(row, categories, scored=scored)) for number, row in rows)
     number, problem = next((number, problem) for number, problem in problems if problem)
     return DataError(f"{path}:{number}: {problem}")
 
 
 def _line_problem(
-    row: Sequence[str], fields: int, categories: Collection[str] | None
+    row: Sequence[str], categories: Collection[str] | None, *, scored: bool
 ) -> str | None:
     """Return what is wrong with one line, or None."""
-    if len(row) != fields:
-        kind = "result lines (which end with a score)" if fields == RESULT_FIELDS else "label lines"
-        return f"{len(row)} fields, but {kind} have {fields}"
+    if len(row) == LABEL_FIELDS and scored:
+        return "15 fields: the score is missing; result lines end with it as the 16th field"
+    if not LABEL_FIELDS <= len(row) <= RESULT_FIELDS:
+        expected = "result lines have 16" if scored else "label lines have 15, or 16 with a score"
+        return f"{len(row)} fields, but {expected}"
     if categories is not None and row[0] not in categories:
         return f"unknown category {row[0][:40]!r}; use one of {', '.join(sorted(categories))}"
-    problem = next(filter(None, map(_number_problem, row[1:])), None)
-    if problem:
-        return problem
-    if row[0] != DONT_CARE and min(map(float, row[8:11])) < 0:
-        return f"negative height, width or length ({' '.join(row[8:11])}) of a {row[0]}"
-    return None
+    fields = RESULT_FIELDS if scored else LABEL_FIELDS
+    problem = next(filter(None, map(_number_problem, row[1:fields])), None)
+    return problem or _size_problem(row)
+
+
+def _size_problem(row: Sequence[str]) -> str | None:
+    """Return what is wrong with the size of the 3D box of a line, or None."""
+    sizes = [float(field) for field in row[8:11]]
+    if row[0] == DONT_CARE or min(sizes) > 0:
+        return None
+    shown = f"height, width and length of the {row[0]} are {' '.join(row[8:11])}"
+    if max(sizes) <= 0:
+        return (
+            f"no 3D box: {shown}; delete the line, or set its category to {DONT_CARE} to keep its "
+            "2D box as a region that is neither object nor background"
+        )
+    return f"{shown}, but must be positive"
 
 
 def _number_problem(field: str) -> str | None:

@@ -2,8 +2,9 @@
 
 Source: Geiger et al., "Vision meets robotics: the KITTI dataset", IJRR 2013. A date folder contains
 calib_velo_to_cam.txt, calib_cam_to_cam.txt, and drives with velodyne_points/data and image_02/data.
-A frame id is the drive and the number: 2011_09_26_drive_0001_sync_0000000005. DRIVE/label_2 may
-contain labels in the format of the KITTI object data set.
+A frame id is the drive and the number: 2011_09_26_drive_0001_sync_0000000005. The labels of a drive
+are those in DRIVE/label_2, in the format of the KITTI object data set, or else the recordings' own
+DRIVE/tracklet_labels.xml.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,27 +13,48 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.formats.clouds import CLOUD_SUFFIXES
 from curate.datasets.formats.containment import Boundary, check_frame_id
+from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder
 from curate.datasets.formats.images import read_optional_image
+from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
+from curate.datasets.kitti.calibration import RAW_CAMERAS, RAW_TO_CAMERA, read_raw_calibration
 from curate.datasets.kitti.dataset import (
     contains_images,
+    describe_skipped,
+    frame_number,
     image_size_option,
-    parse_matrix,
-    read_bytes,
     read_frame_lists,
     read_points,
-    visible_files,
 )
-from curate.datasets.kitti.labels import read_objects, to_annotations
+from curate.datasets.kitti.labels import read_annotations
+from curate.datasets.kitti.tracklets import TRACKLETS, TrackletTable
+from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
-from curate.frames import Calibration, Frame, FrameFiles
+from curate.frames import Frame, FrameFiles
+from curate.geometry.mounting import RotationY, check_rotation_y
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
-_TO_CAMERA, _CAMERAS = "calib_velo_to_cam.txt", "calib_cam_to_cam.txt"
 # The root is a date folder with drives, or a folder of date folders.
 _DRIVES = ("*", "*/*")
+
+
+class _Drive:
+    """The files of a drive by the number of the frame."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.points = FrameFolder(folder / _POINTS, CLOUD_SUFFIXES, "point")
+        self.images = FrameFolder(folder / _IMAGES, IMAGE_SUFFIXES, "image")
+        labels, tracklets = folder / "label_2", folder / TRACKLETS
+        self.has_tracklets = tracklets.is_file() and not labels.is_dir()
+        self.labels = tracklets if self.has_tracklets else labels
+
+    def label(self, number: str) -> Path:
+        """Return the path of the file with a frame's labels, which need not exist."""
+        return self.labels if self.has_tracklets else self.labels / f"{number}.txt"
 
 
 class KittiRawDataset:
@@ -40,8 +62,10 @@ class KittiRawDataset:
 
     Args:
         root: a date folder with drives, or a folder of date folders.
+        layout: the declared layout of the point files.
         image_size: see `KittiDataset`.
         follow_links: whether links may lead out of the root.
+        rotation_y: who computed rotation_y of the labels; see `curate.geometry.mounting.RotationY`.
 
     Raises:
         DataError: if there is no drive.
@@ -53,63 +77,73 @@ class KittiRawDataset:
         self,
         root: StrPath,
         *,
+        layout: PointLayout = UNDECLARED,
         image_size: Sequence[int] | None = None,
         follow_links: bool = False,
+        rotation_y: RotationY = "calibration",
     ) -> None:
+        check_rotation_y(rotation_y)
+        self._rotation_y = rotation_y
         self.root = Path(root)
+        self._layout = layout
         self._boundary = Boundary(self.root, follow_links=follow_links)
-        drives = (
+        self._tracklets: dict[Path, TrackletTable] = {}
+        folders = (
             path.parent.parent
             for pattern in _DRIVES
             for path in self.root.glob(f"{pattern}/{_POINTS}")
         )
-        self._drives = {path.name: path for path in sorted(drives)}
-        if not self._drives:
+        self._folders = {path.name: path for path in sorted(folders)}
+        if not self._folders:
             raise DataError(
                 f"{self.root}: contains no DRIVE/{_POINTS}; set the root to the date folder, which "
-                f"also contains {_TO_CAMERA}, or to the folder of all dates"
+                f"also contains {RAW_TO_CAMERA}, or to the folder of all dates"
+                f"{layout_hint(self.root, self.name)}"
             )
 
-        self._has_images = any(contains_images(path / _IMAGES) for path in self._drives.values())
+        self._has_images = any(contains_images(path / _IMAGES) for path in self._folders.values())
         self._image_size = image_size_option(image_size, self._has_images, self.root)
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return the ids of all frames with points, and with an image if there are any, sorted."""
+        """Return the ids of all frames with points, and with an image if there are any, sorted.
+
+        Raises:
+            DataError: if a frame has two point files or two images.
+        """
         return tuple(self._frames)
 
     @cached_property
-    def _frames(self) -> Mapping[str, tuple[Path, str]]:
-        """The folder of the drive and the number of each frame."""
-        frames = {
-            frame: (folder, number)
-            for frame, (folder, number) in self._sweeps.items()
-            if not self._has_images or (folder / _IMAGES / f"{number}.png").exists()
+    def _frames(self) -> Mapping[str, tuple[_Drive, str]]:
+        """The drive and the number of each frame."""
+        return {
+            frame: (drive, number)
+            for frame, (drive, number) in sorted(self._sweeps.items())
+            if not self._has_images or number in drive.images
         }
-        return dict(sorted(frames.items()))
 
     @cached_property
-    def _sweeps(self) -> Mapping[str, tuple[Path, str]]:
+    def _sweeps(self) -> Mapping[str, tuple[_Drive, str]]:
         """The same for all point files, with or without an image."""
-        return {
-            f"{drive}_{points.stem}": (folder, points.stem)
-            for drive, folder in self._drives.items()
-            for points in visible_files(folder / _POINTS, "*.bin")
-        }
+        frames: dict[str, tuple[_Drive, str]] = {}
+        for name, folder in self._folders.items():
+            drive = _Drive(folder)
+            numbers = drive.points.frames()
+            drive.points.check(numbers)
+            drive.images.check(numbers)
+            frames |= {f"{name}_{number}": (drive, number) for number in numbers}
+        return frames
 
     def skipped_frames(self) -> str:
         """Return how many frames are skipped because they have no image; "" if none is."""
-        count = len(self._sweeps) - len(self._frames)
-        return (
-            f"{count} of {len(self._sweeps)} frames have no image and are skipped" if count else ""
-        )
+        return describe_skipped(len(self._frames), len(self._sweeps))
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in ROOT/ImageSets by file name."""
-        return read_frame_lists(self.root / "ImageSets", self._boundary)
+        return read_frame_lists(self.root / "ImageSets", self._boundary, self.frame_ids())
 
     def sequence_of(self, frame_id: str) -> str | None:
         """Return the drive of a frame, or None if there is no such frame."""
-        return self._frames[frame_id][0].name if frame_id in self._frames else None
+        return self._frames[frame_id][0].folder.name if frame_id in self._frames else None
 
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; all frames of a date share the calibration.
@@ -117,18 +151,15 @@ class KittiRawDataset:
         Raises:
             DataError: if there is no such frame.
         """
-        check_frame_id(frame_id)
-        if frame_id not in self._frames:
-            raise DataError(f"{self.root}: no frame {frame_id}; frame ids are DRIVE_NUMBER")
-        drive, number = self._frames[frame_id]
-        label = drive / "label_2" / f"{number}.txt"
+        drive, number = self._frame(frame_id)
+        label = drive.label(number)
         files = FrameFiles(
-            points=drive / _POINTS / f"{number}.bin",
-            image=drive / _IMAGES / f"{number}.png" if self._has_images else None,
-            calibration=drive.parent / _TO_CAMERA,
+            points=drive.points.path(number),
+            image=drive.images.path(number) if self._has_images else None,
+            calibration=drive.folder.parent / RAW_TO_CAMERA,
             label=label if label.exists() else None,
         )
-        self._boundary.check(*files.paths(), drive.parent / _CAMERAS)
+        self._boundary.check(*files.paths(), drive.folder.parent / RAW_CAMERAS)
         return files
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
@@ -138,7 +169,9 @@ class KittiRawDataset:
             DataError: if a file is missing, damaged or malformed.
         """
         files = self.files(frame_id)
-        sweep = read_points(files.points) if points else np.zeros((0, 4), dtype=np.float32)
+        sweep = np.zeros((0, 4), dtype=np.float32)
+        if points:
+            sweep = read_points(files.points, self._layout)
         calibration = read_raw_calibration(files.calibration.parent)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
@@ -146,37 +179,28 @@ class KittiRawDataset:
     def annotations(self, frame_id: str) -> Annotations:
         """Return the frame's ground truth in the LiDAR frame.
 
+        From tracklet_labels.xml, these are the objects in the camera's view.
+
         Raises:
             DataError: if there is no label file, or it is malformed.
         """
         files = self.files(frame_id)
+        drive, number = self._frame(frame_id)
         if files.label is None:
-            drive, number = self._frames[frame_id]
-            raise DataError(f"{drive / 'label_2' / number}.txt: no such label file")
+            raise DataError(f"{drive.label(number)}: no such label file")
+        if drive.has_tracklets:
+            if files.label not in self._tracklets:
+                self._tracklets[files.label] = TrackletTable(files.label)
+            table = self._tracklets[files.label]
+            index = frame_number(number, files.points)
+            return table.read(index, self.read(frame_id, points=False))
         calibration = read_raw_calibration(files.calibration.parent)
-        return to_annotations(read_objects(files.label), calibration)
+        return read_annotations(
+            files.label, calibration, categories=None, rotation_y=self._rotation_y
+        )
 
-
-def read_raw_calibration(folder: Path) -> Calibration:
-    """Return the calibration of the left colour camera (P_rect_02, R_rect_00, R and T).
-
-    Args:
-        folder: the date folder.
-
-    Raises:
-        DataError: if a file or an entry is missing or malformed.
-    """
-    extrinsic, rectify = np.eye(4), np.eye(4)
-    extrinsic[:3, :3] = _entry(folder / _TO_CAMERA, "R", (3, 3))
-    extrinsic[:3, 3:] = _entry(folder / _TO_CAMERA, "T", (3, 1))
-    rectify[:3, :3] = _entry(folder / _CAMERAS, "R_rect_00", (3, 3))
-    return Calibration(_entry(folder / _CAMERAS, "P_rect_02", (3, 4)), rectify @ extrinsic)
-
-
-def _entry(path: Path, key: str, shape: tuple[int, int]) -> np.ndarray:
-    text = read_bytes(path, "calibration").decode("utf-8", errors="replace")
-    for number, line in enumerate(text.splitlines(), start=1):
-        name, _, entries = line.partition(":")
-        if name == key:
-            return parse_matrix(entries, shape, f"{path}:{number}")
-    raise DataError(f"{path}: no line {key}:")
+    def _frame(self, frame_id: str) -> tuple[_Drive, str]:
+        check_frame_id(frame_id)
+        if frame_id not in self._frames:
+            raise DataError(f"{self.root}: no frame {frame_id}; frame ids are DRIVE_NUMBER")
+        return self._frames[frame_id]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.image_truth import seen_objects
 from curate.datasets.nuscenes.names import category_of
 from curate.datasets.nuscenes.tables import (
     Record,
@@ -25,15 +26,10 @@ from curate.detections import Annotations, as_categories
 from curate.errors import DataError
 from curate.frames import Calibration, Camera
 from curate.geometry.poses import boxes_in_frame
-from curate.geometry.projection import camera_of_boxes, image_rectangles
-from curate.geometry.similarity import wrap_angle
 
 # KITTI's occlusion level for nuScenes' visibility token (up to 40, 60, 80, 100 percent visible).
 _OCCLUSION = {"1": 2, "2": 1, "3": 1, "4": 0}
 _UNKNOWN = 3
-# Margin around the image for truncation, in image widths and heights. It bounds the 2D box of an
-# object that is partly behind the camera.
-_MARGIN = 10
 _SAMPLE = re.compile(rb'"sample_token"\s*:\s*"([^"]*)"')
 
 
@@ -69,19 +65,7 @@ class AnnotationTable:
         categories = as_categories([self._category(record) for record in records])
         visibilities = [str(record.get("visibility_token")) for record in records]
         levels = [_OCCLUSION.get(visibility, _UNKNOWN) for visibility in visibilities]
-        truncated, alpha = np.ones(len(boxes)), np.zeros(len(boxes))
-        rectangles = np.full((len(boxes), 4), np.nan)
-        shown_by = camera_of_boxes(boxes, cameras)
-        for number, camera in enumerate(cameras):
-            shown = shown_by == number
-            calibration, size = camera.calibration, camera.image_size
-            rectangles[shown] = image_rectangles(boxes[shown], calibration, size)
-            truncated[shown] = _truncation(boxes[shown], rectangles[shown], calibration, size)
-            alpha[shown] = _observation_angles(boxes[shown], calibration)
-        objects = Annotations(
-            boxes, categories, truncated, np.array(levels, dtype=np.int64), alpha, rectangles
-        )
-        return objects.select(shown_by >= 0)
+        return seen_objects(boxes, categories, np.array(levels, dtype=np.int64), cameras)
 
     def _records(self, token: str) -> list[Record]:
         with self.path.open("rb") as file:
@@ -137,46 +121,3 @@ class AnnotationTable:
             for token, record in read_table(path).items()
         }
         return {token: names[of] for token, of in categories.items() if of in names}
-
-
-def _truncation(
-    boxes: np.ndarray, rectangles: np.ndarray, calibration: Calibration, size: tuple[int, int]
-) -> np.ndarray:
-    """Return (n,) the fraction of each projected box outside the image; 1 if nothing is inside.
-
-    The full 2D box is the projection into a larger image, with a margin on all sides. For example,
-    a 2D box of 100 x 50 pixels of which 40 x 50 lie in the image has truncation 0.6.
-
-    Args:
-        boxes: (n, 7) in the LiDAR frame.
-        rectangles: (n, 4) projected boxes, clipped to the image.
-        calibration: calibration of the frame.
-        size: (width, height) of the image in pixels.
-    """
-    margin = np.array(size) * _MARGIN
-    shift = np.eye(3)
-    shift[:2, 2] = margin
-    wider = Calibration(shift @ calibration.projection, calibration.lidar_to_camera)
-    width, height = (np.array(size) + 2 * margin).tolist()
-    full = image_rectangles(boxes, wider, (width, height))
-    inside = _areas(rectangles) / np.maximum(_areas(full), 1e-9)
-    outside: np.ndarray = np.clip(1 - np.nan_to_num(inside), 0, 1)
-    return outside
-
-
-def _areas(rectangles: np.ndarray) -> np.ndarray:
-    """Return (n,) areas in pixels of left, top, right, bottom."""
-    areas: np.ndarray = np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)
-    return areas
-
-
-def _observation_angles(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """Return (n,) KITTI's alpha in radians: rotation_y minus the angle of the ray to the centre."""
-    to_camera = calibration.lidar_to_camera
-    centres = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
-    zeros = np.zeros(len(boxes))
-    headings = np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), zeros])
-    headings = headings @ to_camera[:3, :3].T
-    rotation_y = np.arctan2(-headings[:, 2], headings[:, 0])
-    angles: np.ndarray = wrap_angle(rotation_y - np.arctan2(centres[:, 0], centres[:, 2]))
-    return angles

@@ -16,6 +16,7 @@ import numpy as np
 from curate.datasets.formats.clouds import read_cloud
 from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.images import read_image
+from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.nuscenes.annotations import AnnotationTable
 from curate.datasets.nuscenes.keyframes import (
     FRONT_CAMERA,
@@ -26,6 +27,7 @@ from curate.datasets.nuscenes.keyframes import (
 )
 from curate.datasets.nuscenes.names import CATEGORIES
 from curate.datasets.nuscenes.scenes import validation_scenes
+from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
@@ -39,6 +41,7 @@ class NuScenesDataset:
 
     Args:
         root: the folder with samples/ and v1.0-*/.
+        layout: the layout of the point files, if it differs from nuScenes' own.
         version: name of the folder of tables; only needed if there are several.
         camera: channel of the only camera; CAM_FRONT by default.
         cameras: channels of several cameras, or "all"; replaces `camera`.
@@ -58,6 +61,7 @@ class NuScenesDataset:
         self,
         root: StrPath,
         *,
+        layout: PointLayout = UNDECLARED,
         version: str | None = None,
         camera: str | None = None,
         cameras: str | Sequence[str] | None = None,
@@ -67,6 +71,7 @@ class NuScenesDataset:
     ) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
+        self._layout = layout.with_defaults(_COLUMNS, _FULL_INTENSITY)
         self.version = _version(self.root, version)
         self._tables = self.root / self.version
         self._boundary.check(*self._tables.glob("*.json"))
@@ -145,6 +150,16 @@ class NuScenesDataset:
         """Return the scene of a frame, 20 seconds of a drive, or None for an unknown frame."""
         return self._keyframes[frame_id].scene if frame_id in self._keyframes else None
 
+    def file_names(self) -> Mapping[str, str]:
+        """Return the sample token of each name of a sweep or image without suffix."""
+        names: dict[str, str] = {}
+        for token in self._present[0]:
+            frame = self._keyframes[token]
+            names |= {
+                Path(file).name.partition(".")[0]: token for file in (frame.points, *frame.images)
+            }
+        return names
+
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; calibration and labels are tables of all frames.
 
@@ -174,7 +189,7 @@ class NuScenesDataset:
         frame, files = self._frame(frame_id), self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            sweep = read_cloud(files.points, _COLUMNS, _FULL_INTENSITY)
+            sweep = read_cloud(files.points, self._layout)
             # For row vectors, p @ R applies the inverse of R: from the sensor's axes to ours.
             sweep[:, :3] = sweep[:, :3] @ TO_SENSOR_AXES[:3, :3].astype(np.float32)
         cameras = frame.cameras
@@ -225,7 +240,7 @@ def _version(root: Path, version: str | None) -> str:
     if not versions:
         raise DataError(
             f"{root}: contains no v1.0-*/sample_data.json; set the root to the folder with "
-            "samples/ and v1.0-*/"
+            f"samples/ and v1.0-*/{layout_hint(root, NuScenesDataset.name)}"
         )
     if version is None and len(versions) == 1:
         return versions[0]

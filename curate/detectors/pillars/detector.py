@@ -94,6 +94,10 @@ class PillarDetector:
         """The categories that the detector finds."""
         return self._checkpoint.categories
 
+    def category_names(self) -> tuple[str, ...]:
+        """See `curate.detectors.base.NamesCategories`."""
+        return self.categories
+
     def predict(self, frame: Frame) -> Detections:
         """See `curate.detectors.base.Detector`."""
         preset = self._checkpoint.preset

@@ -1,7 +1,7 @@
 """Detector that returns stored predictions."""
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from curate.datasets.frame_names import FrameNames, last_part
 from curate.datasets.kitti.labels import KittiObjects, to_detections
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded.formats import check_kind, detect_kind
@@ -21,16 +22,18 @@ from curate.detectors.recorded.results import (
     as_detections,
 )
 from curate.detectors.recorded.table import TableRecord
+from curate.detectors.scores import describe_invalid_scores, to_probabilities
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame
+from curate.geometry.mounting import RotationY, check_rotation_y
 from curate.geometry.similarity import Similarity
 
 _log = logging.getLogger(__name__)
 # Formats that store the augmented copies in the same file.
-_TABLES: Mapping[str, Callable[[Path], "Record"]] = {
-    "csv": TableRecord.read,
-    "parquet": ParquetRecord.read,
+_TABLES: Mapping[str, Callable[[Path, bool], "Record"]] = {
+    "csv": lambda path, sigmoid: TableRecord.read(path, sigmoid=sigmoid),
+    "parquet": lambda path, _: ParquetRecord.read(path),
 }
 
 # Transforms from these axes to the LiDAR frame of this project (x forward, y left).
@@ -50,6 +53,18 @@ class Record(Protocol):
 
     def frame_ids(self) -> Iterable[str]:
         """Return the recorded frames, in sorted order."""
+        ...
+
+    def category_names(self) -> Collection[str]:
+        """Return the category names of all boxes."""
+        ...
+
+    def check(self, frame_ids: Iterable[str]) -> None:
+        """Check the results of some frames before any work, as far as the format allows.
+
+        Raises:
+            DataError: if a result is malformed.
+        """
         ...
 
     def result(self, frame_id: str) -> RecordedResult:
@@ -84,7 +99,11 @@ class RecordedDetector:
             other names stay unchanged.
         axes: axes of boxes in the LiDAR frame: "forward-left" (x forward, y left), or
             "right-forward" as in nuScenes' LiDAR frame.
-        frame_ids: the frames of the data set; recorded frames outside it are reported.
+        rotation_y: who computed rotation_y of KITTI result files; see
+            `curate.geometry.mounting.RotationY`.
+        sigmoid: whether scores are logits; they become probabilities first.
+        frame_ids: the frames of the data set; recorded frames are matched with them in the
+            spellings of `curate.datasets.frame_names`, and those of no frame are reported.
         calibration: returns the calibration of a frame id; needed for views in the formats of
             KITTI and nuScenes.
         wants_views: whether the run needs a second pass; if it is missing, a warning is logged.
@@ -105,6 +124,8 @@ class RecordedDetector:
         frame_list: str | None = None,
         rename: Mapping[str, str] | None = None,
         axes: str = "forward-left",
+        rotation_y: RotationY = "calibration",
+        sigmoid: bool = False,
         frame_ids: Sequence[str] = (),
         calibration: Callable[[str], Calibration] | None = None,
         wants_views: bool = True,
@@ -112,20 +133,35 @@ class RecordedDetector:
         check_kind(kind)
         if axes not in _AXES:
             raise ConfigError(f"detector.options.axes '{axes}': use one of {', '.join(_AXES)}")
+        check_rotation_y(rotation_y, "detector.options.rotation_y")
+        self._rotation_y = rotation_y
         self.path = Path(path)
         self.minimum_score = minimum_score
         self.rename = dict(rename or {})
+        self.sigmoid = sigmoid
         self._to_lidar_axes = _AXES[axes]
         self._calibration = calibration
         self._wants_views = wants_views
         listed = self.path.parent / frame_list if frame_list else None
-        self._record = _open(self.path, kind, ReadOptions(tuple(classes), listed), passes)
-        if frame_ids:
-            self._report_unmatched(frame_ids)
+        options = ReadOptions(tuple(classes), listed, sigmoid)
+        self._record = _open(self.path, kind, options, passes)
+        # The name in the record of each frame that has another one there.
+        found = self._match(FrameNames.of(frame_ids))
+        self._record.check(found)
+        self._recorded_as = {frame: name for name, frame in found.items() if name != frame}
 
     def frame_ids(self) -> tuple[str, ...]:
-        """Return the recorded frames, in sorted order."""
+        """Return the recorded frames, in sorted order, by the names that the record gives them."""
         return tuple(self._record.frame_ids())
+
+    def category_names(self) -> frozenset[str]:
+        """Return the category names of all recorded boxes, after `rename`.
+
+        Raises:
+            DataError: if a file cannot be read.
+        """
+        names = self._record.category_names()
+        return frozenset(self.rename.get(name, name) for name in names)
 
     def predict(self, frame: Frame) -> Detections:
         """Return the stored result of the original frame; `frame.points` is not used.
@@ -133,7 +169,8 @@ class RecordedDetector:
         Raises:
             DataError: if the frame was not recorded, or its result is malformed.
         """
-        result = self._record.result(frame.frame_id)
+        name = self._recorded_as.get(frame.frame_id, frame.frame_id)
+        result = self._record.result(name)
         return self._detections(frame.frame_id, result, lambda _: frame.calibration)
 
     def views(self, frame_id: str) -> Sequence[tuple[Similarity, Detections]]:
@@ -142,7 +179,7 @@ class RecordedDetector:
         Raises:
             DataError: if the frame was not recorded, or its result is malformed.
         """
-        views = self._record.views(frame_id)
+        views = self._record.views(self._recorded_as.get(frame_id, frame_id))
         if self._wants_views and not views and not self._record.has_views:
             _warn_once(
                 f"{self.path}: no second pass over augmented copies, so no label has a consistency "
@@ -167,11 +204,16 @@ class RecordedDetector:
             result = self._in_lidar(frame_id, result, calibration(frame_id))
         elif self._to_lidar_axes != Similarity():
             result = replace(result, boxes=self._to_lidar_axes.apply_to_boxes(result.boxes))
+        place = f"{self.path}: frame {frame_id}"
+        scores = to_probabilities(result.scores, sigmoid=self.sigmoid)
+        if problem := describe_invalid_scores(scores.min(initial=0), scores.max(initial=0)):
+            raise DataError(f"{place}: {problem}")
+        result = replace(result, scores=scores)
         if self.rename:
             names = [self.rename.get(name, name) for name in result.categories.tolist()]
             result = replace(result, categories=as_categories(names))
         kept = result.select(np.flatnonzero(result.scores >= self.minimum_score))
-        _check_repeated(f"{self.path}: frame {frame_id}", kept)
+        _check_repeated(place, kept)
         return kept
 
     def _in_lidar(
@@ -180,30 +222,37 @@ class RecordedDetector:
         """Return a result in the LiDAR frame of reference."""
         if not isinstance(result, KittiObjects):
             return result.in_lidar(calibration)
-        found = to_detections(result, calibration)
         place = f"{self.path}: frame {frame_id}"
+        try:
+            found = to_detections(result, calibration, self._rotation_y)
+        except DataError as error:
+            raise DataError(f"{place}: {error}") from None
         return as_detections(place, found.boxes, found.scores, found.categories)
 
-    def _report_unmatched(self, frame_ids: Sequence[str]) -> None:
-        """Warn about recorded frames that are not in the data set.
+    def _match(self, frames: FrameNames) -> Mapping[str, str]:
+        """Return the frame of each recorded name.
+
+        Recorded frames that are not in the data set are reported by a warning.
 
         Raises:
-            DataError: if no recorded frame is in the data set.
+            DataError: if no recorded frame is in the data set, or a name fits several frames.
         """
-        expected = set(frame_ids)
-        recorded = sum(1 for _ in self._record.frame_ids())
-        unexpected = [name for name in self._record.frame_ids() if name not in expected]
-        examples = ", ".join(unexpected[:3]) + (", ..." if len(unexpected) > 3 else "")
-        if unexpected and len(unexpected) == recorded:
+        names = list(self._record.frame_ids())
+        if not len(frames):
+            return {name: last_part(name) for name in names}
+        found, unmatched = frames.match(names, self.path)
+        examples = ", ".join(unmatched[:3]) + (", ..." if len(unmatched) > 3 else "")
+        if unmatched and not found:
             raise DataError(
-                f"{self.path}: results for frames that do not exist ({examples}); frames of the "
-                f"data set are named like {frame_ids[0]}"
+                f"{self.path}: results for frames that do not exist ({examples})"
+                f"{frames.nearest(unmatched[0])}"
             )
-        if unexpected:
+        if unmatched:
             _warn_once(
-                f"{self.path}: {len(unexpected)} of {recorded} results are for frames that the "
+                f"{self.path}: {len(unmatched)} of {len(names)} results are for frames that the "
                 f"data set does not have ({examples}); they are left out"
             )
+        return found
 
 
 def _check_repeated(place: str, found: Detections) -> None:
@@ -231,7 +280,7 @@ def _open(
             f"{path}: a table contains its augmented copies as views 1, 2, ...; remove passes from "
             "detector.options"
         )
-    return _TABLES[kind](path)
+    return _TABLES[kind](path, options.sigmoid)
 
 
 @cache

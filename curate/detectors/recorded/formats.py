@@ -4,7 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from curate.detectors.recorded.json_files import holds_object, read_json, stream_results
+import numpy as np
+
+from curate.detectors.recorded.json_files import holds_object, stream_results
 from curate.detectors.recorded.kitti_results import KittiResults
 from curate.detectors.recorded.mmdetection3d import holds_boxes, read_mmdetection3d
 from curate.detectors.recorded.nuscenes import read_nuscenes
@@ -12,6 +14,7 @@ from curate.detectors.recorded.openpcdet import read_openpcdet
 from curate.detectors.recorded.plain_pickle import read_plain_pickle
 from curate.detectors.recorded.results import ReadOptions, ResultsByFrame
 from curate.errors import ConfigError, DataError
+from curate.files.json_text import read_json
 
 # Readers of formats with one list entry per frame.
 _LISTS: Mapping[str, Callable[[Path, Sequence[Any], ReadOptions], ResultsByFrame]] = {
@@ -68,6 +71,13 @@ def read_results(path: Path, kind: str, options: ReadOptions) -> ResultsByFrame:
     if kind == "list":
         kind = _detect_list_kind(path, content)
     return _LISTS[kind](path, content, options)
+
+
+def category_names(results: ResultsByFrame) -> set[str]:
+    """Return the category names of all boxes of a pass."""
+    if isinstance(results, KittiResults):
+        return results.category_names()
+    return {str(name) for result in results.values() for name in np.unique(result.categories)}
 
 
 def _detect_list_kind(path: Path, entries: Sequence[Any]) -> str:

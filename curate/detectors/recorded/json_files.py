@@ -1,34 +1,22 @@
-"""Reading of JSON files: whole, or one frame at a time if ijson is installed."""
+"""Reading of nuScenes' JSON results: one frame at a time if ijson is installed, else whole."""
 
-import json
+import codecs
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from curate.errors import DataError, one_line
+from curate.files.json_text import read_json
 
 _PEEK_BYTES = 4096
-
-
-def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        DataError: if it is missing or not JSON.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
-    except (OSError, RecursionError, ValueError) as error:
-        raise _damaged(path, error) from None
 
 
 def holds_object(path: Path) -> bool:
     """Return whether a file starts like a JSON object."""
     try:
         with path.open("rb") as file:
-            return file.read(_PEEK_BYTES).lstrip().startswith(b"{")
+            start = file.read(_PEEK_BYTES).removeprefix(codecs.BOM_UTF8)
+            return start.lstrip().startswith(b"{")
     except OSError:
         return False
 
@@ -49,11 +37,14 @@ def stream_results(path: Path) -> Iterator[tuple[str, Any]]:
     found = False
     try:
         with path.open("rb") as file:
+            if file.read(len(codecs.BOM_UTF8)) != codecs.BOM_UTF8:
+                file.seek(0)
             for key, value in ijson.kvitems(file, "results", use_float=True):
                 found = True
                 yield key, value
     except (ijson.JSONError, OSError, ValueError) as error:
-        raise _damaged(path, error) from None
+        read_json(path)  # its message says more
+        raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None
     if not found:
         # `results` is empty, missing, or not an object. Read the whole file to report which.
         yield from _results_of(path, read_json(path)).items()
@@ -71,7 +62,3 @@ def _results_of(path: Path, content: Any) -> dict[str, Any]:
             f"{path}: results is a {type(results).__name__}, not an object of sample tokens"
         )
     return results
-
-
-def _damaged(path: Path, error: Exception) -> DataError:
-    return DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}")

@@ -1,31 +1,34 @@
 """KITTI benchmark results: a folder with one FRAME.txt per frame, sixteen fields per line."""
 
+import codecs
+import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from curate.datasets.kitti.labels import KittiObjects, read_objects
+from curate.datasets.kitti.labels import DONT_CARE, KittiObjects, read_objects
 from curate.errors import DataError
 
 
 class KittiResults(Mapping[str, KittiObjects]):
-    """The objects of each frame, each read on access: an invalid file affects only its frame.
+    """The objects of each frame, each read on access.
 
     An empty file is a frame without detections. Any category name is accepted.
 
     Args:
-        folder: contains the result files, directly or in `data/` as KITTI's own tools write them.
+        folder: contains the result files: in `data/`, beside which KITTI's own tools write their
+            statistics, or directly, or in subfolders such as drives.
 
     Raises:
         DataError: if there is no result file.
     """
 
     def __init__(self, folder: Path) -> None:
-        candidates = (folder, folder / "data")
-        found = [
-            [path for path in candidate.glob("*.txt") if path.name[0] != "."]
-            for candidate in candidates
-        ]
-        self._paths = {path.stem: path for path in sorted(found[0] or found[1])}
+        home = folder / "data" if any((folder / "data").glob("*.txt")) else folder
+        found = [path for path in home.glob("*.txt") if path.name[0] != "."]
+        self._paths = {path.stem: path for path in sorted(found)}
+        if not found:
+            nested = sorted(path for path in home.rglob("*.txt") if path.name[0] != ".")
+            self._paths = {path.relative_to(home).as_posix(): path for path in nested}
         if not self._paths:
             raise DataError(f"{folder}: contains no KITTI result files (FRAME.txt)")
 
@@ -36,6 +39,18 @@ class KittiResults(Mapping[str, KittiObjects]):
             DataError: if its file is malformed.
         """
         return read_objects(self._paths[frame_id], scored=True, categories=None)
+
+    def category_names(self) -> set[str]:
+        """Return the category names of all objects: the first word of every line.
+
+        A file that cannot be read is left out: it affects only its frame.
+        """
+        names: set[bytes] = set()
+        for path in self._paths.values():
+            with contextlib.suppress(OSError):
+                lines = path.read_bytes().removeprefix(codecs.BOM_UTF8).splitlines()
+                names.update(line.split(None, 1)[0] for line in lines if line.strip())
+        return {name.decode(errors="replace") for name in names} - {DONT_CARE}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._paths)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from curate.datasets.frame_names import read_frame_list
 from curate.detections import Detections
 from curate.detectors.recorded.results import ReadOptions, ResultsByFrame, as_detections
 from curate.errors import ConfigError, DataError
@@ -98,10 +99,7 @@ def _frames(path: Path, entries: Sequence[Any], frame_list: Path | None) -> list
                 "frame_list, a file with the frame ids in the order of the results, one per line"
             )
         return [str(frame_id) for frame_id in frame_ids]
-    try:
-        listed = frame_list.read_text(encoding="utf-8").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{frame_list}: not a list of frame ids: {error}") from None
+    listed = [name for _, name in read_frame_list(frame_list)]
     if len(listed) != len(entries):
         raise DataError(
             f"{frame_list}: {len(listed)} frame ids for {len(entries)} entries in {path}"
@@ -113,6 +111,4 @@ def _frame_of(entry: Any) -> str | None:
     if not isinstance(entry, Mapping):
         return None
     key = next((key for key in _FRAME_KEYS if key in entry), None)
-    if key is None:
-        return None
-    return Path(entry[key]).stem if key == "lidar_path" else str(entry[key])
+    return None if key is None else str(entry[key])

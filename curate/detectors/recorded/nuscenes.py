@@ -51,6 +51,16 @@ class MapBoxes:
     numbers: np.ndarray
     names: Sequence[str]
 
+    @property
+    def categories(self) -> np.ndarray:
+        """(n,) category names of the project."""
+        return as_categories([CATEGORIES.get(name, name) for name in self.names])
+
+    @property
+    def scores(self) -> np.ndarray:
+        """(n,) the scores of the boxes."""
+        return self.numbers[:, 10]
+
     def in_lidar(self, calibration: Calibration) -> Detections:
         """Return the boxes in the LiDAR frame, with the category names of the project.
 
@@ -75,8 +85,7 @@ class MapBoxes:
                 f"must be in the map frame: {hint}"
             )
         boxes = boxes_in_frame(centres, sizes[:, [1, 0, 2]], rotations, pose)
-        names = [CATEGORIES.get(name, name) for name in self.names]
-        return as_detections(self.place, boxes, self.numbers[:, 10], as_categories(names))
+        return as_detections(self.place, boxes, self.numbers[:, 10], self.categories)
 
 
 def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str, MapBoxes]:
@@ -94,6 +103,8 @@ def read_nuscenes(path: Path, results: Iterable[tuple[str, Any]]) -> Mapping[str
     interned: dict[str, str] = {}
     long_boxes = wide_boxes = 0
     for token, boxes in results:
+        if token in found:
+            raise DataError(f"{path}: results of {_shortened(token)} occur twice; remove one")
         frame = _frame(path, token, boxes, interned)
         _check_rotations(frame)
         width_length = frame.numbers[np.isin(frame.names, _LONG_CLASSES), 3:5]
@@ -115,7 +126,20 @@ def _frame(path: Path, token: str, boxes: Any, interned: dict[str, str]) -> MapB
         raise DataError(f"{place}: expected a list of boxes, not {type(boxes).__name__}")
     rows = [_row(f"{place}: box {k}", token, box) for k, box in enumerate(boxes)]
     names = [interned.setdefault(box["detection_name"], box["detection_name"]) for box in boxes]
-    return MapBoxes(place, np.array(rows, dtype=np.float64).reshape(-1, _NUMBERS), names)
+    numbers = np.array(rows, dtype=np.float64).reshape(-1, _NUMBERS)
+    _check_sizes(place, numbers)
+    return MapBoxes(place, numbers, names)
+
+
+def _check_sizes(place: str, numbers: np.ndarray) -> None:
+    """Raise DataError if a width, length or height is not positive."""
+    flat = (numbers[:, 3:6] <= 0).any(axis=1)
+    if flat.any():
+        k = int(np.argmax(flat))
+        raise DataError(
+            f"{place}: box {k}: length, width or height is not positive: its size is "
+            f"{numbers[k, 3:6].tolist()}"
+        )
 
 
 def _row(place: str, token: str, box: Any) -> list[float]:

@@ -1,6 +1,6 @@
 """Results of one frame as a record stores them, and the check of their values."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -9,6 +9,7 @@ import numpy as np
 
 from curate.datasets.kitti.labels import KittiObjects
 from curate.detections import Detections, as_categories
+from curate.detectors.scores import describe_invalid_scores
 from curate.errors import DataError, one_line
 from curate.frames import Calibration
 from curate.geometry.similarity import wrap_angle
@@ -19,6 +20,16 @@ LARGEST = 1e6
 
 class ForeignBoxes(Protocol):
     """Boxes in another frame of reference; their conversion needs the calibration of the frame."""
+
+    @property
+    def categories(self) -> np.ndarray:
+        """(n,) category names of the boxes."""
+        ...
+
+    @property
+    def scores(self) -> np.ndarray:
+        """(n,) the scores of the boxes as they are stored."""
+        ...
 
     def in_lidar(self, calibration: Calibration) -> Detections:
         """Return the boxes in the LiDAR frame of reference.
@@ -45,10 +56,12 @@ class ReadOptions:
         classes: class names of numbered labels, in the order of the model's configuration.
         frame_list: a text file with one frame id per line, in the order of the results; for
             results without frame ids.
+        sigmoid: whether the scores are logits, which the detector converts.
     """
 
     classes: Sequence[str] = ()
     frame_list: Path | None = None
+    sigmoid: bool = False
 
 
 def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections:
@@ -57,12 +70,11 @@ def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections
     Args:
         place: file and entry, for messages.
         boxes: (n, >=7) centre boxes in the LiDAR frame; further columns (velocities) are ignored.
-        scores: (n,) in [0, 1].
+        scores: (n,); their range is checked by `check_scores`, or where they are used.
         names: (n,) category names.
 
     Raises:
-        DataError: if the lengths differ, a number is not finite, a size is not positive, or a score
-            is out of range.
+        DataError: if the lengths differ, a number is not finite, or a size is not positive.
     """
     try:
         boxes = np.array(boxes, dtype=np.float64)
@@ -80,16 +92,43 @@ def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections
             f"{len(categories)} names do not fit; expected [n, 7], [n] and n"
         )
     boxes = boxes[:, :7]
-    invalid = {
-        "a number is NaN or infinite": ~np.isfinite(np.column_stack([boxes, scores])).all(axis=1),
-        f"a number is beyond {LARGEST:g}": (np.abs(boxes) > LARGEST).any(axis=1),
-        "length, width or height is not positive": (boxes[:, 3:6] <= 0).any(axis=1),
-        "the score is not in [0, 1]": (scores < 0) | (scores > 1),
-    }
-    for reason, rows in invalid.items():
+    for reason, rows in invalid_rows(boxes, scores).items():
         if rows.any():
             k = int(np.argmax(rows))
             numbers = [round(float(number), 3) for number in (*boxes[k], scores[k])]
             raise DataError(f"{place}: box {k}: {reason}: {numbers} (x, y, z, l, w, h, yaw, score)")
     boxes[:, 6] = wrap_angle(boxes[:, 6])
     return Detections(boxes, scores, categories)
+
+
+def invalid_rows(boxes: np.ndarray, scores: np.ndarray) -> Mapping[str, np.ndarray]:
+    """Return the (n,) mask of rows that cannot be boxes, by reason; shared by all formats.
+
+    Args:
+        boxes: (n, 7) x, y, z, length, width, height, yaw.
+        scores: (n,) in any range.
+    """
+    return {
+        "a number is NaN or infinite": ~np.isfinite(np.column_stack([boxes, scores])).all(axis=1),
+        f"a number is beyond {LARGEST:g}": (np.abs(boxes) > LARGEST).any(axis=1),
+        "length, width or height is not positive": (boxes[:, 3:6] <= 0).any(axis=1),
+    }
+
+
+def check_scores(place: object, scores: Iterable[tuple[str, np.ndarray]], *, sigmoid: bool) -> None:
+    """Raise DataError if the scores of the frames of a pass are not in [0, 1].
+
+    Args:
+        place: the file, for messages.
+        scores: the name and the scores of each frame.
+        sigmoid: whether they are logits, in any range.
+    """
+    lowest, highest, example = 0.0, 0.0, ""
+    for name, found in scores:
+        low, high = found.min(initial=0), found.max(initial=0)
+        if not example and (low < 0 or high > 1):
+            example = name
+        lowest, highest = min(lowest, low), max(highest, high)
+    problem = None if sigmoid else describe_invalid_scores(lowest, highest)
+    if problem:
+        raise DataError(f"{place}: frame {example}: {problem}")

@@ -4,7 +4,7 @@ The record is a CSV file with a header and one row per box: frame, view, flip_y,
 scale, category, score, x, y, z, length, width, height, yaw; other columns are ignored. View 0 is
 the original frame; view v >= 1 is an augmented copy A(x) with A given by flip_y, rotation_rad and
 scale (see `Similarity`). Boxes are centre boxes in the LiDAR frame of their view, in metres and
-radians.
+radians. See `curate.files.csv_text` for the variations of CSV that are read.
 
 A frame or view without boxes has no row in such a file and cannot be distinguished from one that
 was never recorded. A frame without any row is therefore an error: it is reported as a failed frame,
@@ -12,9 +12,8 @@ not as an empty scene. A frame that has only rows of other views has no detectio
 """
 
 import codecs
-import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -22,9 +21,12 @@ from typing import BinaryIO
 import numpy as np
 
 from curate.detections import Detections, as_categories
-from curate.detectors.recorded.results import LARGEST
+from curate.detectors.recorded.results import invalid_rows
+from curate.detectors.scores import describe_invalid_scores
 from curate.errors import DataError, one_line
 from curate.files.batches import batched
+from curate.files.csv_text import Header, parse_number
+from curate.files.text import check_not_utf16
 from curate.geometry.similarity import Similarity, wrap_angle
 
 View = tuple[Similarity, Detections]
@@ -43,37 +45,54 @@ class TableRecord:
 
     Attributes:
         path: the file.
+        header: its first row.
         order: index of each of `_COLUMNS` in a row.
         names: (n,) the frame of each run of consecutive rows, as UTF-8, sorted.
         places: (n, 3) first byte, end byte and first line of each run.
+        categories: the category names of all rows.
+        sigmoid: whether the scores are logits.
     """
 
     path: Path
+    header: Header
     order: tuple[int, ...]
     names: np.ndarray
     places: np.ndarray
+    categories: frozenset[str]
+    sigmoid: bool = False
 
     @classmethod
-    def read(cls, path: Path) -> "TableRecord":
+    def read(cls, path: Path, *, sigmoid: bool = False) -> "TableRecord":
         """Check every row of a file and index the rows of its frames.
 
+        Args:
+            path: the file.
+            sigmoid: whether the scores are logits, in any range.
+
         Raises:
-            DataError: if the file is missing or not a CSV file, a column is missing, or a row has a
-                wrong number of fields or an invalid value.
+            DataError: if the file is missing or not a CSV file, a column is missing, a row has a
+                wrong number of fields or an invalid value, or a row occurs twice.
         """
         try:
             with path.open("rb") as file:
                 rows = _Rows(path, file)
-                order = rows.header()
-                runs = [_check_block(path, block) for block in rows.blocks(order)]
+                order = rows.header.places(path, _COLUMNS)
+                categories: set[str] = set()
+                runs = []
+                for block in rows.blocks(order):
+                    runs.append(_check_block(path, block, sigmoid))
+                    categories.update(row[1] for row in block.rows)
         except FileNotFoundError:
             raise DataError(f"{path}: no such file of recorded detections") from None
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
+        except OSError as error:
             raise DataError(f"{path}: cannot be read as CSV: {one_line(error)}") from error
-        names = np.concatenate([names for names, _ in runs] or [np.empty(0, dtype="S1")])
-        places = np.concatenate([places for _, places in runs] or [np.empty((0, 3), np.int64)])
+        _check_repeated_rows(path, [(hashes, lines) for _, _, hashes, lines in runs])
+        names = np.concatenate([found for found, _, _, _ in runs] or [np.empty(0, dtype="S1")])
+        places = np.concatenate([found for _, found, _, _ in runs] or [np.empty((0, 3), np.int64)])
         sort = np.argsort(names, kind="stable")
-        return cls(path, order, names[sort], places[sort])
+        return cls(
+            path, rows.header, order, names[sort], places[sort], frozenset(categories), sigmoid
+        )
 
     @property
     def has_views(self) -> bool:
@@ -83,6 +102,13 @@ class TableRecord:
     def frame_ids(self) -> Iterator[str]:
         """Return the recorded frames, in sorted order."""
         return (name.decode() for name in np.unique(self.names))
+
+    def category_names(self) -> frozenset[str]:
+        """Return the category names of all boxes."""
+        return self.categories
+
+    def check(self, frame_ids: Iterable[str]) -> None:
+        """Do nothing: every row was checked when the file was read."""
 
     def result(self, frame_id: str) -> Detections:
         """Return the detections of the original frame.
@@ -111,11 +137,11 @@ class TableRecord:
         with self.path.open("rb") as file:
             for begin, end, line in self.places[first:last].tolist():
                 file.seek(begin)
-                text = file.read(end - begin).decode()
-                rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row]
-                fields += [[row[place] for place in self.order] for row in rows]
-                lines += range(line, line + len(rows))
-        return _views_of(self.path, fields, lines)
+                text = io.StringIO(file.read(end - begin).decode(), newline="")
+                for number, row in self.header.rows(text, self.path, line):
+                    fields.append([row[place] for place in self.order])
+                    lines.append(number)
+        return _views_of(self.path, fields, lines, _numbers(self.path, fields, lines, self.sigmoid))
 
 
 @dataclass(frozen=True)
@@ -137,23 +163,28 @@ class _Rows:
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path = path
         self._end = 0
-        self._reader = csv.reader(self._lines(file))
+        self._lines = self._read_lines(file)
+        self.header = Header.read(self._lines)
 
-    def _lines(self, file: BinaryIO) -> Iterator[str]:
+    def _read_lines(self, file: BinaryIO) -> Iterator[str]:
         for line in file:
-            # Spreadsheets write a byte order mark at the start of a file.
-            text = line.removeprefix(codecs.BOM_UTF8) if self._end == 0 else line
-            self._end += len(line)
-            yield text.decode()
+            if self._end == 0:
+                check_not_utf16(line[:4], self.path)
+            # Old Macs end a line with a carriage return alone.
+            for part in line.splitlines(keepends=True) if b"\r" in line[:-2] else (line,):
+                # Spreadsheets write a byte order mark at the start of a file.
+                text = part.removeprefix(codecs.BOM_UTF8) if self._end == 0 else part
+                self._end += len(part)
+                yield self._decoded(text)
 
-    def header(self) -> tuple[int, ...]:
-        """Return the index of each of `_COLUMNS`; raise DataError if one is missing."""
-        header = next(self._reader, [])
-        missing = [name for name in _COLUMNS if name not in header]
-        if missing:
-            raise DataError(f"{self.path}:1: no column {', '.join(missing)} in the header")
-        self._width = len(header)
-        return tuple(header.index(name) for name in _COLUMNS)
+    def _decoded(self, line: bytes) -> str:
+        try:
+            return line.decode()
+        except UnicodeDecodeError as error:
+            raise DataError(
+                f"{self.path}: not UTF-8 text (byte {self._end - len(line) + error.start}); save "
+                "the file as UTF-8"
+            ) from None
 
     def blocks(self, order: Sequence[int]) -> Iterator[_Block]:
         """Yield all rows in blocks; raise DataError for a row with a wrong number of fields."""
@@ -164,41 +195,68 @@ class _Rows:
         self, order: Sequence[int]
     ) -> Iterator[tuple[list[str], tuple[int, int, int]]]:
         begin = self._end
-        for row in self._reader:
-            line = self._reader.line_num
-            if row and len(row) != self._width:
-                raise DataError(
-                    f"{self.path}:{line}: {len(row)} fields, the header has {self._width}"
-                )
-            if row:
-                yield [row[place] for place in order], (begin, self._end, line)
+        for line, row in self.header.rows(self._lines, self.path, self.header.line + 1):
+            yield [row[place] for place in order], (begin, self._end, line)
             begin = self._end
 
 
-def _check_block(path: Path, block: _Block) -> tuple[np.ndarray, np.ndarray]:
-    """Check the rows of a block; return frame and place of each run of consecutive rows.
+def _check_block(
+    path: Path, block: _Block, sigmoid: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Check the rows of a block.
+
+    Returns:
+        Frame and place of each run of consecutive rows, and hash and line of each row.
 
     Raises:
         DataError: if a row has an invalid value.
     """
-    _views_of(path, block.rows, block.places[:, 2].tolist())
+    lines = block.places[:, 2]
+    numbers = _numbers(path, block.rows, lines.tolist(), sigmoid)
+    _views_of(path, block.rows, lines.tolist(), numbers)
     names = np.array([row[0].encode() for row in block.rows])
     first = np.flatnonzero(np.append(True, names[1:] != names[:-1]))
     last = np.append(first[1:], len(names)) - 1
     begin, end, line = block.places[first, 0], block.places[last, 1], block.places[first, 2]
-    return names[first], np.column_stack([begin, end, line])
+    hashes = [
+        hash((row[0], row[1], values.tobytes()))
+        for row, values in zip(block.rows, numbers, strict=True)
+    ]
+    places = np.column_stack([begin, end, line])
+    return names[first], places, np.array(hashes, dtype=np.int64), lines
 
 
-def _views_of(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> dict[int, View]:
+def _check_repeated_rows(path: Path, blocks: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+    """Raise DataError if two rows have the same hash, as in a file that was appended to itself."""
+    if not blocks:
+        return
+    hashes, lines = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    order = np.argsort(hashes, kind="stable")
+    again = np.flatnonzero(hashes[order][1:] == hashes[order][:-1])
+    if len(again):
+        k = again[np.argmin(lines[order][again + 1])]
+        raise DataError(
+            f"{path}:{lines[order][k + 1]}: the same row as line {lines[order][k]}; were the "
+            "results written twice into one file?"
+        )
+
+
+def _views_of(
+    path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int], numbers: np.ndarray
+) -> dict[int, View]:
     """Return the views in the rows of one frame, by number.
 
     Rows of several frames are checked as well, but their views overwrite each other in the result.
 
+    Args:
+        path: the file, for messages.
+        rows: the fields of the rows, in the order of `_COLUMNS`.
+        lines: their lines.
+        numbers: (n, 12) the columns of `_NUMBERS`.
+
     Raises:
-        DataError: if a row has an invalid value, or rows of one view disagree on A.
+        DataError: if rows of one view disagree on A.
     """
-    numbers = _parse_numbers(path, rows, lines)
-    _check_values(path, lines, numbers)
     similarities, scores = numbers[:, 1:4], numbers[:, 4]
     boxes = numbers[:, 5:].copy()
     boxes[:, 6] = wrap_angle(boxes[:, 6])
@@ -217,33 +275,37 @@ def _views_of(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -
     return views
 
 
-def _parse_numbers(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> np.ndarray:
-    """Return the (n, 12) columns of `_NUMBERS`."""
+def _numbers(
+    path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int], sigmoid: bool
+) -> np.ndarray:
+    """Return the (n, 12) columns of `_NUMBERS`; raise DataError for an invalid value."""
     numbers = np.empty((len(rows), len(_NUMBERS)))
     for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
         try:
-            numbers[index] = [float(field) for field in row[2:]]
+            numbers[index] = [parse_number(field) for field in row[2:]]
         except ValueError as error:
-            raise DataError(f"{path}:{line}: {str(error)[:120]}") from None
+            raise DataError(f"{path}:{line}: {error}") from None
+    _check_values(path, lines, numbers, sigmoid)
     return numbers
 
 
-def _check_values(path: Path, lines: Sequence[int], numbers: np.ndarray) -> None:
+def _check_values(path: Path, lines: Sequence[int], numbers: np.ndarray, sigmoid: bool) -> None:
     """Raise DataError for the first row that cannot be a detection."""
     view, flip_y, rotation_rad, scale, score = numbers[:, :5].T
     identity = (flip_y == 0) & (rotation_rad == 0) & (scale == 1)
     invalid = {
-        "a number is NaN or infinite": ~np.isfinite(numbers).all(axis=1),
-        f"a number is beyond {LARGEST:g}": (np.abs(numbers) > LARGEST).any(axis=1),
+        **invalid_rows(numbers[:, 5:], score),
+        "rotation_rad or scale is NaN or infinite": ~np.isfinite(numbers).all(axis=1),
         "view is not 0, 1, 2, ...": (view < 0) | (view != np.floor(view)),
         "flip_y is neither 0 nor 1": (flip_y != 0) & (flip_y != 1),
         "scale is not positive": scale <= 0,
         "view 0 is the original frame, but flip_y, rotation_rad, scale are not 0, 0, 1": (
             (view == 0) & ~identity
         ),
-        "score is not in [0, 1]": (score < 0) | (score > 1),
-        "length, width or height is not positive": (numbers[:, 8:11] <= 0).any(axis=1),
     }
+    problem = describe_invalid_scores(score.min(initial=0), score.max(initial=0))
+    if problem and not sigmoid:
+        invalid[problem] = (score < 0) | (score > 1)
     for reason, rows in invalid.items():
         if rows.any():
             raise DataError(f"{path}:{lines[int(np.argmax(rows))]}: {reason}")

@@ -1,6 +1,6 @@
 """KITTI's text format: one line per box, for any tool that writes KITTI labels.
 
-DIRECTORY/label_2/FRAME.txt has a line of 15 fields per box; line i is box i of the image.
+DIRECTORY/label_2/FRAME.txt has a line of 15 fields per box, in the order of review.csv.
 DIRECTORY/calib/FRAME.txt is the calibration that its camera coordinates refer to. Lines with a
 16th field, a score, are accepted too; DontCare regions are skipped.
 """
@@ -12,19 +12,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.calibration import write_calibration
 from curate.datasets.kitti.labels import (
     DONT_CARE,
-    RESULT_FIELDS,
     from_detections,
     read_objects,
+    read_rows,
     to_detections,
     write_objects,
 )
 from curate.detections import Detections
 from curate.errors import DataError
 from curate.review.editors.base import Reader
-from curate.review.editors.names import check_frame_names
+from curate.review.editors.names import match_frame_names
 from curate.review.edits import EditedBox
 from curate.review.sheet import Sheet
 
@@ -56,19 +56,15 @@ class KittiEditor:
         paths = {
             path.stem: path for path in sorted(folder.glob("*.txt")) if path.name[0] not in "._"
         }
-        check_frame_names(folder, paths, sheet)
-        return {name: _read_file(path, sheet, name, read) for name, path in paths.items()}
+        frames = match_frame_names(folder, paths, sheet)
+        return {
+            frame: _read_file(paths[name], sheet, frame, read) for name, frame in frames.items()
+        }
 
 
 def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[EditedBox]:
-    lines = [
-        (number, line)
-        for number, line in enumerate(_text(path).splitlines(), start=1)
-        if line.strip()
-    ]
-    scored = bool(lines) and all(len(line.split()) == RESULT_FIELDS for _, line in lines)
-    objects = read_objects(path, scored=scored, categories={*sheet.categories, DONT_CARE})
-    places = [number for number, line in lines if line.split()[0] != DONT_CARE]
+    objects = read_objects(path, categories={*sheet.categories, DONT_CARE})
+    places = [number for number, row in read_rows(path) if row[0] != DONT_CARE]
     found = to_detections(objects, read(name).calibration)
     return [
         EditedBox(str(category), tuple(box), f"{path}:{number}")
@@ -76,8 +72,3 @@ def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[Edited
             found.categories, found.boxes.tolist(), places, strict=True
         )
     ]
-
-
-def _text(path: Path) -> str:
-    """Return the text; `read_objects` reports bytes that are not text."""
-    return path.read_bytes().decode("utf-8-sig", errors="replace")

@@ -10,8 +10,10 @@ from support.toys import write_toy_kitti
 
 from curate.datasets.folder import FolderDataset
 from curate.datasets.formats.clouds import read_cloud
-from curate.datasets.kitti.dataset import KittiDataset, read_calibration
-from curate.datasets.kitti.raw import KittiRawDataset, read_raw_calibration
+from curate.datasets.formats.point_layout import PointLayout
+from curate.datasets.kitti.calibration import read_calibration, read_raw_calibration
+from curate.datasets.kitti.dataset import KittiDataset
+from curate.datasets.kitti.raw import KittiRawDataset
 from curate.errors import ConfigError, DataError
 
 LAYOUTS = {
@@ -70,7 +72,7 @@ def test_invalid_raw_calibration_is_reported(tmp_path):
         ('images = "camera"\n', 'images = "camera"\nimage_size = [120, 40]\n', "remove one"),
         ('points = "lidar"\n', "", "no key points"),
         ("intensity_scale = 255\n", "intensity_scale = 0\n", "invalid value of intensity_scale"),
-        ("intensity_scale = 255\n", "columns = 2\n", "invalid value of calibration or columns"),
+        ("intensity_scale = 255\n", "columns = 2\n", "columns = 2: must be 3 to 64"),
         (
             "intensity_scale = 255\n",
             f"intensity_scale = 1{'0' * 400}\n",
@@ -148,9 +150,9 @@ def test_damaged_point_files_are_rejected(tmp_path, suffix):
 
 def test_points_that_are_not_finite_are_left_out(tmp_path):
     """Organised clouds mark missing returns by NaN."""
-    points = np.array([[1, 2, 3, 100], [np.nan, 0, 0, 0], [4, 5, 6, 300]])
+    points = np.array([[1, 2, 3, 100], [np.nan, 0, 0, 0], [4, 5, 6, 200]])
     write_cloud(tmp_path / "a.npy", points)
-    found = read_cloud(tmp_path / "a.npy", intensity_scale=200)
+    found = read_cloud(tmp_path / "a.npy", PointLayout(intensity_scale=200))
     assert found.tolist() == [[1, 2, 3, 0.5], [4, 5, 6, 1]]
 
 

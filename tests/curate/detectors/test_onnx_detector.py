@@ -4,6 +4,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
+from support.fatal_files import write_overflowing_model
 from support.tiny_onnx import tiny_detector
 from support.toys import toy_calibration
 
@@ -185,3 +186,12 @@ def test_a_failing_model_prints_nothing_itself(path, capfd):
     with pytest.raises(ModelError, match="Failed to allocate memory"):
         OnnxDetector(path, classes=CATEGORIES).predict(frame())
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("early", [False, True])
+def test_a_model_that_ends_the_process_is_rejected(tmp_path, early):
+    """ONNX Runtime divides the lowest integer by -1, which is SIGFPE: while it loads or runs."""
+    write_overflowing_model(tmp_path / "a.onnx", early=early)
+    with pytest.raises(ModelError, match=r"onnxruntime ends the process \(SIGFPE\)") as caught:
+        OnnxDetector(tmp_path / "a.onnx", classes=("Car",)).predict(frame())
+    assert str(caught.value).startswith(f"{tmp_path / 'a.onnx'}: ")

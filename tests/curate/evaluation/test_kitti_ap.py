@@ -54,6 +54,7 @@ def test_the_official_values_are_reproduced(official, kit_sampling):
             assert figures[positions][category].keys() == by_figure.keys()
             for figure, values in by_figure.items():
                 assert figures[positions][category][figure] == pytest.approx(values, abs=1e-4)
+    assert all(min(counted) > 0 for counted in figures["objects"].values())
 
 
 def test_ground_truth_against_itself_is_100(official):
@@ -64,7 +65,7 @@ def test_ground_truth_against_itself_is_100(official):
         there = np.broadcast_to(evaluation.objects[:, None, :] > 0, evaluation.ap_r40.shape)
         for averages in (evaluation.ap_r11, evaluation.ap_r40):
             assert np.all(averages[there] == 100)
-            assert np.all(averages[~there] == 0)
+            assert np.isnan(averages[~there]).all()
         assert np.all(evaluation.recall_3d[there[:, :3]] == 1)
 
 
@@ -81,7 +82,11 @@ def test_crowded_frames_equal_the_slow_oracle(seed):
                     labels, results, category, figure, d, overlap
                 )
                 got = evaluation.ap_r11[c, f, d], evaluation.ap_r40[c, f, d]
-                assert got == pytest.approx(expected, abs=1e-9), (category, figure, d)
+                if evaluation.objects[c, d] == 0:  # the devkit prints 0
+                    assert np.isnan(got).all()
+                    assert expected == (0, 0)
+                else:
+                    assert got == pytest.approx(expected, abs=1e-9), (category, figure, d)
 
 
 def test_more_objects_than_positions_equal_the_slow_oracle():
@@ -102,9 +107,9 @@ def test_the_order_of_frames_does_not_matter(seed):
     order = generator.permutation(10)
     one = evaluate(labels, results)
     other = evaluate([labels[i] for i in order], [results[i] for i in order])
-    assert np.allclose(one.curves, other.curves, rtol=0, atol=1e-12)
+    assert np.allclose(one.curves, other.curves, rtol=0, atol=1e-12, equal_nan=True)
     assert np.array_equal(one.objects, other.objects)
-    assert np.array_equal(one.recall_3d, other.recall_3d)
+    assert np.array_equal(one.recall_3d, other.recall_3d, equal_nan=True)
 
 
 @settings(max_examples=20)
@@ -115,19 +120,23 @@ def test_a_false_positive_with_the_lowest_score_never_raises_precision(seed):
     before = evaluate(objects_of(labels), objects_of(results))
     results[3] = [*results[3], car(x=40, z=60, score=0.001, box_2d=(900, 0, 999, 99))]
     after = evaluate(objects_of(labels), objects_of(results))
-    assert np.all(after.curves <= before.curves)
+    known = ~np.isnan(before.curves)
+    assert np.array_equal(known, ~np.isnan(after.curves))
+    assert np.all(after.curves[known] <= before.curves[known])
 
 
 @settings(max_examples=20)
 @given(seeds)
 def test_values_are_percentages_and_orientation_is_below_image(seed):
-    """Within 0 and 100, never NaN, AOS at most the image AP, a stricter IoU never finds more."""
+    """Within 0 and 100, NaN only without objects, AOS at most the image AP, falling curves."""
     labels, results = random_frames(np.random.default_rng(seed), 6)
     evaluation = evaluate(objects_of(labels), objects_of(results))
     for averages in (evaluation.ap_r11, evaluation.ap_r40):
-        assert np.all((averages >= 0) & (averages <= 100))
-        assert np.all(averages[:, 1] <= averages[:, 0] + 1e-9)
-    assert np.all(np.diff(evaluation.curves, axis=-1) <= 0)
+        there = np.broadcast_to(evaluation.objects[:, None] > 0, averages.shape)
+        assert np.array_equal(there, ~np.isnan(averages))
+        assert np.all((averages[there] >= 0) & (averages[there] <= 100))
+        assert not np.any(averages[:, 1] > averages[:, 0] + 1e-9)
+    assert not np.any(np.diff(evaluation.curves, axis=-1) > 0)
 
 
 def test_half_of_the_objects_found_by_the_formula():
@@ -191,7 +200,8 @@ def test_difficulty_decides_what_counts(change, counted):
     """Occlusion, truncation and height set the difficulty; harder objects are not missed."""
     evaluation = evaluate(objects_of([[car(**change)]]), [EMPTY])
     assert evaluation.objects[0].tolist() == counted
-    assert evaluation.ap_r40[0].tolist() == [[0, 0, 0]] * 4
+    found = [0 if count else None for count in counted]
+    assert evaluation.as_dict()["AP_R40"]["Car"] == dict.fromkeys(FIGURES, found)
 
 
 @pytest.mark.parametrize("change", [{"category": "Van"}, {"occluded": 3}, {"truncated": 0.9}])
@@ -247,16 +257,20 @@ def test_detections_with_equal_scores_are_counted_together():
     assert curve.tolist() == [0.5] * 41
 
 
-def test_empty_input_gives_zeros():
-    """No frames, no objects, no detections: zeros and counts, never NaN."""
+def test_without_objects_there_is_no_figure():
+    """No frames or no objects: nothing to compute. Objects without detections: 0."""
     one = objects_of([[car()]])
-    cases = (([], [], 0), ([EMPTY], [EMPTY], 0), ([EMPTY], one, 0), (one, [EMPTY], 3))
-    for labels, results, count in cases:
+    for labels, results in (([], []), ([EMPTY], [EMPTY]), ([EMPTY], one)):
         evaluation = evaluate(labels, results)
-        assert np.all(evaluation.curves == 0)
-        assert np.all(evaluation.recall_3d == 0)
-        assert evaluation.objects.sum() == count
-        json.dumps(evaluation.as_dict(), allow_nan=False)
+        assert np.isnan(evaluation.curves).all()
+        assert np.isnan(evaluation.recall_3d).all()
+        assert evaluation.objects.sum() == 0
+        plain = json.loads(json.dumps(evaluation.as_dict(), allow_nan=False))
+        assert plain["AP_R40"]["Car"]["3d"] == plain["recall_3d"]["Car"]["0.7"] == [None] * 3
+    missed = evaluate(one, [EMPTY])
+    assert np.all(missed.ap_r40[0] == 0)
+    assert np.all(missed.recall_3d[0] == 0)
+    assert missed.objects.tolist() == [[1, 1, 1], [0, 0, 0], [0, 0, 0]]
 
 
 def test_without_orientation_there_is_no_aos():

@@ -87,7 +87,7 @@ def test_outcomes_add_up_to_the_counts_of_the_oracle(seed, metric, difficulty, t
         labels,
         results,
         metric=metric,
-        difficulty=("easy", "moderate", "hard")[difficulty],
+        level=("easy", "moderate", "hard")[difficulty],
         score_threshold=threshold,
     )
     for category, overlap in {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}.items():
@@ -140,7 +140,7 @@ def test_no_frames_and_no_objects_have_no_outcomes():
         assert len(of_labels) == len(of_results) == 0
 
 
-@pytest.mark.parametrize("wrong", [{"metric": "4d"}, {"difficulty": "harder"}])
+@pytest.mark.parametrize("wrong", [{"metric": "4d"}, {"level": "harder"}])
 def test_unknown_names_are_rejected(wrong):
     """The message lists the known ones."""
     with pytest.raises(ConfigError, match="image, bev, 3d"):

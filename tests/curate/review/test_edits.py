@@ -22,8 +22,8 @@ def back(**changes: tuple[float, ...] | None) -> list[EditedBox]:
 
 
 def decisions_of(edits: FrameEdits) -> list[tuple[int | None, str]]:
-    """Return numbers and decisions."""
-    return [(each.number, each.decision) for each in edits.decisions]
+    """Return k and decisions."""
+    return [(each.k, each.decision) for each in edits.decisions]
 
 
 def test_an_unchanged_box_has_not_been_reviewed() -> None:
@@ -43,7 +43,7 @@ def test_moved_deleted_and_new_boxes_are_decisions() -> None:
     moved = (CAR[0] + 0.4, *CAR[1:])
     new = EditedBox("Cyclist", (12.0, 9.0, -0.6, 1.8, 0.6, 1.7, 0.0), "file:9")
     edits = compare_frame(FRAME, [*back(box1=moved, box2=None), new])
-    assert decisions_of(edits) == [(1, "moved"), (2, "rejected"), (None, "added")]
+    assert decisions_of(edits) == [(0, "moved"), (1, "rejected"), (None, "added")]
     first, second, third = edits.decisions
     assert (first.box, first.seen) == (moved, CAR)
     assert (second.box, third.seen, edits.untouched) == (WALKER, None, 1)
@@ -52,7 +52,7 @@ def test_moved_deleted_and_new_boxes_are_decisions() -> None:
 def test_a_box_moved_without_overlap_is_rejected_and_added() -> None:
     """Without overlap it cannot be identified as the same object."""
     far = (CAR[0] + 9, *CAR[1:])
-    assert decisions_of(compare_frame(FRAME, back(box1=far))) == [(1, "rejected"), (None, "added")]
+    assert decisions_of(compare_frame(FRAME, back(box1=far))) == [(0, "rejected"), (None, "added")]
 
 
 def test_another_category_is_a_correction() -> None:
@@ -60,34 +60,38 @@ def test_another_category_is_a_correction() -> None:
     edited = back()
     edited[1] = replace(edited[1], category="Cyclist")
     edits = compare_frame(FRAME, edited)
-    assert decisions_of(edits) == [(2, "moved")]
+    assert decisions_of(edits) == [(1, "moved")]
     assert (edits.decisions[0].category, edits.decisions[0].box) == ("Cyclist", WALKER)
 
 
 def test_decisions_in_the_table_accept_and_reject() -> None:
     """The accepted box is the exported one, to the last digit."""
     rounded = tuple(round(value, 3) for value in CAR)
-    edits = compare_frame(FRAME, back(box1=rounded), {1: "accepted", 2: "rejected"})
-    assert decisions_of(edits) == [(1, "accepted"), (2, "rejected")]
+    edits = compare_frame(FRAME, back(box1=rounded), {0: "accepted", 1: "rejected"})
+    assert decisions_of(edits) == [(0, "accepted"), (1, "rejected")]
     assert edits.decisions[0].box == CAR
 
 
 def test_accepting_the_rest_does_not_change_human_labels() -> None:
     """They are decided already."""
     edits = compare_frame(FRAME, back(), accept_rest=True)
-    assert (decisions_of(edits), edits.untouched) == ([(1, "accepted"), (2, "accepted")], 1)
+    assert (decisions_of(edits), edits.untouched) == ([(0, "accepted"), (1, "accepted")], 1)
 
 
 def test_a_human_label_can_be_corrected() -> None:
     """Like any other box."""
-    assert decisions_of(compare_frame(FRAME, back(box3=None))) == [(3, "rejected")]
+    assert decisions_of(compare_frame(FRAME, back(box3=None))) == [(1_000_000, "rejected")]
 
 
 @pytest.mark.parametrize(
     ("edited", "words", "message"),
     [
-        (back(box1=None), {1: "accepted"}, "marked as accepted but deleted"),
-        (back(box1=(CAR[0] + 0.4, *CAR[1:])), {1: "rejected"}, "file:1.*marked as rejected"),
+        (back(box1=None), {0: "accepted"}, "label 0 is marked as accepted but deleted"),
+        (
+            back(box1=(CAR[0] + 0.4, *CAR[1:])),
+            {0: "rejected"},
+            "file:1: label 0 of .*marked as rejected",
+        ),
     ],
 )
 def test_contradictions_between_table_and_boxes_are_rejected(

@@ -26,7 +26,7 @@ def test_a_manifest_is_read_back(tmp_path: Path) -> None:
         ('"category": "Car"', '"category": "Van"', "changed since the export"),
         ('"frames"', '"pages"', "damaged"),
         ("curate review 1", "curate review 9", "not a review manifest"),
-        ("{", "", "invalid JSON"),
+        ("{", "", "cannot be read as JSON"),
     ],
 )
 def test_a_changed_manifest_is_rejected(
@@ -36,7 +36,7 @@ def test_a_changed_manifest_is_rejected(
     write_sheet(tmp_path, small_sheet())
     path = tmp_path / MANIFEST
     path.write_text(path.read_text().replace(before, after, 1))
-    with pytest.raises(DataError, match=f"{MANIFEST}: .*{message}") as error:
+    with pytest.raises(DataError, match=f"{MANIFEST}:.*{message}") as error:
         read_sheet(tmp_path)
     assert "\n" not in str(error.value)
 
@@ -66,33 +66,55 @@ def test_an_empty_column_has_no_decisions(tmp_path: Path) -> None:
 
 def test_decisions_are_read(tmp_path: Path) -> None:
     """Of boxes, and of all others of a frame."""
-    edited(tmp_path, f000001_1="accept", f000001_2="Rejected", f000002_all="accept")
+    edited(tmp_path, f000001_0="accept", f000001_1="Rejected", f000002_all="accept")
     words = read_table(tmp_path, small_sheet())
-    assert words["000001"].boxes == {1: "accepted", 2: "rejected"}
+    assert words["000001"].boxes == {0: "accepted", 1: "rejected"}
     assert (words["000001"].accept_rest, words["000002"].accept_rest) == (False, True)
 
 
 def test_changes_by_spreadsheet_programs_are_tolerated(tmp_path: Path) -> None:
     """Semicolons, a byte order mark, no leading zeros."""
-    edited(tmp_path, f000002_1="accept")
+    edited(tmp_path, f000002_0="accept")
     text = (tmp_path / TABLE).read_text().replace(",", ";").replace("00000", "")
     (tmp_path / TABLE).write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
-    assert read_table(tmp_path, small_sheet())["000002"].boxes == {1: "accepted"}
+    assert read_table(tmp_path, small_sheet())["000002"].boxes == {0: "accepted"}
+
+
+def test_an_older_table_counts_the_labels_of_a_frame_from_one(tmp_path: Path) -> None:
+    """Curate 0.1 wrote such tables, with the column `box`."""
+    edited(tmp_path)
+    lines = [
+        "frame,box,asked,category,score,weight,decision",
+        "000001,1,yes,Car,0.6,0.5,accept",
+        "000001,3,human,Car,0.6,0.5,reject",
+    ]
+    (tmp_path / TABLE).write_text("\n".join(lines) + "\n")
+    words = read_table(tmp_path, small_sheet())
+    assert words["000001"].boxes == {0: "accepted", 1_000_000: "rejected"}
+    (tmp_path / TABLE).write_text("\n".join(lines).replace("001,3", "001,4") + "\n")
+    with pytest.raises(DataError, match=r"3: box '4' is not in frame 000001 .* it has 1, 2, 3"):
+        read_table(tmp_path, small_sheet())
 
 
 @pytest.mark.parametrize(
     ("key", "word", "before", "after", "message"),
     [
-        ("f000001_1", "maybe", "", "", "3: invalid decision 'maybe'; write accept, reject"),
+        ("f000001_0", "maybe", "", "", "3: invalid decision 'maybe'; write accept, reject"),
         ("f000001_all", "reject", "", "", "2: a whole frame cannot be rejected"),
-        ("f000001_2", "accept", "000001,2", "000001,7", "frame 000001 has boxes 1 to 3, not '7'"),
-        ("f000001_2", "accept", "000001,2", "000009,2", "frame '000009' is not in this review"),
         (
-            "f000001_2",
+            "f000001_1",
+            "accept",
+            "000001,1,",
+            "000001,7,",
+            "k '7' is not in frame 000001 of this review; it has 0, 1, 1000000",
+        ),
+        ("f000001_1", "accept", "000001,1,", "000009,1,", "frame '000009' is not in this review"),
+        (
+            "f000001_1",
             "accept",
             "decision",
             "opinion",
-            "1: the columns frame, box and decision are req",
+            "1: no column decision in the header",
         ),
     ],
 )

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from support.paths import ROOT
 
-from curate.datasets.kitti.dataset import KittiDataset, read_calibration
+from curate.datasets.kitti.calibration import read_calibration
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import ConfigError, DataError
 from curate.simulation import simulate
 from curate.simulation.rig import CameraRig

@@ -179,6 +179,9 @@ def test_the_command_prints_plots_and_stores_the_audit(
     bins = json.loads(curate("query", BIN, "--json", "-w", workspace.root)[1])
     assert [(row["low"], row["labels"]) for row in bins] == [(0.9, 12)]
     assert count(workspace, "SELECT count(*) FROM audit_slice") == 7 * 4 * 7
+    options = ("--policy", "spsl", "--policy", "score", "--replicates", "50")
+    assert curate("audit", "-w", workspace.root, *options)[0] == 0
+    assert (plot.parent / "audit-round-01-val-bev-spsl-score.png").is_file()
 
 
 def test_the_json_has_the_same_values_as_the_tables(curate: Curate, workspace: Workspace) -> None:

@@ -10,7 +10,7 @@ import pytest
 from support.pipelines_cli import Curate
 from support.toys import toy_calibration, toy_document
 
-from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.calibration import write_calibration
 from curate.errors import ConfigError, DataError, WorkspaceError
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
@@ -112,7 +112,7 @@ def test_an_empty_list_of_frames_is_rejected(
     (tmp_path / "val.txt").write_bytes(content)
     code, _, err = evaluate(curate, folders, "--frames", tmp_path / "val.txt")
     assert code == DataError.exit_code
-    assert "val.txt: " in err
+    assert "val.txt:" in err
     assert err.count("\n") == 1
 
 
@@ -133,10 +133,10 @@ def test_a_missing_checkpoint_gives_a_one_line_error(curate: Curate, workspace: 
             "results/000001.txt",
             f"\n{LINE.replace('1.5 1.6', '1.5 -1.6')} 0.5",
             "000001.txt:2",
-            "negative height, width or length",
+            "1.5 -1.6 4.0, but must be positive",
         ),
         ("results/000001.txt", f"Ship{LINE[3:]} 0.5", "000001.txt:1", "unknown category 'Ship'"),
-        ("label_2/000001.txt", f"{LINE} 0.5", "000001.txt:1", "16 fields"),
+        ("label_2/000001.txt", f"{LINE} 0.5 1", "000001.txt:1", "17 fields"),
         ("results/000009.txt", f"{LINE} 0.5", "label_2/000009.txt", "no label file"),
     ],
 )
@@ -164,18 +164,27 @@ def test_a_missing_result_file_is_not_treated_as_empty(
 
 
 @pytest.mark.parametrize("empty", [(0,), (1,), (0, 1)])
-def test_without_detections_or_ground_truth_every_value_is_zero(
+def test_without_ground_truth_there_is_no_value_and_without_detections_it_is_zero(
     curate: Curate, folders: tuple[Path, Path], empty: tuple[int, ...]
 ) -> None:
-    """On either side or on both: 0, never NaN, and the number of objects."""
+    """Nothing can be computed without an object: null and "-", not 0; a missed object gives 0."""
     for side in empty:
         (folders[side] / "000001.txt").write_text("")
-    code, out, _ = evaluate(curate, folders, "--json")
+    code, out, err = evaluate(curate, folders, "--json")
     assert code == 0
     found = json.loads(out, parse_constant=pytest.fail)
-    assert found["AP_R40"]["Car"]["3d"] == found["AP_R11"]["Car"]["image"] == [0, 0, 0]
+    expected = [None if 0 in empty else 0] * 3
+    assert found["AP_R40"]["Car"]["3d"] == found["AP_R11"]["Car"]["image"] == expected
+    assert found["recall_3d"]["Car"]["0.7"] == expected
     assert found["objects"]["Car"] == [1 - (0 in empty)] * 3
-    assert evaluate(curate, folders)[0] == 0
+    warned = [("objects", 0), ("results", 1)]
+    for side, number in warned:
+        sentence = f"There are no {side} of Car, Pedestrian, Cyclist"
+        assert (sentence in found["notes"]) == (number in empty)
+        assert (f"warning: {sentence}\n" in err) == (number in empty)
+    _, out, _ = evaluate(curate, folders)
+    row = next(line.split() for line in out.splitlines() if line.startswith("Car         3d"))
+    assert row[2:] == (["-"] if 0 in empty else ["0.00"]) * 6
 
 
 def test_detections_with_equal_scores_are_counted_together(
@@ -232,6 +241,7 @@ def test_missed_objects_can_be_queried(curate: Curate, workspace: Workspace) -> 
     missed = query_rows(curate, workspace, MISSED)
     found = query_rows(curate, workspace, "SELECT * FROM evaluation WHERE outcome = 'tp'")
     objects = [row for row in found if row["side"] == "object"]
+    assert not any("2D box" in note for note in figures["notes"])
     for category, overlap in (("Car", "0.7"), ("Pedestrian", "0.5"), ("Cyclist", "0.5")):
         tp = sum(row["category"] == category for row in objects)
         fn = sum(row["category"] == category for row in missed)
@@ -240,9 +250,11 @@ def test_missed_objects_can_be_queried(curate: Curate, workspace: Workspace) -> 
     assert missed
     assert objects
     assert all(row["iou"] <= 0.7 for row in missed)
-    sql = "SELECT ap_r40 FROM evaluation_ap WHERE figure = '3d' AND category = 'Cyclist'"
-    stored = [row["ap_r40"] for row in query_rows(curate, workspace, sql)]
-    assert sorted(stored) == pytest.approx(sorted(figures["AP_R40"]["Cyclist"]["3d"]))
+    sql = "SELECT * FROM evaluation_ap WHERE figure = '3d' AND category = 'Cyclist'"
+    rows = {row["difficulty"]: row for row in query_rows(curate, workspace, sql)}
+    stored = [rows[level]["ap_r40"] for level in figures["difficulties"]]
+    assert stored == figures["AP_R40"]["Cyclist"]["3d"]
+    assert [value is None for value in stored] == [n == 0 for n in figures["objects"]["Cyclist"]]
 
 
 def test_outcomes_contain_their_boxes(curate: Curate, workspace: Workspace) -> None:

@@ -242,7 +242,7 @@ def test_an_object_bank_of_unlabeled_frames(curate: Curate, work: Path) -> None:
     code, _, err = curate("export", "--format", "openpcdet", "-w", work)
     assert code == 0, err
     assert curate("check", "-w", work)[0] == 0
-    bank = work / "exports" / "openpcdet" / "gt_database"
+    bank = work / "exports" / "round-01-pspsl-openpcdet" / "gt_database"
     leaked = frames(work, "unlabeled")[1]
     (bank / f"{leaked}_Person_sitting_0.bin").write_bytes(bytes(64))
     assert_caught(curate, work, f"outside X_l: {leaked}", started=False)

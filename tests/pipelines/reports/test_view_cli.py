@@ -232,7 +232,7 @@ def test_example_frame_is_drawn_from_above_and_over_its_image(weighted: Workspac
     paths = draw_example_frame(weighted, 1)
     names = {path.name for path in paths}
     frame = next(name for name in weighted.frames("unlabeled") if any(name in n for n in names))
-    assert names == {f"round-01-{frame}-bird-eye.png", f"round-01-{frame}-image.png"}
+    assert names == {f"round-01-{frame}-pspsl-{kind}.png" for kind in ("bird-eye", "image")}
     assert all(drawn_image(path).size for path in paths)
 
 

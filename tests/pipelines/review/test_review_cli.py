@@ -8,11 +8,18 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from support.exported import rows_of
 from support.paths import ROOT
 from support.pipelines_cli import Curate
+from support.reviewed import (
+    advance,
+    corrected,
+    decide,
+    export_review,
+    import_review,
+    only_first,
+)
 from support.rounds import state_of
 from support.stored_rows import rows
 from support.stored_tuples import store
@@ -24,76 +31,13 @@ from pipelines.registry import EDITORS, POLICIES
 from pipelines.stages.export import label_set
 from pipelines.workspace.workspace import Workspace
 
-ADDED = "Cyclist 0 0 0 0 0 10 10 1.7 0.6 1.8 -9.0 1.0 30.0 0.1"
 LABELS = "SELECT frame, k, category, x, weight, provenance FROM weighted_labels "
-
-
-@pytest.fixture
-def weighted(curate: Curate, workspace: Workspace) -> Workspace:
-    """Create weights for X_u in round 1."""
-    advance(curate, workspace, 1)
-    return workspace
-
-
-def advance(curate: Curate, workspace: Workspace, number: int) -> None:
-    """Bring a round up to its weights."""
-    for command in ("predict", "repredict", "score", "solve"):
-        code, _, err = curate(command, "-w", workspace.root, "--round", number)
-        assert code == 0, err
 
 
 def change(workspace: Workspace, sql: str) -> None:
     """Change the database without the pipeline."""
     with workspace.database.writing() as connection:
         connection.exec_driver_sql(sql)
-
-
-def export_review(curate: Curate, workspace: Workspace, folder: Path, *options: object) -> str:
-    """Export a review; return the first of its frames."""
-    code, out, err = curate("review", "export", folder, "-w", workspace.root, "--json", *options)
-    assert code == 0, err
-    return json.loads(out)["frames"][0]
-
-
-def only_first(workspace: Workspace) -> tuple[str, str]:
-    """Return the option that selects all labels of one frame and no others."""
-    return "--frames", next(iter(workspace.frames("unlabeled")))
-
-
-def decide(folder: Path, frame: str, box: int, word: str) -> None:
-    """Write a decision into the table."""
-    path = folder / "review.csv"
-    start = f"{frame},{box},"
-    lines = [row + word * row.startswith(start) for row in path.read_text().splitlines()]
-    path.write_text("\n".join(lines) + "\n")
-
-
-def corrected(folder: Path, frame: str) -> None:
-    """Accept box 1, delete box 2, move box 3 half a metre ahead, add a cyclist."""
-    decide(folder, frame, 1, "accept")
-    path = folder / "label_2" / f"{frame}.txt"
-    lines = [line.split() for line in path.read_text().splitlines()]
-    lines[2][13] = f"{float(lines[2][13]) + 0.2:.4f}"
-    path.write_text("\n".join([" ".join(lines[0]), " ".join(lines[2]), ADDED]) + "\n")
-
-
-def import_review(curate: Curate, workspace: Workspace, folder: Path, *options: object) -> dict:
-    """Import a review."""
-    code, out, err = curate(
-        "review", "import", folder, "-w", workspace.root, "--json", "--reviewer", "ada", *options
-    )
-    assert code == 0, err
-    return json.loads(out)
-
-
-@pytest.fixture
-def reviewed(curate: Curate, weighted: Workspace, tmp_path: Path) -> tuple[Workspace, Path, str]:
-    """Return workspace, folder and frame of a review with one frame corrected and imported."""
-    folder = tmp_path / "review"
-    frame = export_review(curate, weighted, folder, *only_first(weighted))
-    corrected(folder, frame)
-    import_review(curate, weighted, folder)
-    return weighted, folder, frame
 
 
 def test_a_review_exports_whole_frames(curate: Curate, weighted: Workspace, tmp_path: Path) -> None:
@@ -105,7 +49,7 @@ def test_a_review_exports_whole_frames(curate: Curate, weighted: Workspace, tmp_
     assert export_review(curate, weighted, folder, "--count", 1) == name
     table = (folder / "review.csv").read_text().splitlines()
     assert [line.split(",")[:3] for line in table[1:]] == [
-        [name, "all", ""], [name, "1", ""], [name, "2", "yes"], [name, "3", ""],
+        [name, "all", ""], [name, "0", ""], [name, "1", "yes"], [name, "2", ""],
     ]  # fmt: skip
     assert len((folder / "label_2" / f"{name}.txt").read_text().splitlines()) == 3
     assert (folder / "pictures" / f"{name}.png").stat().st_size > 10_000
@@ -245,7 +189,7 @@ def test_a_repeated_import_changes_nothing(
     before = rows(workspace, stored)
     assert not import_review(curate, workspace, folder)["changed"]
     assert rows(workspace, stored) == before
-    decide(folder, frame, 3, "accept")
+    decide(folder, frame, 2, "accept")
     path = folder / "label_2" / f"{frame}.txt"
     path.write_text("\n".join(path.read_text().splitlines()[:2]) + "\n")
     assert import_review(curate, workspace, folder)["added"] == 0
@@ -310,9 +254,9 @@ def test_human_labels_are_marked_in_every_output(
     untouched = curate("explain", other, 0, "-w", workspace.root)[1]
     assert "differ" not in untouched
     found = read_frame(workspace, frame, 1, "pspsl")
-    assert (len(found.labels), found.weights.tolist()) == (1, [0.0])
-    assert found.human_boxes.shape == (3, 7)
-    assert np.isfinite(found.human_boxes).all()
+    assert found.numbers.tolist() == [0, 1, 2, 1_000_003]
+    assert found.weights.tolist() == [1, 0, 1, 1]
+    assert found.decisions.tolist() == ["accepted", "rejected", "moved", "added"]
     assert curate("report", "-w", workspace.root)[0] == 0
     page = next((workspace.root / "reports").glob("*.html")).read_text()
     assert "1 accepted, 1 added, 1 moved, 1 rejected" in page
@@ -357,15 +301,15 @@ def spoil_text(folder: Path, frame: str) -> None:
 def spoil_both(folder: Path, frame: str) -> None:
     """Write the same object twice."""
     path = folder / "label_2" / f"{frame}.txt"
-    decide(folder, frame, 1, "accept")
+    decide(folder, frame, 0, "accept")
     path.write_text(path.read_text() + path.read_text().splitlines()[0] + "\n")
 
 
 INVALID_EDITS = (
     (lambda folder, frame: (folder / "review.json").unlink(), (), "review.json: no such file"),
     (spoil_text, (), "fields, but label lines"),
-    (spoil_both, (), "cannot overlap: reject one of box 1 ("),
-    (lambda folder, frame: decide(folder, frame, 1, "perhaps"), (), "decision 'perhaps'"),
+    (spoil_both, (), "cannot overlap: reject one of label 0 ("),
+    (lambda folder, frame: decide(folder, frame, 0, "perhaps"), (), "decision 'perhaps'"),
     (lambda folder, frame: None, ("--answer", "nowhere"), "nowhere: no such folder"),
     (lambda folder, frame: None, ("--accept", "000099"), "'000099' is not in this review"),
 )
@@ -377,7 +321,7 @@ def test_an_invalid_import_gives_one_line_and_stores_nothing(
     """Not even the valid half; an existing folder is not changed."""
     whole = tmp_path / "review"
     frame = export_review(curate, weighted, whole, *only_first(weighted))
-    decide(whole, frame, 2, "accept")
+    decide(whole, frame, 1, "accept")
     for number, (spoil, options, message) in enumerate(INVALID_EDITS):
         folder = tmp_path / str(number)
         shutil.copytree(whole, folder)

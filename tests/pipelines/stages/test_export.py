@@ -1,5 +1,6 @@
 """export: which frames are exported, and in which formats."""
 
+import json
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -9,7 +10,7 @@ from sqlalchemy import text
 from support.pipelines_cli import Curate
 from support.rounds import run_workspace
 
-from curate.errors import ConfigError, DataError, WorkspaceError
+from curate.errors import ConfigError, DataError, FramesFailed, WorkspaceError
 from curate.training.labels import WeightedLabels
 from pipelines.workspace.workspace import Workspace
 
@@ -68,10 +69,10 @@ def test_an_unlabeled_frame_with_only_zero_weights_is_exported(
 def test_formats_are_chosen_by_name(curate: Curate, workspace: Workspace, tmp_path: Path) -> None:
     """Into the workspace or another folder; the error for unknown formats lists the known ones."""
     run(workspace)
-    folder = ("-w", workspace.root)
+    folder, made = ("-w", workspace.root), workspace.root / "exports" / "round-01-pspsl-kitti"
     code, out, _ = curate("export", "--format", "kitti", *folder)
-    assert (code, out) == (0, f"18 labels of round 1 in {workspace.root}/exports/kitti\n")
-    folders = [workspace.root / "exports" / "kitti" / name for name in ("weight", "label_2")]
+    assert (code, out) == (0, f"18 labels of round 1 in {made}\n")
+    folders = [made / name for name in ("weight", "label_2")]
     listed, objects = (
         [line for path in folder.iterdir() for line in path.read_text().splitlines()]
         for folder in folders
@@ -159,3 +160,83 @@ def test_a_manually_changed_weight_is_reported_and_not_exported(
         assert len(err.splitlines()) == 1
     assert (workspace.root / "exports" / "labels.sqlite").read_bytes() == exported
     assert not list(tmp_path.glob("labels.*"))
+
+
+def test_an_export_of_one_policy_never_replaces_that_of_another(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """By default every file has its round and policy in its name, in every format."""
+    run(workspace)
+    folder = workspace.root / "exports"
+    before = {path.name: path.read_bytes() for path in folder.glob("*.sqlite")}
+    assert {"labels.sqlite", "round-01-pspsl.sqlite"} <= set(before)
+    assert curate("solve", "--policy", "spsl", "-w", workspace.root)[0] == 0
+    ends = {
+        "sqlite": ".sqlite", "csv": ".csv", "parquet": ".parquet", "kitti": "-kitti",
+        "openpcdet": "-openpcdet", "mmdet3d": "-mmdet3d", "coco": "-coco.json", "st3d": "-st3d",
+    }  # fmt: skip
+    for name, end in ends.items():
+        for policy in ("pspsl", "spsl"):
+            code, _, err = curate(
+                "export", "--format", name, "--policy", policy, "-w", workspace.root
+            )
+            assert code == 0, err
+            assert (folder / f"round-01-{policy}{end}").exists()
+    made = {f"round-01-{policy}{end}" for policy in ("pspsl", "spsl") for end in ends.values()}
+    assert {each.name for each in folder.iterdir()} == {*before, *made}
+    assert {path: (folder / path).read_bytes() for path in before} == before
+    for path in ("pspsl", "spsl"):
+        with closing(sqlite3.connect(folder / f"round-01-{path}.sqlite")) as connection:
+            query = "SELECT DISTINCT policy FROM weighted_labels"
+            assert connection.execute(query).fetchall() == [(path,)]
+
+
+@pytest.fixture
+def with_failed(curate: Curate, workspace: Workspace, toy_kitti: Path) -> tuple[Workspace, str]:
+    """Return a workspace with weights, and the name of a frame that failed."""
+    name = first(workspace, "unlabeled")
+    (toy_kitti / "training" / "velodyne" / f"{name}.bin").write_bytes(b"damaged")
+    for command in ("predict", "repredict", "score", "solve"):
+        curate(command, "-w", workspace.root)
+    return workspace, name
+
+
+@pytest.mark.parametrize("file_format", ["sqlite", "csv", "kitti"])
+def test_a_failed_frame_is_reported_by_the_export(
+    curate: Curate, with_failed: tuple[Workspace, str], file_format: str
+) -> None:
+    """In one line, in JSON, and again by an export that is up to date."""
+    workspace, name = with_failed
+    command = ("export", "--format", file_format, "-w", workspace.root)
+    for _ in range(2):
+        code, out, _ = curate(*command)
+        assert code == 0
+        assert (
+            f"failed frames that are missing from the export: 1 ({name}); "
+            "see `curate status --failed`\n"
+        ) in out
+    code, out, _ = curate(*command, "--json")
+    assert code == 0
+    assert json.loads(out)[0]["missing"] == [name]
+
+
+@pytest.mark.parametrize("file_format", ["sqlite", "csv", "kitti"])
+def test_strict_makes_a_missing_frame_an_error(
+    curate: Curate, with_failed: tuple[Workspace, str], file_format: str
+) -> None:
+    """Nothing is written."""
+    workspace, name = with_failed
+    code, _, err = curate("export", "--format", file_format, "--strict", "-w", workspace.root)
+    assert code == FramesFailed.exit_code
+    assert err.startswith(
+        f"error: --strict: failed frames of round 1 that would be missing: 1 ({name}); see"
+    )
+    assert not list((workspace.root / "exports").glob("round-*"))
+
+
+def test_strict_exports_complete_labels(curate: Curate, workspace: Workspace) -> None:
+    """It changes nothing if no frame failed; frames of another policy's round do not count."""
+    run(workspace)
+    code, out, _ = curate("export", "--format", "csv", "--strict", "--json", "-w", workspace.root)
+    assert code == 0
+    assert json.loads(out)[0]["missing"] == []

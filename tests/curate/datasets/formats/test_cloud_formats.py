@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from curate.datasets.formats.clouds import read_cloud
+from curate.datasets.formats.point_layout import PointLayout
 from curate.errors import DataError
 
 POINTS = np.random.default_rng(0).uniform(-50, 50, (40, 4)).astype(np.float32)
@@ -152,3 +153,128 @@ def test_a_damaged_header_gives_one_error_and_no_warning(tmp_path: Path) -> None
         with pytest.raises(DataError, match=r"a\.npy: not a readable"):
             read_cloud(path)
     assert not recorded
+
+
+def write_pcd(path: Path, fields: str, values: bytes, **entries: str) -> Path:
+    """Write a binary PCD of two points.
+
+    Args:
+        path: the file.
+        fields: name, type with size and count of each field, such as "x F4 1, _ U1 4".
+        values: content of the points.
+        entries: further or other entries of the header.
+    """
+    parts = [part.split() for part in fields.split(", ")]
+    header = {
+        "VERSION": ".7",
+        "FIELDS": " ".join(name for name, _, _ in parts),
+        "SIZE": " ".join(kind[1] for _, kind, _ in parts),
+        "TYPE": " ".join(kind[0] for _, kind, _ in parts),
+        "COUNT": " ".join(count for _, _, count in parts),
+        "WIDTH": "2",
+        "HEIGHT": "1",
+        "VIEWPOINT": "0 0 0 1 0 0 0",
+        "POINTS": "2",
+        **entries,
+        "DATA": "binary",
+    }
+    lines = [f"{key} {value}" for key, value in header.items() if value]
+    path.write_bytes("\n".join(["# .PCD v.7", *lines, ""]).encode() + values)
+    return path
+
+
+TWO = np.array([[4, 1, -1, 0.5], [8, -2, -1.5, 0.25]], dtype=np.float32)
+
+
+def test_padding_takes_the_bytes_of_its_count(tmp_path: Path) -> None:
+    """Padding of four, no and three bytes, as in clouds that ROS' drivers record."""
+    fields = "x F4 1, y F4 1, z F4 1, _ U1 4, intensity F4 1, _ U1 0, t F8 1, _ U1 3"
+    rows = [struct.pack("<3f4xfd3x", *point, 9.5) for point in TWO.tolist()]
+    path = write_pcd(tmp_path / "a.pcd", fields, b"".join(rows))
+    np.testing.assert_array_equal(read_cloud(path), TWO)
+    text = path.read_bytes().partition(b"DATA")[0].decode() + "DATA ascii\n"
+    lines = [f"{x} {y} {z} 0 0 0 0 {i} 9.5 0 0 0" for x, y, z, i in TWO.tolist()]
+    path.write_text(text + "\n".join(lines) + "\n")
+    np.testing.assert_array_equal(read_cloud(path), TWO)
+    content = b"".join(column.tobytes() for column in TWO[:, :3].T) + bytes(8)
+    content += TWO[:, 3].tobytes() + bytes(16 + 6)
+    literal = packed(content)
+    head = text.replace("ascii", "binary_compressed").encode()
+    path.write_bytes(head + struct.pack("<II", len(literal), len(content)) + literal)
+    np.testing.assert_array_equal(read_cloud(path), TWO)
+
+
+@pytest.mark.parametrize("name", ["Intensity", "INTENSITY", "intensities", "reflectivity", "i"])
+def test_the_intensity_is_found_by_its_usual_names(tmp_path: Path, name: str) -> None:
+    """In every format with names."""
+    path = write_pcd(tmp_path / "a.pcd", f"x F4 1, y F4 1, z F4 1, {name} F4 1", TWO.tobytes())
+    np.testing.assert_array_equal(read_cloud(path), TWO)
+    table = np.zeros(2, [("t", "f8"), (name, "f4"), ("z", "f8"), ("y", "f8"), ("x", "f8")])
+    for field, column in zip(("x", "y", "z", name), TWO.T, strict=True):
+        table[field] = column
+    np.save(tmp_path / "a.npy", table)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.npy"), TWO)
+    np.save(tmp_path / "a.npy", table.reshape(2, 1))  # an organised cloud
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.npy"), TWO)
+    names = "".join(f"property double {axis}\n" for axis in "xyz")
+    rows = "\n".join(" ".join(map(str, row)) for row in TWO.tolist())
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\ncomment Created by CloudCompare\nelement vertex 2\n{names}"
+        f"property float scalar_{name}\nend_header\n{rows}\n"
+    )
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), TWO)
+
+
+def test_two_fields_that_may_be_the_intensity_are_refused_by_name(tmp_path: Path) -> None:
+    """Ouster's driver writes intensity and reflectivity."""
+    fields = "x F4 1, y F4 1, z F4 1, intensity F4 1, reflectivity U2 1"
+    rows = [struct.pack("<4fH", *point[:3], 700, 51 * k) for k, point in enumerate(TWO.tolist())]
+    path = write_pcd(tmp_path / "a.pcd", fields, b"".join(rows))
+    with pytest.raises(DataError, match=r"intensity and reflectivity may all be the intensity"):
+        read_cloud(path)
+    layout = PointLayout(intensity_field="reflectivity", intensity_scale=255)
+    np.testing.assert_allclose(read_cloud(path, layout)[:, 3], [0, 0.2])
+
+
+def test_headers_of_other_programs(tmp_path: Path) -> None:
+    """CR LF, lower case, a byte order mark, COLUMNS, no POINTS, and comments of any language."""
+    body = "\r\n".join(" ".join(map(str, row)) for row in TWO.tolist())
+    head = "# Punktwolke für später\nversion .5\ncolumns x y z intensity\nsize 4 4 4 4\n"
+    head += "type f f f f\ncount 1 1 1 1\nwidth 2\nheight 1\ndata ascii\n"
+    content = "\ufeff" + head.replace("\n", "\r\n") + body
+    (tmp_path / "a.pcd").write_bytes(content.encode())
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), TWO)
+
+
+def test_an_organised_cloud_has_points_without_return(tmp_path: Path) -> None:
+    table = np.vstack([TWO, np.full((2, 4), np.nan, dtype=np.float32)])
+    size = {"WIDTH": "2", "HEIGHT": "2", "POINTS": "4"}
+    fields = "x F4 1, y F4 1, z F4 1, intensity F4 1"
+    path = write_pcd(tmp_path / "a.pcd", fields, table.tobytes(), **size)
+    np.testing.assert_array_equal(read_cloud(path), TWO)
+
+
+def test_a_header_that_contradicts_itself_is_rejected(tmp_path: Path) -> None:
+    fields = "x F4 1, y F4 1, z F4 1, intensity F4 1"
+    path = write_pcd(tmp_path / "a.pcd", fields, TWO.tobytes(), HEIGHT="2")
+    with pytest.raises(DataError, match=r"POINTS is 2, but WIDTH 2 times HEIGHT 2 is 4"):
+        read_cloud(path)
+    path = write_pcd(tmp_path / "a.pcd", fields, TWO.tobytes(), SIZE="4 4 4")
+    with pytest.raises(DataError, match="malformed PCD header; FIELDS, SIZE, TYPE and COUNT"):
+        read_cloud(path)
+    path = write_pcd(tmp_path / "a.pcd", fields.replace("x", "range"), TWO.tobytes())
+    with pytest.raises(DataError, match="no column x among range, y, z, intensity"):
+        read_cloud(path)
+
+
+def test_a_pose_of_the_sensor_is_logged_once_and_not_applied(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As other readers of PCD do; the calibration says where the LiDAR is."""
+    fields = "x F4 1, y F4 1, z F4 1, intensity F4 1"
+    for name in ("a.pcd", "b.pcd"):
+        path = write_pcd(
+            tmp_path / name, fields, TWO.tobytes(), VIEWPOINT="1 2 0.5 0.707 0 0 0.707"
+        )
+        np.testing.assert_array_equal(read_cloud(path), TWO)
+    assert caplog.text.count("VIEWPOINT is 1 2 0.5 0.707 0 0 0.707 and is not applied") == 1

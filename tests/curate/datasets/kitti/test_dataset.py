@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 from support.toys import toy_calibration, write_toy_kitti
 
-from curate.datasets.kitti.dataset import (
-    KittiDataset,
-    read_calibration,
-    read_points,
-    write_calibration,
-)
+from curate.datasets.kitti.calibration import read_calibration, write_calibration
+from curate.datasets.kitti.dataset import KittiDataset, read_points
 from curate.errors import DataError
 from curate.frames import Calibration
 from curate.geometry.projection import project_points
@@ -117,7 +113,7 @@ def test_a_missing_frame_in_a_list_fails_when_read(toy_kitti):
     """The error contains the missing file."""
     with pytest.raises(DataError) as caught:
         KittiDataset(toy_kitti).read("000777")
-    assert one_line(caught).endswith("velodyne/000777.bin: no such velodyne file")
+    assert one_line(caught).endswith("velodyne/000777.bin: no such point file")
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../000001", "a/b", "/etc/passwd", "a\\b", "a\0b"])
@@ -139,7 +135,7 @@ def test_a_list_must_be_text(toy_kitti):
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"\xef\xbb\xbf000001\n")
     assert KittiDataset(toy_kitti).splits()["train"] == ("000001",)
     (toy_kitti / "ImageSets" / "train.txt").write_bytes(b"000001\n\xff\xfe\n")
-    with pytest.raises(DataError, match=r"train\.txt: not UTF-8 text"):
+    with pytest.raises(DataError, match=r"train\.txt:2: not UTF-8 text"):
         KittiDataset(toy_kitti).splits()
 
 
@@ -155,9 +151,16 @@ def test_annotations_are_in_the_lidar_frame(toy_kitti):
 def test_an_invalid_label_line_is_reported(toy_kitti):
     """`annotations` raises with file and line."""
     path = toy_kitti / "training" / "label_2" / "000002.txt"
-    path.write_text("Unicorn" + path.read_text()[3:])
-    with pytest.raises(DataError, match=r"000002\.txt:1: unknown category 'Unicorn'"):
+    path.write_text(path.read_text().replace("Car ", "Car one ", 1))
+    with pytest.raises(DataError, match=r"000002\.txt:1: "):
         KittiDataset(toy_kitti).annotations("000002")
+
+
+def test_any_category_is_read(toy_kitti):
+    """Names are compared with the declared categories when a workspace is created."""
+    path = toy_kitti / "training" / "label_2" / "000002.txt"
+    path.write_text("Unicorn" + path.read_text()[3:])
+    assert KittiDataset(toy_kitti).annotations("000002").categories[0] == "Unicorn"
 
 
 def test_an_empty_sweep_is_valid(tmp_path):
@@ -212,7 +215,9 @@ def test_calibration_is_read_by_name(tmp_path):
         ("R0_rect: 1", "R0_rect: 1 1", r":3: 10 numbers, expected 3 x 3"),
         ("0.3\n", "inf\n", r":4: contains NaN or infinite numbers"),
         ("0.3\n", "zero\n", r":4: could not convert string to float: 'zero'"),
-        ("R0_rect: 1 0 0", "R0_rect: 0 0 0", "cannot be inverted"),
+        ("R0_rect: 1 0 0", "R0_rect: 0 0 0", "is not a rotation .* lengths are 0, 1, 1"),
+        ("R0_rect: 1 0 0", "R0_rect: 1 0.1 0", "is not a rotation"),
+        ("R0_rect: 1 0 0", "R0_rect: -1 0 0", "mirrors"),
     ],
 )
 def test_invalid_calibration_is_reported_with_its_position(tmp_path, former, later, message):
@@ -238,7 +243,7 @@ def test_calibration_is_written_and_read_exactly(tmp_path):
     """Every bit of the matrices is the same."""
     generator = np.random.default_rng(0)
     calibration = Calibration(generator.normal(size=(3, 4)), toy_calibration().lidar_to_camera)
-    calibration.lidar_to_camera[:3] += generator.normal(scale=0.01, size=(3, 4))
+    calibration.lidar_to_camera[:3] += generator.normal(scale=0.001, size=(3, 4))
     write_calibration(tmp_path / "a.txt", calibration)
     back = read_calibration(tmp_path / "a.txt")
     np.testing.assert_array_equal(back.projection, calibration.projection)

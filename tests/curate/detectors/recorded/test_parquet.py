@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.exported import BOXES, CATEGORIES, SCORES, toy_labels
+from support.fatal_files import write_aborting_parquet
 from support.toys import empty_frame
 
 from curate.detectors.recorded import RecordedDetector
@@ -113,7 +114,7 @@ VIEWS = {"view": [0, 1, 1], "flip_y": [0, 1, 1], "rotation_rad": [0, 0, 0], "sca
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"score": [0.9, 1.5, 0.5]}, "frame a: box 1: the score is not in"),
+        ({"score": [0.9, 1.5, 0.5]}, "frame a: scores from 0 to 1.5 are not in"),
         ({"length": [0.0, 1.0, 4.0]}, "frame a: box 0: length, width or height is not positive"),
         ({"z": [np.nan, 1.0, 4.0]}, "frame a: box 0: a number is NaN"),
         ({"z": [None, 1.0, 4.0]}, "row group 0: 1 rows have no z"),
@@ -186,3 +187,20 @@ def test_only_a_few_row_groups_are_in_memory(tmp_path, monkeypatch):
     cached = 30 - len(read)
     assert cached <= 2
     assert read == list(reversed(range(30 - cached)))
+
+
+def test_a_file_that_makes_pyarrow_abort_is_rejected(tmp_path):
+    """Case 24: it ended the process with SIGABRT."""
+    write_aborting_parquet(tmp_path / "a.parquet")
+    with pytest.raises(
+        DataError, match=r"pyarrow ends the process \(SIGABRT: Definition"
+    ) as caught:
+        RecordedDetector(tmp_path / "a.parquet")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_without_the_column_of_frames_is_rejected(tmp_path):
+    """Also if another column of text is missing."""
+    path = write(tmp_path / "a.parquet", frame=None, category=None)
+    with pytest.raises(DataError, match="no column frame, category; it has score"):
+        RecordedDetector(path)

@@ -1,0 +1,161 @@
+"""Category names of label files, detector, segmenter and settings, compared before work starts.
+
+The ground truth of unlabeled frames is never read for it: only the stored names of X_l and val.
+"""
+
+import logging
+from collections.abc import Collection, Iterable, Mapping
+
+from sqlalchemy import func, select
+
+from curate.datasets.kitti.labels import DONT_CARE
+from curate.detectors.base import Detector, NamesCategories
+from curate.errors import ConfigError, CurateError
+from curate.names import NamedSide, NameFinding, compare_names
+from curate.spelling import did_you_mean
+from db import bulk
+from db.models import BOX_COLUMNS
+from pipelines import registry
+from pipelines.assembly import check_segmenter_names, open_detector
+from pipelines.workspace.config import Config
+from pipelines.workspace.setup import label_names
+from pipelines.workspace.workspace import Workspace
+
+_log = logging.getLogger(__name__)
+
+
+def check_names(workspace: Workspace) -> None:
+    """Compare the names that are known without a detector, at the start of a command.
+
+    If `dataset.rename` has changed, the stored ground truth is renamed first.
+
+    Raises:
+        ConfigError: if names differ so that no work can start.
+    """
+    _rename_stored(workspace)
+    report(find_differences(workspace))
+
+
+def find_differences(workspace: Workspace) -> list[NameFinding]:
+    """Return the differences between label files, segmenter and settings; nothing is changed."""
+    config = workspace.config
+    findings = compare_names(
+        label_names(config, stored_names(workspace)), config.dataset.categories
+    )
+    return [*findings, *_settings(config), *_segmenter(config)]
+
+
+def check_detector_names(config: Config, detector: Detector) -> None:
+    """Compare the names that a detector returns, if it knows them before it sees a frame.
+
+    Raises:
+        ConfigError: if they differ so that no work can start.
+    """
+    report(detector_differences(config, detector))
+
+
+def detector_differences(config: Config, detector: Detector) -> list[NameFinding]:
+    """Return the differences between a detector's names and `dataset.categories`."""
+    if not isinstance(detector, NamesCategories):
+        return []
+    path = config.detector.path
+    title = (
+        f"the results {path}" if config.detector.name == "recorded" else "the detector's outputs"
+    )
+    return compare_names(
+        NamedSide(
+            title,
+            sorted(detector.category_names()),
+            "detector.rename",
+            config.detector.rename or {},
+        ),
+        config.dataset.categories,
+    )
+
+
+def check_before_init(config: Config) -> None:
+    """Compare the names of settings, segmenter and a user-supplied detector with each other.
+
+    A detector that cannot be opened is only a warning: its file may be written later.
+
+    Raises:
+        ConfigError: if names differ so that no work can start.
+    """
+    findings = [*_settings(config), *_segmenter(config)]
+    path, name = config.detector.path, config.detector.name
+    if path is not None and hasattr(registry.DETECTORS.load(name), "category_names"):
+        try:
+            findings += detector_differences(config, open_detector(config, path))
+        except CurateError as error:
+            findings.append(NameFinding(False, str(error)))
+    report(findings)
+
+
+def report(findings: Iterable[NameFinding]) -> None:
+    """Log the findings as warnings.
+
+    Raises:
+        ConfigError: if one is wrong; the message has all that are.
+    """
+    wrong = []
+    for finding in findings:
+        if finding.wrong:
+            wrong.append(finding.message)
+        else:
+            _log.warning("%s", finding.message)
+    if wrong:
+        raise ConfigError("; ".join(wrong))
+
+
+def stored_names(workspace: Workspace) -> Mapping[str, int]:
+    """Return the number of stored objects of X_l and val by category, sorted by name."""
+    truth = bulk.table("ground_truth")
+    query = select(truth.c.category, func.count()).group_by(truth.c.category)
+    return dict(sorted(workspace.database.rows(query)))
+
+
+def _rename_stored(workspace: Workspace) -> None:
+    """Rename the stored ground truth, if `dataset.rename` has changed since it was read."""
+    rename = workspace.config.dataset.rename or {}
+    stored = stored_names(workspace)
+    changes = {name: rename[name] for name in stored if rename.get(name, name) != name}
+    if not changes:
+        return
+    truth = bulk.table("ground_truth")
+    no_box = dict.fromkeys(BOX_COLUMNS)
+    with workspace.database.writing() as connection:
+        for name, target in changes.items():
+            values = {"category": target, **(no_box if target == DONT_CARE else {})}
+            connection.execute(truth.update().where(truth.c.category == name).values(**values))
+            _log.warning("%d objects %s are %s now (dataset.rename)", stored[name], name, target)
+
+
+def _settings(config: Config) -> list[NameFinding]:
+    """Return findings for categories in the options of policies that do not exist."""
+    categories = config.dataset.categories
+    return [
+        NameFinding(
+            False,
+            f"solve.options.{policy}.{key}: {name!r} is not in dataset.categories "
+            f"({', '.join(categories)}){did_you_mean(name, categories)}",
+        )
+        for policy, options in config.solve.options.items()
+        for key, values in options.items()
+        if key.endswith("per_category") and isinstance(values, Mapping)
+        for name in _unknown(values, categories)
+    ]
+
+
+def _unknown(names: Collection[str], categories: Collection[str]) -> list[str]:
+    return [name for name in names if name not in categories]
+
+
+def _segmenter(config: Config) -> list[NameFinding]:
+    """Return a finding if a prior counts pixels of a category without classes."""
+    if not any(registry.PRIORS.takes(name, "segmenter") for name in config.run.priors):
+        return []
+    try:
+        check_segmenter_names(config)
+    except ConfigError as error:
+        return [NameFinding(True, str(error))]
+    return []
