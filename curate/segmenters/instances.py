@@ -161,10 +161,13 @@ def _by_frame(
     of_camera = {name: each for name, each in images.items() if camera and _folder(name) == camera}
     found = of_camera or images
     if not len(frame_ids):
-        frames = {last_part(name): objects for name, objects in found.items()}
-        if len(frames) < len(found):
-            raise DataError(f"{path}: contains several images of a frame, of which only one counts")
-        return frames
+        by_name = {last_part(name): objects for name, objects in found.items()}
+        if len(by_name) < len(found):
+            raise DataError(
+                f"{path}: several images of one frame, as of several cameras; keep those of the "
+                "camera that the data set reads"
+            )
+        return by_name
     matched, unmatched = frame_ids.match(found, path)
     if unmatched and not matched:
         raise DataError(
