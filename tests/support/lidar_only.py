@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.calibration import write_calibration
 from curate.datasets.kitti.labels import from_detections, write_objects
 from curate.detections import Detections
 from curate.frames import Calibration

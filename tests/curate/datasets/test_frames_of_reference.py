@@ -17,7 +17,7 @@ from support.dataset_layouts import DRIVE, write_toy_folder, write_toy_raw
 from support.rigs import Rig, assert_equal_boxes, detections, rigs
 from support.toys import write_toy_kitti
 
-from curate.datasets.kitti.dataset import write_calibration
+from curate.datasets.kitti.calibration import write_calibration
 from curate.datasets.kitti.labels import from_annotations, from_detections
 from curate.detections import Detections
 from curate.errors import ConfigError, DataError

@@ -10,7 +10,7 @@ from oracles.camera_boxes import in_camera
 from support.reviews import shown
 from support.rigs import NAMES, Rig, assert_equal_boxes, detections, rigs
 
-from curate.datasets.kitti.dataset import read_calibration
+from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.labels import read_objects
 from curate.detections import Detections
 from curate.frames import Frame

@@ -108,7 +108,7 @@ def test_an_older_table_counts_the_labels_of_a_frame_from_one(tmp_path: Path) ->
             "000001,7,",
             "k '7' is not in frame 000001 of this review; it has 0, 1, 1000000",
         ),
-        ("f000001_1", "accept", "000001,1,", "000009,1,", "frame '000009' is not in this review"),
+        ("f000001_1", "accept", "000001,1,", "000009,1,", "there is no frame '000009'"),
         (
             "f000001_1",
             "accept",

@@ -12,7 +12,8 @@ from support.pipelines_cli import Curate
 from support.rigs import TILTED, Rig, assert_equal_boxes
 from support.toys import toy_calibration
 
-from curate.datasets.kitti.dataset import KittiDataset, write_calibration
+from curate.datasets.kitti.calibration import write_calibration
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.detections import Annotations
 from curate.exporters.base import BOX_COLUMNS
 from curate.frames import Calibration

@@ -11,7 +11,8 @@ from support.pipelines_cli import Curate
 from support.terminals import terminal
 from support.toys import toy_calibration
 
-from curate.datasets.kitti.dataset import KittiDataset, write_calibration
+from curate.datasets.kitti.calibration import write_calibration
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import ConfigError, DataError
 from curate.frames import Frame
 from pipelines.workspace.workspace import Workspace

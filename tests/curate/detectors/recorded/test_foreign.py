@@ -178,10 +178,13 @@ def test_every_format_knows_its_names(written):
 
 
 def test_a_damaged_result_file_does_not_hide_the_names_of_others(tmp_path):
-    """It fails its frame alone, when that is predicted."""
+    """As long as its frame is not in the data set; otherwise the record is rejected."""
     folder = write_kitti(tmp_path / "results")
     (folder / "000003.txt").write_bytes(b"\xff\xfe 1 2\n\nDontCare 1\n")
-    assert RecordedDetector(folder).category_names() == {"Car", "Pedestrian"}
+    found = RecordedDetector(folder, frame_ids=tuple(FRAMES))
+    assert found.category_names() == {"Car", "Pedestrian"}
+    with pytest.raises(DataError, match=r"000003\.txt"):
+        RecordedDetector(folder)
 
 
 def test_the_names_of_further_passes_count(tmp_path):
@@ -550,7 +553,8 @@ def test_frames_are_matched_in_every_spelling(tmp_path, kind, spelling):
 def test_mmdetection3d_names_frames_by_number_or_path(tmp_path, key, names):
     """As its versions do."""
     entries = [
-        {key: name, **entry} for name, entry in zip(names, mmdetection3d().values(), strict=True)
+        {key: name, "box_type_3d": "LiDAR", **entry}
+        for name, entry in zip(names, mmdetection3d().values(), strict=True)
     ]
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(entries))
     detector = RecordedDetector(
@@ -560,7 +564,7 @@ def test_mmdetection3d_names_frames_by_number_or_path(tmp_path, key, names):
 
 
 def test_a_path_is_matched_by_its_last_part_without_a_data_set(tmp_path):
-    entry = {"lidar_path": "velodyne/000001.bin", **mmdetection3d()["000001"]}
+    entry = {"lidar_path": "a/000001.bin", "box_type_3d": "LiDAR", **mmdetection3d()["000001"]}
     (tmp_path / "a.pkl").write_bytes(pickle.dumps([entry]))
     detector = RecordedDetector(tmp_path / "a.pkl", classes=CLASSES)
     assert len(detector.predict(frame("000001"))) == 2
