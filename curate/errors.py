@@ -14,6 +14,9 @@ CurateError (1)
 Each message is one line: what is wrong, where (file and line), and what to do.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class CurateError(Exception):
     """Base class of the tree; `exit_code` is the exit status of the command that raised it."""
@@ -93,3 +96,12 @@ def joined_lines(error: BaseException | None) -> str:
 def first_line(error: BaseException) -> str:
     """Return the first line of another library's error message, or the error's type name."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+@contextmanager
+def error_prefix(place: str) -> Iterator[None]:
+    """Put a place, such as a file, a frame or a setting, in front of the message of an error."""
+    try:
+        yield
+    except CurateError as error:
+        raise type(error)(f"{place}: {error}") from error

@@ -7,12 +7,22 @@ y down, z forward, in metres; image coordinates are pixels from the top left cor
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
 from curate.errors import ConfigError
 from curate.shapes import Float, Float32, UInt8
+
+RotationY = Literal[
+    "calibration", "openpcdet", "mmdetection3d", "view-of-delft", "nuscenes", "dair-v2x"
+]
+"""The meaning of rotation_y in files of KITTI's form, named by who writes it.
+
+"calibration": an angle about the LiDAR's vertical from the direction in which the camera looks.
+"openpcdet", "mmdetection3d", "view-of-delft": -yaw - pi/2, whatever the mounting of the camera is.
+"nuscenes" (its export to KITTI), "dair-v2x": the heading projected into the camera's xz plane.
+All agree for a camera that looks along x and is level. See `curate.geometry.mounting`."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +34,13 @@ class Calibration:
         lidar_to_camera: (4, 4) LiDAR frame to rectified camera frame (KITTI's R0_rect * Tr).
         lidar_to_map: (4, 4) pose of the LiDAR in the map frame at the time of the sweep; None if
             the data set has no poses.
+        rotation_y: the meaning of rotation_y in the data set's label files.
     """
 
     projection: Float[np.ndarray, "3 4"]
     lidar_to_camera: Float[np.ndarray, "4 4"]
     lidar_to_map: Float[np.ndarray, "4 4"] | None = None
+    rotation_y: RotationY = "calibration"
 
     @property
     def lidar_to_image(self) -> Float[np.ndarray, "3 4"]:

@@ -31,7 +31,7 @@ lidar_to_camera = [[...], [...], [...]]
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -45,14 +45,22 @@ from curate.datasets.formats.images import check_image_size, read_optional_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.dataset import checked_frames, read_frame_lists
-from curate.datasets.kitti.labels import read_objects, to_annotations
+from curate.datasets.kitti.labels import read_annotations
 from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
-from curate.frames import Calibration, Camera, Frame, FrameFiles, calibration_without_camera
+from curate.frames import (
+    Calibration,
+    Camera,
+    Frame,
+    FrameFiles,
+    RotationY,
+    calibration_without_camera,
+)
+from curate.geometry.mounting import check_lidar_to_camera, check_rotation_y
 from curate.spelling import did_you_mean
 
 DESCRIPTION = "dataset.toml"
@@ -93,10 +101,12 @@ class FolderDataset:
         root: the folder with dataset.toml.
         layout: the declared layout of the point files, in place of the keys of dataset.toml.
         follow_links: whether links and paths in dataset.toml may lead out of the folder.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
         DataError: if dataset.toml is missing or malformed.
-        ConfigError: if the layout and dataset.toml contradict each other.
+        ConfigError: if `rotation_y` is unknown, or the layout and dataset.toml contradict each
+            other.
     """
 
     name = "folder"
@@ -107,8 +117,11 @@ class FolderDataset:
         *,
         layout: PointLayout = UNDECLARED,
         follow_links: bool = False,
+        rotation_y: RotationY = "calibration",
     ) -> None:
+        check_rotation_y(rotation_y)
         self.root = Path(root)
+        self._rotation_y = rotation_y
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._path = self.root / DESCRIPTION
         self._boundary.check(self._path)
@@ -232,19 +245,20 @@ class FolderDataset:
                     "to the folder of label files"
                 )
             raise DataError(f"{expected}: no such label file")
-        objects = read_objects(label, categories=None)
-        return to_annotations(objects, self._label_calibration(frame_id))
+        return read_annotations(label, self._label_calibration(frame_id), categories=None)
 
     def _label_calibration(self, frame_id: str) -> Calibration:
         """Return the calibration that the labels refer to: that of the first camera."""
         if not self._calibrations:
-            return calibration_without_camera()
+            return replace(calibration_without_camera(), rotation_y=self._rotation_y)
         return self._calibration(next(iter(self._calibrations)), frame_id)
 
     def _calibration(self, camera: str, frame_id: str) -> Calibration:
         """Return the calibration of a camera in a frame."""
         found = self._calibrations[camera]
-        return read_calibration(_of_frame(found, frame_id)) if isinstance(found, Path) else found
+        if isinstance(found, Path):
+            found = read_calibration(_of_frame(found, frame_id))
+        return replace(found, rotation_y=self._rotation_y)
 
     @cached_property
     def _calibrations(self) -> Mapping[str, Calibration | Path]:
@@ -388,8 +402,7 @@ def _read_calibration(path: Path, place: str, calibration: Path | Mapping[str, A
     extrinsic = np.eye(4)
     rows = _matrix(path, place, calibration, "lidar_to_camera", ((3, 4), (4, 4)))
     extrinsic[: len(rows)] = rows
-    if abs(np.linalg.det(extrinsic)) < 1e-6:
-        raise DataError(f"{path}: {place}.lidar_to_camera cannot be inverted")
+    check_lidar_to_camera(extrinsic, f"{path}: {place}.lidar_to_camera")
     return Calibration(projection, extrinsic)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from curate.detections import Annotations
 from curate.frames import Calibration, Camera
+from curate.geometry.mounting import observation_angles
 from curate.geometry.projection import camera_of_boxes, image_rectangles
-from curate.geometry.similarity import wrap_angle
 
 # Margin around the image for truncation, in image widths and heights. It bounds the 2D box of an
 # object that is partly behind the camera.
@@ -69,15 +69,3 @@ def _areas(rectangles: np.ndarray) -> np.ndarray:
     """Return (n,) areas in pixels of left, top, right, bottom."""
     areas: np.ndarray = np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)
     return areas
-
-
-def observation_angles(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """Return (n,) KITTI's alpha in radians: rotation_y minus the angle of the ray to the centre."""
-    to_camera = calibration.lidar_to_camera
-    centres = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
-    zeros = np.zeros(len(boxes))
-    headings = np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), zeros])
-    headings = headings @ to_camera[:3, :3].T
-    rotation_y = np.arctan2(-headings[:, 2], headings[:, 0])
-    angles: np.ndarray = wrap_angle(rotation_y - np.arctan2(centres[:, 0], centres[:, 2]))
-    return angles

@@ -1,38 +1,19 @@
-"""Checks of a frame's data and of the conventions of a detector's boxes, for `curate doctor`.
+"""Checks of a frame's data and of a detector's boxes, for `curate doctor`."""
 
-To find a wrong box convention, the boxes are converted as each common mistake would require. If the
-converted boxes contain more LiDAR points than can be expected of correct boxes, compared with the
-points that they lose, the mistake is reported.
-"""
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from curate.detections import Detections
-from curate.frames import Calibration, Frame
-from curate.geometry.points_in_boxes import count_points_in_boxes, points_in_box_mask
+from curate.evaluation.box_conventions import BoxesInSweep, suspect_convention
+from curate.frames import Frame
+from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.geometry.projection import box_rectangles, in_camera_view
-from curate.geometry.similarity import wrap_angle
 
-# Limits of the ratio gained points / lost points, above which a conversion is reported. Measured on
-# 24 KITTI frames with the boxes of a weak detector: in the correct convention the ratio stayed
-# below these limits; in a wrong one it exceeded the first limit in all frames, the second in 90 %,
-# the third in 75 % (lowered boxes gain points of the ground), and the last in about a third.
-_TURNED_LIMIT, _RAISED_LIMIT, _LOWERED_LIMIT, _NEGATED_LIMIT = 1.0, 0.75, 2.25, 2.5
-# At this multiple of the limit the finding is "wrong", not only "suspect".
-_CERTAIN = 1.3
-# Added to gained and lost points, because the ratio of a few points is noise.
-_PRIOR_POINTS = 3
-_MIN_POINTS = 20
-# Limits the influence of a single near box.
-_MAX_POINTS_PER_BOX = 100
 _TOP_BOXES = 20
 # Share of boxes outside the image above which they are reported: some are cut by its border.
 _OUTSIDE_LIMIT = 0.1
-
-_Conversion = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -139,91 +120,29 @@ def _projections(frame: Frame, found: Detections) -> Finding:
 
 
 def _convention(frame: Frame, found: Detections) -> Finding:
-    """Return the mistake that explains the points best, if its ratio is above its limit."""
-    top = found.boxes[np.argsort(-found.scores, kind="stable")[:_TOP_BOXES]]
-    inside = sum(int(_inside(frame.points, box).sum()) for box in top)
-    summary = f"{inside} points in the {len(top)} boxes with the highest scores"
-    best, best_ratio = "", 0.0
-    for mistake, (convert, limit) in _conversions(frame.calibration).items():
-        gained, lost = _exchanged(frame.points, top, convert(top))
-        ratio = (gained + _PRIOR_POINTS) / (lost + _PRIOR_POINTS) / limit
-        if gained >= _MIN_POINTS and ratio > max(best_ratio, 1):
-            best, best_ratio = f"{summary}; {gained} more and {lost} fewer if {mistake}", ratio
-    if best:
-        return Finding("convention", "wrong" if best_ratio > _CERTAIN else "suspect", best)
-    if inside < _MIN_POINTS:
-        return Finding("convention", "suspect", f"{summary}: too few to decide; try another frame")
-    return Finding("convention", "ok", f"{summary}; no other convention explains them better")
+    top = found.select(np.argsort(-found.scores, kind="stable")[:_TOP_BOXES])
+    sweep = BoxesInSweep(frame.points, top.boxes, top.categories, frame.calibration)
+    where = f"the {len(top)} boxes with the highest scores"
+    return judge_convention("convention", [sweep], where, labels=False)
 
 
-def _exchanged(points: np.ndarray, boxes: np.ndarray, others: np.ndarray) -> tuple[int, int]:
-    """Return how many points are only in `others` (gained) and only in `boxes` (lost)."""
-    gained = lost = 0
-    for box, other in zip(boxes, others, strict=True):
-        before, after = _inside(points, box), _inside(points, other)
-        gained += min(int((after & ~before).sum()), _MAX_POINTS_PER_BOX)
-        lost += min(int((before & ~after).sum()), _MAX_POINTS_PER_BOX)
-    return gained, lost
+def judge_convention(
+    check: str, sweeps: Sequence[BoxesInSweep], where: str, *, labels: bool
+) -> Finding:
+    """Return the finding on the convention of boxes.
 
-
-def _inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Return (p,) bool, True for points in the upper four fifths of a box, without the ground."""
-    upper = box + np.array([0, 0, 0.1 * box[5], 0, 0, -0.2 * box[5], 0])
-    return points_in_box_mask(points, upper)
-
-
-def _conversions(calibration: Calibration) -> Mapping[str, tuple[_Conversion, float]]:
-    """Return the conversion that corrects each common mistake, and its limit."""
-    to_lidar = np.linalg.inv(calibration.lidar_to_camera)
-
-    def turned(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, yaw=boxes[:, 6] + np.pi / 2)
-
-    def mirrored(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, yaw=-boxes[:, 6])
-
-    def rotation_y(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, yaw=-boxes[:, 6] - np.pi / 2)
-
-    def raised(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, centres=boxes[:, :3] + np.outer(boxes[:, 5] / 2, [0, 0, 1]))
-
-    def lowered(boxes: np.ndarray) -> np.ndarray:
-        return _with(boxes, centres=boxes[:, :3] - np.outer(boxes[:, 5] / 2, [0, 0, 1]))
-
-    def from_camera(boxes: np.ndarray) -> np.ndarray:
-        centres = boxes[:, :3] - np.outer(boxes[:, 5] / 2, [0, 1, 0])
-        return _with(rotation_y(boxes), centres=centres @ to_lidar[:3, :3].T + to_lidar[:3, 3])
-
-    return {
-        "turned by 90 degrees: yaw is measured from y, or length and width are swapped": (
-            turned,
-            _TURNED_LIMIT,
-        ),
-        "yaw is negated: it grows clockwise": (mirrored, _NEGATED_LIMIT),
-        "yaw is KITTI's rotation_y, but must be -rotation_y - pi/2": (rotation_y, _TURNED_LIMIT),
-        "raised by half their height: z is the bottom of the box, not its centre": (
-            raised,
-            _RAISED_LIMIT,
-        ),
-        "lowered by half their height: z is the top of the box, not its centre": (
-            lowered,
-            _LOWERED_LIMIT,
-        ),
-        "converted from the camera frame, as in KITTI's label files": (
-            from_camera,
-            _TURNED_LIMIT,
-        ),
-    }
-
-
-def _with(
-    boxes: np.ndarray, yaw: np.ndarray | None = None, centres: np.ndarray | None = None
-) -> np.ndarray:
-    """Return a copy of the boxes with another yaw or other centres."""
-    changed = boxes.copy()
-    if yaw is not None:
-        changed[:, 6] = wrap_angle(yaw)
-    if centres is not None:
-        changed[:, :3] = centres
-    return changed
+    Args:
+        check: name of the check.
+        sweeps: the boxes.
+        where: describes the boxes, for the message.
+        labels: whether they are labels, not boxes of a detector.
+    """
+    found = suspect_convention(sweeps, labels=labels)
+    summary = f"{found.inside} points in {where}"
+    if found.mistake:
+        state = "wrong" if found.certain else "suspect"
+        return Finding(check, state, f"{summary}; {found.mistake}")
+    if found.undecided:
+        state = "ok" if labels else "suspect"
+        return Finding(check, state, f"{summary}: too few to decide; try another frame")
+    return Finding(check, "ok", f"{summary}; no other convention explains them better")

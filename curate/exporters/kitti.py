@@ -1,9 +1,10 @@
 """Export weighted labels as KITTI label files, for trainers that read this format.
 
-DIRECTORY/label_2/FRAME.txt has one line per label in KITTI's format. An optional 16th field is the
-weight or the score. Labels of weight 0 are not objects there. A label to ignore is a DontCare
-region with the label's 2D box, which KITTI readers treat neither as an object nor as background. A
-background label has no line.
+DIRECTORY/label_2/FRAME.txt has one line per label in KITTI's format; rotation_y has the meaning
+that the data set declares for its own labels. An optional 16th field is the weight or the score.
+Labels of weight 0 are not objects there. A label to ignore is a DontCare region with the label's 2D
+box, which KITTI readers treat neither as an object nor as background. A background label has no
+line.
 
 DIRECTORY/weight/FRAME.txt has one line for every label, in the same order, including the labels
 that have no line in label_2. The line contains category, weight, score, and the box in the LiDAR
@@ -24,7 +25,7 @@ import numpy as np
 
 from curate.datasets.kitti.labels import DONT_CARE, from_detections, write_objects
 from curate.detections import Detections
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, error_prefix
 from curate.exporters.base import LabelSet
 from curate.exporters.folder import write_folder
 from curate.exporters.objects import frame_objects
@@ -68,7 +69,8 @@ class KittiExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
-            DataError: if the calibration or the image of a frame cannot be read.
+            DataError: if the calibration or the image of a frame cannot be read, or the mounting of
+                the camera does not define headings.
         """
         zero_weight = labels.description.zero_weight
         return export_kitti(path, _weighted_frames(labels), zero_weight=zero_weight)
@@ -142,7 +144,8 @@ def _write_frame(folder: Path, frame: WeightedFrame, last_field: str) -> None:
             f"frame {frame.frame_id}: needs one weight in [0, 1] for each of {len(labels)} labels"
         )
     name = f"{frame.frame_id}.txt"
-    objects = from_detections(labels, frame.calibration, frame.image_size)
+    with error_prefix(f"frame {frame.frame_id}"):
+        objects = from_detections(labels, frame.calibration, frame.image_size)
     categories = np.where(frame.ignored, DONT_CARE, objects.categories)
     last = {"weight": weights, "score": labels.scores, "none": np.full(len(labels), np.nan)}
     objects = replace(objects, categories=categories, scores=last[last_field])

@@ -5,11 +5,12 @@ DIRECTORY/kitti_infos_train.pkl, to be used as `ann_file` of `KittiDataset`, is 
 with `categories`, and `data_list` with one dict per frame of X_l and X_u.
 
 `bbox_3d` of an instance is x, y, z of the bottom centre in the rectified camera frame, length,
-height, width, and the yaw about the camera's y axis. `bbox_label_3d` is the number of the category.
-For a label of weight 0 it is -1: mmdetection3d skips such instances, so a trainer that does not
-read the additional keys treats them as background. The additional keys are `weight` (v; 1 for
-ground truth), `category` and `ignored` (True if a label of weight 0 is a region to ignore, False if
-it is background). `zero_weight` in `metainfo` gives the meaning of weight 0.
+height, width, and rotation_y by mmdetection3d's formula, so that its own conversion gives the same
+box in the LiDAR frame for every mounting of the camera. `bbox_label_3d` is the number of the
+category. For a label of weight 0 it is -1: mmdetection3d skips such instances, so a trainer that
+does not read the additional keys treats them as background. The additional keys are `weight` (v; 1
+for ground truth), `category` and `ignored` (True if a label of weight 0 is a region to ignore,
+False if it is background). `zero_weight` in `metainfo` gives the meaning of weight 0.
 
 Without a camera, `images` has the transforms of the reference calibration only: no path, no size.
 
@@ -119,7 +120,7 @@ def _instances(
     numbers: Mapping[str, int],
 ) -> list[dict[str, Any]]:
     found = objects.detections
-    in_camera = from_detections(found, calibration, image_size)
+    in_camera = from_detections(found, calibration, image_size, "mmdetection3d")
     centres, depths = project_points(found.boxes, calibration)
     levels = difficulties(in_camera.boxes_2d, objects.truncated, objects.occluded)
     lengths_first = in_camera.dimensions[:, [2, 0, 1]]

@@ -14,8 +14,10 @@ treats all these labels as background, never as objects. `zero_weight` of export
 meaning of weight 0.
 
 Annos are in the rectified camera frame (`location` is the bottom centre, `dimensions` are length,
-height, width). `gt_boxes_lidar` is (n, 7) at the box centre in the LiDAR frame. R0_rect is the
-identity, and Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera.
+height, width; `rotation_y` by OpenPCDet's formula, so that its own conversion gives the same boxes
+in the LiDAR frame for every mounting of the camera). `gt_boxes_lidar` is (n, 7) at the box centre
+in the LiDAR frame. R0_rect is the identity, and Tr_velo_to_cam is the complete transform from the
+LiDAR to the rectified camera.
 """
 
 from collections.abc import Mapping
@@ -82,7 +84,9 @@ def _info(objects: FrameObjects, frame: Frame) -> Info:
         )
     width, height = frame.image_size
     last_row = np.array([[0.0, 0, 0, 1]])
-    in_camera = from_detections(objects.detections, frame.calibration, frame.image_size)
+    in_camera = from_detections(
+        objects.detections, frame.calibration, frame.image_size, "openpcdet"
+    )
     return {
         "point_cloud": {"num_features": 4, "lidar_idx": objects.frame_id},
         "image": {

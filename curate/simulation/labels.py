@@ -14,7 +14,7 @@ import numpy as np
 
 from curate.detections import Annotations, as_categories
 from curate.frames import Calibration
-from curate.geometry.similarity import wrap_angle
+from curate.geometry.mounting import observation_angles
 from curate.simulation.camera import View
 from curate.simulation.rig import IMAGE_SIZE, CameraRig
 from curate.simulation.scene import Caster, Scene
@@ -51,7 +51,7 @@ def annotate(scene: Scene, view: View, rig: CameraRig) -> Annotations:
         np.where(unclear, "DontCare", categories),
         np.where(unclear, -1.0, truncated),
         np.where(unclear, -1, np.digitize(-visible, -np.array(_OCCLUSION_FRACTIONS))),
-        np.where(unclear, -10.0, _alpha(boxes, calibration)),
+        np.where(unclear, -10.0, observation_angles(boxes, calibration)),
         boxes_2d,
     )
     return annotations.select(np.lexsort((distance, unclear)))
@@ -63,15 +63,6 @@ def _box(scene: Scene, number: int) -> np.ndarray:
     size = placement.mesh.size * placement.scale
     centre = placement.position + np.array([0, 0, size[2] / 2])
     return np.array([*centre, *size, placement.yaw_rad])
-
-
-def _alpha(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """Return (n,) observation angles: rotation_y minus the angle of the ray to the box centre."""
-    matrix = calibration.lidar_to_camera
-    centres = boxes[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
-    rotation_y = -boxes[:, 6] - np.pi / 2
-    alpha: np.ndarray = wrap_angle(rotation_y - np.arctan2(centres[:, 0], centres[:, 2]))
-    return alpha
 
 
 def _outline(scene: Scene, number: int, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:

@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 SETTINGS_FILE = "simulation.json"
 SEMANTIC_FOLDER = "semantic_2"
-_FORMAT = 1  # incremented whenever the same seed gives different frames
+_FORMAT = 2  # incremented whenever the same seed gives different frames
 _FOLDERS = {
     "velodyne": ".bin",
     "image_2": ".png",

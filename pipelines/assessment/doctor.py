@@ -6,7 +6,9 @@ import numpy as np
 
 from curate.detectors.base import RecordedViews
 from curate.errors import ConfigError, CurateError
+from curate.evaluation.camera_examination import examine_camera
 from curate.evaluation.examination import Finding, examine_detections, examine_frame
+from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
 from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
@@ -14,6 +16,9 @@ from pipelines.engine.rounds import newest_checkpoint
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
+
+# Labeled frames whose labels are checked together.
+_LABELED_FRAMES = 5
 
 
 def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Finding]]:
@@ -37,6 +42,8 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     except CurateError as error:
         return name, [Finding("data set", "wrong", str(error))]
     findings = examine_frame(frame)
+    findings += examine_camera(frame)
+    findings += _guarded("labels", lambda: _labels(workspace, frame))
     findings += _guarded("detector", lambda: _detector(workspace, frame))
     if semantic:
         findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
@@ -49,6 +56,18 @@ def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Find
         return check()
     except CurateError as error:
         return [Finding(name, "wrong", str(error))]
+
+
+def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
+    """Check the labels of some labeled frames, with those of the frame itself if it has any."""
+    others = [name for name in workspace.frames("labeled", "val") if name != frame.frame_id]
+    own = len(others) < len(workspace.frames("labeled", "val"))
+    dataset = workspace.dataset
+    frames = [frame] if own else []
+    frames += [dataset.read(name) for name in others[: _LABELED_FRAMES - len(frames)]]
+    if not frames:
+        return []
+    return examine_labels([(each, dataset.annotations(each.frame_id)) for each in frames])
 
 
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:

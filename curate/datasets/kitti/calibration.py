@@ -25,7 +25,8 @@ import numpy as np
 from curate.errors import DataError
 from curate.files.atomic import replace_file
 from curate.files.text import read_lines
-from curate.frames import Calibration
+from curate.frames import Calibration, RotationY
+from curate.geometry.mounting import check_lidar_to_camera
 
 LEFT_COLOUR = 2
 """Number of KITTI's camera of the images in image_2."""
@@ -100,16 +101,20 @@ class CalibrationLines:
         return np.asarray(found)
 
 
-def read_calibration(path: Path, camera: int = LEFT_COLOUR) -> Calibration:
+def read_calibration(
+    path: Path, camera: int = LEFT_COLOUR, rotation_y: RotationY = "calibration"
+) -> Calibration:
     """Return the calibration of one camera from a file with all matrices.
 
     Args:
         path: a calibration file of the object, tracking or odometry benchmark, or of a converter.
         camera: number of the camera.
+        rotation_y: the meaning of rotation_y in the label files of the data set.
 
     Raises:
         DataError: if the file or a matrix is missing, a matrix has a wrong number of entries,
-            entries that are not finite, or no inverse, or two names of one matrix differ.
+            entries that are not finite, two names of one matrix differ, or the transform from
+            LiDAR to camera is not a rotation and a translation.
     """
     lines = CalibrationLines(path)
     names = (f"P{camera}", f"P_rect_{camera:02d}")
@@ -129,19 +134,24 @@ def read_calibration(path: Path, camera: int = LEFT_COLOUR) -> Calibration:
             raise DataError(f"{place} differs from Tr; both lead to the rectified camera")
         to_rectified = product
     transform = _square(np.asarray(to_rectified))
-    return Calibration(np.asarray(projection), _invertible(transform, place))
+    check_lidar_to_camera(transform, place)
+    return Calibration(np.asarray(projection), transform, rotation_y=rotation_y)
 
 
-def read_raw_calibration(folder: Path, camera: int = LEFT_COLOUR) -> Calibration:
+def read_raw_calibration(
+    folder: Path, camera: int = LEFT_COLOUR, rotation_y: RotationY = "calibration"
+) -> Calibration:
     """Return the calibration of one camera of KITTI's raw recordings.
 
     Args:
         folder: the date folder, with `RAW_CAMERAS` (P_rect_0n, R_rect_00) and `RAW_TO_CAMERA` (R,
             T).
         camera: number of the camera.
+        rotation_y: the meaning of rotation_y in the label files of the data set.
 
     Raises:
-        DataError: if a file or an entry is missing or malformed.
+        DataError: if a file or an entry is missing or malformed, or the transform from LiDAR to
+            camera is not a rotation and a translation.
     """
     extrinsic, rectify = np.eye(4), np.eye(4)
     to_camera = CalibrationLines(folder / RAW_TO_CAMERA)
@@ -150,7 +160,8 @@ def read_raw_calibration(folder: Path, camera: int = LEFT_COLOUR) -> Calibration
     cameras = CalibrationLines(folder / RAW_CAMERAS)
     rectify[:3, :3] = cameras.required(("R_rect_00",), _SQUARE)
     projection = cameras.required((f"P_rect_{camera:02d}",), _WIDE)
-    return Calibration(projection, rectify @ extrinsic)
+    check_lidar_to_camera(rectify @ extrinsic, str(folder / RAW_TO_CAMERA))
+    return Calibration(projection, rectify @ extrinsic, rotation_y=rotation_y)
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
@@ -230,9 +241,3 @@ def _square(matrix: np.ndarray) -> np.ndarray:
     square = np.eye(4)
     square[:3, : matrix.shape[1]] = matrix
     return square
-
-
-def _invertible(matrix: np.ndarray, place: str) -> np.ndarray:
-    if abs(np.linalg.det(matrix)) < 1e-6:
-        raise DataError(f"{place} cannot be inverted")
-    return matrix

@@ -29,13 +29,14 @@ from curate.datasets.formats.images import check_image_size, read_optional_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.frame_names import FrameNames, match_frame_list
 from curate.datasets.kitti.calibration import read_calibration
-from curate.datasets.kitti.labels import read_objects, to_annotations
+from curate.datasets.kitti.labels import read_annotations
 from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.files.text import read_lines, read_text
-from curate.frames import Frame, FrameFiles
+from curate.frames import Frame, FrameFiles, RotationY
+from curate.geometry.mounting import check_rotation_y
 from curate.shapes import Float32
 
 _log = logging.getLogger(__name__)
@@ -58,11 +59,13 @@ class KittiDataset:
         image_size: width and height in pixels of the calibrated camera's image, for a data set
             without images; without it, such a data set has no camera.
         follow_links: whether links may lead out of the root.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`. The
+            default is "calibration", and "mmdetection3d" for conversions of Waymo.
 
     Raises:
         DataError: if the root contains neither.
-        ConfigError: if there is no folder of images of the camera, or the image size is invalid, or
-            given for a data set with images.
+        ConfigError: if `rotation_y` is unknown, there is no folder of images of the camera, or the
+            image size is invalid, or given for a data set with images.
     """
 
     name = "kitti"
@@ -75,6 +78,7 @@ class KittiDataset:
         camera: int | None = None,
         image_size: Sequence[int] | None = None,
         follow_links: bool = False,
+        rotation_y: RotationY | None = None,
     ) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
@@ -90,6 +94,10 @@ class KittiDataset:
         self._boundary.check(home / "calib")
         # Converters of data with several cameras write all labels in the frame of camera 0.
         self._front = _has_own_extrinsics(home / "calib")
+        self._rotation_y: RotationY = "mmdetection3d" if self._front else "calibration"
+        if rotation_y is not None:
+            check_rotation_y(rotation_y)
+            self._rotation_y = rotation_y
         self.camera = _camera(home, camera, front=self._front)
         folder = home / f"image_{self.camera}"
         self._has_images = contains_images(folder)
@@ -188,7 +196,7 @@ class KittiDataset:
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
             sweep = read_points(files.points, self._layout)
-        calibration = read_calibration(files.calibration, self.camera)
+        calibration = read_calibration(files.calibration, self.camera, self._rotation_y)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
@@ -202,9 +210,8 @@ class KittiDataset:
         if files.label is None:
             raise DataError(f"{self._labels / frame_id}.txt: no such label file")
         camera = 0 if self._front else self.camera
-        return to_annotations(
-            read_objects(files.label), read_calibration(files.calibration, camera)
-        )
+        calibration = read_calibration(files.calibration, camera, self._rotation_y)
+        return read_annotations(files.label, calibration)
 
 
 def read_points(path: Path, layout: PointLayout = UNDECLARED) -> Float32[np.ndarray, "n 4"]:

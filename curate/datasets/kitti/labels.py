@@ -5,12 +5,12 @@ line: category, truncated, occluded, alpha, left, top, right, bottom (pixels), h
 (metres), x, y, z of the bottom centre in the rectified camera frame (metres), rotation_y (radians),
 and in result files a 16th field, the score.
 
-The LiDAR's z axis and the camera's y axis point in opposite directions and differ by less than one
-degree. As is usual with KITTI, they are treated as the same axis: yaw = -rotation_y - pi/2. The
-bottom centre is raised by half the height along the camera's y axis (which points down), and then
-transformed to the LiDAR frame. Example: a car 1.5 m high at (2, 1.7, 20) in the camera frame, which
-drives away from the camera, has rotation_y = -pi/2. Its centre is (2, 0.95, 20) in the camera
-frame, about (20, -2, -0.95) in the frame of a LiDAR at the camera, and its yaw is 0.
+An object stands upright in the LiDAR frame, on its bottom centre, which the calibration carries
+from the camera frame into the LiDAR frame. The box centre is half the height above it, along the
+LiDAR's z axis, whichever way the camera is tilted. `curate.geometry.mounting` defines the heading.
+Example: a car 1.5 m high at (2, 1.7, 20) in the camera frame, which drives away from the camera,
+has rotation_y -pi/2. If a level camera is at the LiDAR's origin, the car stands at (20, -2, -1.7),
+its centre is (20, -2, -0.95), and its yaw is 0.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -21,13 +21,18 @@ from typing import Self
 import numpy as np
 
 from curate.detections import Annotations, Columns, Detections, as_categories
-from curate.errors import DataError
+from curate.errors import DataError, error_prefix
 from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
 from curate.files.text import read_lines
-from curate.frames import Calibration
+from curate.frames import Calibration, RotationY
+from curate.geometry.mounting import (
+    bottom_centres_in_camera,
+    observation_angles,
+    rotations_y_of_yaws,
+    yaws_of_rotations_y,
+)
 from curate.geometry.projection import image_rectangles
-from curate.geometry.similarity import wrap_angle
 from curate.shapes import Float, Int, Shaped
 
 DONT_CARE = "DontCare"
@@ -167,9 +172,37 @@ def write_objects(path: StrPath, objects: KittiObjects) -> None:
     replace_file(path, "".join(f"{line}\n" for line in lines).encode())
 
 
-def to_annotations(objects: KittiObjects, calibration: Calibration) -> Annotations:
-    """Return the objects as ground truth in the LiDAR frame; boxes of DontCare regions are NaN."""
-    boxes = _boxes_lidar(objects, calibration)
+def read_annotations(
+    path: StrPath,
+    calibration: Calibration,
+    *,
+    categories: Collection[str] | None = KITTI_CATEGORIES,
+) -> Annotations:
+    """Return the ground truth of a label file; see `read_objects` and `to_annotations`.
+
+    Raises:
+        DataError: if the file is missing or malformed, or the mounting of the camera does not
+            define the headings.
+    """
+    objects = read_objects(path, categories=categories)
+    with error_prefix(str(path)):
+        return to_annotations(objects, calibration)
+
+
+def to_annotations(
+    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY | None = None
+) -> Annotations:
+    """Return the objects as ground truth in the LiDAR frame; boxes of DontCare regions are NaN.
+
+    Args:
+        objects: objects in the camera frame.
+        calibration: calibration of the frame.
+        rotation_y: the meaning of rotation_y; None for that of the data set.
+
+    Raises:
+        DataError: if the mounting of the camera does not define the headings.
+    """
+    boxes = _boxes_lidar(objects, calibration, rotation_y)
     boxes[objects.categories == DONT_CARE] = np.nan
     return Annotations(
         boxes,
@@ -181,18 +214,26 @@ def to_annotations(objects: KittiObjects, calibration: Calibration) -> Annotatio
     )
 
 
-def to_detections(objects: KittiObjects, calibration: Calibration) -> Detections:
-    """Return the objects as detections in the LiDAR frame, without DontCare regions."""
+def to_detections(
+    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY | None = None
+) -> Detections:
+    """Return the objects as detections in the LiDAR frame, without DontCare regions.
+
+    Arguments and errors are those of `to_annotations`.
+    """
     kept = objects.select(objects.categories != DONT_CARE)
-    return Detections(_boxes_lidar(kept, calibration), kept.scores, kept.categories)
+    return Detections(_boxes_lidar(kept, calibration, rotation_y), kept.scores, kept.categories)
 
 
 def from_annotations(annotations: Annotations, calibration: Calibration) -> KittiObjects:
     """Return ground truth as KITTI objects, the inverse of `to_annotations`.
 
     DontCare regions get KITTI's placeholders: dimensions -1, location -1000, rotation_y -10.
+
+    Raises:
+        DataError: if the mounting of the camera does not define the headings.
     """
-    dimensions, locations, rotations_y = _boxes_camera(annotations.boxes, calibration)
+    dimensions, locations, rotations_y = _boxes_camera(annotations.boxes, calibration, None)
     region = annotations.categories == DONT_CARE
     dimensions[region], locations[region], rotations_y[region] = -1, -1000, -10
     return KittiObjects(
@@ -209,7 +250,10 @@ def from_annotations(annotations: Annotations, calibration: Calibration) -> Kitt
 
 
 def from_detections(
-    detections: Detections, calibration: Calibration, image_size: tuple[int, int] | None
+    detections: Detections,
+    calibration: Calibration,
+    image_size: tuple[int, int] | None,
+    rotation_y: RotationY | None = None,
 ) -> KittiObjects:
     """Return detections as KITTI objects, in the same order.
 
@@ -222,15 +266,20 @@ def from_detections(
         calibration: calibration of the frame.
         image_size: (width, height) of the image in pixels; None if there is no image, so that
             nothing is clipped.
+        rotation_y: the meaning of rotation_y; None for that of the data set. alpha follows the
+            calibration in any case.
+
+    Raises:
+        DataError: if the mounting of the camera does not define the headings.
     """
-    dimensions, locations, rotations_y = _boxes_camera(detections.boxes, calibration)
+    dimensions, locations, rotations_y = _boxes_camera(detections.boxes, calibration, rotation_y)
     boxes_2d = image_rectangles(detections.boxes, calibration, image_size)
     count = len(detections)
     return KittiObjects(
         detections.categories,
         np.full(count, -1.0),
         np.full(count, -1, dtype=np.int64),
-        wrap_angle(rotations_y - np.arctan2(locations[:, 0], locations[:, 2])),
+        observation_angles(detections.boxes, calibration),
         np.where(np.isnan(boxes_2d), -1.0, boxes_2d),
         dimensions,
         locations,
@@ -239,31 +288,27 @@ def from_detections(
     )
 
 
-def _boxes_lidar(objects: KittiObjects, calibration: Calibration) -> np.ndarray:
+def _boxes_lidar(
+    objects: KittiObjects, calibration: Calibration, rotation_y: RotationY | None
+) -> np.ndarray:
     """Return the (n, 7) boxes in the LiDAR frame."""
     height, width, length = objects.dimensions.T
-    centres = objects.locations.copy()
-    centres[:, 1] -= height / 2  # the camera's y points down
     to_lidar = np.linalg.inv(calibration.lidar_to_camera)
-    return np.column_stack(
-        [
-            centres @ to_lidar[:3, :3].T + to_lidar[:3, 3],
-            length,
-            width,
-            height,
-            wrap_angle(-objects.rotations_y - np.pi / 2),
-        ]
-    )
+    centres = objects.locations @ to_lidar[:3, :3].T + to_lidar[:3, 3]
+    centres[:, 2] += height / 2
+    yaws = yaws_of_rotations_y(objects.rotations_y, calibration, rotation_y)
+    return np.column_stack([centres, length, width, height, yaws])
 
 
 def _boxes_camera(
-    boxes: np.ndarray, calibration: Calibration
+    boxes: np.ndarray, calibration: Calibration, rotation_y: RotationY | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (n, 3) height, width, length; (n, 3) bottom centres; (n,) rotation_y, as in KITTI."""
-    to_camera = calibration.lidar_to_camera
-    locations = boxes[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
-    locations[:, 1] += boxes[:, 5] / 2
-    return boxes[:, [5, 4, 3]], locations, wrap_angle(-boxes[:, 6] - np.pi / 2)
+    return (
+        boxes[:, [5, 4, 3]],
+        bottom_centres_in_camera(boxes, calibration),
+        rotations_y_of_yaws(boxes[:, 6], calibration, rotation_y),
+    )
 
 
 def _columns(values: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -27,13 +27,14 @@ from curate.datasets.kitti.dataset import (
     read_frame_lists,
     read_points,
 )
-from curate.datasets.kitti.labels import read_objects, to_annotations
+from curate.datasets.kitti.labels import read_annotations
 from curate.datasets.kitti.tracklets import TRACKLETS, TrackletTable
 from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
-from curate.frames import Frame, FrameFiles
+from curate.frames import Calibration, Frame, FrameFiles, RotationY
+from curate.geometry.mounting import check_rotation_y
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
 # The root is a date folder with drives, or a folder of date folders.
@@ -64,9 +65,11 @@ class KittiRawDataset:
         layout: the declared layout of the point files.
         image_size: see `KittiDataset`.
         follow_links: whether links may lead out of the root.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
         DataError: if there is no drive.
+        ConfigError: if `rotation_y` is unknown.
     """
 
     name = "kitti-raw"
@@ -78,9 +81,12 @@ class KittiRawDataset:
         layout: PointLayout = UNDECLARED,
         image_size: Sequence[int] | None = None,
         follow_links: bool = False,
+        rotation_y: RotationY = "calibration",
     ) -> None:
+        check_rotation_y(rotation_y)
         self.root = Path(root)
         self._layout = layout
+        self._rotation_y = rotation_y
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._tracklets: dict[Path, TrackletTable] = {}
         folders = (
@@ -167,7 +173,7 @@ class KittiRawDataset:
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
             sweep = read_points(files.points, self._layout)
-        calibration = read_raw_calibration(files.calibration.parent)
+        calibration = self._calibration(files)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
@@ -189,8 +195,10 @@ class KittiRawDataset:
             table = self._tracklets[files.label]
             index = frame_number(number, files.points)
             return table.read(index, self.read(frame_id, points=False))
-        calibration = read_raw_calibration(files.calibration.parent)
-        return to_annotations(read_objects(files.label), calibration)
+        return read_annotations(files.label, self._calibration(files))
+
+    def _calibration(self, files: FrameFiles) -> Calibration:
+        return read_raw_calibration(files.calibration.parent, rotation_y=self._rotation_y)
 
     def _frame(self, frame_id: str) -> tuple[_Drive, str]:
         check_frame_id(frame_id)

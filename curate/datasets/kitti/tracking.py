@@ -35,9 +35,10 @@ from curate.datasets.kitti.dataset import (
 from curate.datasets.kitti.labels import LABEL_FIELDS, parse_rows, read_rows, to_annotations
 from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
-from curate.errors import DataError
+from curate.errors import DataError, error_prefix
 from curate.files.paths import StrPath
-from curate.frames import Frame, FrameFiles
+from curate.frames import Frame, FrameFiles, RotationY
+from curate.geometry.mounting import check_rotation_y
 
 # The fraction outside the image for a level of truncation.
 _TRUNCATION = {0: 0.0, 1: 0.5, 2: 1.0}
@@ -64,9 +65,11 @@ class KittiTrackingDataset:
         layout: the declared layout of the point files.
         image_size: see `KittiDataset`.
         follow_links: whether links may lead out of the root.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
         DataError: if the root contains neither.
+        ConfigError: if `rotation_y` is unknown.
     """
 
     name = "kitti-tracking"
@@ -78,7 +81,10 @@ class KittiTrackingDataset:
         layout: PointLayout = UNDECLARED,
         image_size: Sequence[int] | None = None,
         follow_links: bool = False,
+        rotation_y: RotationY = "calibration",
     ) -> None:
+        check_rotation_y(rotation_y)
+        self._rotation_y = rotation_y
         self.root = Path(root)
         self._layout = layout
         self._boundary = Boundary(self.root, follow_links=follow_links)
@@ -167,7 +173,7 @@ class KittiTrackingDataset:
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
             sweep = read_points(files.points, self._layout)
-        calibration = read_calibration(files.calibration)
+        calibration = read_calibration(files.calibration, rotation_y=self._rotation_y)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
@@ -189,7 +195,9 @@ class KittiTrackingDataset:
         objects = replace(
             objects, truncated=np.array([_TRUNCATION.get(level, level) for level in levels])
         )
-        return to_annotations(objects, read_calibration(files.calibration))
+        calibration = read_calibration(files.calibration, rotation_y=self._rotation_y)
+        with error_prefix(str(files.label)):
+            return to_annotations(objects, calibration)
 
     def _frame(self, frame_id: str) -> tuple[_Sequence, str]:
         check_frame_id(frame_id)

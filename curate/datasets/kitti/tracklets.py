@@ -20,10 +20,11 @@ from xml.parsers import expat
 import numpy as np
 
 from curate.datasets.formats.binary import read_bytes
-from curate.datasets.image_truth import observation_angles, seen_objects
+from curate.datasets.image_truth import seen_objects
 from curate.detections import Annotations, as_categories
 from curate.errors import DataError
 from curate.frames import Frame
+from curate.geometry.mounting import observation_angles
 from curate.geometry.projection import image_rectangles
 from curate.geometry.similarity import wrap_angle
 

@@ -23,9 +23,10 @@ from curate.detectors.recorded.results import (
 )
 from curate.detectors.recorded.table import TableRecord
 from curate.detectors.scores import describe_invalid_scores, to_probabilities
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, error_prefix
 from curate.files.paths import StrPath
-from curate.frames import Calibration, Frame
+from curate.frames import Calibration, Frame, RotationY
+from curate.geometry.mounting import check_rotation_y
 from curate.geometry.similarity import Similarity
 
 _log = logging.getLogger(__name__)
@@ -95,6 +96,8 @@ class RecordedDetector:
         axes: axes of boxes in the LiDAR frame: "forward-left" (x forward, y left), or
             "right-forward" as in nuScenes' LiDAR frame.
         sigmoid: whether scores are logits; they become probabilities first.
+        rotation_y: who computed rotation_y of KITTI result files, see `curate.frames.RotationY`;
+            None for the meaning in the data set's label files.
         frame_ids: the frames of the data set; recorded frames are matched with them in the
             spellings of `curate.datasets.frame_names`, and those of no frame are reported.
         calibration: returns the calibration of a frame id; needed for views in the formats of
@@ -118,6 +121,7 @@ class RecordedDetector:
         rename: Mapping[str, str] | None = None,
         axes: str = "forward-left",
         sigmoid: bool = False,
+        rotation_y: RotationY | None = None,
         frame_ids: Sequence[str] = (),
         calibration: Callable[[str], Calibration] | None = None,
         wants_views: bool = True,
@@ -125,6 +129,9 @@ class RecordedDetector:
         check_kind(kind)
         if axes not in _AXES:
             raise ConfigError(f"detector.options.axes '{axes}': use one of {', '.join(_AXES)}")
+        if rotation_y is not None:
+            check_rotation_y(rotation_y, "detector.options.rotation_y")
+        self._rotation_y = rotation_y
         self.path = Path(path)
         self.minimum_score = minimum_score
         self.rename = dict(rename or {})
@@ -203,8 +210,9 @@ class RecordedDetector:
         """Return a result in the LiDAR frame of reference."""
         if not isinstance(result, KittiObjects):
             return result.in_lidar(calibration)
-        found = to_detections(result, calibration)
         place = f"{self.path}: frame {frame_id}"
+        with error_prefix(place):
+            found = to_detections(result, calibration, self._rotation_y)
         return as_detections(place, found.boxes, found.scores, found.categories)
 
     def _match(self, frames: FrameNames) -> Mapping[str, str]:

@@ -22,7 +22,7 @@ from curate.datasets.kitti.labels import (
     write_objects,
 )
 from curate.detections import Detections
-from curate.errors import DataError
+from curate.errors import DataError, error_prefix
 from curate.review.editors.base import Reader
 from curate.review.editors.names import match_frame_names
 from curate.review.edits import EditedBox
@@ -43,7 +43,8 @@ class KittiEditor:
             labels = Detections.from_rows(
                 [(box.category, box.score, *box.box, None) for box in shown.boxes]
             )
-            objects = from_detections(labels, frame.calibration, frame.image_size)
+            with error_prefix(f"frame {shown.frame}"):
+                objects = from_detections(labels, frame.calibration, frame.image_size)
             unscored = replace(objects, scores=np.full(len(labels), np.nan))
             write_objects(folder / "label_2" / f"{shown.frame}.txt", unscored)
             write_calibration(folder / "calib" / f"{shown.frame}.txt", frame.calibration)
@@ -65,7 +66,8 @@ class KittiEditor:
 def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[EditedBox]:
     objects = read_objects(path, categories={*sheet.categories, DONT_CARE})
     places = [number for number, row in read_rows(path) if row[0] != DONT_CARE]
-    found = to_detections(objects, read(name).calibration)
+    with error_prefix(str(path)):
+        found = to_detections(objects, read(name).calibration)
     return [
         EditedBox(str(category), tuple(box), f"{path}:{number}")
         for category, box, number in zip(

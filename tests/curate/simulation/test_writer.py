@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,9 @@ from support.paths import ROOT
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import ConfigError, DataError
+from curate.evaluation.camera_examination import examine_camera
+from curate.evaluation.examination import examine_frame
+from curate.evaluation.label_examination import examine_labels
 from curate.simulation import simulate
 from curate.simulation.rig import CameraRig
 
@@ -187,3 +191,17 @@ def is_running(pid):
     except OSError:
         return False
     return state != "Z"
+
+
+def test_doctor_has_nothing_to_report(simulated):
+    """Neither in a single frame nor in several; wrong labels are found."""
+    dataset = KittiDataset(simulated)
+    labeled = [(dataset.read(name), dataset.annotations(name)) for name in dataset.frame_ids()]
+    for group in [*[[each] for each in labeled], labeled[:5]]:
+        found = [*examine_frame(group[0][0]), *examine_camera(group[0][0]), *examine_labels(group)]
+        assert {one.state for one in found} == {"ok"}, found
+    swapped = [
+        (frame, replace(truth, boxes=truth.boxes[:, [0, 1, 2, 4, 3, 5, 6]]))
+        for frame, truth in labeled[:5]
+    ]
+    assert "length and width are swapped" in examine_labels(swapped)[1].message

@@ -1,9 +1,12 @@
 """KITTI's label format and its conversion to the LiDAR frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.rigs import TILTED, Rig, rigs
 from support.toys import toy_calibration
 
 from curate.datasets.kitti.calibration import read_calibration
@@ -12,6 +15,7 @@ from curate.datasets.kitti.labels import (
     KittiObjects,
     from_annotations,
     from_detections,
+    read_annotations,
     read_objects,
     to_annotations,
     to_detections,
@@ -19,7 +23,6 @@ from curate.datasets.kitti.labels import (
 )
 from curate.detections import Annotations, Detections
 from curate.errors import DataError
-from curate.frames import Calibration
 from curate.geometry.overlap import bev_iou
 
 CAR = "Car 0.00 1 -1.33 597.59 176.18 720.90 261.14 1.47 1.60 3.66 -1.07 1.55 14.44 -1.25"
@@ -35,19 +38,6 @@ def numbers(low, high):
 def angles():
     """Draw yaws in (-pi, pi], the ends included."""
     return numbers(-np.pi, np.pi).map(lambda angle: np.pi if angle == -np.pi else angle)
-
-
-@st.composite
-def calibrations(draw):
-    """Draw a camera that looks roughly along the LiDAR's x, slightly tilted and displaced."""
-    looks_ahead = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    tilt = np.array([draw(numbers(-0.05, 0.05)) for _ in range(3)])
-    skew = np.array([[0, -tilt[2], tilt[1]], [tilt[2], 0, -tilt[0]], [-tilt[1], tilt[0], 0]])
-    rotation, _ = np.linalg.qr(np.eye(3) + skew)
-    transform = np.eye(4)
-    transform[:3, :3] = (rotation * np.sign(np.diag(rotation))) @ looks_ahead
-    transform[:3, 3] = [draw(numbers(-1, 1)) for _ in range(3)]
-    return Calibration(toy_calibration().projection, transform)
 
 
 @st.composite
@@ -196,10 +186,31 @@ def test_a_positive_rotation_y_turns_clockwise_seen_from_above():
     assert yaws == pytest.approx([-np.pi / 2, -np.pi / 2 - 0.3])
 
 
-@given(box_arrays(), calibrations())
+def test_a_tilted_camera_neither_moves_nor_turns_a_box():
+    """The camera looks 12 degrees down: a box stands upright on the point that it stood on."""
+    box = np.array([[12.0, 3.0, -0.95, 4.1, 1.7, 1.5, 0.4]])
+    objects = from_annotations(annotations_of(box), TILTED.calibration)
+    bottom = TILTED.turn.apply([12.0, 3.0, -1.7]) + TILTED.origin
+    assert objects.locations[0] == pytest.approx(bottom)
+    assert objects.rotations_y[0] == pytest.approx(-0.4 - np.pi / 2)
+    assert to_annotations(objects, TILTED.calibration).boxes == pytest.approx(box)
+
+
+def test_labels_of_a_camera_that_looks_down_are_rejected(tmp_path):
+    """Its optical axis is vertical, so rotation_y is not a heading."""
+    path = write(tmp_path / "a.txt", CAR)
+    down = Rig(pitch=np.pi / 2).calibration
+    with pytest.raises(DataError, match=r"a\.txt: the camera's y axis is 0\.0 degrees"):
+        read_annotations(path, down)
+    by_formula = read_annotations(path, replace(down, rotation_y="openpcdet"))
+    assert by_formula.boxes[0, 6] == pytest.approx(1.25 - np.pi / 2)
+
+
+@given(box_arrays(), rigs)
 @settings(max_examples=60)
-def test_the_conversions_are_inverse_to_each_other(boxes, calibration):
-    """LiDAR to camera and back gives the boxes, with yaw in (-pi, pi]."""
+def test_the_conversions_are_inverse_to_each_other(boxes, rig):
+    """LiDAR to camera and back gives the boxes, with yaw in (-pi, pi], for every mounting."""
+    calibration = rig.calibration
     objects = from_annotations(annotations_of(boxes), calibration)
     back = to_annotations(objects, calibration)
     assert back.boxes == pytest.approx(boxes, abs=1e-9)
@@ -209,10 +220,11 @@ def test_the_conversions_are_inverse_to_each_other(boxes, calibration):
     assert again.rotations_y == pytest.approx(objects.rotations_y, abs=1e-9)
 
 
-@given(boxes=box_arrays(), calibration=calibrations())
+@given(boxes=box_arrays(), rig=rigs)
 @settings(max_examples=40)
-def test_a_file_keeps_boxes_to_a_millimetre(tmp_path_factory, boxes, calibration):
-    """LiDAR, file, LiDAR: no coordinate is off by more than 1e-3."""
+def test_a_file_keeps_boxes_to_a_millimetre(tmp_path_factory, boxes, rig):
+    """LiDAR, file, LiDAR: no coordinate is off by more than 1e-3, for every mounting."""
+    calibration = rig.calibration
     path = tmp_path_factory.mktemp("labels") / "a.txt"
     annotations = annotations_of(boxes)
     write_objects(path, from_annotations(annotations, calibration))

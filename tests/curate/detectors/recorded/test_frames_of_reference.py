@@ -8,49 +8,23 @@ import json
 import pickle
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
+from oracles.camera_boxes import in_camera, mmdetection3d_boxes, openpcdet_boxes
 from scipy.spatial.transform import Rotation
+from support.rigs import NAMES, Rig, assert_equal_boxes, detections, rigs
 from support.strategies import similarities
 
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded import RecordedDetector
 from curate.detectors.recorded.formats import KINDS
-from curate.errors import ConfigError
-from curate.frames import Calibration, Frame
+from curate.errors import ConfigError, DataError
 from curate.geometry.similarity import Similarity
 
-NAMES = ("Car", "Pedestrian", "Cyclist")
 FRAME = "000001"
-# From the LiDAR (x forward, y left, z up) to a camera (x right, y down, z forward).
-LOOKING_AHEAD = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-
-
-@dataclass(frozen=True)
-class Rig:
-    """The poses of the sensors.
-
-    Attributes:
-        to_camera: rotation from LiDAR to camera, and the LiDAR's position in the camera frame.
-        to_map: rotation from LiDAR to map, and the LiDAR's position.
-    """
-
-    to_camera: tuple[Rotation, np.ndarray]
-    to_map: tuple[Rotation, np.ndarray]
-
-    @property
-    def calibration(self) -> Calibration:
-        """Return the same as matrices."""
-        projection = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]])
-        camera, place = np.eye(4), np.eye(4)
-        for matrix, (turn, origin) in ((camera, self.to_camera), (place, self.to_map)):
-            matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), origin
-        return Calibration(projection, camera, place)
 
 
 def write_csv(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
@@ -78,19 +52,24 @@ def write_parquet(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]
 
 
 def write_kitti(path: Path, found: Detections, rig: Rig) -> tuple[Path, dict]:
-    """Write camera frame, bottom centre, height width length, rotation_y about the downward y."""
-    turn, origin = rig.to_camera
+    """Write camera frame, bottom centre, height width length, rotation_y by the calibration."""
+    bottoms, rotations_y = in_camera(
+        found.boxes, rig.turn, np.array(rig.origin), rig.yaw, upside_down=rig.upside_down
+    )
+    write_result_file(path, found, bottoms, rotations_y)
+    return path, {}
+
+
+def write_result_file(
+    path: Path, found: Detections, bottoms: np.ndarray, rotations_y: np.ndarray
+) -> None:
+    """Write the result file of a frame."""
     lines = []
-    for box, score, name in rows_of(found):
-        x, y, z = turn.apply(box[:3]) + origin
-        length, width, height = box[3:6]
-        # Seen from above, KITTI's angle grows clockwise from the camera's x, which is our -y.
-        rotation_y = -(box[6] + np.pi / 2)
-        numbers = (height, width, length, x, y + height / 2, z, rotation_y, score)
+    for k, (box, score, name) in enumerate(rows_of(found)):
+        numbers = (*box[5:2:-1], *bottoms[k], rotations_y[k], score)
         lines.append(f"{name} -1 -1 0 0 0 1 1 {' '.join(f'{number:.12f}' for number in numbers)}\n")
     path.mkdir()
     (path / f"{FRAME}.txt").write_text("".join(lines))
-    return path, {}
 
 
 def write_openpcdet(path: Path, found: Detections, _rig: Rig) -> tuple[Path, dict]:
@@ -147,38 +126,9 @@ def rows_of(found: Detections):
     return zip(found.boxes.tolist(), found.scores.tolist(), found.categories.tolist(), strict=True)
 
 
-small_turns = st.tuples(*[st.floats(-0.05, 0.05)] * 2)
-places = st.tuples(*[st.floats(-2.0, 2.0)] * 3).map(np.array)
-rigs = st.builds(
-    lambda camera, offset, heading, tilt, place: Rig(
-        (Rotation.from_euler("xy", camera) * LOOKING_AHEAD, offset),
-        (Rotation.from_euler("zyx", [heading, *tilt]), place * [900, 900, 1]),
-    ),
-    small_turns, places, st.floats(-3.1, 3.1), small_turns, places,
-)  # fmt: skip
-boxes = st.tuples(
-    st.floats(2, 60), st.floats(-30, 30), st.floats(-3, 3),
-    st.floats(2.1, 9), st.floats(0.3, 2.0), st.floats(0.3, 4), st.floats(-np.pi, np.pi),
-)  # fmt: skip
-detections = st.lists(
-    st.tuples(boxes, st.floats(0.01, 1), st.sampled_from(NAMES)),
-    min_size=1,
-    max_size=5,
-    unique_by=lambda row: round(row[0][0], 6),  # duplicate boxes are rejected
-).map(
-    lambda rows: Detections(
-        np.array([row[0] for row in rows]),
-        np.array([row[1] for row in rows]),
-        as_categories([row[2] for row in rows]),
-    )
-)
-
-
 def assert_equal(one: Detections, other: Detections) -> None:
     """Check equality to a micrometre; yaw is compared as a direction."""
-    np.testing.assert_allclose(one.boxes[:, :6], other.boxes[:, :6], atol=1e-6)
-    turn = one.boxes[:, 6] - other.boxes[:, 6]
-    np.testing.assert_allclose(np.abs(np.sin(turn / 2)), 0, atol=1e-7)
+    assert_equal_boxes(one.boxes, other.boxes)
     assert ((one.boxes[:, 6] > -np.pi) & (one.boxes[:, 6] <= np.pi)).all()
     np.testing.assert_allclose(one.scores, other.scores, atol=1e-9)
     assert one.categories.tolist() == other.categories.tolist()
@@ -196,8 +146,7 @@ def test_boxes_are_read_back_unchanged(kind: str, found: Detections, rig: Rig) -
     with tempfile.TemporaryDirectory() as folder:
         path, options = WRITERS[kind](Path(folder) / "results", found, rig)
         record = RecordedDetector(path, **options)
-        frame = Frame(FRAME, np.zeros((0, 4), np.float32), rig.calibration, (1200, 360))
-        assert_equal(record.predict(frame), found)
+        assert_equal(record.predict(rig.frame(FRAME)), found)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in WRITERS if kind not in ("csv", "parquet")])
@@ -232,11 +181,46 @@ def test_boxes_in_the_axes_of_nuscenes_sensor_are_read_back(kind: str, tmp_path:
     found = Detections(boxes, np.array([0.9, 0.5]), as_categories(["Car", "Pedestrian"]))
     quarter = Rotation.from_euler("z", 90, degrees=True)
     there = np.column_stack([quarter.apply(boxes[:, :3]), boxes[:, 3:6], boxes[:, 6] + np.pi / 2])
-    rig = Rig((LOOKING_AHEAD, np.zeros(3)), (Rotation.identity(), np.zeros(3)))
+    rig = Rig()
     written = Detections(there, found.scores, found.categories)
     path, options = WRITERS[kind](tmp_path / "results", written, rig)
-    frame = Frame(FRAME, np.zeros((0, 4), np.float32), rig.calibration, (1200, 360))
     record = RecordedDetector(path, axes="right-forward", **options)
-    assert_equal(record.predict(frame), found)
+    assert_equal(record.predict(rig.frame(FRAME)), found)
     with pytest.raises(ConfigError, match="axes 'up': use one of forward-left, right-forward"):
         RecordedDetector(path, axes="up", **options)
+
+
+@pytest.mark.parametrize("writer", ["openpcdet", "mmdetection3d", "view-of-delft"])
+@settings(max_examples=15)
+@given(found=detections, rig=rigs)
+def test_results_by_the_formula_of_other_frameworks_are_read_back(
+    writer: str, found: Detections, rig: Rig
+) -> None:
+    """They write rotation_y = -yaw - pi/2 whatever the calibration says, and declare it."""
+    bottoms, _ = in_camera(found.boxes, rig.turn, np.array(rig.origin), 0, upside_down=False)
+    rotations_y = -found.boxes[:, 6] - np.pi / 2
+    # The formulas, to be sure that these files are those of the frameworks.
+    lengths_first = found.boxes[:, [3, 5, 4]]
+    matrix = rig.calibration.lidar_to_camera
+    assert_equal_boxes(openpcdet_boxes(bottoms, lengths_first, rotations_y, matrix), found.boxes)
+    standing = found.boxes - np.outer(found.boxes[:, 5] / 2, [0, 0, 1, 0, 0, 0, 0])
+    camera_boxes = np.column_stack([bottoms, lengths_first, rotations_y])
+    assert_equal_boxes(mmdetection3d_boxes(camera_boxes, matrix), standing)
+    with tempfile.TemporaryDirectory() as folder:
+        write_result_file(Path(folder) / "results", found, bottoms, rotations_y)
+        record = RecordedDetector(Path(folder) / "results", rotation_y=writer)
+        assert_equal(record.predict(rig.frame(FRAME)), found)
+
+
+def test_an_unknown_meaning_of_rotation_y_is_rejected(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"use one of calibration, .*; did you mean 'openpcdet'"):
+        RecordedDetector(tmp_path, rotation_y="OpenPCDet ")
+
+
+def test_results_of_a_camera_on_its_side_are_rejected(tmp_path: Path) -> None:
+    """Its rotation_y is not a heading; the message contains file and frame."""
+    rig = Rig(roll=np.pi / 2)
+    found = Detections(np.ones((1, 7)), np.ones(1), as_categories(["Car"]))
+    path, _ = write_kitti(tmp_path / "results", found, rig)
+    with pytest.raises(DataError, match=r"results: frame 000001: the camera's y axis is 0\.0 deg"):
+        RecordedDetector(path).predict(rig.frame(FRAME))
