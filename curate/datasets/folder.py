@@ -104,9 +104,9 @@ class FolderDataset:
         rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
 
     Raises:
-        ConfigError: if `rotation_y` is unknown.
         DataError: if dataset.toml is missing or malformed.
-        ConfigError: if the layout and dataset.toml contradict each other.
+        ConfigError: if `rotation_y` is unknown, or the layout and dataset.toml contradict each
+            other.
     """
 
     name = "folder"
@@ -250,7 +250,7 @@ class FolderDataset:
     def _label_calibration(self, frame_id: str) -> Calibration:
         """Return the calibration that the labels refer to: that of the first camera."""
         if not self._calibrations:
-            return calibration_without_camera()
+            return replace(calibration_without_camera(), rotation_y=self._rotation_y)
         return self._calibration(next(iter(self._calibrations)), frame_id)
 
     def _calibration(self, camera: str, frame_id: str) -> Calibration:

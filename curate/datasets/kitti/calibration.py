@@ -113,8 +113,8 @@ def read_calibration(
 
     Raises:
         DataError: if the file or a matrix is missing, a matrix has a wrong number of entries,
-            entries that are not finite, two names of one matrix differ, or the transform from LiDAR
-            to camera is not a rotation and a translation.
+            entries that are not finite, two names of one matrix differ, or the transform from
+            LiDAR to camera is not a rotation and a translation.
     """
     lines = CalibrationLines(path)
     names = (f"P{camera}", f"P_rect_{camera:02d}")
@@ -133,9 +133,9 @@ def read_calibration(
         if to_rectified is not None and not np.allclose(product, to_rectified, atol=1e-4):
             raise DataError(f"{place} differs from Tr; both lead to the rectified camera")
         to_rectified = product
-    lidar_to_camera = _square(np.asarray(to_rectified))
-    check_lidar_to_camera(lidar_to_camera, place)
-    return Calibration(np.asarray(projection), lidar_to_camera, rotation_y=rotation_y)
+    transform = _square(np.asarray(to_rectified))
+    check_lidar_to_camera(transform, place)
+    return Calibration(np.asarray(projection), transform, rotation_y=rotation_y)
 
 
 def read_raw_calibration(

@@ -59,7 +59,8 @@ class KittiDataset:
         image_size: width and height in pixels of the calibrated camera's image, for a data set
             without images; without it, such a data set has no camera.
         follow_links: whether links may lead out of the root.
-        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`.
+        rotation_y: who computed rotation_y of the labels; see `curate.frames.RotationY`. The
+            default is "calibration", and "mmdetection3d" for conversions of Waymo.
 
     Raises:
         DataError: if the root contains neither.
@@ -77,10 +78,8 @@ class KittiDataset:
         camera: int | None = None,
         image_size: Sequence[int] | None = None,
         follow_links: bool = False,
-        rotation_y: RotationY = "calibration",
+        rotation_y: RotationY | None = None,
     ) -> None:
-        check_rotation_y(rotation_y)
-        self._rotation_y = rotation_y
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
         homes = [self.root / "training", self.root]
@@ -95,6 +94,10 @@ class KittiDataset:
         self._boundary.check(home / "calib")
         # Converters of data with several cameras write all labels in the frame of camera 0.
         self._front = _has_own_extrinsics(home / "calib")
+        self._rotation_y: RotationY = "mmdetection3d" if self._front else "calibration"
+        if rotation_y is not None:
+            check_rotation_y(rotation_y)
+            self._rotation_y = rotation_y
         self.camera = _camera(home, camera, front=self._front)
         folder = home / f"image_{self.camera}"
         self._has_images = contains_images(folder)

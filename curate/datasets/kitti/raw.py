@@ -33,7 +33,7 @@ from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import DataError
 from curate.files.paths import StrPath
-from curate.frames import Frame, FrameFiles, RotationY
+from curate.frames import Calibration, Frame, FrameFiles, RotationY
 from curate.geometry.mounting import check_rotation_y
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
@@ -83,9 +83,9 @@ class KittiRawDataset:
         rotation_y: RotationY = "calibration",
     ) -> None:
         check_rotation_y(rotation_y)
-        self._rotation_y = rotation_y
         self.root = Path(root)
         self._layout = layout
+        self._rotation_y = rotation_y
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._tracklets: dict[Path, TrackletTable] = {}
         folders = (
@@ -172,7 +172,7 @@ class KittiRawDataset:
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
             sweep = read_points(files.points, self._layout)
-        calibration = read_raw_calibration(files.calibration.parent, rotation_y=self._rotation_y)
+        calibration = self._calibration(files)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)
 
@@ -194,8 +194,10 @@ class KittiRawDataset:
             table = self._tracklets[files.label]
             index = frame_number(number, files.points)
             return table.read(index, self.read(frame_id, points=False))
-        calibration = read_raw_calibration(files.calibration.parent, rotation_y=self._rotation_y)
-        return read_annotations(files.label, calibration, categories=None)
+        return read_annotations(files.label, self._calibration(files), categories=None)
+
+    def _calibration(self, files: FrameFiles) -> Calibration:
+        return read_raw_calibration(files.calibration.parent, rotation_y=self._rotation_y)
 
     def _frame(self, frame_id: str) -> tuple[_Drive, str]:
         check_frame_id(frame_id)

@@ -70,6 +70,7 @@ class KittiTrackingDataset:
     Raises:
         ConfigError: if `rotation_y` is unknown.
         DataError: if the root contains neither.
+        ConfigError: if `rotation_y` is unknown.
     """
 
     name = "kitti-tracking"

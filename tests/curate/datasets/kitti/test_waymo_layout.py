@@ -60,6 +60,13 @@ def test_each_camera_has_its_image_and_calibration(tmp_path: Path, camera: int |
     np.testing.assert_allclose(dataset.annotations(NAMES[0]).boxes, expected.boxes, atol=1e-9)
 
 
+def test_rotation_y_is_that_of_the_converter_unless_declared(tmp_path: Path) -> None:
+    write_waymo(tmp_path)
+    assert KittiDataset(tmp_path).read(NAMES[0]).calibration.rotation_y == "mmdetection3d"
+    declared = KittiDataset(tmp_path, rotation_y="calibration")
+    assert declared.read(NAMES[0]).calibration.rotation_y == "calibration"
+
+
 def test_labels_of_the_camera_come_first(tmp_path: Path) -> None:
     write_waymo(tmp_path)
     (tmp_path / "training" / "label_1").mkdir()
