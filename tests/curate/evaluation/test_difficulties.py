@@ -214,3 +214,10 @@ def test_the_outcomes_take_the_level_with_the_most_objects():
     ):
         found, _ = object_outcomes(labels, labels, difficulty=difficulty, points=points)
         assert found.outcomes.tolist() == expected
+
+
+def test_a_range_includes_its_lower_limit():
+    """An object at exactly 30 m is in the range from 30 m."""
+    at_limit = [to_objects([car(z=30.0)])]
+    found = evaluate(at_limit, at_limit, difficulty=DistanceDifficulty((30.0,)))
+    assert found.objects[0].tolist() == [0, 1]
