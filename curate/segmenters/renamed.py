@@ -1,33 +1,26 @@
 """A segmenter with other category names in its table of classes."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from curate.frames import Frame
 from curate.segmenters.base import Segmenter, SemanticMap
 
 
-@dataclass(frozen=True)
 class RenamedSegmenter:
     """A `Segmenter` whose categories are renamed; its maps stay the same.
 
-    Attributes:
+    Args:
         segmenter: the segmenter.
         rename: the new name of each renamed category.
     """
 
-    segmenter: Segmenter
-    rename: Mapping[str, str]
-
-    @property
-    def needs_image(self) -> bool:
-        """Whether the segmenter reads the image."""
-        return self.segmenter.needs_image
-
-    @property
-    def needs_points(self) -> bool:
-        """Whether the segmenter reads the points; assumed if it does not declare it."""
-        return bool(getattr(self.segmenter, "needs_points", True))
+    def __init__(self, segmenter: Segmenter, rename: Mapping[str, str]) -> None:
+        self.segmenter = segmenter
+        self.rename = dict(rename)
+        self.needs_image = segmenter.needs_image
+        # Assumed if the segmenter does not declare it.
+        self.needs_points = bool(getattr(segmenter, "needs_points", True))
 
     def segment(self, frame: Frame) -> SemanticMap:
         """See `curate.segmenters.base.Segmenter`."""

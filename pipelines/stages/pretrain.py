@@ -75,7 +75,7 @@ def _check_objects(workspace: Workspace) -> None:
     """Raise ConfigError if X_l has no object of any category."""
     truth, categories = bulk.table("ground_truth"), workspace.config.dataset.categories
     query = select(truth.c.category, func.count()).where(truth.c.split == "labeled")
-    found = dict(sorted(workspace.database.rows(query.group_by(truth.c.category))))
+    found: dict[str, int] = dict(sorted(workspace.database.rows(query.group_by(truth.c.category))))
     if not any(name in categories for name in found):
         frames = len(workspace.frames("labeled"))
         raise ConfigError(

@@ -124,7 +124,7 @@ def _states(workspace: Workspace, round_number: int, frames: int) -> str:
         )
         .group_by(task.c.state)
     )
-    states = dict(workspace.database.rows(query))
+    states: dict[str, int] = dict(workspace.database.rows(query))
     failed, empty = states.get("failed", 0), states.get("empty", 0)
     return (
         f"of {frames} unlabeled frames, {failed} failed in predict (`curate status --failed`) and "
