@@ -17,7 +17,7 @@ class RenamedSegmenter:
 
     def __init__(self, segmenter: Segmenter, rename: Mapping[str, str]) -> None:
         self.segmenter = segmenter
-        self.rename = rename
+        self.rename = dict(rename)
         self.needs_image = segmenter.needs_image
         # Assumed if the segmenter does not declare it.
         self.needs_points = bool(getattr(segmenter, "needs_points", True))

@@ -105,6 +105,7 @@ def test_contradictions_between_table_and_boxes_are_rejected(
     ("category", "box", "message"),
     [
         ("Tram", CAR, "unknown category 'Tram'; the categories of this review are Car"),
+        ("car", CAR, "unknown category 'car'; the categories of this review are Car.*'Car'?"),
         ("Car", (float("nan"), *CAR[1:]), "not finite"),
         ("Car", (*CAR[:3], 0.0, *CAR[4:]), "the sides are 0 x 1.8 x 1.6"),
         ("Car", (*CAR[:3], 400.0, *CAR[4:]), "at most 50"),
