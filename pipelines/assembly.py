@@ -158,7 +158,11 @@ def open_segmenter(config: Config) -> Segmenter:
     segmenter: Segmenter = registry.SEGMENTERS.build(
         name,
         path,
-        offered={"classes": lambda: _class_map(name, classes), "seed": lambda: config.run.seed},
+        offered={
+            "classes": lambda: _class_map(name, classes),
+            "seed": lambda: config.run.seed,
+            "frame_ids": lambda: FrameNames.of_dataset(open_dataset(config)),
+        },
         options=section.options,
     )
     return segmenter
@@ -176,7 +180,7 @@ def check_segmenter(config: Config) -> None:
             registry.SEGMENTERS.check(
                 name,
                 segmenter_path(config),
-                offered=("classes", "seed"),
+                offered=("classes", "seed", "frame_ids"),
                 options=config.segmenter.options,
             )
 

@@ -16,6 +16,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar, overload
@@ -104,15 +105,26 @@ class FrameNames(Sequence[str]):
             return _only(name, self._numbered.get(int(last), ()))
         return None
 
-    def require(self, name: str) -> str:
+    def require(
+        self, name: str, place: object = None, *, error_type: type[CurateError] = DataError
+    ) -> str:
         """Return the frame with a name.
 
+        Args:
+            name: the name.
+            place: file and line, or the option of the command line, for messages.
+            error_type: class of the error.
+
         Raises:
-            DataError: if no frame has it, or several have.
+            CurateError: of class `error_type`, if no frame has it, or several have.
         """
-        found = self.find(name)
+        prefix = "" if place is None else f"{place}: "
+        try:
+            found = self.find(name)
+        except DataError as error:
+            raise error_type(f"{prefix}{error}") from None
         if found is None:
-            raise DataError(f"there is no frame {name[:200]!r}{self.nearest(name)}")
+            raise error_type(f"{prefix}there is no frame {name[:200]!r}{self.nearest(name)}")
         return found
 
     def match(self, names: Iterable[str], place: object) -> tuple[dict[str, str], list[str]]:
@@ -198,29 +210,42 @@ def match_frames(
     return found
 
 
-def match_files(
-    paths: Iterable[Path], frame_ids: Iterable[str], place: object
+def files_by_frame(
+    folder: Path, patterns: str | Sequence[str], frame_ids: Sequence[str]
 ) -> Mapping[str, Path]:
-    """Return the file of each frame; files of other frames are left out.
+    """Return the file of each frame in a folder; files of other frames are left out.
 
     Args:
-        paths: files that are named like their frame.
-        frame_ids: the ids of all frames, or `FrameNames`.
-        place: the folder, for messages.
+        folder: the folder; if no file in it matches the patterns, its subfolders are searched.
+        patterns: of the file names in lower case, such as "*.png".
+        frame_ids: the ids of all frames; if empty, no file is matched.
 
     Raises:
         DataError: if no file is of a frame of the data set, a file could be of several, or two
             files are of one frame.
     """
+    if not len(frame_ids):
+        return {}
+    allowed = (patterns,) if isinstance(patterns, str) else patterns
+    by_name = _matching(folder.iterdir(), allowed, folder)
+    by_name = by_name or _matching(folder.rglob("*"), allowed, folder)
     frames = FrameNames.of(frame_ids)
-    by_name = {str(path.relative_to(str(place))): path for path in sorted(paths)}
-    found, unmatched = frames.match(by_name, place)
+    found, unmatched = frames.match(by_name, folder)
     if unmatched and not found:
         raise DataError(
-            f"{place}: no file is of a frame of the data set, such as {unmatched[0][:200]!r}"
+            f"{folder}: no file is of a frame of the data set, such as {unmatched[0][:200]!r}"
             f"{frames.nearest(unmatched[0])}"
         )
     return {frame: by_name[name] for name, frame in found.items()}
+
+
+def _matching(paths: Iterable[Path], patterns: Sequence[str], folder: Path) -> Mapping[str, Path]:
+    """Return the visible files that match a pattern, by their paths in the folder."""
+    return {
+        path.relative_to(folder).as_posix(): path
+        for path in paths
+        if path.name[0] != "." and any(fnmatchcase(path.name.lower(), each) for each in patterns)
+    }
 
 
 def read_frame_list(
@@ -266,9 +291,10 @@ def match_frame_list(
     for number, line in read_frame_list(path, error_type=error_type):
         for name in [line] if line in frames or line in groups else line.split():
             try:
-                found |= dict.fromkeys(groups.get(name) or [_listed(frames, name, allow_missing)])
+                listed = groups.get(name) or [_listed(frames, name, allow_missing)]
             except DataError as error:
                 raise error_type(f"{path}:{number}: {error}") from None
+            found |= dict.fromkeys(listed)
     return tuple(found)
 
 
@@ -287,10 +313,10 @@ def last_part(name: str) -> str:
 
 def _parts(name: str) -> tuple[list[str], str]:
     """Return the folders of a path of any system, and its last part without suffix."""
-    *folders, last = name.strip().replace("\\", "/").split("/")
-    while len(short := _SUFFIX.sub("", last)) < len(last) and short:
-        last = short
-    return [folder for folder in folders if folder], last
+    folders, _, last = name.strip().replace("\\", "/").rpartition("/")
+    while "." in last and (match := _SUFFIX.search(last)) and match.start():
+        last = last[: match.start()]
+    return [folder for folder in folders.split("/") if folder], last
 
 
 def _unpadded(text: str) -> str:

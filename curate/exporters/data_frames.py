@@ -5,10 +5,8 @@ give the columns of `weighted_labels` with the same types. The types come from t
 a reader that guesses types would turn the frame id "000001" into the number 1.
 """
 
-import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, overload
 
@@ -18,6 +16,7 @@ from curate.exporters.columns import WEIGHTED_LABELS
 from curate.exporters.label_file import read_label_rows
 from curate.exporters.parquet import FORMAT
 from curate.files.batches import batched
+from curate.files.csv_text import Header, open_lines
 from curate.files.parquet import load_parquet
 from curate.files.paths import StrPath
 
@@ -32,6 +31,10 @@ Kinds = Mapping[str, Kind]
 Row = Sequence[Any]
 
 BLOCK_ROWS: Final = 65_536
+_NOT_LABELS: Final = (
+    "not exported labels; read_labels reads the formats sqlite, csv and parquet, which "
+    "`curate export --format` writes"
+)
 _PANDAS: Final = {int: "Int64", float: "float64", str: "string"}
 _CORE: Final[Kinds] = {
     column.name: {"name": str, "float64": float}.get(column.kind, int) for column in WEIGHTED_LABELS
@@ -69,12 +72,7 @@ def read_labels(path: StrPath, as_: Library | None = None) -> Any:
     if start.startswith(b"SQLite format 3\0"):
         with read_label_rows(path) as (kinds, rows):
             return _as_data_frame(library, kinds, rows)
-    if start.decode("utf-8", "replace").startswith(",".join(WEIGHTED_LABEL_COLUMNS)):
-        return _read_csv(path, library)
-    raise DataError(
-        f"{path}: not exported labels; read_labels reads the formats sqlite, csv and parquet, "
-        "which `curate export --format` writes"
-    )
+    return _read_csv(path, library)
 
 
 def _choose(as_: str | None) -> Library:
@@ -90,7 +88,7 @@ def _start(path: Path) -> bytes:
     """Return the first bytes, enough to detect the format."""
     try:
         with path.open("rb") as file:
-            return file.read(len(",".join(WEIGHTED_LABEL_COLUMNS)))
+            return file.read(16)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
 
@@ -99,42 +97,49 @@ def _read_csv(path: Path, library: Library) -> Any:
     """Read a CSV export; columns beyond the core columns are numbers if all their values are.
 
     Raises:
-        DataError: if a row is too short or too long, or a value does not have its column's type.
+        DataError: if a core column is missing, a row is too short or too long, or a value does not
+            have its column's type.
     """
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            lines = csv.reader(file)
-            names = next(lines)
-            further = {
-                name: _kind_of_texts(path, names.index(name)) for name in names[len(_CORE) :]
-            }
-            kinds = {**_CORE, **further}
-            return _as_data_frame(library, kinds, _parse(path, lines, kinds))
-    except (csv.Error, UnicodeDecodeError, OverflowError) as error:
-        raise DataError(f"{path}: cannot be read: {one_line(error)}; export it again") from None
+    header = Header.read(open_lines(path))
+    known = {name.casefold() for name in header.names}
+    if not known.issuperset(WEIGHTED_LABEL_COLUMNS):
+        raise DataError(f"{path}: {_NOT_LABELS}")
+    further = [name for name in header.names if name.casefold() not in WEIGHTED_LABEL_COLUMNS]
+    names = (*WEIGHTED_LABEL_COLUMNS, *further)
+    places = header.places(path, names)
+    kinds = {**_CORE, **{name: _kind_of_texts(path, header, name) for name in further}}
+    return _as_data_frame(library, kinds, _parse(path, _csv_rows(path), places, kinds))
 
 
-def _parse(path: Path, lines: Iterable[Sequence[str]], kinds: Kinds) -> Iterator[Row]:
-    for number, line in enumerate(lines, start=2):
+def _csv_rows(path: Path) -> Iterator[tuple[int, Sequence[str]]]:
+    lines = open_lines(path)
+    header = Header.read(lines)
+    yield from header.rows(lines, path, header.line + 1)
+
+
+def _parse(
+    path: Path, rows: Iterable[tuple[int, Sequence[str]]], places: Sequence[int], kinds: Kinds
+) -> Iterator[Row]:
+    for line, row in rows:
+        texts = [row[place] for place in places]
         try:
             yield [
                 kind(text) if text else None
-                for kind, text in zip(kinds.values(), line, strict=True)
+                for kind, text in zip(kinds.values(), texts, strict=True)
             ]
-        except ValueError as error:
-            raise DataError(f"{path} line {number}: {one_line(error)}; export it again") from None
+        except (OverflowError, ValueError) as error:
+            raise DataError(f"{path}:{line}: {one_line(error)}; export it again") from None
 
 
-def _kind_of_texts(path: Path, place: int) -> Kind:
+def _kind_of_texts(path: Path, header: Header, name: str) -> Kind:
     """Return int or float if every value of a column is written as such a number, else str.
 
     "7" is an int, but "007" is text, because an int would be written as "7".
     """
     fitting: list[Kind] = [int, float]
-    with path.open(newline="", encoding="utf-8") as file:
-        for line in islice(csv.reader(file), 1, None):
-            text = line[place] if place < len(line) else ""
-            fitting = [kind for kind in fitting if not text or _is_written_as(kind, text)]
+    (place,) = header.places(path, (name,))
+    for _, row in _csv_rows(path):
+        fitting = [kind for kind in fitting if not row[place] or _is_written_as(kind, row[place])]
     return fitting[0] if fitting else str
 
 

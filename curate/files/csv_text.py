@@ -15,6 +15,7 @@ from curate.errors import DataError, one_line
 from curate.files.text import check_not_utf16, read_text
 from curate.spelling import did_you_mean
 
+_LONGEST = 100_000  # characters of a header; the module csv rejects longer fields
 _DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
 
@@ -25,7 +26,7 @@ class Header:
     Attributes:
         line: its number.
         delimiter: what separates the fields.
-        names: of the columns, in lower case.
+        names: of the columns.
     """
 
     line: int
@@ -38,8 +39,8 @@ class Header:
         numbered = enumerate(lines, start=1)
         number, text = next(((n, line) for n, line in numbered if line.strip(" \t\r\n,;")), (1, ""))
         delimiter = max(_DELIMITERS, key=text.count)
-        fields = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True), [])
-        names = [field.strip().casefold() for field in fields]
+        fields = next(csv.reader([text[:_LONGEST]], delimiter=delimiter, skipinitialspace=True), [])
+        names = [field.strip() for field in fields]
         while names and not names[-1]:
             names.pop()
         return cls(number, delimiter, tuple(names))
@@ -50,17 +51,18 @@ class Header:
         Raises:
             DataError: if a column is missing or occurs twice.
         """
-        missing = [name for name in columns if name.casefold() not in self.names]
+        known = [name.casefold() for name in self.names]
+        missing = [name for name in columns if name.casefold() not in known]
         if missing:
             hint = did_you_mean(missing[0], filter(None, self.names))
             raise DataError(
                 f"{place}:{self.line}: no column {', '.join(missing)} in the header, in which "
-                f"{_DELIMITERS[self.delimiter]} separate {len(self.names)} columns{hint}"
+                f"{_DELIMITERS[self.delimiter]} separate {len(known)} columns{hint}"
             )
-        twice = [name for name in columns if self.names.count(name.casefold()) > 1]
+        twice = [name for name in columns if known.count(name.casefold()) > 1]
         if twice:
             raise DataError(f"{place}:{self.line}: column {twice[0]} occurs twice in the header")
-        return tuple(self.names.index(name.casefold()) for name in columns)
+        return tuple(known.index(name.casefold()) for name in columns)
 
     def rows(
         self, lines: Iterable[str], place: object, first_line: int
@@ -80,7 +82,7 @@ class Header:
         try:
             for row in reader:
                 line = first_line - 1 + reader.line_num
-                fields = [field.strip() for field in row]
+                fields = list(map(str.strip, row))
                 while len(fields) > width and not fields[-1]:
                     fields.pop()
                 if not any(fields):
@@ -106,17 +108,14 @@ def read_csv(path: Path, columns: Sequence[str]) -> Iterator[tuple[int, tuple[st
         yield line, tuple(row[place] for place in places)
 
 
-def parse_number(text: str) -> float:
-    """Return a number of a CSV file.
-
-    Raises:
-        ValueError: if the text is not a number; the message says what to do.
-    """
+def number_problem(text: str) -> str | None:
+    """Return what is wrong with a field that must be a number, and what to do, or None."""
     try:
-        return float(text)
+        float(text)
     except ValueError:
         hint = "; write a decimal point" if "," in text else ""
-        raise ValueError(f"{text[:40]!r} is not a number{hint}") from None
+        return f"{text[:40]!r} is not a number{hint}"
+    return None
 
 
 def open_lines(path: Path) -> Iterator[str]:

@@ -71,7 +71,9 @@ def check_not_utf16(
 ) -> None:
     """Raise an error if the first four bytes of a text file are those of UTF-16 or UTF-32."""
     marks = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    if start.startswith(marks) or (b"\0" in start and start.strip(b"\0").isascii()):
+    halves = (start[::2], start[1::2])  # without a mark, one half of ASCII in UTF-16 is null bytes
+    is_wide = len(start) > 1 and sorted(map(any, halves)) == [False, True]
+    if start.startswith(marks) or (is_wide and any(map(all, halves))):
         raise error_type(f'{place}: saved as UTF-16 (Windows\' "Unicode"); {_REMEDY}')
 
 

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from curate.errors import DataError, one_line
+from curate.errors import DataError
 from curate.files.atomic import replace_file
+from curate.files.json_text import read_json
 
 MANIFEST = "review.json"
 FORMAT = "curate review 1"
@@ -104,7 +105,11 @@ def read_sheet(folder: Path) -> Sheet:
         DataError: if it is missing, damaged or changed.
     """
     path = folder / MANIFEST
-    document = read_json(path, "; import the folder that `curate review export` wrote")
+    if not path.is_file():
+        raise DataError(
+            f"{path}: no such file; import the folder that `curate review export` wrote"
+        )
+    document = read_json(path)
     if not isinstance(document, Mapping) or document.get("format") != FORMAT:
         raise DataError(f"{path}: not a review manifest; import the folder as it was exported")
     try:
@@ -119,20 +124,6 @@ def read_sheet(folder: Path) -> Sheet:
             "files instead"
         )
     return sheet
-
-
-def read_json(path: Path, remedy: str = "") -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        DataError: if it is missing or damaged.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file{remedy}") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: invalid JSON: {one_line(error)}") from None
 
 
 def _sheet(document: Mapping[str, Any]) -> Sheet:

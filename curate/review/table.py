@@ -10,10 +10,12 @@ import io
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from curate.datasets.frame_names import FrameNames
 from curate.errors import DataError
 from curate.files.atomic import replace_file
+from curate.files.csv_text import read_csv
 from curate.review.human_labels import ACCEPTED, REJECTED
-from curate.review.sheet import Sheet
+from curate.review.sheet import Sheet, ShownFrame
 
 TABLE = "review.csv"
 COLUMNS = ("frame", "box", "asked", "category", "score", "weight", "decision")
@@ -58,48 +60,29 @@ def read_table(folder: Path, sheet: Sheet) -> dict[str, ExplicitDecisions]:
     path = folder / TABLE
     if not path.is_file():
         return {}
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a UTF-8 text file (byte {error.start})") from None
-    # In some languages spreadsheets save CSV with semicolons.
-    delimiter = ";" if ";" in text.partition("\n")[0] else ","
-    rows = csv.DictReader(io.StringIO(text), delimiter=delimiter)
-    if not {"frame", "box", "decision"} <= set(rows.fieldnames or ()):
-        raise DataError(f"{path}:1: the columns frame, box and decision are required")
+    shown = {frame.frame: frame for frame in sheet.frames}
+    frames = FrameNames(shown)
     found: dict[str, ExplicitDecisions] = {}
-    for row in rows:
-        word = (row["decision"] or "").strip().lower()
-        if word:
-            _add_decision(row, word, f"{path}:{rows.line_num}", sheet, found)
+    for line, (name, box, decision) in read_csv(path, ("frame", "box", "decision")):
+        if decision:
+            place = f"{path}:{line}"
+            frame = frames.require(name, place)
+            words = found.setdefault(frame, ExplicitDecisions())
+            _add_decision(shown[frame], box.lower(), decision.lower(), place, words)
     return found
 
 
 def _add_decision(
-    row: dict[str, str], word: str, place: str, sheet: Sheet, found: dict[str, ExplicitDecisions]
+    shown: ShownFrame, box: str, word: str, place: str, words: ExplicitDecisions
 ) -> None:
     if word not in _WORDS:
         raise DataError(f"{place}: invalid decision {word!r}; write accept, reject or nothing")
-    name = _frame(row["frame"], place, sheet)
-    words = found.setdefault(name, ExplicitDecisions())
-    if (row["box"] or "").strip().lower() == ALL:
+    if box == ALL:
         if _WORDS[word] == REJECTED:
             raise DataError(f"{place}: a whole frame cannot be rejected; reject its boxes")
         words.accept_rest = True
         return
-    count = len(next(frame for frame in sheet.frames if frame.frame == name).boxes)
-    number = int(row["box"]) if (row["box"] or "").strip().isdigit() else 0
+    number, count = int(box) if box.isdecimal() else 0, len(shown.boxes)
     if not 1 <= number <= count:
-        raise DataError(f"{place}: frame {name} has boxes 1 to {count}, not {row['box']!r}")
+        raise DataError(f"{place}: frame {shown.frame} has boxes 1 to {count}, not {box!r}")
     words.boxes[number] = _WORDS[word]
-
-
-def _frame(name: str, place: str, sheet: Sheet) -> str:
-    """Return the frame of a row; spreadsheets remove leading zeros."""
-    names = [frame.frame for frame in sheet.frames]
-    matches = [each for each in names if each.lstrip("0") == name.strip().lstrip("0")]
-    if name in names:
-        return name
-    if len(matches) != 1:
-        raise DataError(f"{place}: frame '{name}' is not in this review")
-    return matches[0]

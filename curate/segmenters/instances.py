@@ -4,14 +4,15 @@ Source: COCO's data format: annotations `{images, annotations}`, a list of resul
 per frame. Where masks overlap, the mask with the higher score is on top.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from curate.errors import ConfigError, DataError, one_line
+from curate.datasets.frame_names import FrameNames, files_by_frame, last_part
+from curate.errors import ConfigError, DataError
+from curate.files.json_text import read_json
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.segmenters.base import SemanticMap
@@ -30,6 +31,8 @@ class InstanceSegmenter:
             which contains such a list or `{annotations: [...]}`.
         classes: the COCO category ids that count for each category.
         minimum_score: masks below it are dropped; a mask without a score counts as score 1.
+        frame_ids: the frames of the data set, with which the names of files and images are matched
+            in the spellings of `curate.datasets.frame_names`; without them, names are frame ids.
 
     Raises:
         DataError: if the path is missing, or contains no instance masks.
@@ -39,14 +42,23 @@ class InstanceSegmenter:
     needs_image = False
 
     def __init__(
-        self, path: StrPath, classes: Mapping[str, Sequence[int]], *, minimum_score: float = 0.5
+        self,
+        path: StrPath,
+        classes: Mapping[str, Sequence[int]],
+        *,
+        minimum_score: float = 0.5,
+        frame_ids: Sequence[str] = (),
     ) -> None:
         if not 0 <= minimum_score <= 1:
             raise ConfigError(f"segmenter minimum_score {minimum_score}: expected 0 to 1")
         self.path = Path(path)
         self.classes = checked_classes(classes)
         self.minimum_score = minimum_score
-        self._frames = None if self.path.is_dir() else _by_frame(self.path)
+        self._files = self._frames = None
+        if self.path.is_dir():
+            self._files = files_by_frame(self.path, "*.json", frame_ids)
+        else:
+            self._frames = _by_frame(self.path, FrameNames.of(frame_ids))
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's masks as a semantic map.
@@ -78,35 +90,45 @@ class InstanceSegmenter:
 
     def _objects(self, frame_id: str) -> tuple[str, Objects]:
         """Return the place of a frame's objects, for error messages, and the objects."""
-        if self._frames is None:
-            path = self.path / f"{frame_id}.json"
-            return str(path), _object_list(path, _read(path))
-        number = int(frame_id) if frame_id.isdecimal() else None
-        for key in (frame_id, number):
-            if key in self._frames:
-                return f"{self.path}: frame {frame_id}", self._frames[key]
+        if self._files is not None:
+            path = self._files.get(frame_id, self.path / f"{frame_id}.json")
+            return str(path), _object_list(path, read_json(path, "instance mask"))
+        names = (frame_id, str(int(frame_id))) if frame_id.isdecimal() else (frame_id,)
+        for name in names:
+            if self._frames is not None and name in self._frames:
+                return f"{self.path}: frame {frame_id}", self._frames[name]
         raise DataError(
             f"{self.path}: no masks for frame {frame_id}; list a frame without objects in "
             '`images`: {"images": [{"id": 1, "file_name": "FRAME.png"}], "annotations": [...]}'
         )
 
 
-def _by_frame(path: Path) -> dict[str | int, list[Mapping[str, Any]]]:
-    """Return the objects of each frame, by its name or by the `image_id` of a list of results."""
-    document = _read(path)
+def _by_frame(path: Path, frame_ids: FrameNames) -> Mapping[str, list[Mapping[str, Any]]]:
+    """Return the objects of each frame of the data set, or of each image without `frame_ids`."""
+    document = read_json(path, "instance mask")
     images = document.get("images", ()) if isinstance(document, dict) else ()
     try:
-        names = {image["id"]: Path(image["file_name"]).stem for image in images}
-        frames: dict[str | int, list[Mapping[str, Any]]] = {name: [] for name in names.values()}
+        names = {image["id"]: str(image["file_name"]) for image in images}
+        found: dict[str, list[Mapping[str, Any]]] = {name: [] for name in names.values()}
         for entry in _object_list(path, document):
             key = entry["image_id"]
-            frames.setdefault(names[key] if names else key, []).append(entry)
+            found.setdefault(names[key] if names else str(key), []).append(entry)
     except (KeyError, TypeError) as error:
         words = f"no {error.args[0]!s:.80}" if isinstance(error, KeyError) else str(error)
         raise DataError(
             f"{path}: not COCO's format of images and masks: {' '.join(words.split())}"
         ) from None
-    return frames
+    if len(found) < len(names):
+        raise DataError(f"{path}: two images have the same file_name; remove one")
+    if not len(frame_ids):
+        return {last_part(name): objects for name, objects in found.items()}
+    matched, unmatched = frame_ids.match(found, path)
+    if unmatched and not matched:
+        raise DataError(
+            f"{path}: no image is of a frame of the data set, such as {unmatched[0][:200]!r}"
+            f"{frame_ids.nearest(unmatched[0])}"
+        )
+    return {frame: found[name] for name, frame in matched.items()}
 
 
 def _object_list(path: Path, document: Any) -> list[Mapping[str, Any]]:
@@ -124,12 +146,3 @@ def _score(source: str, number: int, entry: Mapping[str, Any]) -> float:
     if not isinstance(score, int | float) or not 0 <= score <= 1:
         raise DataError(f"{source}: object {number}: the score is not a number from 0 to 1")
     return float(score)
-
-
-def _read(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file of instance masks") from None
-    except (OSError, RecursionError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.frame_names import files_by_frame
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Frame
@@ -16,6 +17,7 @@ from curate.segmenters.map_files import MapFile, read_map
 
 _MAX_CLASSES = 256
 _SUFFIXES = (".png", ".npy")
+_PATTERNS = tuple(f"*{suffix}" for suffix in _SUFFIXES)
 _CHANNELS = ("red", "green", "blue")
 # What a value below the divisor is, where a published format defines it: a class without
 # instances in Cityscapes' instanceIds, an instance of class 0 in KITTI's semantic instances.
@@ -29,7 +31,7 @@ class SavedSegmenter:
     declared, because no file states them.
 
     Args:
-        directory: the folder of the maps.
+        directory: the folder of the maps; if none is in it, they are in its subfolders.
         classes: the class ids that count for each category.
         divisor: for maps of class * divisor + instance number: 1000 for Cityscapes' instanceIds,
             256 for KITTI's. 1 for class ids in 16 bits, which could be either.
@@ -38,9 +40,11 @@ class SavedSegmenter:
         colours: for maps that show classes in colours: the name of a colour table, or the colour
             [red, green, blue] of each class id. "none": the palette of a PNG has no meaning.
         channel: for maps in colours with the class id in one channel: "red" for CARLA's.
+        frame_ids: the frames of the data set, with which the names of the maps are matched in the
+            spellings of `curate.datasets.frame_names`; without them, names are frame ids.
 
     Raises:
-        DataError: if the folder does not exist.
+        DataError: if the folder does not exist, or no map is of a frame of the data set.
         ConfigError: if a class id or another option is invalid.
     """
 
@@ -56,6 +60,7 @@ class SavedSegmenter:
         below: str | None = None,
         colours: str | Mapping[str, Sequence[int]] | None = None,
         channel: str | None = None,
+        frame_ids: Sequence[str] = (),
     ) -> None:
         if divisor is not None and not (type(divisor) is int and divisor >= 1):
             raise ConfigError(f"segmenter divisor {divisor!r}: expected an integer of at least 1")
@@ -74,6 +79,7 @@ class SavedSegmenter:
         self._ignores_palette = colours == "none"
         if not self.directory.is_dir():
             raise DataError(f"{self.directory}: no such folder of semantic maps")
+        self._maps = files_by_frame(self.directory, _PATTERNS, frame_ids)
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's saved map.
@@ -82,7 +88,7 @@ class SavedSegmenter:
             DataError: if the map is missing, has another size than the frame's image, can be read
                 in two ways, or contains ids that its class set does not have.
         """
-        path = self._path(frame.frame_id)
+        path = self._maps.get(frame.frame_id) or self._path(frame.frame_id)
         class_ids = self._class_ids(path, read_map(path))
         width, height = frame.image_size
         if class_ids.shape != (height, width):

@@ -82,7 +82,7 @@ def evaluate(
             raise ConfigError("evaluate: --store needs a workspace, not --labels and --results")
         from curate.evaluation.kitti_folders import read_folders
 
-        _, truth, detections = read_folders(labels, results, _read_ids(frames) if frames else None)
+        _, truth, detections = read_folders(labels, results, frame_list=frames)
         found = _compare(truth, detections)
         notes = f"{results} on {len(truth)} frames"
     else:
@@ -95,19 +95,6 @@ def evaluate(
     else:
         print_line(notes)
         _print(found.as_dict())
-
-
-def _read_ids(path: Path) -> list[str]:
-    """Return the frame ids in a file such as ImageSets/val.txt."""
-    from curate.errors import DataError
-
-    try:
-        found = path.read_text(encoding="utf-8").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: is not a list of frame ids: {error}") from error
-    if not found:
-        raise DataError(f"{path}: lists no frames; write one frame id per line")
-    return found
 
 
 def _evaluate_val(

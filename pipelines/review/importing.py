@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, select
 
+from curate.datasets.frame_names import FrameNames
 from curate.detections import as_categories
 from curate.errors import ConfigError, DataError, LeakageError
 from curate.review.edits import Decision, EditedBox, FrameEdits, check_boxes, compare_frame
@@ -155,10 +156,13 @@ def _read_edits(
     editor = EDITORS.build(sheet.editor, offered={}, options={})
     edited = editor.read(path, sheet, partial(workspace.dataset.read, points=False))
     table = read_table(folder, sheet)
-    names = {shown.frame for shown in sheet.frames}
-    for name in accept:
-        if name not in {*names, ALL_FRAMES}:
-            raise ConfigError(f"--accept: frame '{name}' is not in this review")
+    frames = FrameNames(shown.frame for shown in sheet.frames)
+    accepted = {
+        name
+        if name == ALL_FRAMES
+        else frames.require(name, "--accept: in this review", error_type=ConfigError)
+        for name in accept
+    }
     edits = []
     for shown in sheet.frames:
         explicit = table.get(shown.frame, ExplicitDecisions())
@@ -166,7 +170,7 @@ def _read_edits(
             continue
         boxes = edited.get(shown.frame, _as_shown(shown))
         check_boxes(boxes, sheet.categories)
-        rest = explicit.accept_rest or not {shown.frame, ALL_FRAMES}.isdisjoint(accept)
+        rest = explicit.accept_rest or not {shown.frame, ALL_FRAMES}.isdisjoint(accepted)
         edits.append(compare_frame(shown, boxes, explicit.boxes, accept_rest=rest))
     _check_overlaps(edits)
     return edits
@@ -264,8 +268,11 @@ def clear(workspace: Workspace, reviews: Collection[str] = (), frames: Collectio
         keys = workspace.frames("unlabeled")
         for name in {*reviews} - known:
             raise ConfigError(f"unknown review {name}; `curate review list` shows the reviews")
-        for name in {*frames} - keys.keys():
-            raise ConfigError(f"--frames: '{name}' is not an unlabeled frame of this workspace")
+        unlabeled = FrameNames(keys)
+        frames = [
+            unlabeled.require(name, "--frames: among the unlabeled frames", error_type=ConfigError)
+            for name in frames
+        ]
         query = select(label.c.frame_id, label.c.n)
         if reviews:
             query = query.where(label.c.review.in_(reviews))

@@ -1,7 +1,7 @@
 """Select the labels of a round to review, with other labels of their frames as context."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, func, select
@@ -62,7 +62,7 @@ def make_sheet(
         LeakageError: if a frame is not unlabeled.
         WorkspaceError: if the policy has weighted nothing, or no label is selected.
     """
-    _check(workspace, request)
+    request = _checked(workspace, request)
     number = _weighted_round(workspace, round_number, policy)
     selected = _changed(workspace, number, policy, request) if request.order == "changed" else None
     with workspace.database.reading() as connection:
@@ -84,22 +84,25 @@ def make_sheet(
     return Sheet(number, policy, editor, categories, frames)
 
 
-def _check(workspace: Workspace, request: ReviewRequest) -> None:
+def _checked(workspace: Workspace, request: ReviewRequest) -> ReviewRequest:
+    """Return the request with the ids of its frames, which may be spelled otherwise."""
     if request.order not in ORDERS:
         raise ConfigError(f"--by {request.order}: use one of {', '.join(ORDERS)}")
     categories = workspace.config.dataset.categories
     for category in request.categories:
         if category not in categories:
             raise ConfigError(f"--category {category}: use one or more of {', '.join(categories)}")
-    everywhere, unlabeled = workspace.frames(*SPLITS), workspace.frames("unlabeled")
-    for frame in request.frames:
-        if frame not in everywhere:
-            raise ConfigError(f"--frames: frame '{frame}' is not in this workspace")
+    everywhere, unlabeled = workspace.frame_names(*SPLITS), workspace.frames("unlabeled")
+    frames = [
+        everywhere.require(name, "--frames", error_type=ConfigError) for name in request.frames
+    ]
+    for frame in frames:
         if frame not in unlabeled:
             raise LeakageError(
                 f"--frames: frame {frame} is not unlabeled; only labels of unlabeled frames can "
                 "be reviewed"
             )
+    return replace(request, frames=tuple(dict.fromkeys(frames)))
 
 
 def _weighted_round(workspace: Workspace, number: int | None, policy: str) -> int:

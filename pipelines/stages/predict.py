@@ -64,9 +64,15 @@ def checked(found: Detections, config: Config) -> Detections:
     """Return the detections with configured categories and sufficient scores, by descending score.
 
     Raises:
-        ModelError: if a box is not finite or has no size, or a category differs from a configured
-            one only in upper and lower case.
+        ModelError: if a box is not finite or has no size, a score is not in [0, 1], or a category
+            differs from a configured one only in upper and lower case.
     """
+    scores = found.scores
+    if len(scores) and not (scores.min() >= 0 and scores.max() <= 1):  # also for NaN
+        raise ModelError(
+            f"the detector returned scores from {scores.min():.3g} to {scores.max():.3g}; a score "
+            "is a probability in [0, 1]"
+        )
     configured = np.isin(found.categories, config.dataset.categories)
     if not configured.all():
         _report_unexpected(np.unique(found.categories[~configured]).tolist(), config)

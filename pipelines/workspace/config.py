@@ -21,6 +21,7 @@ from pydantic import (
 
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, one_line
+from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
 from pipelines import registry
 from pipelines.workspace.config_errors import describe_errors
@@ -413,17 +414,13 @@ def read_config(path: Path) -> Config:
     """
     if path.exists() and not path.is_file():
         raise ConfigError(f"{path}: is not a file but a folder, a pipe or a device; remove it")
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file; `curate init` creates a workspace")
+    text = read_text(path, "configuration", error_type=ConfigError)
     try:
-        document = parse_toml(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; `curate init` creates a workspace") from error
-    except (
-        RecursionError,
-        ValueError,
-    ) as error:  # ValueError also covers numbers that are too long
+        document = parse_toml(text)
+    except (RecursionError, ValueError) as error:  # ValueError also for numbers that are too long
         raise ConfigError(f"{path}: invalid TOML: {one_line(error, 200)}") from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     return make_config(document, str(path))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from curate.errors import ConfigError
 from curate.files.atomic import replace_file
+from curate.files.text import read_text
 from curate.files.toml_text import parse_toml, toml
 from pipelines.workspace.config import Config
 from pipelines.workspace.reference import Setting, sections_of, settings_of
@@ -69,8 +70,8 @@ def change_settings(path: Path, section: str, changes: Mapping[str, str]) -> Non
     """
     lines = [f"{key} = {toml(value)}" for key, value in changes.items()]
     reason = "cannot be changed line by line"
+    text = read_text(path, "configuration", error_type=ConfigError)
     try:
-        text = path.read_text(encoding="utf-8-sig")
         before = parse_toml(text)
         changed = "\n".join(_changed(text.splitlines(), section, lines)) + "\n"
         expected = {**before, section: {**before.get(section, {}), **changes}}

@@ -11,6 +11,7 @@ from sqlalchemy import func, select
 
 from curate.datasets.base import Dataset, sequences_of
 from curate.datasets.formats.containment import check_frame_id
+from curate.datasets.frame_names import FrameNames, match_frame_list
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
@@ -205,19 +206,19 @@ def _choose(
 
 def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> list[str]:
     """Return the frames that a file lists, without repetition; a sequence means all its frames."""
-    try:
-        names = list(dict.fromkeys(path.read_text(encoding="utf-8").split()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--{split} {path}: is not a list of frame ids: {error}") from error
     groups = group_by_sequence(sequences_of(dataset, pool), pool)
-    names = [frame for name in names for frame in groups.get(name, (name,))]
-    unknown = sorted(set(names) - set(pool))
-    if unknown:
-        raise ConfigError(f"--{split} {path}: frame {unknown[0]} is not among the training frames")
+    frames = FrameNames.of_dataset(dataset)
+    try:
+        names = match_frame_list(path, frames, groups=groups, error_type=ConfigError)
+    except ConfigError as error:
+        raise ConfigError(f"--{split} {error}") from None
+    outside = sorted(set(names) - set(pool))
+    if outside:
+        raise ConfigError(f"--{split} {path}: frame {outside[0]} is not among the training frames")
     without_label = [name for name in names if not dataset.files(name).label]
     if without_label:
         raise ConfigError(f"--{split} {path}: frame {without_label[0]} has no label file")
-    return names
+    return list(names)
 
 
 def _store(

@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import select
 
+from curate.datasets.frame_names import read_frame_list
 from curate.errors import ConfigError
 from curate.firewall.split_lists import SplitList, describe_changes
 from db import bulk
@@ -139,7 +140,5 @@ def _row(source: str, name: str, path: str | None, names: SplitList) -> dict[str
 
 def _read(path: Path) -> list[str]:
     """Return the frames that a file lists."""
-    try:
-        return path.read_text(encoding="utf-8").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is not a list of frame ids: {error}") from error
+    lines = read_frame_list(path, error_type=ConfigError)
+    return [name for _, line in lines for name in line.split()]

@@ -11,6 +11,7 @@ import numpy as np
 from sqlalchemy import select
 
 from curate.datasets.base import Dataset
+from curate.datasets.frame_names import FrameNames
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError, WorkspaceError
 from db import bulk
@@ -92,6 +93,10 @@ class Workspace:
         frame = bulk.table("frame")
         query = select(frame.c.frame, frame.c.id).where(frame.c.split.in_(splits))
         return dict(self.database.rows(query.order_by(frame.c.frame)))
+
+    def frame_names(self, *splits: str) -> FrameNames:
+        """Return the frames of some splits, found by any spelling."""
+        return FrameNames(self.frames(*splits))
 
     def ground_truth(self, *splits: str) -> dict[str, Annotations]:
         """Return the stored ground truth by frame name; unlabeled frames have none."""

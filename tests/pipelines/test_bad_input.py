@@ -92,7 +92,7 @@ def test_results_for_other_frames_end_the_command(
     code, _, err = begin(curate, tmp_path / "w", toy_kitti, results)
     assert code == DataError.exit_code
     assert "results for frames that do not exist (drive_000000" in err
-    assert "named like 000000" in err
+    assert "the nearest are '000000' and" in err
     assert "Traceback" not in err
 
 

@@ -248,8 +248,9 @@ def test_a_list_can_contain_a_frame_twice(
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\x90\xff\x00", "is not a list of frame ids"),
-        (b"000099\n", "not among the training frames"),
+        (b"\x90\xff\x00", "ids.txt:1: not UTF-8 text (byte 0x90); save the file as UTF-8"),
+        (b"000099\n", "ids.txt:1: there is no frame '000099'; the nearest are '000009' and"),
+        (b"000011\n", "frame 000011 is not among the training frames"),
         (b"000002\n", "000002 has no label file"),
     ],
 )

@@ -117,7 +117,7 @@ def read_calibration(path: Path, camera: int = LEFT_COLOUR) -> Calibration:
     rectification = lines.matrix(_RECTIFICATIONS, _SQUARE)
     to_camera = _to_camera(lines, camera)
     to_rectified = lines.matrix(_TO_RECTIFIED, _WIDE)
-    needed = {names: projection}
+    needed: dict[tuple[str, ...], np.ndarray | None] = {names: projection}
     if to_rectified is None:
         needed |= {_RECTIFICATIONS: rectification, _TO_CAMERA: to_camera}
     _require(lines, needed)
@@ -128,7 +128,8 @@ def read_calibration(path: Path, camera: int = LEFT_COLOUR) -> Calibration:
         if to_rectified is not None and not np.allclose(product, to_rectified, atol=1e-4):
             raise DataError(f"{place} differs from Tr; both lead to the rectified camera")
         to_rectified = product
-    return Calibration(np.asarray(projection), _invertible(_square(to_rectified), place))
+    transform = _square(np.asarray(to_rectified))
+    return Calibration(np.asarray(projection), _invertible(transform, place))
 
 
 def read_raw_calibration(folder: Path, camera: int = LEFT_COLOUR) -> Calibration:

@@ -11,7 +11,6 @@ contain no braces:
     [{"token": "a1", ...}, {"token": "b2", ...}]   ->   (1, b'{"token": "a1", ...}'), ...
 """
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from curate.errors import DataError, one_line
+from curate.errors import DataError
+from curate.files.json_text import parse_json, read_json
 from curate.geometry.poses import pose_matrix
 
 Record = Mapping[str, Any]
@@ -38,12 +38,9 @@ def read_table(path: Path) -> dict[str, Record]:
     Raises:
         DataError: if the file is missing or not a table.
     """
-    try:
-        records = json.loads(path.read_bytes())
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    except (RecursionError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON: {one_line(error, 200)}") from None
+    if not path.exists():
+        raise _unreadable(path, FileNotFoundError())
+    records = read_json(path, "table")
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         raise DataError(f"{path}: not a table: expected a list of records with a token")
     return {text(path, record, "token"): record for record in records}
@@ -76,10 +73,7 @@ def parse_record(path: Path, content: bytes) -> Record:
     Raises:
         DataError: if the text is not valid JSON.
     """
-    try:
-        record: Record = json.loads(content)
-    except (RecursionError, ValueError) as error:
-        raise DataError(f"{path}: a damaged record: {one_line(error, 200)}") from None
+    record: Record = parse_json(content, f"{path}: a damaged record")
     return record
 
 

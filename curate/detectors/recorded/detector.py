@@ -53,6 +53,14 @@ class Record(Protocol):
         """Return the recorded frames, in sorted order."""
         ...
 
+    def check(self, frame_ids: Iterable[str]) -> None:
+        """Check the results of some frames before any work, as far as the format allows.
+
+        Raises:
+            DataError: if a result is malformed.
+        """
+        ...
+
     def result(self, frame_id: str) -> RecordedResult:
         """Return the result of the original frame.
 
@@ -138,7 +146,9 @@ class RecordedDetector:
         )
         self._record = _open(self.path, kind, options, passes)
         # The name in the record of each frame that has another one there.
-        self._recorded_as = self._match(FrameNames.of(frame_ids))
+        found = self._match(FrameNames.of(frame_ids))
+        self._record.check(found)
+        self._recorded_as = {frame: name for name, frame in found.items() if name != frame}
 
     def frame_ids(self) -> tuple[str, ...]:
         """Return the recorded frames, in sorted order, by the names that the record gives them."""
@@ -208,7 +218,7 @@ class RecordedDetector:
         return as_detections(place, found.boxes, found.scores, found.categories)
 
     def _match(self, frames: FrameNames) -> Mapping[str, str]:
-        """Return the recorded name of each frame that differs from its id.
+        """Return the frame of each recorded name.
 
         Recorded frames that are not in the data set are reported by a warning.
 
@@ -217,7 +227,8 @@ class RecordedDetector:
         """
         names = list(self._record.frame_ids())
         if not len(frames):
-            return {frame: name for name in names if (frame := last_part(name)) != name}
+            parts = {name: last_part(name) for name in names}
+            return parts if len({*parts.values()}) == len(names) else {name: name for name in names}
         found, unmatched = frames.match(names, self.path)
         examples = ", ".join(unmatched[:3]) + (", ..." if len(unmatched) > 3 else "")
         if unmatched and not found:
@@ -230,7 +241,7 @@ class RecordedDetector:
                 f"{self.path}: {len(unmatched)} of {len(names)} results are for frames that the "
                 f"data set does not have ({examples}); they are left out"
             )
-        return {frame: name for name, frame in found.items() if name != frame}
+        return found
 
 
 def _check_repeated(place: str, found: Detections) -> None:

@@ -8,24 +8,25 @@ from curate.errors import DataError
 
 
 class KittiResults(Mapping[str, KittiObjects]):
-    """The objects of each frame, each read on access: an invalid file affects only its frame.
+    """The objects of each frame, each read on access.
 
     An empty file is a frame without detections. Any category name is accepted.
 
     Args:
-        folder: contains the result files, directly or in `data/` as KITTI's own tools write them.
+        folder: contains the result files: in `data/`, beside which KITTI's own tools write their
+            statistics, or directly, or in subfolders such as drives.
 
     Raises:
         DataError: if there is no result file.
     """
 
     def __init__(self, folder: Path) -> None:
-        candidates = (folder, folder / "data")
-        found = [
-            [path for path in candidate.glob("*.txt") if path.name[0] != "."]
-            for candidate in candidates
-        ]
-        self._paths = {path.stem: path for path in sorted(found[0] or found[1])}
+        home = folder / "data" if any((folder / "data").glob("*.txt")) else folder
+        found = [path for path in home.glob("*.txt") if path.name[0] != "."]
+        self._paths = {path.stem: path for path in sorted(found)}
+        if not found:
+            nested = sorted(path for path in home.rglob("*.txt") if path.name[0] != ".")
+            self._paths = {path.relative_to(home).as_posix(): path for path in nested}
         if not self._paths:
             raise DataError(f"{folder}: contains no KITTI result files (FRAME.txt)")
 

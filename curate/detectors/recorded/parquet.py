@@ -9,7 +9,7 @@ A Parquet file is read one row group at a time, see `arrow_groups`. An invalid r
 frame.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +58,9 @@ class ParquetRecord:
     def frame_ids(self) -> tuple[str, ...]:
         """Return the recorded frames, in sorted order."""
         return tuple(sorted(self.runs))
+
+    def check(self, frame_ids: Iterable[str]) -> None:
+        """Do nothing: rows are checked when their frame is requested."""
 
     def result(self, frame_id: str) -> Detections:
         """Return the detections of the original frame.

@@ -1,10 +1,11 @@
 """Passes of a detector over a data set: one over the frames, others over augmented copies."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from curate.datasets.frame_names import FrameNames
 from curate.detectors.recorded.formats import read_results
 from curate.detectors.recorded.results import (
     ReadOptions,
@@ -26,11 +27,13 @@ class PassesRecord:
         path: file or folder of the first pass.
         plain: results of the first pass.
         augmented: path, A and results of each further pass, in A's frame of reference.
+        sigmoid: whether the scores are logits.
     """
 
     path: Path
     plain: ResultsByFrame
     augmented: Sequence[tuple[Path, Similarity, ResultsByFrame]]
+    sigmoid: bool
 
     @classmethod
     def read(
@@ -49,17 +52,16 @@ class PassesRecord:
             ConfigError: if a pass has other keys, or A is missing or the identity.
             DataError: if a file is missing or malformed.
         """
+        plain = read_results(path, kind, options)
         augmented = []
         for number, entry in enumerate(passes, start=1):
             similarity = _similarity(number, entry)
             place = path.parent / entry["path"]
             if not place.exists():
                 raise DataError(f"{place}: no such file or folder; see detector.options.passes")
-            augmented.append((place, similarity, read_results(place, kind, options)))
-        plain = read_results(path, kind, options)
-        for place, results in ((path, plain), *((place, found) for place, _, found in augmented)):
-            check_scores(place, results, sigmoid=options.sigmoid)
-        return cls(path, plain, augmented)
+            results = read_results(place, kind, options)
+            augmented.append((place, similarity, _spelled_as(plain, results, place)))
+        return cls(path, plain, augmented, options.sigmoid)
 
     @property
     def has_views(self) -> bool:
@@ -69,6 +71,20 @@ class PassesRecord:
     def frame_ids(self) -> tuple[str, ...]:
         """Return the frames of the first pass, in sorted order."""
         return tuple(sorted(self.plain))
+
+    def check(self, frame_ids: Iterable[str]) -> None:
+        """Read the results of some frames in all passes, to find invalid ones before any work.
+
+        Raises:
+            DataError: if a result is malformed, or a score is neither in [0, 1] nor a logit.
+        """
+        frame_ids = tuple(frame_ids)
+        for path, results in (
+            (self.path, self.plain),
+            *((path, results) for path, _, results in self.augmented),
+        ):
+            scores = ((name, results[name].scores) for name in frame_ids if name in results)
+            check_scores(path, scores, sigmoid=self.sigmoid)
 
     def result(self, frame_id: str) -> RecordedResult:
         """Return the result of the first pass.
@@ -88,6 +104,14 @@ class PassesRecord:
             (similarity, _frame_result(results, frame_id, path))
             for path, similarity, results in self.augmented
         ]
+
+
+def _spelled_as(plain: ResultsByFrame, results: ResultsByFrame, place: Path) -> ResultsByFrame:
+    """Return the results of a pass under the frame names of the first one."""
+    if results.keys() <= plain.keys():
+        return results
+    found, _ = FrameNames(plain).match(results, place)
+    return {frame: results[name] for name, frame in found.items()}
 
 
 def _frame_result(results: ResultsByFrame, frame_id: str, path: Path) -> RecordedResult:

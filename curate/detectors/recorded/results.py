@@ -1,7 +1,7 @@
 """Results of one frame as a record stores them, and the check of their values."""
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -144,14 +144,17 @@ def invalid_rows(boxes: np.ndarray, scores: np.ndarray) -> Mapping[str, np.ndarr
     }
 
 
-def check_scores(place: object, results: ResultsByFrame, *, sigmoid: bool) -> None:
-    """Raise DataError if the scores of all results of a pass are not in [0, 1], nor logits.
+def check_scores(place: object, scores: Iterable[tuple[str, np.ndarray]], *, sigmoid: bool) -> None:
+    """Raise DataError if the scores of the frames of a pass are not in [0, 1].
 
-    This reads every result, so that a malformed one is found before any work.
+    Args:
+        place: the file, for messages.
+        scores: the name and the scores of each frame.
+        sigmoid: whether they are logits, in any range.
     """
     lowest, highest, example = 0.0, 0.0, ""
-    for name, result in results.items():
-        low, high = result.scores.min(initial=0), result.scores.max(initial=0)
+    for name, found in scores:
+        low, high = found.min(initial=0), found.max(initial=0)
         if not example and (low < 0 or high > 1):
             example = name
         lowest, highest = min(lowest, low), max(highest, high)

@@ -13,7 +13,7 @@ not as an empty scene. A frame that has only rows of other views has no detectio
 
 import codecs
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -25,7 +25,7 @@ from curate.detectors.recorded.results import invalid_rows
 from curate.detectors.scores import describe_invalid_scores
 from curate.errors import DataError, one_line
 from curate.files.batches import batched
-from curate.files.csv_text import Header, parse_number
+from curate.files.csv_text import Header, number_problem
 from curate.files.text import check_not_utf16
 from curate.geometry.similarity import Similarity, wrap_angle
 
@@ -94,6 +94,9 @@ class TableRecord:
     def frame_ids(self) -> Iterator[str]:
         """Return the recorded frames, in sorted order."""
         return (name.decode() for name in np.unique(self.names))
+
+    def check(self, frame_ids: Iterable[str]) -> None:
+        """Do nothing: every row was checked when the file was read."""
 
     def result(self, frame_id: str) -> Detections:
         """Return the detections of the original frame.
@@ -267,9 +270,10 @@ def _numbers(
     numbers = np.empty((len(rows), len(_NUMBERS)))
     for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
         try:
-            numbers[index] = [parse_number(field) for field in row[2:]]
-        except ValueError as error:
-            raise DataError(f"{path}:{line}: {error}") from None
+            numbers[index] = [float(field) for field in row[2:]]
+        except ValueError:
+            problem = next(filter(None, map(number_problem, row[2:])))
+            raise DataError(f"{path}:{line}: {problem}") from None
     _check_values(path, lines, numbers, sigmoid)
     return numbers
 

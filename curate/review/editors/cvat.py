@@ -22,11 +22,12 @@ import cv2
 import numpy as np
 
 from curate.errors import DataError
+from curate.files.json_text import parse_json
 from curate.frames import Frame
 from curate.geometry.similarity import wrap_angle
 from curate.review.editors.base import Reader
 from curate.review.editors.documents import numbers, write_json
-from curate.review.editors.names import check_frame_names
+from curate.review.editors.names import match_frame_names
 from curate.review.edits import EditedBox
 from curate.review.sheet import Sheet, ShownFrame
 
@@ -65,12 +66,12 @@ class CvatEditor:
         for document, place in _documents(path):
             names = _label_names(document, place)
             for item in document["items"]:
-                name = Path(str(item.get("id"))).name
+                name = str(item.get("id"))
                 boxes = found.setdefault(name, [])
                 for i, each in enumerate(item.get("annotations") or (), start=1):
                     boxes += _read_cuboid(each, names, f"{place}: frame {name}, annotation {i}")
-        check_frame_names(path, found, sheet)
-        return found
+        frames = match_frame_names(path, found, sheet)
+        return {frame: found[name] for name, frame in frames.items()}
 
 
 def pcd_bytes(points: np.ndarray) -> bytes:
@@ -154,10 +155,7 @@ def _documents(path: Path) -> Iterator[tuple[Mapping[str, Any], str]]:
 
 
 def _parsed(content: bytes, place: str) -> Mapping[str, Any]:
-    try:
-        document = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{place}: invalid JSON: {' '.join(str(error).split())}") from None
+    document = parse_json(content, place)
     if (
         not isinstance(document, Mapping)
         or not isinstance(document.get("items"), list)

@@ -24,7 +24,7 @@ from curate.datasets.kitti.labels import (
 from curate.detections import Detections
 from curate.errors import DataError
 from curate.review.editors.base import Reader
-from curate.review.editors.names import check_frame_names
+from curate.review.editors.names import match_frame_names
 from curate.review.edits import EditedBox
 from curate.review.sheet import Sheet
 
@@ -56,8 +56,10 @@ class KittiEditor:
         paths = {
             path.stem: path for path in sorted(folder.glob("*.txt")) if path.name[0] not in "._"
         }
-        check_frame_names(folder, paths, sheet)
-        return {name: _read_file(path, sheet, name, read) for name, path in paths.items()}
+        frames = match_frame_names(folder, paths, sheet)
+        return {
+            frame: _read_file(paths[name], sheet, frame, read) for name, frame in frames.items()
+        }
 
 
 def _read_file(path: Path, sheet: Sheet, name: str, read: Reader) -> list[EditedBox]:

@@ -15,12 +15,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from curate.errors import DataError
+from curate.files.json_text import read_json
 from curate.geometry.similarity import wrap_angle
 from curate.review.editors.base import Reader
 from curate.review.editors.documents import numbers, write_json
-from curate.review.editors.names import check_frame_names
+from curate.review.editors.names import match_frame_names
 from curate.review.edits import EditedBox
-from curate.review.sheet import Sheet, ShownFrame, read_json
+from curate.review.sheet import Sheet, ShownFrame
 
 _COLOURS = ("#FFD23F", "#3BCEAC", "#EE4266", "#9DA2AB", "#4C9BE8", "#B388EB")
 _DECIMALS = 6
@@ -66,8 +67,8 @@ class LabelCloudEditor:
             path.stem: path for path in sorted(folder.glob("*.json")) if path.name[0] not in "._"
         }
         paths.pop("review", None)
-        check_frame_names(folder, paths, sheet)
-        return {name: _read_file(path) for name, path in paths.items()}
+        frames = match_frame_names(folder, paths, sheet)
+        return {frame: _read_file(paths[name]) for name, frame in frames.items()}
 
 
 def _document(shown: ShownFrame) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from support.nuscenes_scenes import (
 )
 
 from curate.datasets.base import sequences_of
+from curate.datasets.frame_names import FrameNames
 from curate.datasets.nuscenes import NuScenesDataset
 from curate.errors import ConfigError, DataError
 from curate.geometry.points_in_boxes import count_points_in_boxes
@@ -254,3 +255,14 @@ def test_tables_can_be_larger_than_a_block(unchanged_root, monkeypatch):
     pieces = NuScenesDataset(unchanged_root)
     assert pieces.frame_ids() == whole.frame_ids()
     np.testing.assert_array_equal(pieces.annotations(name).boxes, whole.annotations(name).boxes)
+
+
+def test_frames_are_found_by_the_names_of_their_files(tmp_path):
+    """As in mmdetection3d's lidar_path and COCO's file_name."""
+    write_nuscenes(tmp_path)
+    dataset = NuScenesDataset(tmp_path)
+    names = FrameNames.of_dataset(dataset)
+    for token in dataset.frame_ids():
+        files = dataset.files(token)
+        assert names.find(files.points.name) == token
+        assert names.find(str(files.image.relative_to(tmp_path)).replace("/", "\\")) == token

@@ -73,7 +73,7 @@ def test_results_without_labels_are_an_error(folders):
         (LINE, "15 fields"),
         (f"{LINE} 0.5 1", "17 fields"),
         (f"{LINE} nan", "nan"),
-        (f"{LINE.replace('1.5 1.6', '-1.5 1.6')} 0.5", "negative"),
+        (f"{LINE.replace('1.5 1.6', '-1.5 1.6')} 0.5", "must be positive"),
     ],
 )
 def test_invalid_result_lines_are_reported(folders, line, message):

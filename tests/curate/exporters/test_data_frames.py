@@ -163,9 +163,9 @@ def test_a_file_without_weighted_labels_is_rejected(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"0.75", b"heavy", "line 2: could not convert string to float: 'heavy'"),
-        (b",pspsl,0.75", b"", "line 2: "),
-        (b"Car", b"C\xffr", "cannot be read"),
+        (b"0.75", b"heavy", ":2: could not convert string to float: 'heavy'"),
+        (b",pspsl,0.75", b"", ":2: "),
+        (b"Car", b"C\xffr", "not UTF-8 text"),
     ],
 )
 def test_a_damaged_csv_is_reported(tmp_path, old, new, message):

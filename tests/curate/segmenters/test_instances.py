@@ -138,3 +138,27 @@ def test_a_score_out_of_range_is_rejected(tmp_path: Path) -> None:
     """Before any frame."""
     with pytest.raises(ConfigError, match=r"minimum_score 1\.5"):
         InstanceSegmenter(save(tmp_path / "a.json", []), COCO, minimum_score=1.5)
+
+
+@pytest.mark.parametrize("name", ["000007.png", "7.jpg", "image_2/000007.png", "image_2\\7.png"])
+def test_images_are_matched_with_frames_in_every_spelling(tmp_path: Path, name: str) -> None:
+    """COCO's file_name may be a path; two images of one frame are rejected."""
+    images = [{"id": 7, "file_name": name}]
+    path = save(tmp_path / "a.json", {"images": images, "annotations": [CAR, PERSON]})
+    frame_ids = ("000006", "000007")
+    found = InstanceSegmenter(path, COCO, frame_ids=frame_ids).segment(FRAME)
+    np.testing.assert_array_equal(found.class_ids, expected())
+    images.append({"id": 8, "file_name": "07.png"})
+    save(path, {"images": images, "annotations": [CAR]})
+    with pytest.raises(DataError, match="are both frame 000007; remove one"):
+        InstanceSegmenter(path, COCO, frame_ids=frame_ids)
+    save(path, {"images": [{"id": 7, "file_name": "b.png"}], "annotations": [CAR]})
+    with pytest.raises(DataError, match=r"no image is of a frame .* such as 'b\.png'; the nearest"):
+        InstanceSegmenter(path, COCO, frame_ids=frame_ids)
+
+
+def test_a_folder_of_masks_is_matched_with_frames(tmp_path: Path) -> None:
+    """By number as well."""
+    save(tmp_path / "7.json", [CAR, PERSON])
+    found = InstanceSegmenter(tmp_path, COCO, frame_ids=("000006", "000007")).segment(FRAME)
+    np.testing.assert_array_equal(found.class_ids, expected())

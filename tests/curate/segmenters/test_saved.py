@@ -311,3 +311,20 @@ def test_missing_and_unreadable_maps_are_reported(tmp_path):
         SavedSegmenter(tmp_path / "missing", CLASSES)
     with pytest.raises(ConfigError, match="an id is an integer from 0 to 255"):
         SavedSegmenter(tmp_path, {"Car": (300,)})
+
+
+@pytest.mark.parametrize("name", ["1.png", "0001.png", "000001.PNG", "sub/000001.png"])
+def test_maps_are_matched_with_frames_in_every_spelling(tmp_path, name):
+    """A number, other leading zeros, a subfolder."""
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(tmp_path / name), np.full((5, 12), 7, np.uint8))
+    found = SavedSegmenter(tmp_path, CLASSES, frame_ids=("000000", "000001")).segment(FRAME)
+    assert (found.class_ids == 7).all()
+
+
+def test_maps_of_no_frame_are_rejected(tmp_path):
+    """When the segmenter is opened, with the nearest frames."""
+    save(tmp_path, np.zeros((5, 12), np.uint8))
+    message = r"such as '000001\.png'; the nearest are '0000\d\d' and"
+    with pytest.raises(DataError, match=message):
+        SavedSegmenter(tmp_path, CLASSES, frame_ids=("000010", "000021"))

@@ -112,7 +112,7 @@ def test_an_empty_list_of_frames_is_rejected(
     (tmp_path / "val.txt").write_bytes(content)
     code, _, err = evaluate(curate, folders, "--frames", tmp_path / "val.txt")
     assert code == DataError.exit_code
-    assert "val.txt: " in err
+    assert "val.txt:" in err
     assert err.count("\n") == 1
 
 
@@ -133,10 +133,10 @@ def test_a_missing_checkpoint_gives_a_one_line_error(curate: Curate, workspace: 
             "results/000001.txt",
             f"\n{LINE.replace('1.5 1.6', '1.5 -1.6')} 0.5",
             "000001.txt:2",
-            "negative height, width or length",
+            "1.5 -1.6 4.0, but must be positive",
         ),
         ("results/000001.txt", f"Ship{LINE[3:]} 0.5", "000001.txt:1", "unknown category 'Ship'"),
-        ("label_2/000001.txt", f"{LINE} 0.5", "000001.txt:1", "16 fields"),
+        ("label_2/000001.txt", f"{LINE} 0.5 1", "000001.txt:1", "17 fields"),
         ("results/000009.txt", f"{LINE} 0.5", "label_2/000009.txt", "no label file"),
     ],
 )

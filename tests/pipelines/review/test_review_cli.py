@@ -327,7 +327,7 @@ def test_human_labels_are_marked_in_every_output(
 INVALID_SELECTIONS = (
     (("--frames", "{labeled}"), 5, "is not unlabeled"),
     (("--frames", "{val}"), 5, "is not unlabeled"),
-    (("--frames", "999999"), 2, "frame '999999' is not in this workspace"),
+    (("--frames", "999999"), 2, "--frames: there is no frame '999999'"),
     (("--category", "Tram"), 2, "--category Tram"),
     (("--by", "luck"), 2, "--by luck"),
     (("--format", "paint"), 2, "unknown editor 'paint'"),
@@ -367,7 +367,11 @@ INVALID_EDITS = (
     (spoil_both, (), "cannot overlap: reject one of box 1 ("),
     (lambda folder, frame: decide(folder, frame, 1, "perhaps"), (), "decision 'perhaps'"),
     (lambda folder, frame: None, ("--answer", "nowhere"), "nowhere: no such folder"),
-    (lambda folder, frame: None, ("--accept", "000099"), "'000099' is not in this review"),
+    (
+        lambda folder, frame: None,
+        ("--accept", "000099"),
+        "in this review: there is no frame '000099'; the near",
+    ),
 )
 
 

@@ -307,7 +307,7 @@ def test_the_format_can_be_specified(tmp_path):
     [
         ("Car 0 0", "3 fields"),
         ("Car 0 0 0 1 1 9 9 0 0 0 0 0 0 0 0.5", "no 3D box: height, width and length of the Car"),
-        ("Car 0 0 0 1 1 9 9 1.5 0 4 0 0 0 0 0.5", "are 1.5 0 4, but must be positive"),
+        ("Car 0 0 0 1 1 9 9 1.5 0 4 0 0 0 0 0.5", "height, .* are 1.5 0 4, but must be pos"),
     ],
 )
 def test_an_invalid_result_file_is_found_when_the_results_are_opened(tmp_path, line, message):
@@ -441,6 +441,138 @@ def test_real_results_in_kitti_format_equal_the_record(kitti_root, tmp_path):
         np.testing.assert_allclose(found.boxes[:, :6], expected.boxes[:, :6], atol=2e-4)
         turn = np.abs(np.sin((found.boxes[:, 6] - expected.boxes[:, 6]) / 2))
         assert turn.max(initial=0) < 1e-4
+
+
+@pytest.mark.parametrize("kind", [*FORMATS, "a.csv", "a.parquet"])
+def test_scores_before_the_sigmoid_are_converted_where_that_is_declared(tmp_path, kind):
+    """By the same option in every format, which the message names where it is missing."""
+    logits = np.array([6.5, 2.1, -0.4, -2.6])
+    boxes = np.repeat(BOXES[:1], 4, axis=0) + np.arange(4)[:, None] * [0, 3, 0, 0, 0, 0, 0]
+    frames = {"000001": Detections(boxes, logits, as_categories(["Car"] * 4))}
+    write, options = FORMATS.get(kind, (write_table, {}))
+    path = write(tmp_path / kind, frames)
+    found = RecordedDetector(path, sigmoid=True, **options).predict(frame("000001"))
+    np.testing.assert_allclose(found.scores, [0.9985, 0.8909, 0.4013, 0.0691], atol=5e-5)
+    kept = RecordedDetector(path, 0.4, sigmoid=True, **options).predict(frame("000001"))
+    assert len(kept) == 3
+    message = r"scores from -2.6 to 6.5 are not in \[0, 1\]; set detector\.options\.sigmoid = true"
+    with pytest.raises(DataError, match=message):
+        RecordedDetector(path, **options).predict(frame("000001"))
+    percent = {
+        "000001": Detections(boxes, np.array([99.0, 80, 20, 5]), frames["000001"].categories)
+    }
+    path = write(tmp_path / f"percent-{kind}", percent)
+    with pytest.raises(DataError, match=r"scores from 0 to 99 .*; divide them by 100 if they are"):
+        RecordedDetector(path, **options).predict(frame("000001"))
+
+
+def write_table(path, frames):
+    """Write the columns of a CSV or Parquet record."""
+    pd = pytest.importorskip("pandas")
+    names = ("x", "y", "z", "length", "width", "height", "yaw")
+    tables = [
+        pd.DataFrame(found.boxes, columns=names).assign(
+            frame=name, category=found.categories, score=found.scores,
+            view=0, flip_y=0, rotation_rad=0.0, scale=1.0,
+        )
+        for name, found in frames.items()
+    ]  # fmt: skip
+    table = pd.concat(tables)
+    table.to_csv(path, index=False) if path.suffix == ".csv" else table.to_parquet(path)
+    return path
+
+
+def renamed(write, path, frames, names):
+    """Write a record whose frames have other names."""
+    return write(path, dict(zip(names, frames.values(), strict=True)))
+
+
+TWO = {"000001": FOUND, "000002": Detections(BOXES[:1], FOUND.scores[:1], FOUND.categories[:1])}
+SPELLINGS = {
+    "numbers": ("1", "2"),
+    "padded otherwise": ("0001", "0002"),
+    "numbers and names": ("1", "000002"),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+@pytest.mark.parametrize("kind", [*FORMATS, "a.csv", "a.parquet"])
+def test_frames_are_matched_in_every_spelling(tmp_path, kind, spelling):
+    """In every format; two spellings of one frame are rejected."""
+    write, options = FORMATS.get(kind, (write_table, {}))
+    path = renamed(write, tmp_path / kind, TWO, SPELLINGS[spelling])
+    detector = RecordedDetector(path, frame_ids=("000001", "000002", "000003"), **options)
+    assert [len(detector.predict(frame(name))) for name in TWO] == [2, 1]
+    with pytest.raises(DataError, match="no recorded detections for frame 000003"):
+        detector.predict(frame("000003"))
+    path = renamed(write, tmp_path / f"twice-{kind}", TWO, ("1", "000001"))
+    with pytest.raises(DataError, match="are both frame 000001; remove one"):
+        RecordedDetector(path, frame_ids=("000001", "000002"), **options)
+    with pytest.raises(DataError, match=r"1' could be 'a_1' or 'b_1'; write the whole frame id"):
+        RecordedDetector(path, frame_ids=("a_1", "b_1"), **options)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        (1, 2),
+        (np.int64(1), np.int64(2)),
+        ("000001.bin", "000002.bin"),
+        ("training/velodyne/000001.bin", "training/velodyne/000002.bin"),
+        ("C:\\kitti\\velodyne\\000001.bin", "C:\\kitti\\velodyne\\000002.bin"),
+    ],
+)
+@pytest.mark.parametrize("key", ["frame_id", "sample_idx", "lidar_path"])
+def test_mmdetection3d_names_frames_by_number_or_path(tmp_path, key, names):
+    """As its versions do."""
+    entries = [
+        {key: name, **entry} for name, entry in zip(names, mmdetection3d().values(), strict=True)
+    ]
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(entries))
+    detector = RecordedDetector(
+        tmp_path / "a.pkl",
+        classes=CLASSES,
+        version="1.x",
+        frame_ids=("000001", "000002", "000011"),
+    )
+    assert [len(detector.predict(frame(name))) for name in FRAMES] == [2, 0]
+
+
+def test_a_path_is_matched_by_its_last_part_without_a_data_set(tmp_path):
+    entry = {"lidar_path": "velodyne/000001.bin", **mmdetection3d()["000001"]}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps([entry]))
+    detector = RecordedDetector(tmp_path / "a.pkl", classes=CLASSES, version="1.x")
+    assert len(detector.predict(frame("000001"))) == 2
+
+
+def test_a_second_pass_may_spell_frames_differently(tmp_path):
+    path = write_openpcdet(tmp_path / "a.pkl", TWO)
+    renamed(write_openpcdet, tmp_path / "b.pkl", TWO, ("1", "2"))
+    passes = [{"path": "b.pkl", "flip_y": True}]
+    detector = RecordedDetector(path, passes=passes, frame_ids=tuple(TWO))
+    assert [len(found) for _, found in detector.views("000002")] == [1]
+
+
+def test_other_text_files_beside_results_are_left_out(tmp_path, caplog):
+    """KITTI's tools write statistics beside the folder data, other programs a log."""
+    folder = write_kitti(tmp_path / "results")
+    (folder / "log.txt").write_text("epoch 12\n")
+    detector = RecordedDetector(folder, frame_ids=tuple(FRAMES))
+    assert len(detector.predict(frame("000001"))) == 2
+    assert "1 of 3 results are for frames that the data set does not have (log)" in caplog.text
+    (tmp_path / "kit").mkdir()
+    write_kitti(tmp_path / "kit" / "data")
+    (tmp_path / "kit" / "stats_car_detection.txt").write_text("0.1 0.2\n")
+    assert RecordedDetector(tmp_path / "kit").frame_ids() == tuple(FRAMES)
+
+
+def test_result_files_of_drives_are_in_subfolders(tmp_path):
+    drive = "2011_09_26_drive_0001_sync"
+    (tmp_path / "results").mkdir()
+    write_kitti(tmp_path / "results" / drive)
+    frames = [f"{drive}_{number:010d}" for number in range(4)]
+    detector = RecordedDetector(tmp_path / "results", frame_ids=frames)
+    assert [len(detector.predict(frame(name))) for name in frames[1:3]] == [2, 0]
 
 
 def entry_of(**changes):
