@@ -23,9 +23,9 @@ CLASS_MAPS: Mapping[str, ClassMap] = MappingProxyType(
         "voc": {"Car": (7,), "Pedestrian": (15,), "Cyclist": (2, 15)},
         "cityscapes": {"Car": (13,), "Pedestrian": (11,), "Cyclist": (12, 18)},
         "cityscapes-label-ids": {"Car": (26,), "Pedestrian": (24,), "Cyclist": (25, 33)},
-        "camvid": {"Car": (8,), "Pedestrian": (9,), "Cyclist": (10,)},
         "coco": {"Car": (3,), "Pedestrian": (1,), "Cyclist": (1, 2)},
         "coco-from-0": {"Car": (2,), "Pedestrian": (0,), "Cyclist": (0, 1)},
+        "camvid": {"Car": (8,), "Pedestrian": (9,), "Cyclist": (10,)},
         "simulated": {"Car": (1,), "Pedestrian": (2,), "Cyclist": (3,)},
     }
 )

@@ -164,7 +164,7 @@ def test_results_that_number_frames_are_matched(
             entries.append(entry | {"name": truth.categories})
         else:
             numbers = np.array([CLASSES.index(each) for each in truth.categories], dtype=int)
-            entry = {"sample_idx": int(name), "boxes_3d": boxes, "scores_3d": scores}
+            entry = {"sample_idx": int(name), "bboxes_3d": boxes, "scores_3d": scores}
             entries.append(entry | {"labels_3d": numbers})
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(entries))
     option = f"detector.options.classes={json.dumps(CLASSES)}"

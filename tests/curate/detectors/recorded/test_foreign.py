@@ -558,7 +558,10 @@ def test_mmdetection3d_names_frames_by_number_or_path(tmp_path, key, names):
     ]
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(entries))
     detector = RecordedDetector(
-        tmp_path / "a.pkl", classes=CLASSES, frame_ids=("000001", "000002", "000011")
+        tmp_path / "a.pkl",
+        classes=CLASSES,
+        version="1.x",
+        frame_ids=("000001", "000002", "000011"),
     )
     assert [len(detector.predict(frame(name))) for name in FRAMES] == [2, 0]
 
@@ -566,7 +569,7 @@ def test_mmdetection3d_names_frames_by_number_or_path(tmp_path, key, names):
 def test_a_path_is_matched_by_its_last_part_without_a_data_set(tmp_path):
     entry = {"lidar_path": "a/000001.bin", "box_type_3d": "LiDAR", **mmdetection3d()["000001"]}
     (tmp_path / "a.pkl").write_bytes(pickle.dumps([entry]))
-    detector = RecordedDetector(tmp_path / "a.pkl", classes=CLASSES)
+    detector = RecordedDetector(tmp_path / "a.pkl", classes=CLASSES, version="1.x")
     assert len(detector.predict(frame("000001"))) == 2
 
 
