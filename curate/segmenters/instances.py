@@ -4,6 +4,7 @@ Source: COCO's data format: annotations `{images, annotations}`, a list of resul
 per frame. Where masks overlap, the mask with the higher score is on top.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -58,9 +59,11 @@ class InstanceSegmenter:
         self._frame_ids = frame_ids
         self._files: dict[str, Mapping[str, Path]] = {}
         self._frames: dict[str, Mapping[str, Objects]] = {}
-        if not self.path.is_dir():
+        self._images = {} if self.path.is_dir() else _by_image(self.path)
+        # With images of one name in several folders, the camera of a frame decides which is meant.
+        if self._images and len(set(map(last_part, self._images))) == len(self._images):
             self._objects_by_frame("")
-        elif next(self.path.glob("*.json"), None):
+        elif self.path.is_dir() and next(self.path.glob("*.json"), None):
             self._file_by_frame("")
 
     def _file_by_frame(self, camera: str) -> Mapping[str, Path]:
@@ -73,7 +76,8 @@ class InstanceSegmenter:
     def _objects_by_frame(self, camera: str) -> Mapping[str, Objects]:
         """Return the objects of each frame from a camera; "" for the only one."""
         if camera not in self._frames:
-            self._frames[camera] = _by_frame(self.path, FrameNames.of(self._frame_ids), camera)
+            names = FrameNames.of(self._frame_ids)
+            self._frames[camera] = _by_frame(self.path, self._images, names, camera)
         return self._frames[camera]
 
     def segment(self, frame: Frame) -> SemanticMap:
@@ -122,13 +126,8 @@ class InstanceSegmenter:
         )
 
 
-def _by_frame(
-    path: Path, frame_ids: FrameNames, camera: str
-) -> Mapping[str, list[Mapping[str, Any]]]:
-    """Return the objects of each frame of the data set, or of each image without `frame_ids`.
-
-    With several cameras, images are those in a folder with the name of the camera.
-    """
+def _by_image(path: Path) -> dict[str, list[Mapping[str, Any]]]:
+    """Return the objects of each image by its name, as the file spells it."""
     document = read_json(path, "instance mask")
     images = document.get("images", ()) if isinstance(document, dict) else ()
     try:
@@ -144,17 +143,27 @@ def _by_frame(
         ) from None
     if len(found) < len(names):
         raise DataError(f"{path}: two images have the same file_name; remove one")
+    return found
+
+
+def _by_frame(
+    path: Path, found: Mapping[str, Objects], frame_ids: FrameNames, camera: str
+) -> Mapping[str, Objects]:
+    """Return the objects of each frame of the data set, or of each image without `frame_ids`.
+
+    With several cameras, images are those in a folder with the name of the camera.
+    """
     several = any(Path(name).parent.name == camera for name in found) if camera else False
     if several:
         found = {name: each for name, each in found.items() if Path(name).parent.name == camera}
     if not len(frame_ids):
-        by_name = {last_part(name): objects for name, objects in found.items()}
-        if len(by_name) < len(found):
-            raise DataError(
-                f"{path}: several images of one frame, as of several cameras; keep those of the "
-                "camera that the data set reads"
-            )
-        return by_name
+        # Images of one name belong to several cameras: which one is meant is then unknown.
+        count = Counter(map(last_part, found))
+        return {
+            last_part(name): objects
+            for name, objects in found.items()
+            if count[last_part(name)] == 1
+        }
     matched, unmatched = frame_ids.match(found, path)
     if unmatched and not matched:
         raise DataError(
