@@ -4,6 +4,7 @@ Source: COCO's data format: annotations `{images, annotations}`, a list of resul
 per frame. Where masks overlap, the mask with the higher score is on top.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -58,26 +59,25 @@ class InstanceSegmenter:
         self._frame_ids = frame_ids
         self._files: dict[str, Mapping[str, Path]] = {}
         self._frames: dict[str, Mapping[str, Objects]] = {}
-        self._images: Mapping[str, Objects] = {}
-        if not self.path.is_dir():
-            self._images = _objects_by_image(self.path)
-            if len({_folder(name) for name in self._images} - {""}) < 2:  # else one per camera
-                self._objects_by_frame("")
-        elif next(self.path.glob("*.json"), None):
+        self._images = {} if self.path.is_dir() else _by_image(self.path)
+        # With images of one name in several folders, the camera of a frame decides which is meant.
+        if self._images and len(set(map(last_part, self._images))) == len(self._images):
+            self._objects_by_frame("")
+        elif self.path.is_dir() and next(self.path.glob("*.json"), None):
             self._file_by_frame("")
 
     def _file_by_frame(self, camera: str) -> Mapping[str, Path]:
         """Return the file of each frame from a camera; "" for the only one."""
         if camera not in self._files:
             folder = self.path / camera
-            self._files[camera] = files_by_frame(folder, "*.json", self._frame_ids)
+            self._files[camera] = files_by_frame(folder, (".json",), self._frame_ids)
         return self._files[camera]
 
     def _objects_by_frame(self, camera: str) -> Mapping[str, Objects]:
         """Return the objects of each frame from a camera; "" for the only one."""
         if camera not in self._frames:
-            frames = FrameNames.of(self._frame_ids)
-            self._frames[camera] = _by_frame(self.path, self._images, frames, camera)
+            names = FrameNames.of(self._frame_ids)
+            self._frames[camera] = _by_frame(self.path, self._images, names, camera)
         return self._frames[camera]
 
     def segment(self, frame: Frame) -> SemanticMap:
@@ -126,8 +126,8 @@ class InstanceSegmenter:
         )
 
 
-def _objects_by_image(path: Path) -> Mapping[str, Objects]:
-    """Return the objects of each image, by its file name or its id."""
+def _by_image(path: Path) -> dict[str, list[Mapping[str, Any]]]:
+    """Return the objects of each image by its name, as the file spells it."""
     document = read_json(path, "instance mask")
     images = document.get("images", ()) if isinstance(document, dict) else ()
     try:
@@ -152,22 +152,22 @@ def _folder(name: str) -> str:
 
 
 def _by_frame(
-    path: Path, images: Mapping[str, Objects], frame_ids: FrameNames, camera: str
+    path: Path, found: Mapping[str, Objects], frame_ids: FrameNames, camera: str
 ) -> Mapping[str, Objects]:
     """Return the objects of each frame of the data set, or of each image without `frame_ids`.
 
     With several cameras, images are those in a folder with the name of the camera.
     """
-    of_camera = {name: each for name, each in images.items() if camera and _folder(name) == camera}
-    found = of_camera or images
+    of_camera = {name: each for name, each in found.items() if camera and _folder(name) == camera}
+    found = of_camera or found
     if not len(frame_ids):
-        by_name = {last_part(name): objects for name, objects in found.items()}
-        if len(by_name) < len(found):
-            raise DataError(
-                f"{path}: several images of one frame, as of several cameras; keep those of the "
-                "camera that the data set reads"
-            )
-        return by_name
+        # Images of one name belong to several cameras: which one is meant is then unknown.
+        count = Counter(map(last_part, found))
+        return {
+            last_part(name): objects
+            for name, objects in found.items()
+            if count[last_part(name)] == 1
+        }
     matched, unmatched = frame_ids.match(found, path)
     if unmatched and not matched:
         raise DataError(

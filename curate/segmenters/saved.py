@@ -89,9 +89,7 @@ class SavedSegmenter:
         """Return the map of each frame from a camera; "" for the only one."""
         if camera not in self._found:
             folder = self.directory / camera
-            self._found[camera] = files_by_frame(
-                folder, [f"*{each}" for each in _SUFFIXES], self._frame_ids
-            )
+            self._found[camera] = files_by_frame(folder, _PATTERNS, self._frame_ids)
         return self._found[camera]
 
     def segment(self, frame: Frame) -> SemanticMap:

@@ -194,3 +194,15 @@ def test_masks_of_several_cameras_are_told_apart_by_their_file_names(
     assert (3 in back, 1 in back) == (False, True)
     with pytest.raises(DataError):
         segmenter.segment(FRAME)
+
+
+def test_masks_of_several_cameras_are_matched_to_the_frames_of_the_data_set(tmp_path: Path) -> None:
+    """Two images of one frame are no contradiction if they are of two cameras."""
+    images = [{"id": i, "file_name": f"{each}/000007.jpg"} for i, each in enumerate(("a", "b"))]
+    objects = [CAR | {"image_id": 0}, PERSON | {"image_id": 1}]
+    path = save(tmp_path / "a.json", {"images": images, "annotations": objects})
+    segmenter = InstanceSegmenter(path, COCO, frame_ids=("000007",))
+    assert 3 in segmenter.segment(replace(FRAME, camera="a")).class_ids
+    assert 1 in segmenter.segment(replace(FRAME, camera="b")).class_ids
+    with pytest.raises(DataError, match="are both frame 000007"):
+        segmenter.segment(FRAME)
