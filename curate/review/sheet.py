@@ -128,7 +128,7 @@ def read_json(path: Path, remedy: str = "") -> Any:
         DataError: if it is missing or damaged.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise DataError(f"{path}: no such file{remedy}") from None
     except (OSError, ValueError, RecursionError) as error:

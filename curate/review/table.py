@@ -98,7 +98,7 @@ def _add_decision(
     boxes = next(frame for frame in sheet.frames if frame.frame == name).boxes
     shown = {str(box.k): box.k for box in boxes}
     if name_of_number == _OLD_NUMBER:
-        shown = {str(place): box.k for place, box in enumerate(boxes, start=1)}
+        shown = {str(position): box.k for position, box in enumerate(boxes, start=1)}
     if number not in shown:
         raise DataError(
             f"{place}: {name_of_number} {number!r} is not in frame {name} of this review; it has "
