@@ -37,27 +37,6 @@ def queried(curate: Curate, workspace: Workspace, name: str) -> list[dict]:
     return json.loads(printed(curate, workspace, "query", "--named", name, "--json"))
 
 
-def test_counts_agree_with_the_labels(curate: Curate, reviewed: Reviewed) -> None:
-    """`counts` is fast because it does not count labels; it has the same numbers all the same."""
-    workspace, _, _ = reviewed
-    assert curate("solve", "--policy", "uniform", "-w", workspace.root)[0] == 0
-    expected = rows(
-        workspace,
-        "SELECT round, policy, category, count(*), sum(weight > 0), sum(weight > 0.5), "
-        "sum(weight), sum(provenance = 'human') FROM weighted_labels "
-        "GROUP BY round, policy, category ORDER BY round, policy, category",
-    )
-    found = [tuple(row.values()) for row in queried(curate, workspace, "counts")]
-    assert [row[:6] for row in found] == [tuple(row[:6]) for row in expected]
-    assert [row[7] for row in found] == [row[7] for row in expected]
-    assert [row[6] for row in found] == pytest.approx([row[6] for row in expected])
-    assert sum(row[7] for row in found) == 8
-    one = json.loads(
-        printed(curate, workspace, "query", "--named", "counts", "--policy", "pspsl", "--json")
-    )
-    assert [tuple(row.values()) for row in one] == [row for row in found if row[1] == "pspsl"]
-
-
 def test_named_queries_show_decisions(curate: Curate, reviewed: Reviewed) -> None:
     """How many labels people decided, or which labels they decided."""
     workspace, _, frame = reviewed
