@@ -19,7 +19,7 @@ import numpy as np
 from curate.datasets.folder import FolderDataset
 from curate.datasets.formats.clouds import read_cloud
 from curate.datasets.formats.images import read_image
-from curate.datasets.frame_names import read_frame_list
+from curate.datasets.frame_names import match_frame_list
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.labels import read_objects
 from curate.datasets.kitti.raw import read_raw_calibration
@@ -301,7 +301,7 @@ def _openpcdet(**changes: Any) -> dict[str, Any]:
 def _mmdet3d(**changes: Any) -> dict[str, Any]:
     boxes = _BOXES - np.array([0, 0, 0.5, 0, 0, 0, 0]) * _BOXES[:, 5:6]
     return {
-        "frame_id": "000001", "boxes_3d": boxes.tolist(), "scores_3d": _SCORES.tolist(),
+        "frame_id": "000001", "bboxes_3d": boxes.tolist(), "scores_3d": _SCORES.tolist(),
         "labels_3d": [0, 1],
     } | changes  # fmt: skip
 
@@ -531,7 +531,7 @@ READERS = (
     ),
     Reader(
         "Lists of frames", "One frame per line, for `--labeled`, `--val` and ImageSets.",
-        "train.txt", read_frame_list, _LIST,
+        "train.txt", lambda path: match_frame_list(path, ("000001", "000002")), _LIST,
         [
             *_text_cases(_LIST),
             Case("empty lines between", _LIST.replace("\n", "\n\n")),
@@ -598,14 +598,14 @@ READERS = (
     ),
     Reader(
         "Recorded detections: mmdetection3d",
-        "Pickle or JSON: a list with boxes_3d, scores_3d and labels_3d per frame; "
+        "Pickle or JSON: a list with bboxes_3d, scores_3d and labels_3d per frame; "
         "`detector.options.classes` names the labels.",
         "results.json", _read_numbered, json.dumps([_mmdet3d()]),
         [
             *_text_cases(json.dumps([_mmdet3d()])),
             Case("a pickle", pickle.dumps([_mmdet3d()]), name="results.pkl"),
             Case("9 numbers per box: velocities", json.dumps([_mmdet3d(
-                boxes_3d=[[*box, 0.0, 0.0] for box in _mmdet3d()["boxes_3d"]])])),
+                bboxes_3d=[[*box, 0.0, 0.0] for box in _mmdet3d()["bboxes_3d"]])])),
             Case("a label without a class", json.dumps([_mmdet3d(labels_3d=[0, 7])])),
             Case("fewer scores than boxes", json.dumps([_mmdet3d(scores_3d=[0.9])])),
             Case("no frame and no `frame_list`", json.dumps([_without(_mmdet3d(), "frame_id")])),
