@@ -25,7 +25,7 @@ from curate.errors import ConfigError, DataError
         ),
     ],
 )
-def test_an_invalid_layout_is_refused(values: dict, message: str) -> None:
+def test_an_invalid_layout_is_rejected(values: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         PointLayout(**values)
 
