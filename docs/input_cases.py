@@ -7,128 +7,29 @@ writes what happened, and a test compares that with the page. Add a case as one 
 import io
 import json
 import pickle
-import tempfile
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from curate.datasets.folder import FolderDataset
-from curate.datasets.formats.clouds import read_cloud
-from curate.datasets.formats.images import read_image
 from curate.datasets.frame_names import match_frame_list
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.labels import read_objects
 from curate.datasets.kitti.raw import read_raw_calibration
 from curate.detectors.recorded import RecordedDetector
-from curate.errors import CurateError
 from curate.frames import Calibration, Frame
 from curate.review.edits import check_boxes
 from curate.review.sheet import Sheet, ShownBox, ShownFrame
 from curate.review.table import read_table
 from curate.segmenters.instances import InstanceSegmenter
 from curate.segmenters.saved import SavedSegmenter
+from docs.input_cases_clouds import CLOUDS, PIXELS, POINTS, encoded
+from docs.input_reader import Case, Reader, text_cases
 from pipelines.registry import EDITORS
 from pipelines.workspace.config import read_config
-
-Content = bytes | str
-
-
-@dataclass(frozen=True)
-class Case:
-    """A variation of a file.
-
-    Attributes:
-        variation: what is different from the plain file.
-        content: of the file.
-        other: whether the file holds something else than the plain file, such as no objects.
-        name: of the file; "" for the reader's.
-    """
-
-    variation: str
-    content: Content
-    other: bool = False
-    name: str = ""
-
-
-@dataclass(frozen=True)
-class Reader:
-    """A reader with the variations of its file.
-
-    Attributes:
-        title: of its section on the page.
-        about: sentences above the table.
-        name: of the file, with its folder.
-        read: reads the file.
-        plain: content of a valid file.
-        cases: the variations.
-        beside: other files that the reader needs, by name.
-    """
-
-    title: str
-    about: str
-    name: str
-    read: Callable[[Path], Any]
-    plain: Content
-    cases: Sequence[Case]
-    beside: Sequence[tuple[str, Content]] = ()
-
-    def outcome(self, case: Case) -> tuple[str, str]:
-        """Return "read" or "rejected", and the message.
-
-        Raises:
-            AssertionError: if the file was read, but not as the plain file.
-        """
-        found = self._attempt(case.content, case.name or self.name)
-        if isinstance(found, str):
-            return "rejected", found
-        if not case.other:
-            plain = self._attempt(self.plain, self.name)
-            if isinstance(plain, str) or plain != found:
-                raise AssertionError(f"{self.title}: {case.variation}: {found}, expected {plain}")
-        return "read", ""
-
-    def _attempt(self, content: Content, name: str) -> str | list[str]:
-        """Return the message without the folder, or the result as text in a list."""
-        with tempfile.TemporaryDirectory() as folder:
-            for other, text in (*self.beside, (name, content)):
-                path = Path(folder) / other
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(text if isinstance(text, bytes) else text.encode())
-            try:
-                return [repr(_plain(self.read(Path(folder) / name)))]
-            except CurateError as error:
-                return str(error).replace(f"{folder}/", "").replace(folder, "ROOT")
-
-
-def _plain(value: Any) -> Any:
-    """Return arrays and objects as lists, numbers with six digits."""
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(each) for each in value]
-    if hasattr(value, "__dataclass_fields__"):
-        return [_plain(getattr(value, name)) for name in value.__dataclass_fields__]
-    return float(f"{value:.6g}") if isinstance(value, float) else value
-
-
-def _text_cases(text: str) -> list[Case]:
-    """Return variations that editors and programs of other systems make of any text file."""
-    return [
-        Case("byte order mark", f"\ufeff{text}"),
-        Case("Windows line ends", text.replace("\n", "\r\n")),
-        Case("no newline at the end", text.rstrip("\n")),
-        Case("empty lines at the end", f"{text}\n\n"),
-        Case("blanks at the ends of lines", text.replace("\n", "  \n")),
-        Case("not UTF-8", b"\xff\xfe\xfa" + text.encode()),
-        Case("UTF-16", text.encode("utf-16")),
-    ]
-
 
 _CAR = "Car 0.00 0 1.55 614.24 181.78 727.31 284.77 1.57 1.73 4.15 1.00 1.75 13.22 1.62"
 _WALKER = "Pedestrian 0.10 1 -0.20 712.40 143.00 810.73 307.92 1.89 0.48 1.20 1.84 1.47 8.41 0.01"
@@ -146,7 +47,7 @@ _CAMERAS = "R_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_02: 700 0 600 40 0 700 180 0 0 
 def _label_cases(text: str) -> Iterable[Case]:
     first, second = text.splitlines()
     return [
-        *_text_cases(text),
+        *text_cases(text),
         Case("tabs between the fields", text.replace(" ", "\t")),
         Case("an empty file: no objects", "", other=True),
         Case("a line with 14 fields", f"{' '.join(first.split()[:14])}\n{second}\n"),
@@ -168,7 +69,7 @@ def _dont_care(line: str) -> str:
 def _matrix_cases(text: str) -> Iterable[Case]:
     lines = text.splitlines()
     return [
-        *_text_cases(text),
+        *text_cases(text),
         Case("lines in another order", "\n".join(reversed(lines)) + "\n"),
         Case("further lines", f"{text}P9: 1 2 3\ncalib_time: 15-Mar-2012 11:37:16\n"),
         Case("keys without colon", text.replace(":", "")),
@@ -180,37 +81,9 @@ def _matrix_cases(text: str) -> Iterable[Case]:
     ]
 
 
-_POINTS = np.array([[10, 1, -1, 0.5], [20, -2, 0, 0.25], [30, 3, 1, 1]], dtype="<f4")
-_ROWS = "\n".join(" ".join(f"{number:g}" for number in row) for row in _POINTS.tolist())
-_PCD = (
-    "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
-    "WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\n"
-)
-_PCD_BYTES = f"{_PCD}DATA binary\n".encode() + _POINTS.tobytes()
-_PLY = "ply\nformat {} 1.0\nelement vertex 3\n" + "".join(
-    f"property float {name}\n" for name in ("x", "y", "z", "intensity")
-)
-_PLY_TEXT = f"{_PLY.format('ascii')}end_header\n{_ROWS}\n"
-
-
-def _npy(table: Any) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, table)
-    return buffer.getvalue()
-
-
-def _with_nan(points: np.ndarray) -> np.ndarray:
-    return np.vstack([points, np.full((1, 4), np.nan, dtype="<f4")])
-
-
-_PIXELS = np.arange(40 * 120 * 3, dtype=np.uint32).reshape(40, 120, 3).astype(np.uint8)
 _MAP = np.tile(np.repeat(np.array([0, 3, 1], dtype=np.uint8), 40), (40, 1))
 _SIZE = (120, 40)
 _CLASSES = {"Car": (3,), "Pedestrian": (1,)}
-
-
-def _encoded(pixels: np.ndarray, suffix: str = ".png") -> bytes:
-    return bytes(cv2.imencode(suffix, pixels)[1].tobytes())
 
 
 def _frame(name: str = "000001") -> Frame:
@@ -257,7 +130,7 @@ def _read_folder(path: Path) -> Any:
 
 def _toml_cases(text: str, key: str, value: str) -> Iterable[Case]:
     return [
-        *_text_cases(text),
+        *text_cases(text),
         Case("comments", f"# a comment\n{text}"),
         Case("a misspelled key", text.replace(key, f"{key}s")),
         Case("a number in place of a text", text.replace(value, "3")),
@@ -435,88 +308,23 @@ READERS = (
         "calib_velo_to_cam.txt", lambda path: read_raw_calibration(path.parent), _VELODYNE,
         _matrix_cases(_VELODYNE), [("calib_cam_to_cam.txt", _CAMERAS)],
     ),
-    Reader(
-        "Point clouds: .bin", "Rows of float32, little-endian: x, y, z, intensity.",
-        "000001.bin", read_cloud, _POINTS.tobytes(),
-        [
-            Case("an empty file: no points", b"", other=True),
-            Case("points that are NaN are dropped", _with_nan(_POINTS).tobytes()),
-            Case("the file ends within a point", _POINTS.tobytes()[:-3]),
-            Case("in millimetres", (_POINTS * [1000, 1000, 1000, 1]).astype("<f4").tobytes()),
-            Case("another suffix", _POINTS.tobytes(), name="000001.dat"),
-        ],
-    ),
-    Reader(
-        "Point clouds: .npy", "An array (n, 4) of numbers, as `numpy.save` writes it.",
-        "000001.npy", read_cloud, _npy(_POINTS),
-        [
-            Case("float64", _npy(_POINTS.astype(np.float64))),
-            Case("big-endian", _npy(_POINTS.astype(">f4"))),
-            Case("columns first in memory", _npy(np.asfortranarray(_POINTS))),
-            Case("points that are NaN are dropped", _npy(_with_nan(_POINTS))),
-            Case("no points", _npy(_POINTS[:0]), other=True),
-            Case("five columns without `columns = 5`", _npy(np.hstack([_POINTS, _POINTS[:, :1]]))),
-            Case("one dimension", _npy(_POINTS.ravel())),
-            Case("an array of objects", _npy(np.array([{}, {}], dtype=object))),
-            Case("the file ends early", _npy(_POINTS)[:-8]),
-        ],
-    ),
-    Reader(
-        "Point clouds: .pcd", "PCD 0.7: text, binary or binary_compressed.",
-        "000001.pcd", read_cloud, _PCD_BYTES,
-        [
-            Case("text", f"{_PCD}DATA ascii\n{_ROWS}\n"),
-            Case("Windows line ends in a text file", f"{_PCD}DATA ascii\n{_ROWS}\n".replace(
-                "\n", "\r\n")),
-            Case("a comment before the header", b"# .PCD v.7\n" + _PCD_BYTES),
-            Case("no field x", _PCD_BYTES.replace(b"FIELDS x", b"FIELDS u")),
-            Case("no line DATA", _PCD),
-            Case("the file ends early", _PCD_BYTES[:-4]),
-        ],
-    ),
-    Reader(
-        "Point clouds: .ply", "PLY 1.0: text, or binary of either byte order.",
-        "000001.ply", read_cloud, _PLY_TEXT,
-        [
-            Case("binary, little-endian", f"{_PLY.format('binary_little_endian')}end_header\n"
-                 .encode() + _POINTS.tobytes()),
-            Case("binary, big-endian", f"{_PLY.format('binary_big_endian')}end_header\n".encode()
-                 + _POINTS.astype(">f4").tobytes()),
-            Case("Windows line ends in a text file", _PLY_TEXT.replace("\n", "\r\n")),
-            Case("a comment in the header", _PLY_TEXT.replace("element", "comment a\nelement")),
-            Case("no property x", _PLY_TEXT.replace("float x", "float u")),
-            Case("no end_header", _PLY_TEXT.replace("end_header\n", "")),
-            Case("the file ends early", _PLY_TEXT[:-12]),
-        ],
-    ),
-    Reader(
-        "Images", "PNG or JPEG.", "000001.png", read_image, _encoded(_PIXELS),
-        [
-            Case("grey", _encoded(_PIXELS[..., 0]), other=True),
-            Case("with transparency", _encoded(np.dstack([_PIXELS, _PIXELS[..., :1]]))),
-            Case("16 bits per channel", _encoded(_PIXELS.astype(np.uint16) * 257)),
-            Case("a JPEG file named .png", _encoded(_PIXELS, ".jpg"), other=True),
-            Case("the file ends early", _encoded(_PIXELS)[:-40]),
-            Case("an empty file", b""),
-            Case("another format", b"GIF89a" + bytes(40)),
-        ],
-    ),
+    *CLOUDS,
     Reader(
         "Semantic maps", "`FRAME.png` with a class id per pixel, for the segmenter `saved`.",
-        "maps/000001.png", _read_map, _encoded(_MAP),
+        "maps/000001.png", _read_map, encoded(_MAP),
         [
-            Case("16 bits per pixel without `divisor`", _encoded(_MAP.astype(np.uint16))),
-            Case("three equal channels", _encoded(np.dstack([_MAP] * 3))),
-            Case("another size", _encoded(_MAP[:20])),
-            Case("the file ends early", _encoded(_MAP)[:-20]),
-            Case("the map of another frame", _encoded(_MAP), name="maps/000002.png"),
+            Case("16 bits per pixel without `divisor`", encoded(_MAP.astype(np.uint16))),
+            Case("three equal channels", encoded(np.dstack([_MAP] * 3))),
+            Case("another size", encoded(_MAP[:20])),
+            Case("the file ends early", encoded(_MAP)[:-20]),
+            Case("the map of another frame", encoded(_MAP), name="maps/000002.png"),
         ],
     ),
     Reader(
         "Instance masks", "COCO's JSON with images, annotations and masks.",
         "masks.json", _read_masks, _masks(),
         [
-            *_text_cases(_masks()),
+            *text_cases(_masks()),
             Case("a list of results, `image_id` is the frame", json.dumps([
                 {"image_id": "000001", "category_id": 3, "score": 0.9, "segmentation": _MASK}])),
             Case("`image_id` is the number of the frame", json.dumps([
@@ -533,7 +341,7 @@ READERS = (
         "Lists of frames", "One frame per line, for `--labeled`, `--val` and ImageSets.",
         "train.txt", lambda path: match_frame_list(path, ("000001", "000002")), _LIST,
         [
-            *_text_cases(_LIST),
+            *text_cases(_LIST),
             Case("empty lines between", _LIST.replace("\n", "\n\n")),
             Case("blanks before the names", _LIST.replace("0000", "  0000")),
             Case("an empty file", "", other=True),
@@ -548,7 +356,7 @@ READERS = (
             Case("a missing key", _FOLDER.replace('points = "lidar"\n', "")),
             Case("a matrix with a missing row", _FOLDER.replace(", [0, 0, 1, 0]]", "]")),
         ],
-        [("lidar/000001.bin", _POINTS.tobytes()), ("camera/000001.png", _encoded(_PIXELS))],
+        [("lidar/000001.bin", POINTS.tobytes()), ("camera/000001.png", encoded(PIXELS))],
     ),
     Reader(
         "curate.toml", "The settings of a workspace.", "curate.toml", read_config, _CONFIG,
@@ -562,7 +370,7 @@ READERS = (
         "Recorded detections: CSV", f"A header and a row per box: {_COLUMNS.replace(',', ', ')}.",
         "detections.csv", _read_record, _CSV,
         [
-            *_text_cases(_CSV),
+            *text_cases(_CSV),
             Case("columns in another order", _CSV.replace("category,score", "score,category")
                  .replace("Car,0.9", "0.9,Car").replace("Pedestrian,0.5", "0.5,Pedestrian")),
             Case("a further column", "".join(
@@ -602,7 +410,7 @@ READERS = (
         "`detector.options.classes` names the labels.",
         "results.json", _read_numbered, json.dumps([_mmdet3d()]),
         [
-            *_text_cases(json.dumps([_mmdet3d()])),
+            *text_cases(json.dumps([_mmdet3d()])),
             Case("a pickle", pickle.dumps([_mmdet3d()]), name="results.pkl"),
             Case("9 numbers per box: velocities", json.dumps([_mmdet3d(
                 bboxes_3d=[[*box, 0.0, 0.0] for box in _mmdet3d()["bboxes_3d"]])])),
@@ -615,7 +423,7 @@ READERS = (
         "Recorded detections: nuScenes", "The results of the detection task, as JSON.",
         "results_nusc.json", _read_nuscenes, _nuscenes(),
         [
-            *_text_cases(_nuscenes()),
+            *text_cases(_nuscenes()),
             Case("a key is missing", _nuscenes().replace("translation", "location")),
             Case("a rotation that is not a rotation", _nuscenes(rotation=[0.0] * 4)),
             Case("a score above 1", _nuscenes(detection_score=7.0)),
@@ -626,7 +434,7 @@ READERS = (
         "Review: review.csv", "The table of decisions; spreadsheets may change its form.",
         "review.csv", lambda path: read_table(path.parent, _SHEET), _TABLE,
         [
-            *_text_cases(_TABLE),
+            *text_cases(_TABLE),
             Case("semicolons between the values", _TABLE.replace(",", ";")),
             Case("frames without leading zeros", _TABLE.replace("000001", "1")),
             Case("capital letters: ACCEPT", _TABLE.replace("accept", "ACCEPT")),
@@ -643,7 +451,7 @@ READERS = (
         "Review: KITTI", "`label_2/FRAME.txt` after editing.",
         "label_2/000001.txt", _edited("kitti", 1), _KITTI_BOXES,
         [
-            *_text_cases(_KITTI_BOXES),
+            *text_cases(_KITTI_BOXES),
             Case("16 fields in every line", _KITTI_BOXES.replace("\n", " 0.5\n")),
             Case("a line with 12 fields", " ".join(_KITTI_BOXES.split()[:12]) + "\n"),
             Case("an unknown category", _KITTI_BOXES.replace("Car", "Tram")),
@@ -655,7 +463,7 @@ READERS = (
         "Review: labelCloud", "`labels/FRAME.json` in the format centroid_abs.",
         "labels/000001.json", _edited("labelcloud", 1), _label_cloud(),
         [
-            *_text_cases(_label_cloud()),
+            *text_cases(_label_cloud()),
             Case("a yaw of more than a turn", _label_cloud(
                 rotations={"x": 0.0, "y": 0.0, "z": 365.73})),
             Case("rotated about x", _label_cloud(rotations={"x": 9.0, "y": 0.0, "z": 5.73})),
@@ -670,7 +478,7 @@ READERS = (
         "Review: CVAT", "Datumaro 3D 1.0: annotations.zip, or the JSON in it.",
         "annotations.zip", _edited("cvat", 0), _cvat(),
         [
-            *_text_cases(_cvat()),
+            *text_cases(_cvat()),
             Case("annotations of other types besides are skipped", _cvat().replace(
                 '"annotations": [', '"annotations": [{"type": "label", "label_id": 0}, ')),
             Case("rotated about x", _cvat(rotation=[0.2, 0.0, 0.1])),

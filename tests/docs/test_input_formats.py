@@ -10,8 +10,9 @@ from docs.generate import INPUT_FORMATS
 
 pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")
 
-from docs.input_cases import Case, Reader, readers
+from docs.input_cases import readers
 from docs.input_formats_page import rows_of
+from docs.input_reader import Case, Reader
 
 READERS = {reader.title: reader for reader in readers()}
 CASES = [(title, case) for title, reader in READERS.items() for case in reader.cases]
