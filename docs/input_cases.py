@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from curate.datasets.folder import FolderDataset
 from curate.datasets.frame_names import match_frame_list
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.labels import read_objects
@@ -27,21 +26,22 @@ from curate.review.table import read_table
 from curate.segmenters.instances import InstanceSegmenter
 from curate.segmenters.saved import SavedSegmenter
 from docs.input_cases_clouds import CLOUDS, PIXELS, POINTS, encoded
+from docs.input_cases_data_sets import (
+    CALIBRATION,
+    CAMERAS,
+    CAR,
+    DATA_SETS,
+    FOLDER,
+    VELODYNE,
+    WALKER,
+    read_folder,
+)
 from docs.input_reader import Case, Reader, text_cases
 from pipelines.registry import EDITORS
 from pipelines.workspace.config import read_config
 
-_CAR = "Car 0.00 0 1.55 614.24 181.78 727.31 284.77 1.57 1.73 4.15 1.00 1.75 13.22 1.62"
-_WALKER = "Pedestrian 0.10 1 -0.20 712.40 143.00 810.73 307.92 1.89 0.48 1.20 1.84 1.47 8.41 0.01"
-_LABELS = f"{_CAR}\n{_WALKER}\n"
-_RESULTS = f"{_CAR} 0.9\n{_WALKER} 0.5\n"
-_CALIBRATION = """\
-P2: 700 0 600 40 0 700 180 0.2 0 0 1 0.003
-R0_rect: 1 0 0 0 1 0 0 0 1
-Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3
-"""
-_VELODYNE = "R: 0 -1 0 0 0 -1 1 0 0\nT: 0 -0.1 -0.3\n"
-_CAMERAS = "R_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_02: 700 0 600 40 0 700 180 0 0 0 1 0\n"
+_LABELS = f"{CAR}\n{WALKER}\n"
+_RESULTS = f"{CAR} 0.9\n{WALKER} 0.5\n"
 
 
 def _label_cases(text: str) -> Iterable[Case]:
@@ -113,19 +113,7 @@ def _masks(segmentation: Any = _MASK, **changes: Any) -> str:
 
 
 _LIST = "000001\n000002\n"
-_FOLDER = """\
-points = "lidar"
-images = "camera"
-[calibration]
-projection = [[700.0, 0, 60, 0], [0, 700, 20, 0], [0, 0, 1, 0]]
-lidar_to_camera = [[0.0, -1, 0, 0], [0, 0, -1, -0.1], [1, 0, 0, -0.3]]
-"""
 _CONFIG = '[dataset]\nroot = "data"\n'
-
-
-def _read_folder(path: Path) -> Any:
-    dataset = FolderDataset(path.parent)
-    return [dataset.read(name) for name in dataset.frame_ids()]
 
 
 def _toml_cases(text: str, key: str, value: str) -> Iterable[Case]:
@@ -295,20 +283,21 @@ READERS = (
     ),
     Reader(
         "Calibration", '`calib/FRAME.txt` of KITTI, and `calibration = "FILE"` of a folder.',
-        "calib/000001.txt", read_calibration, _CALIBRATION,
+        "calib/000001.txt", read_calibration, CALIBRATION,
         [
-            *_matrix_cases(_CALIBRATION),
-            Case("R_rect and Tr_velo_cam, as in the tracking benchmark", _CALIBRATION.replace(
+            *_matrix_cases(CALIBRATION),
+            Case("R_rect and Tr_velo_cam, as in the tracking benchmark", CALIBRATION.replace(
                 "R0_rect", "R_rect").replace("velo_to_cam", "velo_cam")),
-            Case("the matrices cannot be inverted", _CALIBRATION.replace("-1 -0.1", "0 -0.1")),
+            Case("the matrices cannot be inverted", CALIBRATION.replace("-1 -0.1", "0 -0.1")),
         ],
     ),
     Reader(
         "Calibration of KITTI raw", "`calib_velo_to_cam.txt` beside `calib_cam_to_cam.txt`.",
-        "calib_velo_to_cam.txt", lambda path: read_raw_calibration(path.parent), _VELODYNE,
-        _matrix_cases(_VELODYNE), [("calib_cam_to_cam.txt", _CAMERAS)],
+        "calib_velo_to_cam.txt", lambda path: read_raw_calibration(path.parent), VELODYNE,
+        _matrix_cases(VELODYNE), [("calib_cam_to_cam.txt", CAMERAS)],
     ),
     *CLOUDS,
+    *DATA_SETS,
     Reader(
         "Semantic maps", "`FRAME.png` with a class id per pixel, for the segmenter `saved`.",
         "maps/000001.png", _read_map, encoded(_MAP),
@@ -350,11 +339,11 @@ READERS = (
     ),
     Reader(
         "dataset.toml", "The description of a plain folder.",
-        "dataset.toml", _read_folder, _FOLDER,
+        "dataset.toml", read_folder, FOLDER,
         [
-            *_toml_cases(_FOLDER, "images", '"camera"'),
-            Case("a missing key", _FOLDER.replace('points = "lidar"\n', "")),
-            Case("a matrix with a missing row", _FOLDER.replace(", [0, 0, 1, 0]]", "]")),
+            *_toml_cases(FOLDER, "images", '"camera"'),
+            Case("a missing key", FOLDER.replace('points = "lidar"\n', "")),
+            Case("a matrix with a missing row", FOLDER.replace(", [0, 0, 1, 0]]", "]")),
         ],
         [("lidar/000001.bin", POINTS.tobytes()), ("camera/000001.png", encoded(PIXELS))],
     ),

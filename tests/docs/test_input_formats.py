@@ -31,15 +31,18 @@ def test_a_plain_file_is_read(title: str) -> None:
     ("title", "case"), CASES, ids=lambda each: getattr(each, "variation", each)
 )
 def test_a_variation_is_read_alike_or_rejected_in_one_line(title: str, case: Case) -> None:
-    """The message names the file, and no variation is silently read as something else."""
+    """The message names the file or setting; no variation is silently read as something else."""
     reader = READERS[title]
     outcome, message = reader.outcome(case)
     assert (outcome == "read") == (message == "")
     if outcome == "rejected":
-        path = Path(case.name or reader.name)
-        assert path.name in message or str(path.parent) in message or reader.name in message
+        name = case.name or reader.name
+        files = [name, reader.name, *(other for other, _ in (*reader.beside, *case.beside))]
+        places = [place for file in files for place in (Path(file).name, str(Path(file).parent))]
+        settings = [key for key in case.options if key in message]
+        assert settings or any(place in message for place in places if place != ".")
         assert len(message.splitlines()) == 1
-        assert len(message) > len(path.name) + 10
+        assert len(message) > len(Path(name).name) + 10
 
 
 @pytest.mark.parametrize("title", READERS)
