@@ -7,6 +7,8 @@ writes what happened, and a test compares that with the page. Add a case as one 
 import io
 import json
 import pickle
+import struct
+import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +21,12 @@ from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.labels import read_objects
 from curate.datasets.kitti.raw import read_raw_calibration
 from curate.detectors.recorded import RecordedDetector
-from curate.frames import Calibration, Frame
 from curate.review.edits import check_boxes
 from curate.review.sheet import Sheet, ShownBox, ShownFrame
 from curate.review.table import read_table
 from curate.segmenters.instances import InstanceSegmenter
 from curate.segmenters.saved import SavedSegmenter
-from docs.input_cases_clouds import CLOUDS, PIXELS, POINTS, encoded
+from docs.input_cases_clouds import CLOUDS, PIXELS, POINTS, encoded, npy
 from docs.input_cases_data_sets import (
     CALIBRATION,
     CAMERAS,
@@ -36,6 +37,8 @@ from docs.input_cases_data_sets import (
     WALKER,
     read_folder,
 )
+from docs.input_cases_models import model_readers
+from docs.input_frame import BOXES, CLASSES, frame
 from docs.input_reader import Case, Reader, text_cases
 from pipelines.registry import EDITORS
 from pipelines.workspace.config import read_config
@@ -82,24 +85,35 @@ def _matrix_cases(text: str) -> Iterable[Case]:
 
 
 _MAP = np.tile(np.repeat(np.array([0, 3, 1], dtype=np.uint8), 40), (40, 1))
-_SIZE = (120, 40)
-_CLASSES = {"Car": (3,), "Pedestrian": (1,)}
+_COLOURS = np.zeros((*_MAP.shape, 3), np.uint8)
+_COLOURS[_MAP == 3], _COLOURS[_MAP == 1] = (142, 0, 0), (60, 20, 220)  # blue, green, red
 
 
-def _frame(name: str = "000001") -> Frame:
-    projection = np.array([[60.0, 0, 60, 0], [0, 60, 20, 0], [0, 0, 1, 0]])
-    lidar_to_camera = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-    image = np.zeros((40, 120, 3), dtype=np.uint8)
-    calibration = Calibration(projection, lidar_to_camera)
-    return Frame(name, np.zeros((0, 4), np.float32), calibration, _SIZE, image)
+def _palette_png() -> bytes:
+    """Return the map as a PNG of indices into a palette."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        checksum = struct.pack(">I", zlib.crc32(kind + content))
+        return struct.pack(">I", len(content)) + kind + content + checksum
+
+    height, width = _MAP.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in _MAP)
+    return b"".join((
+        b"\x89PNG\r\n\x1a\n",
+        chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
+        chunk(b"PLTE", bytes(range(12))),
+        chunk(b"IDAT", zlib.compress(rows)),
+        chunk(b"IEND", b""),
+    ))  # fmt: skip
 
 
-def _read_map(path: Path) -> Any:
-    return SavedSegmenter(path.parent, _CLASSES).segment(_frame()).class_ids
+def _read_map(path: Path, **options: Any) -> Any:
+    return SavedSegmenter(path.parent, CLASSES, **options).segment(frame()).class_ids
 
 
 def _read_masks(path: Path) -> Any:
-    return InstanceSegmenter(path, _CLASSES).segment(_frame()).class_ids
+    segmenter = InstanceSegmenter(path, CLASSES, frame_ids=["000001"])
+    return segmenter.segment(frame()).class_ids
 
 
 _MASK = {"size": [40, 120], "counts": [400, 100, 4300]}
@@ -127,44 +141,58 @@ def _toml_cases(text: str, key: str, value: str) -> Iterable[Case]:
     ]
 
 
-_BOXES = np.array([[10.0, 1, -1, 4, 1.8, 1.6, 0.1], [15.0, -2, -1, 0.8, 0.6, 1.7, 0.5]])
 _SCORES, _NAMES = np.array([0.9, 0.5]), np.array(["Car", "Pedestrian"])
 _COLUMNS = "frame,view,flip_y,rotation_rad,scale,category,score,x,y,z,length,width,height,yaw"
 _CSV = f"{_COLUMNS}\n" + "".join(
     f"000001,0,0,0,1,{name},{score:g},{','.join(f'{number:g}' for number in box)}\n"
-    for name, score, box in zip(_NAMES, _SCORES, _BOXES, strict=True)
+    for name, score, box in zip(_NAMES, _SCORES, BOXES, strict=True)
 )
 
 
 def _detections(path: Path, **options: Any) -> Any:
     detector = RecordedDetector(path, **options)
-    return [detector.predict(_frame(name)) for name in detector.frame_ids()]
+    return [detector.predict(frame(name)) for name in detector.frame_ids()]
 
 
-def _read_record(path: Path) -> Any:
-    return _detections(path)
+def _read_numbered(path: Path, **options: Any) -> Any:
+    return _detections(path, classes=("Car", "Pedestrian"), **options)
 
 
-def _read_numbered(path: Path) -> Any:
-    return _detections(path, classes=("Car", "Pedestrian"))
-
-
-def _read_results(path: Path) -> Any:
-    return _detections(path.parent)
+def _read_results(path: Path, **options: Any) -> Any:
+    return _detections(path.parent, frame_ids=["000001"], **options)
 
 
 def _openpcdet(**changes: Any) -> dict[str, Any]:
     return {
-        "frame_id": "000001", "name": _NAMES, "score": _SCORES, "boxes_lidar": _BOXES,
+        "frame_id": "000001", "name": _NAMES, "score": _SCORES, "boxes_lidar": BOXES,
     } | changes  # fmt: skip
 
 
 def _mmdet3d(**changes: Any) -> dict[str, Any]:
-    boxes = _BOXES - np.array([0, 0, 0.5, 0, 0, 0, 0]) * _BOXES[:, 5:6]
+    boxes = BOXES - np.array([0, 0, 0.5, 0, 0, 0, 0]) * BOXES[:, 5:6]
     return {
         "frame_id": "000001", "bboxes_3d": boxes.tolist(), "scores_3d": _SCORES.tolist(),
         "labels_3d": [0, 1],
     } | changes  # fmt: skip
+
+
+def _old_mmdet3d() -> dict[str, Any]:
+    """Return an entry of mmdetection3d 0.x: width before length, yaw clockwise from -y."""
+    rows = np.array(_mmdet3d()["bboxes_3d"])
+    rows[:, [3, 4]] = rows[:, [4, 3]]
+    rows[:, 6] = -rows[:, 6] - np.pi / 2
+    return _without(_mmdet3d(boxes_3d=rows.tolist()), "bboxes_3d")
+
+
+def _st3d_rows() -> np.ndarray:
+    return np.column_stack([BOXES, [1, 2], _SCORES])
+
+
+def _st3d(**changes: Any) -> bytes:
+    frames = {
+        "000001": {"gt_boxes": _st3d_rows(), "cls_scores": None, "iou_scores": None} | changes
+    }
+    return pickle.dumps(frames)
 
 
 def _without(entry: dict[str, Any], name: str) -> dict[str, Any]:
@@ -172,7 +200,7 @@ def _without(entry: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _changed(place: tuple[int, int], value: float) -> np.ndarray:
-    boxes = _BOXES.copy()
+    boxes = BOXES.copy()
     boxes[place] = value
     return boxes
 
@@ -184,7 +212,7 @@ def _parquet(**changes: Any) -> bytes:
     names = ("x", "y", "z", "length", "width", "height", "yaw")
     columns = {
         "frame": ["000001"] * 2, "category": _NAMES.tolist(), "score": _SCORES,
-        **dict(zip(names, _BOXES.T, strict=True)),
+        **dict(zip(names, BOXES.T, strict=True)),
     } | changes  # fmt: skip
     buffer = io.BytesIO()
     table = pa.table({name: column for name, column in columns.items() if column is not None})
@@ -197,9 +225,9 @@ _NUSCENES_POSE = np.eye(4)
 
 def _read_nuscenes(path: Path) -> Any:
     detector = RecordedDetector(path)
-    calibration = replace(_frame().calibration, lidar_to_map=_NUSCENES_POSE)
+    calibration = replace(frame().calibration, lidar_to_map=_NUSCENES_POSE)
     return [
-        detector.predict(replace(_frame(name), calibration=calibration))
+        detector.predict(replace(frame(name), calibration=calibration))
         for name in detector.frame_ids()
     ]
 
@@ -217,7 +245,7 @@ _SHEET = Sheet(
     1, "pspsl", "kitti", ("Car", "Pedestrian"),
     (ShownFrame("000001", tuple(
         ShownBox(k, str(name), tuple(box.tolist()), 0.6, 0.5, asked=True)
-        for k, (name, box) in enumerate(zip(_NAMES, _BOXES, strict=True))
+        for k, (name, box) in enumerate(zip(_NAMES, BOXES, strict=True))
     )),),
 )  # fmt: skip
 _TABLE = "frame,k,asked,category,score,weight,decision\n000001,0,yes,Car,0.6,0.5,accept\n"
@@ -229,7 +257,7 @@ def _edited(editor: str, depth: int) -> Callable[[Path], Any]:
 
     def read(path: Path) -> Any:
         found = EDITORS.build(editor, offered={}, options={}).read(
-            path.parents[depth], _SHEET, _frame
+            path.parents[depth], _SHEET, frame
         )
         for boxes in found.values():
             check_boxes(boxes, _SHEET.categories)
@@ -278,6 +306,12 @@ READERS = (
             Case("15 fields: no score", _LABELS),
             Case("a score above 1", _RESULTS.replace(" 0.9", " 9.5")),
             Case("a negative score", _RESULTS.replace(" 0.9", " -2.5")),
+            Case("scores before the sigmoid with `sigmoid = true`", _RESULTS.replace(
+                " 0.9", " 2.5"), other=True, options={"sigmoid": True}),
+            Case("the file is called 1.txt", _RESULTS, name="results/1.txt"),
+            Case("two files of one frame", _RESULTS, name="results/1.txt", beside=[
+                ("results/000001.txt", _RESULTS)]),
+            Case("a file of another frame", _RESULTS, name="results/000007.txt"),
             Case("a box twice", _RESULTS + _RESULTS),
         ],
     ),
@@ -303,7 +337,25 @@ READERS = (
         "maps/000001.png", _read_map, encoded(_MAP),
         [
             Case("16 bits per pixel without `divisor`", encoded(_MAP.astype(np.uint16))),
+            Case("16 bits per pixel with `divisor = 1`", encoded(_MAP.astype(np.uint16)),
+                 options={"divisor": 1}),
+            Case("class * 1000 + instance with `divisor = 1000`", encoded(
+                _MAP.astype(np.uint16) * 1000), options={"divisor": 1000}),
+            Case("class * 1000 + instance with `divisor = 256`", encoded(
+                _MAP.astype(np.uint16) * 1000), options={"divisor": 256}, other=True),
+            Case("a palette", _palette_png()),
+            Case("an array in .npy", npy(_MAP), name="maps/000001.npy"),
+            Case("an array of fractions", npy(_MAP / 2), name="maps/000001.npy"),
             Case("three equal channels", encoded(np.dstack([_MAP] * 3))),
+            Case("a colour for each class without `colours`", encoded(_COLOURS)),
+            Case("a colour for each class with `colours`", encoded(_COLOURS),
+                 options={"colours": {"0": (0, 0, 0), "3": (0, 0, 142), "1": (220, 20, 60)}}),
+            Case("a colour that `colours` does not list", encoded(_COLOURS),
+                 options={"colours": {"0": (0, 0, 0), "3": (0, 0, 142)}}),
+            Case("the class id in the red channel with `channel`", encoded(
+                np.dstack([_MAP * 0, _MAP * 0, _MAP])), options={"channel": "red"}),
+            Case("JPEG, which changes values", encoded(_MAP, ".jpg"), name="maps/000001.jpg"),
+            Case("two maps of one frame", encoded(_MAP), beside=[("maps/000001.npy", npy(_MAP))]),
             Case("another size", encoded(_MAP[:20])),
             Case("the file ends early", encoded(_MAP)[:-20]),
             Case("the map of another frame", encoded(_MAP), name="maps/000002.png"),
@@ -318,6 +370,9 @@ READERS = (
                 {"image_id": "000001", "category_id": 3, "score": 0.9, "segmentation": _MASK}])),
             Case("`image_id` is the number of the frame", json.dumps([
                 {"image_id": 1, "category_id": 3, "score": 0.9, "segmentation": _MASK}])),
+            Case("file_name with folders", _masks().replace("000001.png", "image_2/000001.png")),
+            Case("two images of one frame", _masks().replace('"images": [', '"images": ['
+                 '{"id": 2, "file_name": "1.png"}, ')),
             Case("polygons", _masks(_POLYGON), other=True),
             Case("a mask of another size", _masks({"size": [20, 60], "counts": [1200]})),
             Case("runs that do not fill the image", _masks({"size": [40, 120], "counts": [4]})),
@@ -332,6 +387,11 @@ READERS = (
         [
             *text_cases(_LIST),
             Case("empty lines between", _LIST.replace("\n", "\n\n")),
+            Case("numbers: 1 for 000001", "1\n2\n"),
+            Case("file names", "000001.png\n000002.png\n"),
+            Case("paths", "training/velodyne/000001.bin\ntraining/velodyne/000002.bin\n"),
+            Case("a frame twice", "000001\n1\n000002\n"),
+            Case("a frame that is not in the data set", "000003\n"),
             Case("blanks before the names", _LIST.replace("0000", "  0000")),
             Case("an empty file", "", other=True),
             Case("a path out of the data set", f"{_LIST}../000003\n"),
@@ -352,12 +412,13 @@ READERS = (
         [
             *_toml_cases(_CONFIG, "root", '"data"'),
             Case("a misspelled section", f"{_CONFIG}[detectr]\n"),
+            Case("names are renamed in two steps", f'{_CONFIG}rename = {{a = "b", b = "c"}}\n'),
             Case("a number out of its range", f"{_CONFIG}[run]\nworkers = -1\n"),
         ],
     ),
     Reader(
         "Recorded detections: CSV", f"A header and a row per box: {_COLUMNS.replace(',', ', ')}.",
-        "detections.csv", _read_record, _CSV,
+        "detections.csv", _detections, _CSV,
         [
             *text_cases(_CSV),
             Case("columns in another order", _CSV.replace("category,score", "score,category")
@@ -377,13 +438,13 @@ READERS = (
     ),
     Reader(
         "Recorded detections: OpenPCDet", "`result.pkl`: a list with a dict per frame.",
-        "result.pkl", _read_record, pickle.dumps([_openpcdet()]),
+        "result.pkl", _detections, pickle.dumps([_openpcdet()]),
         [
             Case("pickle protocol 2", pickle.dumps([_openpcdet()], protocol=2)),
             Case("float32", pickle.dumps([_openpcdet(
-                boxes_lidar=_BOXES.astype(np.float32), score=_SCORES.astype(np.float32))])),
+                boxes_lidar=BOXES.astype(np.float32), score=_SCORES.astype(np.float32))])),
             Case("a frame without boxes besides", pickle.dumps([_openpcdet(), _openpcdet(
-                frame_id="000002", name=_NAMES[:0], score=_SCORES[:0], boxes_lidar=_BOXES[:0],
+                frame_id="000002", name=_NAMES[:0], score=_SCORES[:0], boxes_lidar=BOXES[:0],
             )]), other=True),
             Case("a key is missing", pickle.dumps([_without(_openpcdet(), "score")])),
             Case("no frame_id", pickle.dumps([_without(_openpcdet(), "frame_id")])),
@@ -403,9 +464,35 @@ READERS = (
             Case("a pickle", pickle.dumps([_mmdet3d()]), name="results.pkl"),
             Case("9 numbers per box: velocities", json.dumps([_mmdet3d(
                 bboxes_3d=[[*box, 0.0, 0.0] for box in _mmdet3d()["bboxes_3d"]])])),
+            Case("boxes_3d without `version`", json.dumps([_old_mmdet3d()])),
+            Case("boxes_3d of 0.x with `version`", json.dumps([_old_mmdet3d()]),
+                 options={"version": "0.x"}),
+            Case("bboxes_3d, which 0.x does not write, with `version`", json.dumps([_mmdet3d()]),
+                 options={"version": "0.x"}),
+            Case("boxes in the camera's frame", json.dumps([_mmdet3d(box_type_3d="Camera")])),
             Case("a label without a class", json.dumps([_mmdet3d(labels_3d=[0, 7])])),
             Case("fewer scores than boxes", json.dumps([_mmdet3d(scores_3d=[0.9])])),
             Case("no frame and no `frame_list`", json.dumps([_without(_mmdet3d(), "frame_id")])),
+        ],
+    ),
+    Reader(
+        "Recorded detections: ST3D and MS3D",
+        "`ps_label_e0.pkl`: a dict of frames; `detector.options.classes` names the categories.",
+        "ps_label_e0.pkl", _read_numbered, _st3d(),
+        [
+            Case("scores in cls_scores", _st3d(
+                gt_boxes=np.column_stack([BOXES, [1, 2]]), cls_scores=_SCORES)),
+            Case("a box with a negative category is left out, with a warning", _st3d(
+                gt_boxes=np.vstack([_st3d_rows(), _st3d_rows()[:1] * [*[1.0] * 7, -1, 1]]))),
+            Case('such boxes with `ignored = "keep"`', _st3d(
+                gt_boxes=_st3d_rows() * [*[1.0] * 7, -1, 1]), options={"ignored": "keep"}),
+            Case("boxes moved by SHIFT_COOR with `shift`", _st3d(
+                gt_boxes=_st3d_rows() + np.float64([0, 0, 1.6, 0, 0, 0, 0, 0, 0])),
+                options={"shift": (0.0, 0.0, 1.6)}),
+            Case("no scores", _st3d(gt_boxes=_st3d_rows()[:, :8])),
+            Case("a category without a class", _st3d(gt_boxes=_st3d_rows() + 2 * np.eye(9)[7])),
+            Case("fewer scores than boxes", _st3d(
+                gt_boxes=_st3d_rows()[:, :8], cls_scores=_SCORES[:1])),
         ],
     ),
     Reader(
@@ -481,15 +568,15 @@ READERS = (
 
 
 def readers() -> tuple[Reader, ...]:
-    """Return all readers; that of Parquet files needs pyarrow."""
-    return (*READERS, _parquet_reader())
+    """Return all readers; those of Arrow files need pyarrow, those of models need onnx."""
+    return (*READERS, _parquet_reader(), _argoverse2_reader(), *model_readers())
 
 
 def _parquet_reader() -> Reader:
     return Reader(
         "Recorded detections: Parquet",
         "The columns of the CSV file; those of the views may be left out.",
-        "detections.parquet", _read_record, _parquet(),
+        "detections.parquet", _detections, _parquet(),
         [
             Case("single precision", _parquet(score=_SCORES.astype(np.float32))),
             Case("a further column", _parquet(note=["a", "b"])),
@@ -498,7 +585,59 @@ def _parquet_reader() -> Reader:
             Case("null", _parquet(x=[10.0, None])),
             Case("NaN", _parquet(x=[10.0, float("nan")])),
             Case("a score above 1", _parquet(score=[9.0, 0.5])),
+            Case("two rows of one box", _parquet(frame=["000001"] * 2, **_twice())),
+            Case("a damaged page", _parquet()[:60] + bytes(20) + _parquet()[80:]),
+            Case("a damaged footer", _parquet()[:-300] + bytes(200) + _parquet()[-100:]),
             Case("the file ends early", _parquet()[:-40]),
             Case("not Parquet", b"PAR1" + bytes(20)),
+        ],
+    )  # fmt: skip
+
+
+def _twice() -> dict[str, Any]:
+    names = ("x", "y", "z", "length", "width", "height", "yaw")
+    columns = {name: [number] * 2 for name, number in zip(names, BOXES[0], strict=True)}
+    return {"category": ["Car"] * 2, "score": [0.9] * 2, **columns}
+
+
+def _feather(**changes: Any) -> bytes:
+    import pyarrow as pa
+    from pyarrow import feather
+
+    names = ("tx_m", "ty_m", "tz_m", "length_m", "width_m", "height_m")
+    half = BOXES[:, 6] / 2
+    columns = {
+        **dict(zip(names, BOXES.T, strict=False)),
+        "qw": np.cos(half), "qx": np.zeros(2), "qy": np.zeros(2), "qz": np.sin(half),
+        "score": _SCORES, "log_id": ["a"] * 2, "timestamp_ns": [1] * 2,
+        "category": _NAMES.tolist(),
+    } | changes  # fmt: skip
+    buffer = io.BytesIO()
+    table = pa.table({name: column for name, column in columns.items() if column is not None})
+    feather.write_feather(table, buffer)
+    return buffer.getvalue()
+
+
+def _read_feather(path: Path, **options: Any) -> Any:
+    detector = RecordedDetector(path, frame_ids=["a_1"], **options)
+    return [detector.predict(frame(name)) for name in detector.frame_ids()]
+
+
+def _argoverse2_reader() -> Reader:
+    return Reader(
+        "Recorded detections: Argoverse 2", "Feather: a row per box in the frame of the vehicle.",
+        "detections.feather", _read_feather, _feather(),
+        [
+            Case("a further column", _feather(track_uuid=["t", "u"])),
+            Case("single precision", _feather(score=_SCORES.astype(np.float32))),
+            Case("frames named by a pattern in `frame_name`", _feather(),
+                 options={"frame_name": "{log_id}_{timestamp_ns}"}),
+            Case("a pattern without the time", _feather(), options={"frame_name": "{log_id}"}),
+            Case("a column is missing", _feather(qw=None)),
+            Case("a rotation that is not a rotation", _feather(qw=np.zeros(2), qz=np.zeros(2))),
+            Case("null", _feather(tx_m=[10.0, None])),
+            Case("a score above 1", _feather(score=[9.0, 0.5])),
+            Case("the file ends early", _feather()[:-40]),
+            Case("not Feather", b"FEA1" + bytes(20)),
         ],
     )  # fmt: skip
