@@ -9,6 +9,7 @@ import pytest
 from docs.generate import INPUT_FORMATS
 
 pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")
+pytest.importorskip("onnx", reason="the package onnx is not installed")
 
 from docs.input_cases import readers
 from docs.input_formats_page import rows_of
