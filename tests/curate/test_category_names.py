@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from curate.category_names import NamedSide, check_rename, compare_names, listed, renamed
 from curate.detections import Detections, as_categories
 from curate.errors import ConfigError
-from curate.names import NamedSide, check_rename, compare_names, listed, renamed
 
 CATEGORIES = ("Car", "Pedestrian", "Cyclist")
 
