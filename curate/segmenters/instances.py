@@ -70,7 +70,7 @@ class InstanceSegmenter:
         """Return the file of each frame from a camera; "" for the only one."""
         if camera not in self._files:
             folder = self.path / camera
-            self._files[camera] = files_by_frame(folder, (".json",), self._frame_ids)
+            self._files[camera] = files_by_frame(folder, "*.json", self._frame_ids)
         return self._files[camera]
 
     def _objects_by_frame(self, camera: str) -> Mapping[str, Objects]:
