@@ -191,7 +191,14 @@ def _setting_cells(setting: Setting) -> tuple[str, ...]:
         f"`{setting.key}`",
         accepted.type,
         "-" if setting.default is None else f"`{setting.default}`" * bool(setting.default),
-        accepted.range or ", ".join([*choices, *["`module:Class`"] * accepted.open]),
+        ", ".join(
+            [
+                *[accepted.range] * bool(accepted.range),
+                *choices,
+                *["`module:Class`"] * accepted.open,
+                *(f"`{word}`" for word in accepted.words),
+            ]
+        ),
         setting.unit,
         _PAGE.sub(r"[\1](\1)", setting.meaning),
     )

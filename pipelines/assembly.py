@@ -344,9 +344,9 @@ def check_prior(config: Config, name: str) -> None:
     with error_prefix("run.priors"):
         whole_sequences = hasattr(registry.PRIORS.load(name), "score_sequence")
         reads_pixels = registry.PRIORS.takes(name, "segmenter")
-    segmenter = _checked_segmenter(config) if reads_pixels else None
     if reads_pixels:
         check_segmenter_names(config)
+    segmenter = _checked_segmenter(config) if reads_pixels else None
     with error_prefix("run.priors"):
         if whole_sequences:
             open_sequence_source(config, name)

@@ -226,6 +226,7 @@ EXECUTORS = Registry(
     "executor",
     "pipelines.engine.executors.base:Executor",
     {
+        "auto": "pipelines.engine.executors.auto:AutoExecutor",
         "serial": "pipelines.engine.executors.serial:SerialExecutor",
         "process": "pipelines.engine.executors.process:ProcessExecutor",
         "ray": "pipelines.engine.executors.ray:RayExecutor",

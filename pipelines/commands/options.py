@@ -75,13 +75,23 @@ ExecutorOption = Annotated[
         autocompletion=complete(EXECUTORS.classes),
     ),
 ]
+
+
+def _worker_count(text: str) -> int | str:
+    """Return the number in a `--workers` option, or "auto"."""
+    if text != "auto" and not (text.isdecimal() and int(text) > 0):
+        raise typer.BadParameter(f"{text!r} is not a whole number from 1 up, and not auto")
+    return text if text == "auto" else int(text)
+
+
 WorkersOption = Annotated[
-    Optional[int],  # noqa: UP045
+    Optional[Any],  # noqa: UP045
     typer.Option(
         "--workers",
-        min=1,
-        help="Number of workers, each with its own copy of the model; more than one needs the "
-        "executor process or ray. Default: run.workers of curate.toml.",
+        parser=_worker_count,
+        metavar="N|auto",
+        help="Number of workers, each with its own copy of the model; auto is one per core where "
+        "that saves time. Default: run.workers of curate.toml.",
     ),
 ]
 ThreadsOption = Annotated[
@@ -116,7 +126,7 @@ ChartFormatOption = Annotated[
 def open_workspace(
     folder: Path | None,
     executor: str | None = None,
-    workers: int | None = None,
+    workers: int | str | None = None,
     threads: int | None = None,
     *,
     allow_empty: bool = False,
@@ -128,8 +138,8 @@ def open_workspace(
     changes: dict[str, Any] = {}
     if workers is not None:
         changes["workers"] = workers
-        if workspace.config.run.executor in {"serial", "process"}:
-            changes["executor"] = "process" if workers > 1 else "serial"
+        if workspace.config.run.executor in {"auto", "serial", "process"}:
+            changes["executor"] = {"auto": "auto", 1: "serial"}.get(workers, "process")
     if executor is not None:
         changes["executor"] = executor
     workspace = workspace.with_settings("run", **changes)

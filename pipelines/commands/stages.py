@@ -19,7 +19,7 @@ def run_frame_command(
     round_number: int | None,
     split: str,
     executor: str | None,
-    workers: int | None,
+    workers: int | str | None,
     *,
     as_json: bool,
     dry_run: bool = False,

@@ -19,6 +19,7 @@ from curate.datasets.base import sequences_of
 from curate.errors import CurateError
 from curate.firewall.sequences import group_by_sequence
 from db import bulk
+from pipelines.engine.executors.machine import usable_cores
 from pipelines.engine.graph import Graph
 from pipelines.engine.plan import FINISHED, Plan, TaskKey, digest, is_current
 from pipelines.engine.rounds import is_student_trained, preview_round, recorded_config
@@ -344,6 +345,7 @@ def _seconds(
     if isinstance(stage, FirstStage | RoundStage):
         return float(rows[0][1])
     workers = workspace.config.run.workers
+    workers = usable_cores() if workers == "auto" else workers
     if isinstance(stage, SequenceStage):  # each frame's task has the seconds of the sequence
         whole: dict[str, float] = dict(rows)
         return count * sum(whole.values()) / len(rows) / workers

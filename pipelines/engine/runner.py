@@ -79,7 +79,7 @@ def open_executor(workspace: Workspace) -> Iterator[Executor]:
     section = workspace.config.run
     executor: Executor = registry.EXECUTORS.build(
         section.executor,
-        offered={"workers": lambda: section.workers},
+        offered={"workers": lambda: None if section.workers == "auto" else section.workers},
         options=section.executor_options.get(section.executor, {}),
     )
     try:
@@ -111,7 +111,7 @@ def run_frames(
                 advance(len(keys), "")
 
             if total:
-                for outcome in _outcomes(plan, stage, split, executor, skip):
+                for outcome in _outcomes(plan, stage, split, total, executor, skip):
                     writer.add(outcome)
                     failed = f"{writer.failed} failed" if writer.failed else ""
                     advance(len(outcome.job.frames), failed)
@@ -213,6 +213,7 @@ def _outcomes(
     plan: Plan,
     stage: FramesStage,
     split: str,
+    total: int,
     executor: Executor,
     skip: Callable[[Sequence[int]], None],
 ) -> Iterator[Outcome]:
@@ -228,7 +229,7 @@ def _outcomes(
     # Start the executor, which loads the models, only if there is a first job.
     for first in jobs:
         function: JobFunction = stage.function(plan.workspace, plan.context)
-        yield from executor.map(function, chain([first], jobs))
+        yield from executor.map(function, _Counted(chain([first], jobs), total))
     if isinstance(stage, SequenceStage) or not stage.reusable:
         return
     frames = plan.waiting_frames(stage, split, measured=True)
@@ -236,6 +237,32 @@ def _outcomes(
     for first in jobs:
         function = stage.reusable.function(plan.workspace, plan.context)
         yield from SerialExecutor().map(function, chain([first], jobs))
+
+
+class _Counted(Iterator[Job]):
+    """Jobs with `operator.length_hint`, the expected number of jobs that are left.
+
+    Args:
+        jobs: the jobs.
+        frames: number of their frames; a sequence has several.
+    """
+
+    def __init__(self, jobs: Iterable[Job], frames: int) -> None:
+        self._jobs = iter(jobs)
+        self._left = frames
+        self._jobs_taken = self._frames_taken = 0
+
+    def __next__(self) -> Job:
+        """Return the next job."""
+        job = next(self._jobs)
+        self._jobs_taken += 1
+        self._frames_taken += len(job.frames)
+        return job
+
+    def __length_hint__(self) -> int:
+        """Return the expected number of jobs that are left."""
+        left = max(0, self._left - self._frames_taken)
+        return round(left * self._jobs_taken / self._frames_taken) if self._frames_taken else left
 
 
 def _frame_jobs(

@@ -467,16 +467,19 @@ class RunSection(Section):
         default={}, description="Arguments of each prior by its name."
     )
     executor: ExecutorName = Field(
-        default="serial", description="Executor that processes the frames; see docs/scale.md."
+        default="auto",
+        description="Executor that processes the frames. 'auto' uses worker processes where they "
+        "save time; see docs/scale.md.",
     )
     executor_options: dict[ExecutorName, Options] = Field(
         default={},
         description="Arguments of each executor by its name, such as {ray = {num_gpus = 1}}.",
     )
-    workers: AtLeastOne = Field(
-        default=1,
-        description="Number of workers, each with its own copy of the model. More than one "
-        "requires an executor other than serial.",
+    workers: AtLeastOne | Literal["auto"] = Field(
+        default="auto",
+        description="Number of workers, each with its own copy of the model. 'auto' is one per "
+        "core, or fewer if the memory is too small. More than one requires an executor other than "
+        "serial.",
         json_schema_extra=_unit("workers"),
     )
     database: str | None = Field(

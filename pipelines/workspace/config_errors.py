@@ -30,10 +30,9 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> tuple[str, str]:
     if error["type"] == "extra_forbidden":
         return _unknown_key(path, model, known)
     accepted = Accepted("table") if field is None or _model_of(field) else accepted_by(field)
+    inside = path[depth:] if accepted.type.startswith("list") else []
     if accepted.type != "table":
-        path, inside = path[:depth], path[depth:]
-    else:
-        inside = []
+        path = path[:depth]
     place = ".".join(map(toml_key, path)) or "the configuration"
     if error["type"] == "missing" and not inside:
         meaning = field.description if field else None

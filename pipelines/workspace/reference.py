@@ -1,7 +1,7 @@
 """Descriptions of what configuration fields accept, for pages, comments and error messages."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -26,12 +26,14 @@ class Accepted:
         range: limits of a number, such as "at least 1"; "" without limits.
         choices: the valid names; () if any value of the type is valid.
         open: whether `module:Class` is valid, too.
+        words: words that are valid besides the values of the type, such as "auto".
     """
 
     type: str
     range: str = ""
     choices: tuple[str, ...] = ()
     open: bool = False
+    words: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Return a phrase, such as "a number from 0 to 1" or "a whole number, at least 1"."""
@@ -41,7 +43,8 @@ class Accepted:
             return f"{kind}{', '.join(self.choices)}{more}"
         article = "" if self.type == _TYPES[bool] else "a "
         comma = "" if not self.range or self.range.startswith("from") else ","
-        return f"{article}{self.type}{comma} {self.range}".rstrip()
+        value = f"{article}{self.type}{comma} {self.range}".rstrip()
+        return ", or ".join((value, *(f'"{word}"' for word in self.words)))
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,9 @@ def _accepted(annotation: Any, metadata: Sequence[Any] = ()) -> Accepted:
             inner += each.metadata if isinstance(each, FieldInfo) else [each]
         return _accepted(arguments[0], [*inner, *metadata])
     if origin in (Union, UnionType):
-        return _accepted(next(each for each in arguments if each is not NoneType), metadata)
+        first, *others = (each for each in arguments if each is not NoneType)
+        words = tuple(word for each in others for word in get_args(each))
+        return replace(_accepted(first, metadata), words=words)
     if origin is Literal:
         return Accepted("string", choices=arguments)
     if origin is tuple:

@@ -378,6 +378,8 @@ def test_the_table_of_a_segmenter_can_be_renamed(tmp_path: Path) -> None:
     rename = {"Car": "car", "Cyclist": "cyclist"}
     config = segmenter_config(tmp_path, categories, name="saved", classes="voc", rename=rename)
     check_segmenter_names(config)
+    root, _ = toy_kitti_layout(tmp_path / "data")
+    config = config.model_copy(update={"dataset": config.dataset.model_copy(update={"root": root})})
     opened = open_segmenter(config)
     assert (opened.needs_image, opened.needs_points) == (False, False)
     own = {"classes": {"Car": [1], "Van": [2]}}

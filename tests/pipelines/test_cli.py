@@ -405,13 +405,21 @@ def test_a_category_without_ground_truth_uses_the_fallback_with_a_warning(
 
 @pytest.mark.parametrize(
     ("configured", "workers", "used"),
-    [("serial", 4, "process"), ("process", 1, "serial"), ("ray", 4, "ray"), ("ray", 1, "ray")],
+    [
+        ("auto", 4, "process"),
+        ("auto", "auto", "auto"),
+        ("serial", 4, "process"),
+        ("process", 1, "serial"),
+        ("process", "auto", "auto"),
+        ("ray", 4, "ray"),
+        ("ray", 1, "ray"),
+    ],
 )
 def test_workers_choose_an_executor_unless_a_cluster_is_configured(
-    made: Path, configured: str, workers: int, used: str
+    made: Path, configured: str, workers: int | str, used: str
 ) -> None:
     """On one machine, more than one worker are processes; a configured cluster is kept."""
     path = made / "curate.toml"
-    path.write_text(path.read_text().replace('executor = "serial"', f'executor = "{configured}"'))
+    path.write_text(path.read_text().replace('executor = "auto"', f'executor = "{configured}"'))
     run = open_workspace(made, workers=workers).config.run
     assert (run.executor, run.workers) == (used, workers)

@@ -171,6 +171,7 @@ def test_the_cost_is_estimated_from_earlier_frames(
         connection.execute(f"UPDATE task SET seconds = 60.0 WHERE id = ({first})")
         connection.execute("UPDATE task SET seconds = 7.0 WHERE stage = 'solve'")
     change(made, "minimum_score = 0.1", "minimum_score = 0.2")
+    change(made, 'workers = "auto"', "workers = 1")
     assert dry("run")["predict"]["seconds"] == pytest.approx(12.0)
     assert dry("run")["solve"]["seconds"] == pytest.approx(7.0)
     assert dry("run", "--workers", 2)["predict"]["seconds"] == pytest.approx(6.0)

@@ -149,7 +149,7 @@ def test_the_class_numbers_of_a_segmenter_must_be_specified(
     ]  # fmt: skip
     code, _, err = curate("init", tmp_path / "w", *words)
     assert code == ConfigError.exit_code
-    assert "--segmenter-classes (one of voc, cityscapes, cityscapes-label-ids, coco" in err
+    assert "--segmenter-classes) to one of voc, cityscapes, cityscapes-label-ids, coco" in err
     code, _, err = curate("init", tmp_path / "w", *words, "--segmenter-classes", "ade")
     assert code == ConfigError.exit_code
     assert "unknown class set 'ade'" in err

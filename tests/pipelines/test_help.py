@@ -130,7 +130,7 @@ def test_a_help_text_lists_the_registered_names(
 ) -> None:
     """All names, in the order of the registry, and a user-supplied class."""
     _, out, _ = curate(*command.split(), "-h")
-    text = " ".join(out.split())
+    text = " ".join(out.split()).replace("kitti- ", "kitti-")  # a line may end after a hyphen
     *others, last = (*names.classes, "module:Class")
     listed = f"{', '.join(others)}"
     assert listed in text

@@ -41,7 +41,9 @@ def test_a_class_without_the_required_members_is_rejected(
         "    def measure(self, frame, detections): ...\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ConfigError, match=r"^prior '.*' has no columns, rho_column; see curate"):
+    with pytest.raises(
+        ConfigError, match=r"^prior '.*' has no columns, rho_column, camera_columns; see"
+    ):
         PRIORS.load("priors_of_a_user:Mine")
 
 

@@ -40,7 +40,7 @@ def fails_before_any_work(curate: Curate, workspace: Workspace, *command: str) -
     ("old", "new", "words"),
     [
         ('name = "support.toys:ToyDetector"', 'name = "pilars"', "detector.name: unknown detector"),
-        ('executor = "serial"', 'executor = "proces"', "run.executor: unknown executor"),
+        ('executor = "auto"', 'executor = "proces"', "run.executor: unknown executor"),
         ('labels_format = "sqlite"', 'labels_format = "kiti"', "train.labels_format: unknown"),
         ('method = "pspsl"', 'method = "pspls"', "run.method: unknown policy"),
         ('kind = "kitti"', 'kind = "kitty"', "dataset.kind: unknown dataset"),
@@ -64,7 +64,7 @@ UNUSABLE = [
     ),
     (
         ("predict", "repredict", "score", "run"),
-        ('executor = "serial"', 'executor = "no_such_package:Executor"'),
+        ('executor = "auto"', 'executor = "no_such_package:Executor"'),
         "run.executor: executor 'no_such_package:Executor' cannot be imported: No module named",
     ),
     (
@@ -184,7 +184,7 @@ def test_a_query_does_not_import_unneeded_classes(
         workspace,
         ("support.toys:ToyDetector", "slow_module:Detector"),
         ('method = "pspsl"', 'method = "slow_module:Policy"'),
-        ('executor = "serial"', 'executor = "slow_module:Executor"'),
+        ('executor = "auto"', 'executor = "slow_module:Executor"'),
         ('labels_format = "sqlite"', 'labels_format = "slow_module:Exporter"'),
     )
     code, out, err = curate("query", "SELECT count(*) AS n FROM frame", "-w", workspace.root)
@@ -202,7 +202,7 @@ def test_status_does_not_import_models(
     edit(
         workspace,
         ("support.toys:ToyDetector", "pillars"),
-        ('executor = "serial"', 'executor = "heavy_module:Executor"'),
+        ('executor = "auto"', 'executor = "heavy_module:Executor"'),
         ('labels_format = "sqlite"', 'labels_format = "heavy_module:Exporter"'),
     )
     code = (

@@ -102,3 +102,22 @@ class Slow:
         (self.folder / f"{job.frame}-{uuid.uuid4()}").touch()
         time.sleep(self.seconds)
         return {"nodes": {"name": [node]}}
+
+
+@dataclass
+class Napping:
+    """Sleep per frame, and return the process that worked on it.
+
+    Attributes:
+        seconds: per frame.
+    """
+
+    seconds: float
+
+    def open(self) -> None:
+        """Do nothing."""
+
+    def __call__(self, job: FrameJob) -> FrameRows:
+        """Return the process as a row."""
+        time.sleep(self.seconds)
+        return {"processes": {"pid": [os.getpid()]}}

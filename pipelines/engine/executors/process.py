@@ -25,6 +25,7 @@ from pipelines.engine.executors.base import (
     JobQueue,
     Outcome,
 )
+from pipelines.engine.executors.machine import usable_cores
 
 # How often to check whether silent workers are alive: a crashed worker's pipe may be kept open by a
 # process that it has forked.
@@ -32,10 +33,14 @@ POLL_S = 5.0
 
 
 class ProcessExecutor:
-    """Processes frames in `workers` spawned processes, which live until `close`."""
+    """Processes frames in spawned processes, which live until `close`.
 
-    def __init__(self, workers: int = 1) -> None:
-        self.workers = workers
+    Args:
+        workers: number of processes; None for one per usable core.
+    """
+
+    def __init__(self, workers: int | None = None) -> None:
+        self.workers = usable_cores() if workers is None else workers
         self._workers: list[_Worker] = []
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:

@@ -21,6 +21,7 @@ from pipelines.engine.executors.base import (
     JobQueue,
     Outcome,
 )
+from pipelines.engine.executors.machine import usable_cores
 
 POLL_S = 5.0
 # Jobs and rows are small; by default Ray reserves a third of a machine's memory.
@@ -31,7 +32,8 @@ class RayExecutor:
     """Processes frames in `workers` actors, which live until `close`.
 
     Args:
-        workers: number of actors; those that the cluster has no resources for wait.
+        workers: number of actors; those that the cluster has no resources for wait. None for as
+            many as the cluster has resources for when it is joined.
         address: address of a running cluster, e.g. "auto" or "10.0.0.1:6379"; None joins the
             cluster in RAY_ADDRESS, or starts one on this machine.
         num_cpus: CPUs per actor.
@@ -45,20 +47,20 @@ class RayExecutor:
 
     def __init__(
         self,
-        workers: int = 1,
+        workers: int | None = None,
         *,
         address: str | None = None,
         num_cpus: float = 1.0,
         num_gpus: float = 0.0,
         start_timeout_s: float = 120.0,
     ) -> None:
-        self.workers = workers
         self.start_timeout_s = start_timeout_s
         self._ray = _import_ray()
         self._needs = {"num_cpus": num_cpus, "num_gpus": num_gpus}
         self._owns_cluster = not self._ray.is_initialized()
         if self._owns_cluster:
-            _join(self._ray, address, workers)
+            _join(self._ray, address, workers or 1)
+        self.workers = workers or self._places()
         # Ray must not restart a crashed actor: the executor replaces it by a new one, and so knows
         # which frame it was processing.
         options = {**self._needs, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
@@ -87,6 +89,14 @@ class RayExecutor:
         finally:
             for actor in [actor for actor in self._actors if actor.results]:
                 self._dismiss(actor)
+
+    def _places(self) -> int:
+        """Return for how many actors the cluster has resources, at least 1."""
+        offered, names = self._ray.cluster_resources(), {"num_cpus": "CPU", "num_gpus": "GPU"}
+        places = [
+            int(offered.get(names[key], 0) / need) for key, need in self._needs.items() if need
+        ]
+        return max(1, min(places, default=1))
 
     def close(self) -> None:
         """End the actors, and the cluster if it was started here."""
@@ -208,7 +218,7 @@ def _join(ray: Any, address: str | None, workers: int) -> None:
         if address
         else {
             "address": "local",  # a new one, even if another one runs on this machine
-            "num_cpus": max(workers, os.cpu_count() or 1),
+            "num_cpus": max(workers, usable_cores()),
             "object_store_memory": OBJECT_STORE_BYTES,
             "include_dashboard": False,
         }

@@ -107,8 +107,8 @@ def test_registered_names_and_user_supplied_classes_are_accepted(
     [
         ("slve.scope=round", "slve: unknown section; did you mean 'solve'?; the configuration has"),
         ("run.threads=3", "run.threads: unknown key; did you mean train.threads?; [run] has "),
-        ("run.workers=many", 'run.workers = "many": use a whole number, at least 1'),
-        ("run.workers=1.5", "run.workers = 1.5: use a whole number, at least 1"),
+        ("run.workers=many", 'run.workers = "many": use a whole number, at least 1, or "auto"'),
+        ("run.workers=1.5", 'run.workers = 1.5: use a whole number, at least 1, or "auto"'),
         ("solve.self_paced=flase", 'solve.self_paced = "flase": use true or false'),
         ("dataset.root=3", "dataset.root = 3: use a path"),
         ("dataset.categories=Car", 'dataset.categories = "Car": use a list of strings'),

@@ -27,7 +27,7 @@ def test_settings_of_a_command_change_only_their_section(workspace: Workspace) -
 
 def test_a_wrong_setting_of_a_command_is_reported(workspace: Workspace) -> None:
     """In one line, with its origin."""
-    message = r"^command line: run\.workers = 0: use a whole number, at least 1$"
+    message = r'^command line: run\.workers = 0: use a whole number, at least 1, or "auto"$'
     with pytest.raises(ConfigError, match=message):
         workspace.with_settings("run", workers=0)
 
