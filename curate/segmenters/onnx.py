@@ -84,9 +84,9 @@ class OnnxSegmenter:
         threads: int = 1,
     ) -> None:
         if tiles < 1:
-            raise ConfigError(f"segmenter tiles {tiles}: expected at least 1")
+            raise ConfigError(f"segmenter.options.tiles {tiles}: expected at least 1")
         if channels not in {None, *_LAYOUTS}:
-            raise ConfigError(f"segmenter channels {channels!r}: use first or last")
+            raise ConfigError(f"segmenter.options.channels {channels!r}: use first or last")
         self.classes = checked_classes(classes)
         self.tiles = tiles
         self._model = ImageModel(Path(model), scaling, threads)
