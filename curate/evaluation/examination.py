@@ -125,10 +125,10 @@ def _convention(frame: Frame, found: Detections) -> Finding:
     top = found.select(np.argsort(-found.scores, kind="stable")[:_TOP_BOXES])
     sweep = BoxesInSweep(frame.points, top.boxes, top.categories, frame.calibration)
     where = f"the {len(top)} boxes with the highest scores"
-    return check_convention("convention", [sweep], where, labels=False)
+    return judge_convention("convention", [sweep], where, labels=False)
 
 
-def check_convention(
+def judge_convention(
     check: str, sweeps: Sequence[BoxesInSweep], where: str, *, labels: bool
 ) -> Finding:
     """Return the finding on the convention of boxes.

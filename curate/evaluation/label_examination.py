@@ -6,7 +6,7 @@ import numpy as np
 
 from curate.detections import Annotations
 from curate.evaluation.box_conventions import BoxesInSweep
-from curate.evaluation.examination import Finding, check_convention
+from curate.evaluation.examination import Finding, judge_convention
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.geometry.projection import image_rectangles
@@ -40,7 +40,7 @@ def examine_labels(labeled: Sequence[tuple[Frame, Annotations]]) -> list[Finding
         return [Finding("labels", "ok", f"no labeled objects in {names}")]
     return [
         _label_points(sweeps, count, names),
-        check_convention("label boxes", sweeps, where, labels=True),
+        judge_convention("label boxes", sweeps, where, labels=True),
         *([_label_rectangles(pictured)] if pictured else []),
     ]
 
