@@ -67,7 +67,8 @@ def references() -> Mapping[Path, str]:
     graph = round_graph()
     dag = graph_table(graph)
     # The page of input formats reads Parquet files.
-    optional = {INPUT_FORMATS: input_formats_page(_NOTE)} if find_spec("pyarrow") else {}
+    has_all = find_spec("pyarrow") and find_spec("onnx")
+    optional = {INPUT_FORMATS: input_formats_page(_NOTE)} if has_all else {}
     return {
         **optional,
         ROOT / "docs" / "cli.md": cli_page(),

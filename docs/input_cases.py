@@ -7,146 +7,50 @@ writes what happened, and a test compares that with the page. Add a case as one 
 import io
 import json
 import pickle
-import tempfile
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+import struct
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from curate.datasets.folder import FolderDataset
-from curate.datasets.formats.clouds import read_cloud
-from curate.datasets.formats.images import read_image
 from curate.datasets.frame_names import match_frame_list
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.labels import read_objects
 from curate.datasets.kitti.raw import read_raw_calibration
 from curate.detectors.recorded import RecordedDetector
-from curate.errors import CurateError
-from curate.frames import Calibration, Frame
 from curate.review.edits import check_boxes
 from curate.review.sheet import Sheet, ShownBox, ShownFrame
 from curate.review.table import read_table
 from curate.segmenters.instances import InstanceSegmenter
 from curate.segmenters.saved import SavedSegmenter
+from docs.input_cases_clouds import CLOUDS, PIXELS, POINTS, encoded, npy
+from docs.input_cases_data_sets import (
+    CALIBRATION,
+    CAMERAS,
+    CAR,
+    DATA_SETS,
+    FOLDER,
+    VELODYNE,
+    WALKER,
+    read_folder,
+)
+from docs.input_cases_models import model_readers
+from docs.input_frame import BOXES, CLASSES, frame
+from docs.input_reader import Case, Reader, text_cases
 from pipelines.registry import EDITORS
 from pipelines.workspace.config import read_config
 
-Content = bytes | str
-
-
-@dataclass(frozen=True)
-class Case:
-    """A variation of a file.
-
-    Attributes:
-        variation: what is different from the plain file.
-        content: of the file.
-        other: whether the file holds something else than the plain file, such as no objects.
-        name: of the file; "" for the reader's.
-    """
-
-    variation: str
-    content: Content
-    other: bool = False
-    name: str = ""
-
-
-@dataclass(frozen=True)
-class Reader:
-    """A reader with the variations of its file.
-
-    Attributes:
-        title: of its section on the page.
-        about: sentences above the table.
-        name: of the file, with its folder.
-        read: reads the file.
-        plain: content of a valid file.
-        cases: the variations.
-        beside: other files that the reader needs, by name.
-    """
-
-    title: str
-    about: str
-    name: str
-    read: Callable[[Path], Any]
-    plain: Content
-    cases: Sequence[Case]
-    beside: Sequence[tuple[str, Content]] = ()
-
-    def outcome(self, case: Case) -> tuple[str, str]:
-        """Return "read" or "rejected", and the message.
-
-        Raises:
-            AssertionError: if the file was read, but not as the plain file.
-        """
-        found = self._attempt(case.content, case.name or self.name)
-        if isinstance(found, str):
-            return "rejected", found
-        if not case.other:
-            plain = self._attempt(self.plain, self.name)
-            if isinstance(plain, str) or plain != found:
-                raise AssertionError(f"{self.title}: {case.variation}: {found}, expected {plain}")
-        return "read", ""
-
-    def _attempt(self, content: Content, name: str) -> str | list[str]:
-        """Return the message without the folder, or the result as text in a list."""
-        with tempfile.TemporaryDirectory() as folder:
-            for other, text in (*self.beside, (name, content)):
-                path = Path(folder) / other
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(text if isinstance(text, bytes) else text.encode())
-            try:
-                return [repr(_plain(self.read(Path(folder) / name)))]
-            except CurateError as error:
-                return str(error).replace(f"{folder}/", "").replace(folder, "ROOT")
-
-
-def _plain(value: Any) -> Any:
-    """Return arrays and objects as lists, numbers with six digits."""
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(each) for each in value]
-    if hasattr(value, "__dataclass_fields__"):
-        return [_plain(getattr(value, name)) for name in value.__dataclass_fields__]
-    return float(f"{value:.6g}") if isinstance(value, float) else value
-
-
-def _text_cases(text: str) -> list[Case]:
-    """Return variations that editors and programs of other systems make of any text file."""
-    return [
-        Case("byte order mark", f"\ufeff{text}"),
-        Case("Windows line ends", text.replace("\n", "\r\n")),
-        Case("no newline at the end", text.rstrip("\n")),
-        Case("empty lines at the end", f"{text}\n\n"),
-        Case("blanks at the ends of lines", text.replace("\n", "  \n")),
-        Case("not UTF-8", b"\xff\xfe\xfa" + text.encode()),
-        Case("UTF-16", text.encode("utf-16")),
-    ]
-
-
-_CAR = "Car 0.00 0 1.55 614.24 181.78 727.31 284.77 1.57 1.73 4.15 1.00 1.75 13.22 1.62"
-_WALKER = "Pedestrian 0.10 1 -0.20 712.40 143.00 810.73 307.92 1.89 0.48 1.20 1.84 1.47 8.41 0.01"
-_LABELS = f"{_CAR}\n{_WALKER}\n"
-_RESULTS = f"{_CAR} 0.9\n{_WALKER} 0.5\n"
-_CALIBRATION = """\
-P2: 700 0 600 40 0 700 180 0.2 0 0 1 0.003
-R0_rect: 1 0 0 0 1 0 0 0 1
-Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3
-"""
-_VELODYNE = "R: 0 -1 0 0 0 -1 1 0 0\nT: 0 -0.1 -0.3\n"
-_CAMERAS = "R_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_02: 700 0 600 40 0 700 180 0 0 0 1 0\n"
+_LABELS = f"{CAR}\n{WALKER}\n"
+_RESULTS = f"{CAR} 0.9\n{WALKER} 0.5\n"
 
 
 def _label_cases(text: str) -> Iterable[Case]:
     first, second = text.splitlines()
     return [
-        *_text_cases(text),
+        *text_cases(text),
         Case("tabs between the fields", text.replace(" ", "\t")),
         Case("an empty file: no objects", "", other=True),
         Case("a line with 14 fields", f"{' '.join(first.split()[:14])}\n{second}\n"),
@@ -168,7 +72,7 @@ def _dont_care(line: str) -> str:
 def _matrix_cases(text: str) -> Iterable[Case]:
     lines = text.splitlines()
     return [
-        *_text_cases(text),
+        *text_cases(text),
         Case("lines in another order", "\n".join(reversed(lines)) + "\n"),
         Case("further lines", f"{text}P9: 1 2 3\ncalib_time: 15-Mar-2012 11:37:16\n"),
         Case("keys without colon", text.replace(":", "")),
@@ -180,53 +84,36 @@ def _matrix_cases(text: str) -> Iterable[Case]:
     ]
 
 
-_POINTS = np.array([[10, 1, -1, 0.5], [20, -2, 0, 0.25], [30, 3, 1, 1]], dtype="<f4")
-_ROWS = "\n".join(" ".join(f"{number:g}" for number in row) for row in _POINTS.tolist())
-_PCD = (
-    "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
-    "WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\n"
-)
-_PCD_BYTES = f"{_PCD}DATA binary\n".encode() + _POINTS.tobytes()
-_PLY = "ply\nformat {} 1.0\nelement vertex 3\n" + "".join(
-    f"property float {name}\n" for name in ("x", "y", "z", "intensity")
-)
-_PLY_TEXT = f"{_PLY.format('ascii')}end_header\n{_ROWS}\n"
-
-
-def _npy(table: Any) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, table)
-    return buffer.getvalue()
-
-
-def _with_nan(points: np.ndarray) -> np.ndarray:
-    return np.vstack([points, np.full((1, 4), np.nan, dtype="<f4")])
-
-
-_PIXELS = np.arange(40 * 120 * 3, dtype=np.uint32).reshape(40, 120, 3).astype(np.uint8)
 _MAP = np.tile(np.repeat(np.array([0, 3, 1], dtype=np.uint8), 40), (40, 1))
-_SIZE = (120, 40)
-_CLASSES = {"Car": (3,), "Pedestrian": (1,)}
+_COLOURS = np.zeros((*_MAP.shape, 3), np.uint8)
+_COLOURS[_MAP == 3], _COLOURS[_MAP == 1] = (142, 0, 0), (60, 20, 220)  # blue, green, red
 
 
-def _encoded(pixels: np.ndarray, suffix: str = ".png") -> bytes:
-    return bytes(cv2.imencode(suffix, pixels)[1].tobytes())
+def _palette_png() -> bytes:
+    """Return the map as a PNG of indices into a palette."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        checksum = struct.pack(">I", zlib.crc32(kind + content))
+        return struct.pack(">I", len(content)) + kind + content + checksum
+
+    height, width = _MAP.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in _MAP)
+    return b"".join((
+        b"\x89PNG\r\n\x1a\n",
+        chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
+        chunk(b"PLTE", bytes(range(12))),
+        chunk(b"IDAT", zlib.compress(rows)),
+        chunk(b"IEND", b""),
+    ))  # fmt: skip
 
 
-def _frame(name: str = "000001") -> Frame:
-    projection = np.array([[60.0, 0, 60, 0], [0, 60, 20, 0], [0, 0, 1, 0]])
-    lidar_to_camera = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-    image = np.zeros((40, 120, 3), dtype=np.uint8)
-    calibration = Calibration(projection, lidar_to_camera)
-    return Frame(name, np.zeros((0, 4), np.float32), calibration, _SIZE, image)
-
-
-def _read_map(path: Path) -> Any:
-    return SavedSegmenter(path.parent, _CLASSES).segment(_frame()).class_ids
+def _read_map(path: Path, **options: Any) -> Any:
+    return SavedSegmenter(path.parent, CLASSES, **options).segment(frame()).class_ids
 
 
 def _read_masks(path: Path) -> Any:
-    return InstanceSegmenter(path, _CLASSES).segment(_frame()).class_ids
+    segmenter = InstanceSegmenter(path, CLASSES, frame_ids=["000001"])
+    return segmenter.segment(frame()).class_ids
 
 
 _MASK = {"size": [40, 120], "counts": [400, 100, 4300]}
@@ -240,24 +127,12 @@ def _masks(segmentation: Any = _MASK, **changes: Any) -> str:
 
 
 _LIST = "000001\n000002\n"
-_FOLDER = """\
-points = "lidar"
-images = "camera"
-[calibration]
-projection = [[700.0, 0, 60, 0], [0, 700, 20, 0], [0, 0, 1, 0]]
-lidar_to_camera = [[0.0, -1, 0, 0], [0, 0, -1, -0.1], [1, 0, 0, -0.3]]
-"""
 _CONFIG = '[dataset]\nroot = "data"\n'
-
-
-def _read_folder(path: Path) -> Any:
-    dataset = FolderDataset(path.parent)
-    return [dataset.read(name) for name in dataset.frame_ids()]
 
 
 def _toml_cases(text: str, key: str, value: str) -> Iterable[Case]:
     return [
-        *_text_cases(text),
+        *text_cases(text),
         Case("comments", f"# a comment\n{text}"),
         Case("a misspelled key", text.replace(key, f"{key}s")),
         Case("a number in place of a text", text.replace(value, "3")),
@@ -266,44 +141,58 @@ def _toml_cases(text: str, key: str, value: str) -> Iterable[Case]:
     ]
 
 
-_BOXES = np.array([[10.0, 1, -1, 4, 1.8, 1.6, 0.1], [15.0, -2, -1, 0.8, 0.6, 1.7, 0.5]])
 _SCORES, _NAMES = np.array([0.9, 0.5]), np.array(["Car", "Pedestrian"])
 _COLUMNS = "frame,view,flip_y,rotation_rad,scale,category,score,x,y,z,length,width,height,yaw"
 _CSV = f"{_COLUMNS}\n" + "".join(
     f"000001,0,0,0,1,{name},{score:g},{','.join(f'{number:g}' for number in box)}\n"
-    for name, score, box in zip(_NAMES, _SCORES, _BOXES, strict=True)
+    for name, score, box in zip(_NAMES, _SCORES, BOXES, strict=True)
 )
 
 
 def _detections(path: Path, **options: Any) -> Any:
     detector = RecordedDetector(path, **options)
-    return [detector.predict(_frame(name)) for name in detector.frame_ids()]
+    return [detector.predict(frame(name)) for name in detector.frame_ids()]
 
 
-def _read_record(path: Path) -> Any:
-    return _detections(path)
+def _read_numbered(path: Path, **options: Any) -> Any:
+    return _detections(path, classes=("Car", "Pedestrian"), **options)
 
 
-def _read_numbered(path: Path) -> Any:
-    return _detections(path, classes=("Car", "Pedestrian"))
-
-
-def _read_results(path: Path) -> Any:
-    return _detections(path.parent)
+def _read_results(path: Path, **options: Any) -> Any:
+    return _detections(path.parent, frame_ids=["000001"], **options)
 
 
 def _openpcdet(**changes: Any) -> dict[str, Any]:
     return {
-        "frame_id": "000001", "name": _NAMES, "score": _SCORES, "boxes_lidar": _BOXES,
+        "frame_id": "000001", "name": _NAMES, "score": _SCORES, "boxes_lidar": BOXES,
     } | changes  # fmt: skip
 
 
 def _mmdet3d(**changes: Any) -> dict[str, Any]:
-    boxes = _BOXES - np.array([0, 0, 0.5, 0, 0, 0, 0]) * _BOXES[:, 5:6]
+    boxes = BOXES - np.array([0, 0, 0.5, 0, 0, 0, 0]) * BOXES[:, 5:6]
     return {
         "frame_id": "000001", "bboxes_3d": boxes.tolist(), "scores_3d": _SCORES.tolist(),
         "labels_3d": [0, 1],
     } | changes  # fmt: skip
+
+
+def _old_mmdet3d() -> dict[str, Any]:
+    """Return an entry of mmdetection3d 0.x: width before length, yaw clockwise from -y."""
+    rows = np.array(_mmdet3d()["bboxes_3d"])
+    rows[:, [3, 4]] = rows[:, [4, 3]]
+    rows[:, 6] = -rows[:, 6] - np.pi / 2
+    return _without(_mmdet3d(boxes_3d=rows.tolist()), "bboxes_3d")
+
+
+def _st3d_rows() -> np.ndarray:
+    return np.column_stack([BOXES, [1, 2], _SCORES])
+
+
+def _st3d(**changes: Any) -> bytes:
+    frames = {
+        "000001": {"gt_boxes": _st3d_rows(), "cls_scores": None, "iou_scores": None} | changes
+    }
+    return pickle.dumps(frames)
 
 
 def _without(entry: dict[str, Any], name: str) -> dict[str, Any]:
@@ -311,7 +200,7 @@ def _without(entry: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _changed(place: tuple[int, int], value: float) -> np.ndarray:
-    boxes = _BOXES.copy()
+    boxes = BOXES.copy()
     boxes[place] = value
     return boxes
 
@@ -323,7 +212,7 @@ def _parquet(**changes: Any) -> bytes:
     names = ("x", "y", "z", "length", "width", "height", "yaw")
     columns = {
         "frame": ["000001"] * 2, "category": _NAMES.tolist(), "score": _SCORES,
-        **dict(zip(names, _BOXES.T, strict=True)),
+        **dict(zip(names, BOXES.T, strict=True)),
     } | changes  # fmt: skip
     buffer = io.BytesIO()
     table = pa.table({name: column for name, column in columns.items() if column is not None})
@@ -336,9 +225,9 @@ _NUSCENES_POSE = np.eye(4)
 
 def _read_nuscenes(path: Path) -> Any:
     detector = RecordedDetector(path)
-    calibration = replace(_frame().calibration, lidar_to_map=_NUSCENES_POSE)
+    calibration = replace(frame().calibration, lidar_to_map=_NUSCENES_POSE)
     return [
-        detector.predict(replace(_frame(name), calibration=calibration))
+        detector.predict(replace(frame(name), calibration=calibration))
         for name in detector.frame_ids()
     ]
 
@@ -356,7 +245,7 @@ _SHEET = Sheet(
     1, "pspsl", "kitti", ("Car", "Pedestrian"),
     (ShownFrame("000001", tuple(
         ShownBox(k, str(name), tuple(box.tolist()), 0.6, 0.5, asked=True)
-        for k, (name, box) in enumerate(zip(_NAMES, _BOXES, strict=True))
+        for k, (name, box) in enumerate(zip(_NAMES, BOXES, strict=True))
     )),),
 )  # fmt: skip
 _TABLE = "frame,k,asked,category,score,weight,decision\n000001,0,yes,Car,0.6,0.5,accept\n"
@@ -368,7 +257,7 @@ def _edited(editor: str, depth: int) -> Callable[[Path], Any]:
 
     def read(path: Path) -> Any:
         found = EDITORS.build(editor, offered={}, options={}).read(
-            path.parents[depth], _SHEET, _frame
+            path.parents[depth], _SHEET, frame
         )
         for boxes in found.values():
             check_boxes(boxes, _SHEET.categories)
@@ -417,110 +306,73 @@ READERS = (
             Case("15 fields: no score", _LABELS),
             Case("a score above 1", _RESULTS.replace(" 0.9", " 9.5")),
             Case("a negative score", _RESULTS.replace(" 0.9", " -2.5")),
+            Case("scores before the sigmoid with `sigmoid = true`", _RESULTS.replace(
+                " 0.9", " 2.5"), other=True, options={"sigmoid": True}),
+            Case("the file is called 1.txt", _RESULTS, name="results/1.txt"),
+            Case("two files of one frame", _RESULTS, name="results/1.txt", beside=[
+                ("results/000001.txt", _RESULTS)]),
+            Case("a file of another frame", _RESULTS, name="results/000007.txt"),
             Case("a box twice", _RESULTS + _RESULTS),
         ],
     ),
     Reader(
         "Calibration", '`calib/FRAME.txt` of KITTI, and `calibration = "FILE"` of a folder.',
-        "calib/000001.txt", read_calibration, _CALIBRATION,
+        "calib/000001.txt", read_calibration, CALIBRATION,
         [
-            *_matrix_cases(_CALIBRATION),
-            Case("R_rect and Tr_velo_cam, as in the tracking benchmark", _CALIBRATION.replace(
+            *_matrix_cases(CALIBRATION),
+            Case("R_rect and Tr_velo_cam, as in the tracking benchmark", CALIBRATION.replace(
                 "R0_rect", "R_rect").replace("velo_to_cam", "velo_cam")),
-            Case("the matrices cannot be inverted", _CALIBRATION.replace("-1 -0.1", "0 -0.1")),
+            Case("the matrices cannot be inverted", CALIBRATION.replace("-1 -0.1", "0 -0.1")),
         ],
     ),
     Reader(
         "Calibration of KITTI raw", "`calib_velo_to_cam.txt` beside `calib_cam_to_cam.txt`.",
-        "calib_velo_to_cam.txt", lambda path: read_raw_calibration(path.parent), _VELODYNE,
-        _matrix_cases(_VELODYNE), [("calib_cam_to_cam.txt", _CAMERAS)],
+        "calib_velo_to_cam.txt", lambda path: read_raw_calibration(path.parent), VELODYNE,
+        _matrix_cases(VELODYNE), [("calib_cam_to_cam.txt", CAMERAS)],
     ),
-    Reader(
-        "Point clouds: .bin", "Rows of float32, little-endian: x, y, z, intensity.",
-        "000001.bin", read_cloud, _POINTS.tobytes(),
-        [
-            Case("an empty file: no points", b"", other=True),
-            Case("points that are NaN are dropped", _with_nan(_POINTS).tobytes()),
-            Case("the file ends within a point", _POINTS.tobytes()[:-3]),
-            Case("in millimetres", (_POINTS * [1000, 1000, 1000, 1]).astype("<f4").tobytes()),
-            Case("another suffix", _POINTS.tobytes(), name="000001.dat"),
-        ],
-    ),
-    Reader(
-        "Point clouds: .npy", "An array (n, 4) of numbers, as `numpy.save` writes it.",
-        "000001.npy", read_cloud, _npy(_POINTS),
-        [
-            Case("float64", _npy(_POINTS.astype(np.float64))),
-            Case("big-endian", _npy(_POINTS.astype(">f4"))),
-            Case("columns first in memory", _npy(np.asfortranarray(_POINTS))),
-            Case("points that are NaN are dropped", _npy(_with_nan(_POINTS))),
-            Case("no points", _npy(_POINTS[:0]), other=True),
-            Case("five columns without `columns = 5`", _npy(np.hstack([_POINTS, _POINTS[:, :1]]))),
-            Case("one dimension", _npy(_POINTS.ravel())),
-            Case("an array of objects", _npy(np.array([{}, {}], dtype=object))),
-            Case("the file ends early", _npy(_POINTS)[:-8]),
-        ],
-    ),
-    Reader(
-        "Point clouds: .pcd", "PCD 0.7: text, binary or binary_compressed.",
-        "000001.pcd", read_cloud, _PCD_BYTES,
-        [
-            Case("text", f"{_PCD}DATA ascii\n{_ROWS}\n"),
-            Case("Windows line ends in a text file", f"{_PCD}DATA ascii\n{_ROWS}\n".replace(
-                "\n", "\r\n")),
-            Case("a comment before the header", b"# .PCD v.7\n" + _PCD_BYTES),
-            Case("no field x", _PCD_BYTES.replace(b"FIELDS x", b"FIELDS u")),
-            Case("no line DATA", _PCD),
-            Case("the file ends early", _PCD_BYTES[:-4]),
-        ],
-    ),
-    Reader(
-        "Point clouds: .ply", "PLY 1.0: text, or binary of either byte order.",
-        "000001.ply", read_cloud, _PLY_TEXT,
-        [
-            Case("binary, little-endian", f"{_PLY.format('binary_little_endian')}end_header\n"
-                 .encode() + _POINTS.tobytes()),
-            Case("binary, big-endian", f"{_PLY.format('binary_big_endian')}end_header\n".encode()
-                 + _POINTS.astype(">f4").tobytes()),
-            Case("Windows line ends in a text file", _PLY_TEXT.replace("\n", "\r\n")),
-            Case("a comment in the header", _PLY_TEXT.replace("element", "comment a\nelement")),
-            Case("no property x", _PLY_TEXT.replace("float x", "float u")),
-            Case("no end_header", _PLY_TEXT.replace("end_header\n", "")),
-            Case("the file ends early", _PLY_TEXT[:-12]),
-        ],
-    ),
-    Reader(
-        "Images", "PNG or JPEG.", "000001.png", read_image, _encoded(_PIXELS),
-        [
-            Case("grey", _encoded(_PIXELS[..., 0]), other=True),
-            Case("with transparency", _encoded(np.dstack([_PIXELS, _PIXELS[..., :1]]))),
-            Case("16 bits per channel", _encoded(_PIXELS.astype(np.uint16) * 257)),
-            Case("a JPEG file named .png", _encoded(_PIXELS, ".jpg"), other=True),
-            Case("the file ends early", _encoded(_PIXELS)[:-40]),
-            Case("an empty file", b""),
-            Case("another format", b"GIF89a" + bytes(40)),
-        ],
-    ),
+    *CLOUDS,
+    *DATA_SETS,
     Reader(
         "Semantic maps", "`FRAME.png` with a class id per pixel, for the segmenter `saved`.",
-        "maps/000001.png", _read_map, _encoded(_MAP),
+        "maps/000001.png", _read_map, encoded(_MAP),
         [
-            Case("16 bits per pixel without `divisor`", _encoded(_MAP.astype(np.uint16))),
-            Case("three equal channels", _encoded(np.dstack([_MAP] * 3))),
-            Case("another size", _encoded(_MAP[:20])),
-            Case("the file ends early", _encoded(_MAP)[:-20]),
-            Case("the map of another frame", _encoded(_MAP), name="maps/000002.png"),
+            Case("16 bits per pixel without `divisor`", encoded(_MAP.astype(np.uint16))),
+            Case("16 bits per pixel with `divisor = 1`", encoded(_MAP.astype(np.uint16)),
+                 options={"divisor": 1}),
+            Case("class * 1000 + instance with `divisor = 1000`", encoded(
+                _MAP.astype(np.uint16) * 1000), options={"divisor": 1000}),
+            Case("class * 1000 + instance with `divisor = 256`", encoded(
+                _MAP.astype(np.uint16) * 1000), options={"divisor": 256}, other=True),
+            Case("a palette", _palette_png()),
+            Case("an array in .npy", npy(_MAP), name="maps/000001.npy"),
+            Case("an array of fractions", npy(_MAP / 2), name="maps/000001.npy"),
+            Case("three equal channels", encoded(np.dstack([_MAP] * 3))),
+            Case("a colour for each class without `colours`", encoded(_COLOURS)),
+            Case("a colour for each class with `colours`", encoded(_COLOURS),
+                 options={"colours": {"0": (0, 0, 0), "3": (0, 0, 142), "1": (220, 20, 60)}}),
+            Case("a colour that `colours` does not list", encoded(_COLOURS),
+                 options={"colours": {"0": (0, 0, 0), "3": (0, 0, 142)}}),
+            Case("the class id in the red channel with `channel`", encoded(
+                np.dstack([_MAP * 0, _MAP * 0, _MAP])), options={"channel": "red"}),
+            Case("JPEG, which changes values", encoded(_MAP, ".jpg"), name="maps/000001.jpg"),
+            Case("two maps of one frame", encoded(_MAP), beside=[("maps/000001.npy", npy(_MAP))]),
+            Case("another size", encoded(_MAP[:20])),
+            Case("the file ends early", encoded(_MAP)[:-20]),
+            Case("the map of another frame", encoded(_MAP), name="maps/000002.png"),
         ],
     ),
     Reader(
         "Instance masks", "COCO's JSON with images, annotations and masks.",
         "masks.json", _read_masks, _masks(),
         [
-            *_text_cases(_masks()),
+            *text_cases(_masks()),
             Case("a list of results, `image_id` is the frame", json.dumps([
                 {"image_id": "000001", "category_id": 3, "score": 0.9, "segmentation": _MASK}])),
             Case("`image_id` is the number of the frame", json.dumps([
                 {"image_id": 1, "category_id": 3, "score": 0.9, "segmentation": _MASK}])),
+            Case("file_name with folders", _masks().replace("000001.png", "image_2/000001.png")),
+            Case("two images of one frame", _masks().replace('"images": [', '"images": ['
+                 '{"id": 2, "file_name": "1.png"}, ')),
             Case("polygons", _masks(_POLYGON), other=True),
             Case("a mask of another size", _masks({"size": [20, 60], "counts": [1200]})),
             Case("runs that do not fill the image", _masks({"size": [40, 120], "counts": [4]})),
@@ -533,8 +385,13 @@ READERS = (
         "Lists of frames", "One frame per line, for `--labeled`, `--val` and ImageSets.",
         "train.txt", lambda path: match_frame_list(path, ("000001", "000002")), _LIST,
         [
-            *_text_cases(_LIST),
+            *text_cases(_LIST),
             Case("empty lines between", _LIST.replace("\n", "\n\n")),
+            Case("numbers: 1 for 000001", "1\n2\n"),
+            Case("file names", "000001.png\n000002.png\n"),
+            Case("paths", "training/velodyne/000001.bin\ntraining/velodyne/000002.bin\n"),
+            Case("a frame twice", "000001\n1\n000002\n"),
+            Case("a frame that is not in the data set", "000003\n"),
             Case("blanks before the names", _LIST.replace("0000", "  0000")),
             Case("an empty file", "", other=True),
             Case("a path out of the data set", f"{_LIST}../000003\n"),
@@ -542,27 +399,28 @@ READERS = (
     ),
     Reader(
         "dataset.toml", "The description of a plain folder.",
-        "dataset.toml", _read_folder, _FOLDER,
+        "dataset.toml", read_folder, FOLDER,
         [
-            *_toml_cases(_FOLDER, "images", '"camera"'),
-            Case("a missing key", _FOLDER.replace('points = "lidar"\n', "")),
-            Case("a matrix with a missing row", _FOLDER.replace(", [0, 0, 1, 0]]", "]")),
+            *_toml_cases(FOLDER, "images", '"camera"'),
+            Case("a missing key", FOLDER.replace('points = "lidar"\n', "")),
+            Case("a matrix with a missing row", FOLDER.replace(", [0, 0, 1, 0]]", "]")),
         ],
-        [("lidar/000001.bin", _POINTS.tobytes()), ("camera/000001.png", _encoded(_PIXELS))],
+        [("lidar/000001.bin", POINTS.tobytes()), ("camera/000001.png", encoded(PIXELS))],
     ),
     Reader(
         "curate.toml", "The settings of a workspace.", "curate.toml", read_config, _CONFIG,
         [
             *_toml_cases(_CONFIG, "root", '"data"'),
             Case("a misspelled section", f"{_CONFIG}[detectr]\n"),
+            Case("names are renamed in two steps", f'{_CONFIG}rename = {{a = "b", b = "c"}}\n'),
             Case("a number out of its range", f"{_CONFIG}[run]\nworkers = -1\n"),
         ],
     ),
     Reader(
         "Recorded detections: CSV", f"A header and a row per box: {_COLUMNS.replace(',', ', ')}.",
-        "detections.csv", _read_record, _CSV,
+        "detections.csv", _detections, _CSV,
         [
-            *_text_cases(_CSV),
+            *text_cases(_CSV),
             Case("columns in another order", _CSV.replace("category,score", "score,category")
                  .replace("Car,0.9", "0.9,Car").replace("Pedestrian,0.5", "0.5,Pedestrian")),
             Case("a further column", "".join(
@@ -580,13 +438,13 @@ READERS = (
     ),
     Reader(
         "Recorded detections: OpenPCDet", "`result.pkl`: a list with a dict per frame.",
-        "result.pkl", _read_record, pickle.dumps([_openpcdet()]),
+        "result.pkl", _detections, pickle.dumps([_openpcdet()]),
         [
             Case("pickle protocol 2", pickle.dumps([_openpcdet()], protocol=2)),
             Case("float32", pickle.dumps([_openpcdet(
-                boxes_lidar=_BOXES.astype(np.float32), score=_SCORES.astype(np.float32))])),
+                boxes_lidar=BOXES.astype(np.float32), score=_SCORES.astype(np.float32))])),
             Case("a frame without boxes besides", pickle.dumps([_openpcdet(), _openpcdet(
-                frame_id="000002", name=_NAMES[:0], score=_SCORES[:0], boxes_lidar=_BOXES[:0],
+                frame_id="000002", name=_NAMES[:0], score=_SCORES[:0], boxes_lidar=BOXES[:0],
             )]), other=True),
             Case("a key is missing", pickle.dumps([_without(_openpcdet(), "score")])),
             Case("no frame_id", pickle.dumps([_without(_openpcdet(), "frame_id")])),
@@ -602,20 +460,46 @@ READERS = (
         "`detector.options.classes` names the labels.",
         "results.json", _read_numbered, json.dumps([_mmdet3d()]),
         [
-            *_text_cases(json.dumps([_mmdet3d()])),
+            *text_cases(json.dumps([_mmdet3d()])),
             Case("a pickle", pickle.dumps([_mmdet3d()]), name="results.pkl"),
             Case("9 numbers per box: velocities", json.dumps([_mmdet3d(
                 bboxes_3d=[[*box, 0.0, 0.0] for box in _mmdet3d()["bboxes_3d"]])])),
+            Case("boxes_3d without `version`", json.dumps([_old_mmdet3d()])),
+            Case("boxes_3d of 0.x with `version`", json.dumps([_old_mmdet3d()]),
+                 options={"version": "0.x"}),
+            Case("bboxes_3d, which 0.x does not write, with `version`", json.dumps([_mmdet3d()]),
+                 options={"version": "0.x"}),
+            Case("boxes in the camera's frame", json.dumps([_mmdet3d(box_type_3d="Camera")])),
             Case("a label without a class", json.dumps([_mmdet3d(labels_3d=[0, 7])])),
             Case("fewer scores than boxes", json.dumps([_mmdet3d(scores_3d=[0.9])])),
             Case("no frame and no `frame_list`", json.dumps([_without(_mmdet3d(), "frame_id")])),
         ],
     ),
     Reader(
+        "Recorded detections: ST3D and MS3D",
+        "`ps_label_e0.pkl`: a dict of frames; `detector.options.classes` names the categories.",
+        "ps_label_e0.pkl", _read_numbered, _st3d(),
+        [
+            Case("scores in cls_scores", _st3d(
+                gt_boxes=np.column_stack([BOXES, [1, 2]]), cls_scores=_SCORES)),
+            Case("a box with a negative category is left out, with a warning", _st3d(
+                gt_boxes=np.vstack([_st3d_rows(), _st3d_rows()[:1] * [*[1.0] * 7, -1, 1]]))),
+            Case('such boxes with `ignored = "keep"`', _st3d(
+                gt_boxes=_st3d_rows() * [*[1.0] * 7, -1, 1]), options={"ignored": "keep"}),
+            Case("boxes moved by SHIFT_COOR with `shift`", _st3d(
+                gt_boxes=_st3d_rows() + np.float64([0, 0, 1.6, 0, 0, 0, 0, 0, 0])),
+                options={"shift": (0.0, 0.0, 1.6)}),
+            Case("no scores", _st3d(gt_boxes=_st3d_rows()[:, :8])),
+            Case("a category without a class", _st3d(gt_boxes=_st3d_rows() + 2 * np.eye(9)[7])),
+            Case("fewer scores than boxes", _st3d(
+                gt_boxes=_st3d_rows()[:, :8], cls_scores=_SCORES[:1])),
+        ],
+    ),
+    Reader(
         "Recorded detections: nuScenes", "The results of the detection task, as JSON.",
         "results_nusc.json", _read_nuscenes, _nuscenes(),
         [
-            *_text_cases(_nuscenes()),
+            *text_cases(_nuscenes()),
             Case("a key is missing", _nuscenes().replace("translation", "location")),
             Case("a rotation that is not a rotation", _nuscenes(rotation=[0.0] * 4)),
             Case("a score above 1", _nuscenes(detection_score=7.0)),
@@ -626,7 +510,7 @@ READERS = (
         "Review: review.csv", "The table of decisions; spreadsheets may change its form.",
         "review.csv", lambda path: read_table(path.parent, _SHEET), _TABLE,
         [
-            *_text_cases(_TABLE),
+            *text_cases(_TABLE),
             Case("semicolons between the values", _TABLE.replace(",", ";")),
             Case("frames without leading zeros", _TABLE.replace("000001", "1")),
             Case("capital letters: ACCEPT", _TABLE.replace("accept", "ACCEPT")),
@@ -643,7 +527,7 @@ READERS = (
         "Review: KITTI", "`label_2/FRAME.txt` after editing.",
         "label_2/000001.txt", _edited("kitti", 1), _KITTI_BOXES,
         [
-            *_text_cases(_KITTI_BOXES),
+            *text_cases(_KITTI_BOXES),
             Case("16 fields in every line", _KITTI_BOXES.replace("\n", " 0.5\n")),
             Case("a line with 12 fields", " ".join(_KITTI_BOXES.split()[:12]) + "\n"),
             Case("an unknown category", _KITTI_BOXES.replace("Car", "Tram")),
@@ -655,7 +539,7 @@ READERS = (
         "Review: labelCloud", "`labels/FRAME.json` in the format centroid_abs.",
         "labels/000001.json", _edited("labelcloud", 1), _label_cloud(),
         [
-            *_text_cases(_label_cloud()),
+            *text_cases(_label_cloud()),
             Case("a yaw of more than a turn", _label_cloud(
                 rotations={"x": 0.0, "y": 0.0, "z": 365.73})),
             Case("rotated about x", _label_cloud(rotations={"x": 9.0, "y": 0.0, "z": 5.73})),
@@ -670,7 +554,7 @@ READERS = (
         "Review: CVAT", "Datumaro 3D 1.0: annotations.zip, or the JSON in it.",
         "annotations.zip", _edited("cvat", 0), _cvat(),
         [
-            *_text_cases(_cvat()),
+            *text_cases(_cvat()),
             Case("annotations of other types besides are skipped", _cvat().replace(
                 '"annotations": [', '"annotations": [{"type": "label", "label_id": 0}, ')),
             Case("rotated about x", _cvat(rotation=[0.2, 0.0, 0.1])),
@@ -684,15 +568,15 @@ READERS = (
 
 
 def readers() -> tuple[Reader, ...]:
-    """Return all readers; that of Parquet files needs pyarrow."""
-    return (*READERS, _parquet_reader())
+    """Return all readers; those of Arrow files need pyarrow, those of models need onnx."""
+    return (*READERS, _parquet_reader(), _argoverse2_reader(), *model_readers())
 
 
 def _parquet_reader() -> Reader:
     return Reader(
         "Recorded detections: Parquet",
         "The columns of the CSV file; those of the views may be left out.",
-        "detections.parquet", _read_record, _parquet(),
+        "detections.parquet", _detections, _parquet(),
         [
             Case("single precision", _parquet(score=_SCORES.astype(np.float32))),
             Case("a further column", _parquet(note=["a", "b"])),
@@ -701,7 +585,59 @@ def _parquet_reader() -> Reader:
             Case("null", _parquet(x=[10.0, None])),
             Case("NaN", _parquet(x=[10.0, float("nan")])),
             Case("a score above 1", _parquet(score=[9.0, 0.5])),
+            Case("two rows of one box", _parquet(frame=["000001"] * 2, **_twice())),
+            Case("a damaged page", _parquet()[:60] + bytes(20) + _parquet()[80:]),
+            Case("a damaged footer", _parquet()[:-300] + bytes(200) + _parquet()[-100:]),
             Case("the file ends early", _parquet()[:-40]),
             Case("not Parquet", b"PAR1" + bytes(20)),
+        ],
+    )  # fmt: skip
+
+
+def _twice() -> dict[str, Any]:
+    names = ("x", "y", "z", "length", "width", "height", "yaw")
+    columns = {name: [number] * 2 for name, number in zip(names, BOXES[0], strict=True)}
+    return {"category": ["Car"] * 2, "score": [0.9] * 2, **columns}
+
+
+def _feather(**changes: Any) -> bytes:
+    import pyarrow as pa
+    from pyarrow import feather
+
+    names = ("tx_m", "ty_m", "tz_m", "length_m", "width_m", "height_m")
+    half = BOXES[:, 6] / 2
+    columns = {
+        **dict(zip(names, BOXES.T, strict=False)),
+        "qw": np.cos(half), "qx": np.zeros(2), "qy": np.zeros(2), "qz": np.sin(half),
+        "score": _SCORES, "log_id": ["a"] * 2, "timestamp_ns": [1] * 2,
+        "category": _NAMES.tolist(),
+    } | changes  # fmt: skip
+    buffer = io.BytesIO()
+    table = pa.table({name: column for name, column in columns.items() if column is not None})
+    feather.write_feather(table, buffer)
+    return buffer.getvalue()
+
+
+def _read_feather(path: Path, **options: Any) -> Any:
+    detector = RecordedDetector(path, frame_ids=["a_1"], **options)
+    return [detector.predict(frame(name)) for name in detector.frame_ids()]
+
+
+def _argoverse2_reader() -> Reader:
+    return Reader(
+        "Recorded detections: Argoverse 2", "Feather: a row per box in the frame of the vehicle.",
+        "detections.feather", _read_feather, _feather(),
+        [
+            Case("a further column", _feather(track_uuid=["t", "u"])),
+            Case("single precision", _feather(score=_SCORES.astype(np.float32))),
+            Case("frames named by a pattern in `frame_name`", _feather(),
+                 options={"frame_name": "{log_id}_{timestamp_ns}"}),
+            Case("a pattern without the time", _feather(), options={"frame_name": "{log_id}"}),
+            Case("a column is missing", _feather(qw=None)),
+            Case("a rotation that is not a rotation", _feather(qw=np.zeros(2), qz=np.zeros(2))),
+            Case("null", _feather(tx_m=[10.0, None])),
+            Case("a score above 1", _feather(score=[9.0, 0.5])),
+            Case("the file ends early", _feather()[:-40]),
+            Case("not Feather", b"FEA1" + bytes(20)),
         ],
     )  # fmt: skip

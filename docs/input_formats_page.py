@@ -1,7 +1,8 @@
 """The page of input formats: what each reader tolerates and what it rejects, found by reading."""
 
 from docs.errors_page import as_code
-from docs.input_cases import Reader, readers
+from docs.input_cases import readers
+from docs.input_reader import Reader
 
 _INTRODUCTION = """\
 What curate does with files that are not quite as described: the outcome of each row was found by

@@ -8,13 +8,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from curate.category_names import inline_table, listed, mapping
 from curate.consistency import ConsistencySettings
 from curate.datasets.frame_names import FrameNames
 from curate.detectors.base import Detector, TrainableDetector, choose_preset
 from curate.errors import ConfigError, CurateError, error_prefix
 from curate.files.toml_text import toml_key
 from curate.frames import Calibration
-from curate.names import inline_table, listed, mapping
 from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
 from curate.priors.semantic import SemanticSettings

@@ -5,15 +5,15 @@ The ground truth of unlabeled frames is never read for it: only the stored names
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
-from functools import cache
 
 from sqlalchemy import func, select
 
+from curate.category_names import NamedSide, NameFinding, compare_names
 from curate.datasets.kitti.labels import DONT_CARE
 from curate.detectors.base import Detector, NamesCategories
 from curate.errors import ConfigError, CurateError
-from curate.names import NamedSide, NameFinding, compare_names
 from curate.spelling import did_you_mean
+from curate.warnings_once import warn_once
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines import registry
@@ -51,7 +51,7 @@ def check_detector_names(config: Config, detector: Detector) -> None:
     Raises:
         ConfigError: if they differ so that no work can start.
     """
-    report(detector_differences(config, detector), warn=_warn_once)
+    report(detector_differences(config, detector), warn=warn_once)
 
 
 def detector_differences(config: Config, detector: Detector) -> list[NameFinding]:
@@ -96,12 +96,6 @@ def report(findings: Iterable[NameFinding], warn: Callable[[str], None] = _log.w
             warn(finding.message)
     if wrong:
         raise ConfigError("; ".join(wrong))
-
-
-@cache
-def _warn_once(message: str) -> None:
-    """Log a warning once per process: several stages open the same detector."""
-    _log.warning("%s", message)
 
 
 def all_differences(workspace: Workspace) -> list[NameFinding]:

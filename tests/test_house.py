@@ -20,9 +20,10 @@ MAY_IMPORT = {
 # The subpackages of each package, from the bottom up: each imports only those before it.
 LAYERS = {
     "curate": (
-        "shapes", "errors", "spelling", "files", "frames", "geometry", "detections", "consistency",
-        "datasets", "names", "simulation", "segmenters", "priors", "weighting", "evaluation",
-        "exporters", "detectors", "firewall", "viewing", "review", "training", "__main__",
+        "shapes", "errors", "spelling", "warnings_once", "files", "frames", "geometry",
+        "detections", "consistency", "datasets", "category_names", "simulation", "segmenters",
+        "priors", "weighting", "evaluation", "exporters", "detectors", "firewall", "viewing",
+        "review", "training", "__main__",
     ),
     "pipelines": (
         "user_modules", "registry", "workspace", "assembly", "category_names", "engine", "labels",

@@ -188,28 +188,6 @@ class FrameNames(Sequence[str]):
         return _grouped((int(match[1]), frame) for match, frame in matches if match)
 
 
-def match_frames(
-    names: Iterable[str], frame_ids: Iterable[str], place: object = "frames"
-) -> dict[str, str]:
-    """Return the frame of each name, in any of the spellings that this module describes.
-
-    Args:
-        names: different names.
-        frame_ids: the ids of all frames, or `FrameNames`.
-        place: the file, for messages.
-
-    Raises:
-        DataError: if a name fits no frame or several, or two names fit one frame.
-    """
-    frames = FrameNames.of(frame_ids)
-    found, unmatched = frames.match(names, place)
-    if unmatched:
-        raise DataError(
-            f"{place}: there is no frame {unmatched[0][:200]!r}{frames.nearest(unmatched[0])}"
-        )
-    return found
-
-
 def files_by_frame(
     folder: Path, patterns: str | Sequence[str], frame_ids: Sequence[str]
 ) -> Mapping[str, Path]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from curate.errors import ConfigError, ModelError
-from curate.files.onnx_session import ModelValue, is_numeric_array
+from curate.files.onnx_session import ModelValue, is_numeric_array, without_batch
 
 KEYS = ("boxes", "scores", "labels")
 # Names in the exports of OpenPCDet, mmdetection3d and mmdeploy.
@@ -115,7 +115,7 @@ def raw_boxes(named: Mapping[str, np.ndarray], first_label: int, classes: int) -
     for values in arrays.values():
         if not is_numeric_array(values):
             raise ModelError(f"an output is {values.dtype}, expected numbers")
-    rows = _without_batch(arrays["boxes"], 2)
+    rows = without_batch(arrays["boxes"], 2)
     count = len(rows) if rows.ndim == 2 else -1
     labels = arrays.get("labels")
     candidates = list(_score_shapes(arrays["scores"], count, classes, labels is None))
@@ -134,16 +134,11 @@ def raw_boxes(named: Mapping[str, np.ndarray], first_label: int, classes: int) -
     return _without_padding(RawBoxes(rows, scores.astype(np.float64), labels), first_label)
 
 
-def _without_batch(values: np.ndarray, axes: int) -> np.ndarray:
-    """Return values of that many axes without a leading batch axis of length 1."""
-    return values[0] if values.ndim == axes + 1 and len(values) == 1 else values
-
-
 def _score_shapes(
     scores: np.ndarray, count: int, classes: int, per_class: bool
 ) -> Iterator[np.ndarray]:
     """Yield the scores as (n, classes) or (n,), if their shape allows it."""
-    scores = _without_batch(scores, 2)
+    scores = without_batch(scores, 2)
     if per_class and scores.shape == (count, classes):
         yield scores
     if (not per_class or classes == 1) and scores.shape in {(count,), (count, 1), (1, count)}:

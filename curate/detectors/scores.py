@@ -21,7 +21,8 @@ def describe_invalid_scores(lowest: float, highest: float) -> str | None:
     percent = (
         "; divide them by 100 if they are percentages" if lowest >= 0 and highest <= 100 else ""
     )
+    shown = f"up to {highest:.3g}" if lowest >= 0 else f"from {lowest:.3g} to {highest:.3g}"
     return (
-        f"scores from {lowest:.3g} to {highest:.3g} are not in [0, 1]; set {SIGMOID_OPTION} = true "
+        f"scores {shown} are not in [0, 1]; set {SIGMOID_OPTION} = true "
         f"if they are logits (before the sigmoid){percent}"
     )

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.datasets.formats.frame_files import IMAGE_SUFFIXES
 from curate.datasets.formats.images import read_image_size
 from curate.datasets.frame_names import FrameNames, match_frame_list
 from curate.datasets.kitti.calibration import read_calibration
@@ -24,8 +25,6 @@ from curate.evaluation.missing_boxes import ProjectedBoxes, with_projected_boxes
 from curate.files.paths import StrPath
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.shapes import Int
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,15 @@ _ERRORS = (
 )
 
 
-def map_npy(path: Path) -> np.ndarray:
+def map_npy(path: Path, kind: str = "array") -> np.ndarray:
     """Return the array of a file as a memory map.
 
     A header that claims more than the file contains allocates no memory. Pickles and archives are
     rejected.
+
+    Args:
+        path: the file.
+        kind: what the file is, for messages.
 
     Raises:
         DataError: if the file is missing or damaged.
@@ -37,7 +41,7 @@ def map_npy(path: Path) -> np.ndarray:
             warnings.simplefilter("ignore")
             array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
     except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
+        raise DataError(f"{path}: no such {kind} file") from None
     except _ERRORS as error:
         raise DataError(f"{path}: not a readable .npy array: {one_line(error, 200)}") from None
     return array

@@ -86,6 +86,11 @@ def is_numeric_array(output: Any) -> bool:
     return isinstance(output, np.ndarray) and output.dtype.kind in "fiub"
 
 
+def without_batch(values: np.ndarray, axes: int) -> np.ndarray:
+    """Return values of that many axes without a leading batch axis of length 1."""
+    return values[0] if values.ndim == axes + 1 and len(values) == 1 else values
+
+
 def _declared(values: Sequence[Any]) -> tuple[ModelValue, ...]:
     return tuple(ModelValue(value.name, value.type, tuple(value.shape or ())) for value in values)
 

@@ -63,17 +63,25 @@ def colour_table(colours: str | Mapping[str, Sequence[int]]) -> ColourTable:
         if colours not in COLOUR_TABLES:
             names = ", ".join(COLOUR_TABLES)
             hint = did_you_mean(colours, COLOUR_TABLES)
-            raise ConfigError(f"segmenter colours {colours!r}: use {names} or a table{hint}")
+            raise ConfigError(
+                f"segmenter.options.colours {colours!r}: use {names} or a table{hint}"
+            )
         return COLOUR_TABLES[colours]
     table: dict[tuple[int, ...], int] = {}
     for class_id, colour in colours.items():
         valid = isinstance(colour, Sequence) and len(colour) == 3
         if not (valid and all(isinstance(part, int) and 0 <= part <= 255 for part in colour)):
-            raise ConfigError(f"segmenter colours: {colour!r} is not a colour like [0, 0, 142]")
+            raise ConfigError(
+                f"segmenter.options.colours: {colour!r} is not a colour like [0, 0, 142]"
+            )
         if not (str(class_id).isdecimal() and int(class_id) <= 255):
-            raise ConfigError(f"segmenter colours: {class_id!r} is not a class id from 0 to 255")
+            raise ConfigError(
+                f"segmenter.options.colours: {class_id!r} is not a class id from 0 to 255"
+            )
         if tuple(colour) in table:
-            raise ConfigError(f"segmenter colours: two classes have the colour {list(colour)}")
+            raise ConfigError(
+                f"segmenter.options.colours: two classes have the colour {list(colour)}"
+            )
         table[tuple(colour)] = int(class_id)
     return table
 

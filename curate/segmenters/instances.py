@@ -52,7 +52,7 @@ class InstanceSegmenter:
         frame_ids: Sequence[str] = (),
     ) -> None:
         if not 0 <= minimum_score <= 1:
-            raise ConfigError(f"segmenter minimum_score {minimum_score}: expected 0 to 1")
+            raise ConfigError(f"segmenter.options.minimum_score {minimum_score}: expected 0 to 1")
         self.path = Path(path)
         self.classes = checked_classes(classes)
         self.minimum_score = minimum_score

@@ -84,9 +84,9 @@ class OnnxSegmenter:
         threads: int = 1,
     ) -> None:
         if tiles < 1:
-            raise ConfigError(f"segmenter tiles {tiles}: expected at least 1")
+            raise ConfigError(f"segmenter.options.tiles {tiles}: expected at least 1")
         if channels not in {None, *_LAYOUTS}:
-            raise ConfigError(f"segmenter channels {channels!r}: use first or last")
+            raise ConfigError(f"segmenter.options.channels {channels!r}: use first or last")
         self.classes = checked_classes(classes)
         self.tiles = tiles
         self._model = ImageModel(Path(model), scaling, threads)
@@ -233,6 +233,8 @@ def _class_ids(output: np.ndarray, size: tuple[int, int], channels: str | None) 
     if values.ndim == 3:
         axis = _class_axis(returned, values.shape, size, channels)
         values = values.squeeze(axis) if values.shape[axis] == 1 else values.argmax(axis)
+    elif not _is_in_proportion(values.shape, size):
+        raise ModelError(_proportions(returned, size))
     if not np.issubdtype(values.dtype, np.integer) or values.min() < 0 or values.max() > 255:
         raise ModelError(f"{returned}; {_EXPECTED}")
     class_ids: np.ndarray = values.astype(np.uint8)
@@ -255,20 +257,24 @@ def _class_axis(
     maps = {0: shape[1:], -1: shape[:2]}
     fitting = [axis for axis, (height, width) in maps.items() if (width, height) == size]
     if not fitting:
-        errors = {
-            axis: width / height / (size[0] / size[1]) for axis, (height, width) in maps.items()
-        }
-        fitting = [
-            axis for axis, error in errors.items() if max(error, 1 / error) <= _MAX_ASPECT_ERROR
-        ]
+        fitting = [axis for axis, own in maps.items() if _is_in_proportion(own, size)]
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:
-        raise ModelError(
-            f"{returned} for an image of {size[0]} x {size[1]} pixels; {_EXPECTED}, in its "
-            "proportions"
-        )
+        raise ModelError(_proportions(returned, size))
     raise ModelError(
         f"{returned}, which can be {shape[0]} classes first or {shape[2]} classes last; set "
         "segmenter.options.channels to first or last"
+    )
+
+
+def _is_in_proportion(shape: Sequence[int], size: tuple[int, int]) -> bool:
+    """Return whether (height, width) of a map has about the proportions of (width, height)."""
+    error = shape[1] / shape[0] / (size[0] / size[1])
+    return max(error, 1 / error) <= _MAX_ASPECT_ERROR
+
+
+def _proportions(returned: str, size: tuple[int, int]) -> str:
+    return (
+        f"{returned} for an image of {size[0]} x {size[1]} pixels; {_EXPECTED}, in its proportions"
     )

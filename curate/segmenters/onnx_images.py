@@ -85,7 +85,9 @@ class ImageModel:
 
     def __init__(self, path: Path, scaling: str, threads: int, *, single: bool = False) -> None:
         if scaling not in SCALINGS:
-            raise ConfigError(f"segmenter scaling {scaling!r}: use one of {', '.join(SCALINGS)}")
+            raise ConfigError(
+                f"segmenter.options.scaling {scaling!r}: use one of {', '.join(SCALINGS)}"
+            )
         self.path = Path(path)
         self._scaling = scaling
         self._model = OnnxModel(self.path, threads, "segmenter")

@@ -61,7 +61,7 @@ class OnnxInstanceSegmenter:
         threads: int = 1,
     ) -> None:
         if not 0 <= minimum_score <= 1:
-            raise ConfigError(f"segmenter minimum_score {minimum_score}: expected 0 to 1")
+            raise ConfigError(f"segmenter.options.minimum_score {minimum_score}: expected 0 to 1")
         self.classes = checked_classes(classes)
         self.minimum_score = minimum_score
         self.mask_threshold = mask_threshold
@@ -99,7 +99,7 @@ class OnnxInstanceSegmenter:
         """Return the declared outputs after a check that they exist and form a supported kind."""
         if frozenset(outputs) not in KINDS:
             kinds = "; or ".join(", ".join(sorted(kind)) for kind in KINDS)
-            raise ConfigError(f"segmenter outputs {', '.join(outputs)}: declare {kinds}")
+            raise ConfigError(f"segmenter.options.outputs {', '.join(outputs)}: declare {kinds}")
         existing = [output.name for output in self._model.outputs]
         missing = [name for name in outputs.values() if name not in existing]
         if missing:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from curate.errors import ModelError
+from curate.files.onnx_session import without_batch
 from curate.segmenters.pasting import Box
 
 Outputs = Mapping[str, np.ndarray]
@@ -58,13 +59,13 @@ def boxed_instances(
     Raises:
         ModelError: if a shape or a value is invalid.
     """
-    boxes = _without_batch(outputs["boxes"], 2)
+    boxes = without_batch(outputs["boxes"], 2)
     masks = outputs["masks"]
     masks = masks[0] if masks.ndim == 5 or (masks.ndim == 4 and masks.shape[1] != 1) else masks
     masks = masks[:, 0] if masks.ndim == 4 else masks
-    labels = _without_batch(outputs["labels"], 1)
+    labels = without_batch(outputs["labels"], 1)
     if "scores" in outputs:
-        scores = _without_batch(outputs["scores"], 1)
+        scores = without_batch(outputs["scores"], 1)
     else:
         scores = boxes[:, 4] if boxes.ndim == 2 and boxes.shape[1] == 5 else np.zeros(0)
     fits = boxes.ndim == 2 and boxes.shape[1] in (4, 5) and masks.ndim == 3
@@ -122,11 +123,6 @@ KINDS: Mapping[frozenset[str], Reader] = {
     frozenset({"predictions", "prototypes"}): prototype_instances,
 }
 """The function that parses each supported set of declared outputs."""
-
-
-def _without_batch(values: np.ndarray, axes: int) -> np.ndarray:
-    """Return values of that many axes without a leading batch axis of length 1."""
-    return values[0] if values.ndim == axes + 1 and len(values) == 1 else values
 
 
 def _by_rising_score(scores: np.ndarray, minimum_score: float) -> list[int]:

@@ -64,11 +64,15 @@ class SavedSegmenter:
         frame_ids: Sequence[str] = (),
     ) -> None:
         if divisor is not None and not (type(divisor) is int and divisor >= 1):
-            raise ConfigError(f"segmenter divisor {divisor!r}: expected an integer of at least 1")
+            raise ConfigError(
+                f"segmenter.options.divisor {divisor!r}: expected an integer of at least 1"
+            )
         if below not in {None, "class", "instance"}:
-            raise ConfigError(f"segmenter below {below!r}: use class or instance")
+            raise ConfigError(f"segmenter.options.below {below!r}: use class or instance")
         if channel not in {None, *_CHANNELS}:
-            raise ConfigError(f"segmenter channel {channel!r}: use one of {', '.join(_CHANNELS)}")
+            raise ConfigError(
+                f"segmenter.options.channel {channel!r}: use one of {', '.join(_CHANNELS)}"
+            )
         self._table = None if colours in (None, "none") else colour_table(colours)
         if [divisor, self._table, channel].count(None) < 2:
             raise ConfigError("segmenter: declare only one of divisor, colours and channel")

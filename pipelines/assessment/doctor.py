@@ -4,13 +4,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from curate.category_names import NameFinding, renamed
 from curate.detectors.base import RecordedViews
 from curate.errors import ConfigError, CurateError
 from curate.evaluation.camera_examination import examine_camera
 from curate.evaluation.examination import Finding, examine_detections, examine_frame
 from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
-from curate.names import NameFinding, renamed
 from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
 from pipelines.category_names import detector_differences, find_differences

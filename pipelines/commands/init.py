@@ -93,8 +93,8 @@ def init(
 
     Example: curate init work --root data/simulated --labeled 0.06 --segmenter simulated
     """
+    from curate.category_names import listed
     from curate.errors import ConfigError
-    from curate.names import listed
     from pipelines.assembly import check_extensions
     from pipelines.category_names import check_before_init, stored_names
     from pipelines.workspace.config import change_setting, make_config

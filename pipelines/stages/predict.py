@@ -1,20 +1,19 @@
 """predict: l = f(x; w), the boxes of the teacher, including those with low scores."""
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from curate.category_names import renamed
 from curate.detections import Detections
 from curate.detectors.base import Detector, NamesCategories
 from curate.errors import ModelError
 from curate.frames import Frame
 from curate.geometry.projection import in_camera_view
-from curate.names import renamed
+from curate.warnings_once import warn_once
 from db.models import BOX_COLUMNS
 from pipelines.assembly import check_detector, open_detector
 from pipelines.category_names import check_detector_names
@@ -22,8 +21,6 @@ from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
 from pipelines.workspace.config import Config, DetectorSection, SegmenterSection
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -114,18 +111,11 @@ def _report_unexpected(unexpected: Sequence[str], config: Config) -> None:
                 f' set detector.rename = {{"{name}" = "{category}"}}, or '
                 "dataset.categories"
             )
-        _warn_once(name, config.dataset.categories)
-
-
-@cache
-def _warn_once(name: str, categories: tuple[str, ...]) -> None:
-    """Log the warning once per process and name."""
-    _log.warning(
-        "the detector returns '%s', which is not a category of the data set (%s): such boxes are "
-        "left out; detector.rename maps names",
-        name,
-        ", ".join(categories),
-    )
+        warn_once(
+            f"the detector returns '{name}', which is not a category of the data set "
+            f"({', '.join(config.dataset.categories)}): such boxes are left out; detector.rename "
+            "maps names"
+        )
 
 
 def detection_columns(found: Detections) -> dict[str, list[Any]]:

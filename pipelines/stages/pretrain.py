@@ -5,8 +5,8 @@ from typing import Any
 
 from sqlalchemy import Connection, func, select
 
+from curate.category_names import listed
 from curate.errors import ConfigError, WorkspaceError
-from curate.names import listed
 from db import bulk
 from pipelines.assembly import trained_detector
 from pipelines.engine.progress import Progress

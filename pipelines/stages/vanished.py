@@ -13,9 +13,9 @@ from typing import Any
 
 from sqlalchemy import func, select
 
+from curate.category_names import listed
 from curate.errors import LabelsVanished
 from curate.files.atomic import replace_file
-from curate.names import listed
 from curate.review.human_labels import REJECTED
 from db import bulk
 from pipelines.assembly import open_policy

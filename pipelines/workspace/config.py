@@ -20,12 +20,12 @@ from pydantic import (
     model_validator,
 )
 
+from curate.category_names import check_rename
 from curate.detections import CATEGORIES
 from curate.errors import ConfigError, one_line
 from curate.evaluation.kitti_rules import overlaps_of
 from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
-from curate.names import check_rename
 from pipelines import registry
 from pipelines.workspace.config_errors import describe_errors
 from pipelines.workspace.names import KnownClassSet, KnownName

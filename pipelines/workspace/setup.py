@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import func, select
 
+from curate.category_names import NamedSide, compare_names, inline_table
 from curate.datasets.base import Dataset, sequences_of
 from curate.datasets.formats.containment import check_frame_id
 from curate.datasets.frame_names import FrameNames, match_frame_list
@@ -19,7 +20,6 @@ from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
 from curate.files.batches import batched
 from curate.firewall.sequences import choose_sequences, group_by_sequence, shared_sequences
-from curate.names import NamedSide, compare_names, inline_table
 from curate.segmenters.classes import missing_classes
 from curate.spelling import closest, did_you_mean
 from db import bulk

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from sqlalchemy import select
 
+from curate.category_names import renamed
 from curate.datasets.base import Dataset
 from curate.datasets.formats.point_layout import PointLayout
 from curate.datasets.frame_names import FrameNames
 from curate.datasets.kitti.labels import DONT_CARE
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError, WorkspaceError
-from curate.names import renamed
 from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from db.session import Database

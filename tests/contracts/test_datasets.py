@@ -141,7 +141,7 @@ def test_a_frame_without_a_label_file_can_be_read(dataset, root: Path) -> None:
     assert len(dataset.read(name).points) > 0
 
 
-def test_two_point_files_or_images_of_a_frame_are_refused(
+def test_two_point_files_or_images_of_a_frame_are_rejected(
     request: pytest.FixtureRequest, dataset, root: Path
 ) -> None:
     """When the frames are listed, so at init; both files are in the message."""

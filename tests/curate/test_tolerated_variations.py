@@ -1,4 +1,4 @@
-"""Every reader of text takes the same variations of a file, and refuses the same ones."""
+"""Every reader of text takes the same variations of a file, and rejects the same ones."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -299,7 +299,7 @@ TOLERATED: Mapping[str, Callable[[bytes], bytes]] = {
     "no newline at the end": lambda content: content.rstrip(b"\n"),
     "empty lines at the end": lambda content: content + b"\n  \n\n",
 }
-REFUSED: Mapping[str, tuple[Callable[[bytes], bytes], str]] = {
+REJECTED: Mapping[str, tuple[Callable[[bytes], bytes], str]] = {
     "UTF-16 with mark": (
         lambda content: content.decode().encode("utf-16"),
         r"saved as UTF-16 \(Windows' \"Unicode\"\); save the file as UTF-8",
@@ -324,12 +324,12 @@ def test_every_reader_takes_the_same_variations(tmp_path, reader, variation):
     assert READERS[reader].read(path) == expected
 
 
-@pytest.mark.parametrize("kind", REFUSED)
+@pytest.mark.parametrize("kind", REJECTED)
 @pytest.mark.parametrize("reader", READERS)
-def test_every_reader_refuses_other_encodings_by_name(tmp_path, reader, kind):
+def test_every_reader_rejects_other_encodings_by_name(tmp_path, reader, kind):
     """In one line with the file and the remedy."""
     path = READERS[reader].write(tmp_path)
-    change, message = REFUSED[kind]
+    change, message = REJECTED[kind]
     path.write_bytes(change(path.read_bytes()))
     with pytest.raises(CurateError, match=message) as caught:
         READERS[reader].read(path)
@@ -374,7 +374,7 @@ def test_every_csv_reader_takes_the_same_variations(tmp_path, reader, variation)
 
 
 @pytest.mark.parametrize("reader", CSV)
-def test_every_csv_reader_refuses_what_could_be_misread(tmp_path, reader):
+def test_every_csv_reader_rejects_what_could_be_misread(tmp_path, reader):
     """A column twice, a row of another width, a missing column, decimal commas."""
     path = READERS[reader].write(tmp_path)
     plain = path.read_text()
@@ -390,7 +390,7 @@ def test_every_csv_reader_refuses_what_could_be_misread(tmp_path, reader):
         assert str(caught.value).startswith(str(path))
 
 
-def test_decimal_commas_are_refused_with_advice(tmp_path):
+def test_decimal_commas_are_rejected_with_advice(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(ROWS.replace(",", ";").replace("0.9", "0,9"))
     with pytest.raises(
@@ -401,7 +401,7 @@ def test_decimal_commas_are_refused_with_advice(tmp_path):
 
 @pytest.mark.parametrize("constant", ["NaN", "Infinity", "-Infinity"])
 @pytest.mark.parametrize("reader", JSON)
-def test_every_json_reader_refuses_numbers_that_are_not_json(tmp_path, reader, constant):
+def test_every_json_reader_rejects_numbers_that_are_not_json(tmp_path, reader, constant):
     """With line and column, also in a value that is not used."""
     path = READERS[reader].write(tmp_path)
     text = path.read_text()
@@ -416,7 +416,7 @@ def test_every_json_reader_refuses_numbers_that_are_not_json(tmp_path, reader, c
 
 
 @pytest.mark.parametrize("reader", JSON)
-def test_every_json_reader_refuses_a_second_document(tmp_path, reader):
+def test_every_json_reader_rejects_a_second_document(tmp_path, reader):
     """As in JSON Lines, of which a reader would take the first line alone."""
     path = READERS[reader].write(tmp_path)
     path.write_text(path.read_text() + "{}\n")
@@ -427,7 +427,7 @@ def test_every_json_reader_refuses_a_second_document(tmp_path, reader):
 
 
 @pytest.mark.parametrize("reader", JSON)
-def test_every_json_reader_refuses_a_repeated_key(tmp_path, reader):
+def test_every_json_reader_rejects_a_repeated_key(tmp_path, reader):
     """Python would keep the last one. Of nuScenes' results, which are streamed, tokens count."""
     path = READERS[reader].write(tmp_path)
     text = path.read_text()
@@ -454,7 +454,7 @@ PLACEHOLDERS = ("0 0 0 0 0 0 0", "-1 -1 -1 -1000 -1000 -1000 -10", "0.00 0.00 0.
 
 @pytest.mark.parametrize("numbers", PLACEHOLDERS)
 @pytest.mark.parametrize("reader", KITTI_TEXT)
-def test_every_reader_of_kitti_text_refuses_a_line_without_a_3d_box(tmp_path, reader, numbers):
+def test_every_reader_of_kitti_text_rejects_a_line_without_a_3d_box(tmp_path, reader, numbers):
     """By one check, with file and line."""
     path = READERS[reader].write(tmp_path)
     path.write_text(f"{path.read_text()}\nCar 0 0 0 1 1 9 9 {numbers} 0.5\n")

@@ -9,9 +9,11 @@ import pytest
 from docs.generate import INPUT_FORMATS
 
 pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")
+pytest.importorskip("onnx", reason="the package onnx is not installed")
 
-from docs.input_cases import Case, Reader, readers
+from docs.input_cases import readers
 from docs.input_formats_page import rows_of
+from docs.input_reader import Case, Reader
 
 READERS = {reader.title: reader for reader in readers()}
 CASES = [(title, case) for title, reader in READERS.items() for case in reader.cases]
@@ -30,15 +32,18 @@ def test_a_plain_file_is_read(title: str) -> None:
     ("title", "case"), CASES, ids=lambda each: getattr(each, "variation", each)
 )
 def test_a_variation_is_read_alike_or_rejected_in_one_line(title: str, case: Case) -> None:
-    """The message names the file, and no variation is silently read as something else."""
+    """The message names the file or setting; no variation is silently read as something else."""
     reader = READERS[title]
     outcome, message = reader.outcome(case)
     assert (outcome == "read") == (message == "")
     if outcome == "rejected":
-        path = Path(case.name or reader.name)
-        assert path.name in message or str(path.parent) in message or reader.name in message
+        name = case.name or reader.name
+        files = [name, reader.name, *(other for other, _ in (*reader.beside, *case.beside))]
+        places = [place for file in files for place in (Path(file).name, str(Path(file).parent))]
+        settings = [key for key in case.options if key in message]
+        assert settings or any(place in message for place in places if place != ".")
         assert len(message.splitlines()) == 1
-        assert len(message) > len(path.name) + 10
+        assert len(message) > len(Path(name).name) + 10
 
 
 @pytest.mark.parametrize("title", READERS)

@@ -46,3 +46,10 @@ def test_a_broken_link_is_found(tmp_path: Path) -> None:
         "[c](gone.md) [d](page.md#one) `[e](f)`\n"
     )
     assert broken_links(page) == ["#two", "gone.md", "page.md#one"]
+
+
+def test_the_site_lists_every_page() -> None:
+    """The navigation of the site has each page once."""
+    listed = re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    pages = [page.relative_to(ROOT / "docs").as_posix() for page in PAGES if page.parent != ROOT]
+    assert sorted(listed) == sorted(pages)

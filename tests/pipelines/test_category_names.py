@@ -124,7 +124,7 @@ def test_declared_categories_are_the_vocabulary(curate: Curate, tmp_path: Path) 
     assert "objects in the label files: Car 2; not in dataset.categories: Bus 4\n" in out
 
 
-def test_a_typing_error_in_kittis_layout_is_refused(curate: Curate, tmp_path: Path) -> None:
+def test_a_typing_error_in_kittis_layout_is_rejected(curate: Curate, tmp_path: Path) -> None:
     """With file, line and what was meant."""
     root, labels = toy_kitti_layout(tmp_path / "data")
     rewrite_labels(labels, lambda text: text.replace("Cyclist", "Cyclsit"))
@@ -245,7 +245,7 @@ def exports(work: Path) -> dict[str, bytes]:
 def test_results_without_a_known_name_leave_the_export_untouched(
     curate: Curate, tmp_path: Path, toy_kitti: Path, command: str
 ) -> None:
-    """After a good run, results with 'vehicle' alone are refused before any work."""
+    """After a good run, results with 'vehicle' alone are rejected before any work."""
     work = tmp_path / "w"
     record = write_record(tmp_path / "a.csv", toy_kitti, str)
     assert recorded(curate, work, toy_kitti, record)[0] == 0
@@ -314,7 +314,7 @@ def test_an_older_place_of_the_mapping_is_accepted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("section", ["dataset", "detector", "segmenter"])
-def test_a_mapping_in_steps_is_refused(curate: Curate, tmp_path: Path, section: str) -> None:
+def test_a_mapping_in_steps_is_rejected(curate: Curate, tmp_path: Path, section: str) -> None:
     """For every side alike."""
     code, _, err = curate(
         "init", tmp_path / "w", "--root", tmp_path, "--set", f'{section}.rename={{a="b", b="c"}}'

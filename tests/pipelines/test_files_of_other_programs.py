@@ -67,7 +67,7 @@ def test_label_files_with_a_score_are_read(curate: Curate, tmp_path: Path, toy_k
 
 
 @pytest.mark.parametrize("numbers", ["0 0 0 0 0 0 0", "-1 -1 -1 -1000 -1000 -1000 -10"])
-def test_a_label_without_a_3d_box_is_refused_at_init(
+def test_a_label_without_a_3d_box_is_rejected_at_init(
     curate: Curate, tmp_path: Path, toy_kitti: Path, numbers: str
 ) -> None:
     """As a region it is accepted."""
@@ -103,7 +103,7 @@ def test_lists_take_every_spelling(
     assert curate("check", "-w", tmp_path / "w")[0] == 0
 
 
-def test_an_unknown_name_in_a_list_is_refused_with_the_nearest(
+def test_an_unknown_name_in_a_list_is_rejected_with_the_nearest(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
     (tmp_path / "list.txt").write_text("000001\n000123\n")
@@ -134,7 +134,7 @@ def test_lists_and_results_of_evaluate_take_every_spelling(
     assert f"are both frame {names[0]}; remove one" in err
 
 
-def test_scores_before_the_sigmoid_are_refused_or_declared(
+def test_scores_before_the_sigmoid_are_rejected_or_declared(
     curate: Curate, tmp_path: Path, toy_kitti: Path
 ) -> None:
     results = result_files(toy_kitti, tmp_path / "results", (6.5, 2.1, -0.4))

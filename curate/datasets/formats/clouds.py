@@ -6,8 +6,6 @@ they are clipped.
 """
 
 import os
-import tokenize
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -16,21 +14,10 @@ from curate.datasets.formats.binary import open_unbuffered, read_bytes
 from curate.datasets.formats.cloud_formats import read_pcd, read_ply
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.formats.readings import better_readings, fitting
-from curate.errors import DataError, one_line
+from curate.errors import DataError
+from curate.files.npy import map_npy
 from curate.shapes import Float, Float32
 
-# The errors that numpy raises for a damaged .npy header.
-_NPY_ERRORS = (
-    EOFError,
-    MemoryError,
-    OSError,
-    OverflowError,
-    RecursionError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-    tokenize.TokenError,
-)
 CLOUD_SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 # Beyond the range of any LiDAR. Farther points would make grids over the points too large.
 MAX_RANGE_METRES = 2000.0
@@ -217,17 +204,7 @@ def _scaled(points: Float32[np.ndarray, "n 4"], layout: PointLayout) -> Float32[
 
 def _read_npy(path: Path, layout: PointLayout) -> np.ndarray:
     """Return x, y, z and, if there is one, the intensity of an array."""
-    try:
-        # A memory map: a header that claims more than the file contains allocates no memory, and
-        # pickles and archives are rejected.
-        with warnings.catch_warnings():
-            # Python warns about odd literals in the header, numpy about files written by Python 2.
-            warnings.simplefilter("ignore")
-            table = np.lib.format.open_memmap(path, mode="r")
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such point file") from None
-    except _NPY_ERRORS as error:
-        raise DataError(f"{path}: not a readable .npy array: {one_line(error, 200)}") from None
+    table = map_npy(path, "point")
     if table.dtype.names:
         return _named_fields(path, table, layout)
     columns = len(layout.names)

@@ -264,11 +264,6 @@ def frame_number(stem: str, path: Path) -> int:
     return int(stem)
 
 
-def describe_skipped(kept: int, count: int) -> str:
-    """Return how many frames are skipped because they have no image; "" if none is."""
-    return f"{count - kept} of {count} frames have no image and are skipped" if kept < count else ""
-
-
 def _has_own_extrinsics(calib: Path) -> bool:
     """Return whether each camera has a transform of its own, from one of the calibration files."""
     path = next(visible_files(calib, "*.txt"), None)

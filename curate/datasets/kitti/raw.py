@@ -14,20 +14,20 @@ from pathlib import Path
 import numpy as np
 
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES
-from curate.datasets.formats.containment import Boundary, check_frame_id
+from curate.datasets.formats.containment import Boundary
 from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder
 from curate.datasets.formats.images import read_optional_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.kitti.calibration import RAW_CAMERAS, RAW_TO_CAMERA, read_raw_calibration
 from curate.datasets.kitti.dataset import (
     contains_images,
-    describe_skipped,
     frame_number,
     image_size_option,
     read_frame_lists,
     read_points,
 )
 from curate.datasets.kitti.labels import read_annotations
+from curate.datasets.kitti.sequences import SequenceFrames
 from curate.datasets.kitti.tracklets import TRACKLETS, TrackletTable
 from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
@@ -110,32 +110,16 @@ class KittiRawDataset:
         Raises:
             DataError: if a frame has two point files or two images.
         """
-        return tuple(self._frames)
+        return self._frames.ids()
 
     @cached_property
-    def _frames(self) -> Mapping[str, tuple[_Drive, str]]:
-        """The drive and the number of each frame."""
-        return {
-            frame: (drive, number)
-            for frame, (drive, number) in sorted(self._sweeps.items())
-            if not self._has_images or number in drive.images
-        }
-
-    @cached_property
-    def _sweeps(self) -> Mapping[str, tuple[_Drive, str]]:
-        """The same for all point files, with or without an image."""
-        frames: dict[str, tuple[_Drive, str]] = {}
-        for name, folder in self._folders.items():
-            drive = _Drive(folder)
-            numbers = drive.points.frames()
-            drive.points.check(numbers)
-            drive.images.check(numbers)
-            frames |= {f"{name}_{number}": (drive, number) for number in numbers}
-        return frames
+    def _frames(self) -> SequenceFrames[_Drive]:
+        drives = {name: _Drive(folder) for name, folder in self._folders.items()}
+        return SequenceFrames(drives, has_images=self._has_images)
 
     def skipped_frames(self) -> str:
         """Return how many frames are skipped because they have no image; "" if none is."""
-        return describe_skipped(len(self._frames), len(self._sweeps))
+        return self._frames.describe_skipped()
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in ROOT/ImageSets by file name."""
@@ -143,7 +127,7 @@ class KittiRawDataset:
 
     def sequence_of(self, frame_id: str) -> str | None:
         """Return the drive of a frame, or None if there is no such frame."""
-        return self._frames[frame_id][0].folder.name if frame_id in self._frames else None
+        return self._frame(frame_id)[0].folder.name if frame_id in self._frames else None
 
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; all frames of a date share the calibration.
@@ -200,7 +184,4 @@ class KittiRawDataset:
         return read_raw_calibration(files.calibration.parent, rotation_y=self._rotation_y)
 
     def _frame(self, frame_id: str) -> tuple[_Drive, str]:
-        check_frame_id(frame_id)
-        if frame_id not in self._frames:
-            raise DataError(f"{self.root}: no frame {frame_id}; frame ids are DRIVE_NUMBER")
-        return self._frames[frame_id]
+        return self._frames.find(frame_id, self.root, "DRIVE_NUMBER")

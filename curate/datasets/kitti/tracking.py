@@ -19,20 +19,20 @@ from pathlib import Path
 import numpy as np
 
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES
-from curate.datasets.formats.containment import Boundary, check_frame_id
+from curate.datasets.formats.containment import Boundary
 from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder, visible_names
 from curate.datasets.formats.images import read_optional_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.dataset import (
     contains_images,
-    describe_skipped,
     frame_number,
     image_size_option,
     read_frame_lists,
     read_points,
 )
 from curate.datasets.kitti.labels import LABEL_FIELDS, parse_rows, read_rows, to_annotations
+from curate.datasets.kitti.sequences import SequenceFrames
 from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import DataError, error_prefix
@@ -70,7 +70,6 @@ class KittiTrackingDataset:
     Raises:
         ConfigError: if `rotation_y` is unknown.
         DataError: if the root contains neither.
-        ConfigError: if `rotation_y` is unknown.
     """
 
     name = "kitti-tracking"
@@ -108,28 +107,14 @@ class KittiTrackingDataset:
         Raises:
             DataError: if there are none, or a frame has two point files or two images.
         """
-        return tuple(self._frames)
+        return self._frames.ids()
 
     @cached_property
-    def _frames(self) -> Mapping[str, tuple[_Sequence, str]]:
-        """The sequence and the number of each frame."""
-        return {
-            frame: (sequence, number)
-            for frame, (sequence, number) in sorted(self._sweeps.items())
-            if not self._has_images or number in sequence.images
-        }
-
-    @cached_property
-    def _sweeps(self) -> Mapping[str, tuple[_Sequence, str]]:
-        """The same for all point files, with or without an image."""
-        frames: dict[str, tuple[_Sequence, str]] = {}
-        for name in visible_names(self._home / "velodyne"):
-            sequence = _Sequence(self._home, name)
-            numbers = sequence.points.frames()
-            sequence.points.check(numbers)
-            sequence.images.check(numbers)
-            frames |= {f"{name}_{number}": (sequence, number) for number in numbers}
-        if not frames:
+    def _frames(self) -> SequenceFrames[_Sequence]:
+        names = visible_names(self._home / "velodyne")
+        sequences = {name: _Sequence(self._home, name) for name in names}
+        frames = SequenceFrames(sequences, has_images=self._has_images)
+        if not any(sequence.points.frames() for sequence in sequences.values()):
             raise DataError(
                 f"{self._home / 'velodyne'}: no point files SEQUENCE/FRAME.bin"
                 f"{layout_hint(self.root, self.name)}"
@@ -138,7 +123,7 @@ class KittiTrackingDataset:
 
     def skipped_frames(self) -> str:
         """Return how many frames are skipped because they have no image; "" if none is."""
-        return describe_skipped(len(self._frames), len(self._sweeps))
+        return self._frames.describe_skipped()
 
     def splits(self) -> Mapping[str, tuple[str, ...]]:
         """Return the frame lists in ROOT/ImageSets by file name."""
@@ -146,7 +131,7 @@ class KittiTrackingDataset:
 
     def sequence_of(self, frame_id: str) -> str | None:
         """Return the sequence of a frame, or None if there is no such frame."""
-        return self._frames[frame_id][0].name if frame_id in self._frames else None
+        return self._frame(frame_id)[0].name if frame_id in self._frames else None
 
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; a sequence shares calibration and label file.
@@ -201,10 +186,7 @@ class KittiTrackingDataset:
             return to_annotations(objects, calibration)
 
     def _frame(self, frame_id: str) -> tuple[_Sequence, str]:
-        check_frame_id(frame_id)
-        if frame_id not in self._frames:
-            raise DataError(f"{self.root}: no frame {frame_id}; frame ids are SEQUENCE_NUMBER")
-        return self._frames[frame_id]
+        return self._frames.find(frame_id, self.root, "SEQUENCE_NUMBER")
 
 
 def rows_by_frame(path: Path) -> Mapping[int, Sequence[tuple[int, Sequence[str]]]]:

@@ -3,8 +3,7 @@
 Source: the development kit of KITTI's raw data (Geiger et al., IJRR 2013), readme.txt. A tracklet
 is an object with its category (objectType), its size (h, w, l in metres), the number of its first
 frame, and one pose per frame from there on. A pose is the bottom centre of the box in the LiDAR
-frame (tx, ty, tz in metres), its rotation (only rz, about the z axis, is used; rx and ry are 0),
-and states:
+frame (tx, ty, tz in metres), its rotation (rz about the z axis; rx and ry are 0), and states:
 
 | field | values |
 |---|---|
@@ -34,6 +33,7 @@ _CATEGORIES = {"Person (sitting)": "Person_sitting"}
 _OUTSIDE = (2, 3)
 _MAX_DEPTH = 16
 _MAX_NUMBER = 1e6
+_UPRIGHT_RAD = 0.01
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,11 @@ def _poses_by_frame(path: Path) -> Mapping[int, list[_Pose]]:
         poses = [item for each in tracklet.every("poses") for item in each.every("item")]
         for number, pose in enumerate(poses, start=first):
             x, y, bottom, yaw = (pose.number(path, key) for key in ("tx", "ty", "tz", "rz"))
+            tilts = np.array([pose.number(path, key, 0) for key in ("rx", "ry")])
+            if np.abs(wrap_angle(tilts)).max() > _UPRIGHT_RAD:
+                raise DataError(
+                    f"{path}:{pose.line}: rotated about x or y; only rotation about z is supported"
+                )
             box = (
                 x,
                 y,

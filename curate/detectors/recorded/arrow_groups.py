@@ -254,7 +254,7 @@ def _values(place: str, name: str, column: Any, *, is_text: bool) -> np.ndarray:
     elif arrow.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     if missing:
-        raise DataError(f"{place}: {missing} rows have no {name}")
+        raise DataError(f"{place}: no {name} in {missing} of {len(column)} rows")
     if is_text:
         return np.concatenate([np.empty(0, object), *map(_texts, chunks)])
     return np.asarray(column.cast(arrow.float64()).to_numpy())

@@ -19,7 +19,6 @@ from curate.detectors.recorded.results import (
     ReadOptions,
     RecordedResult,
     as_detections,
-    warn_once,
 )
 from curate.detectors.recorded.table import TableRecord
 from curate.detectors.scores import describe_invalid_scores, to_probabilities
@@ -28,6 +27,7 @@ from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, RotationY
 from curate.geometry.mounting import check_rotation_y
 from curate.geometry.similarity import Similarity
+from curate.warnings_once import warn_once
 
 # Formats that store the augmented copies in the same file.
 _TABLES: Mapping[str, Callable[[Path, bool], "Record"]] = {

@@ -1,9 +1,7 @@
 """Results of one frame as a record stores them, and the check of their values."""
 
-import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +14,6 @@ from curate.errors import ConfigError, DataError, one_line
 from curate.frames import Calibration
 from curate.geometry.similarity import wrap_angle
 
-_log = logging.getLogger(__name__)
 # Largest valid number, in metres or radians: boxes are in the LiDAR frame, not on a map.
 LARGEST = 1e6
 
@@ -90,12 +87,6 @@ class ReadOptions:
         is_number = [isinstance(metres, int | float) for metres in self.shift]
         if is_number != [True] * 3:
             raise ConfigError(f"detector.options.shift {self.shift}: expected [x, y, z] in metres")
-
-
-@cache
-def warn_once(message: str) -> None:
-    """Log a warning once per process, however many stages and frames report it."""
-    _log.warning(message)
 
 
 def as_detections(place: str, boxes: Any, scores: Any, names: Any) -> Detections:

@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 
 from curate.detections import Detections
-from curate.detectors.recorded.results import ReadOptions, ResultsByFrame, as_detections, warn_once
+from curate.detectors.recorded.results import ReadOptions, ResultsByFrame, as_detections
 from curate.errors import ConfigError, DataError, one_line
+from curate.warnings_once import warn_once
 
 _BOXES = "gt_boxes"
 

@@ -12,7 +12,6 @@ from curate.datasets.frame_names import (
     FrameNames,
     files_by_frame,
     match_frame_list,
-    match_frames,
 )
 from curate.errors import ConfigError, DataError
 
@@ -21,6 +20,15 @@ DRIVES = ("2011_09_26_drive_0001_sync", "2011_09_26_drive_0002_sync")
 RAW = (*(f"{DRIVES[0]}_{n:010d}" for n in range(3)), f"{DRIVES[1]}_0000000007")
 ids = st.lists(st.text("0127ab_", min_size=1, max_size=5), min_size=1, max_size=8, unique=True)
 names = st.lists(st.text("0127ab_/", min_size=1, max_size=6), min_size=1, max_size=8, unique=True)
+
+
+def match_frames(names, frame_ids, place="frames"):
+    """Return the frame of each name; a name that no frame has is an error."""
+    frames = FrameNames.of(frame_ids)
+    found, unmatched = frames.match(names, place)
+    for name in unmatched:
+        frames.require(name, place)
+    return found
 
 
 @pytest.mark.parametrize(

@@ -242,7 +242,7 @@ def test_outputs_are_told_apart_by_usual_names_or_by_type_and_shape(path, names,
     assert found.categories.tolist() == ["Cyclist", "Car"]
 
 
-def test_outputs_that_could_be_either_are_refused_with_their_shapes(path):
+def test_outputs_that_could_be_either_are_rejected_with_their_shapes(path):
     """Scores of seven classes look like boxes of seven numbers."""
     outputs = {"a": ROWS, "b": np.full((2, 7), 0.5, np.float32)}
     words = (
@@ -297,7 +297,7 @@ def test_models_of_other_precision_get_their_type(path, kind):
     assert len(detect_constant(path, outputs, inputs=inputs)) == 2
 
 
-def test_a_model_without_boxes_is_refused_with_its_outputs(path):
+def test_a_model_without_boxes_is_rejected_with_its_outputs(path):
     """Six numbers are not a box."""
     words = r"the outputs are a tensor.float.\[2, 6\], .*; there is no output boxes; map boxes"
     with pytest.raises(ModelError, match=words):

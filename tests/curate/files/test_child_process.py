@@ -31,7 +31,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def refused(file: Path, read, error=DataError) -> str:
+def rejected(file: Path, read, error=DataError) -> str:
     """Return the message."""
     with pytest.raises(error) as caught:
         require_survival(file, "pyarrow", read, error=error)
@@ -41,11 +41,11 @@ def refused(file: Path, read, error=DataError) -> str:
 
 def test_an_abort_is_one_line_with_the_librarys_words(file: Path) -> None:
     """And the next file gets a new child."""
-    assert refused(file, fatal_files.abort) == (
+    assert rejected(file, fatal_files.abort) == (
         f"{file}: damaged: pyarrow ends the process (SIGABRT: histogram size mismatch); write the "
         "file again"
     )
-    assert "exit code 23" in refused(file, fatal_files.leave, ModelError)
+    assert "exit code 23" in rejected(file, fatal_files.leave, ModelError)
     require_survival(file, "pyarrow", fatal_files.read_nothing)
 
 
@@ -55,10 +55,10 @@ def test_ordinary_errors_and_missing_files_are_left_to_the_reader(file: Path) ->
     require_survival(file.with_name("missing"), "pyarrow", fatal_files.abort)
 
 
-def test_a_file_that_never_ends_is_refused(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_never_ends_is_rejected(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The child is killed."""
     monkeypatch.setattr(child_process, "_MIN_SECONDS", 1.0)
-    assert "has not read it within 1 s" in refused(file, fatal_files.hang)
+    assert "has not read it within 1 s" in rejected(file, fatal_files.hang)
 
 
 def test_a_child_that_says_much_does_not_block(file: Path) -> None:
@@ -97,7 +97,7 @@ def test_a_cache_folder_that_cannot_be_written_is_not_needed(
     for _ in range(2):
         require_survival(file, "pyarrow", fatal_files.count)
     assert calls(file) == 1
-    assert "SIGABRT" in refused(file, fatal_files.abort)
+    assert "SIGABRT" in rejected(file, fatal_files.abort)
 
 
 def test_a_file_in_a_read_only_folder_is_read(file: Path) -> None:

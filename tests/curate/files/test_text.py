@@ -23,7 +23,7 @@ def test_marks_and_line_ends_are_removed(content, text):
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32"])
 @pytest.mark.parametrize("text", ["1", "000001\n", "Car 0"])
-def test_utf_16_is_refused_by_name(encoding, text):
+def test_utf_16_is_rejected_by_name(encoding, text):
     """With or without a byte order mark."""
     with pytest.raises(DataError, match=r"^a: saved as UTF-16 .*; save the file as UTF-8$"):
         decode_text(text.encode(encoding), "a")
@@ -39,7 +39,7 @@ def test_utf_16_is_refused_by_name(encoding, text):
         (b"\0", "^a:1: not a text file: a null byte$"),
     ],
 )
-def test_other_bytes_are_refused_with_their_line(content, message):
+def test_other_bytes_are_rejected_with_their_line(content, message):
     with pytest.raises(DataError, match=message):
         decode_text(content, "a")
 

@@ -395,7 +395,7 @@ def test_the_map_of_several_outputs(tmp_path):
         segment_constant(path, outputs, output="c")
 
 
-def test_scores_that_can_be_read_in_two_orders_are_refused_with_both(tmp_path):
+def test_scores_that_can_be_read_in_two_orders_are_rejected_with_both(tmp_path):
     """Both leave a nearly square map."""
     path = tmp_path / "a.onnx"
     shape = (1, 3, 48, 48)
@@ -410,7 +410,7 @@ def test_scores_that_can_be_read_in_two_orders_are_refused_with_both(tmp_path):
         segment_constant(path, {"a": scores}, shape=shape, channels="middle")
 
 
-def test_scores_out_of_proportion_are_refused(tmp_path):
+def test_scores_out_of_proportion_are_rejected(tmp_path):
     """They cannot be a map of the image."""
     words = r"returns float32 \[1, 19, 5, 50\] for an image of 48 x 24 pixels; expected class ids"
     with pytest.raises(ModelError, match=words):

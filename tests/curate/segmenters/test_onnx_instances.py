@@ -224,7 +224,10 @@ def test_wrong_prototypes_are_rejected(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"outputs": {"boxes": "boxes"}}, "segmenter outputs boxes: declare boxes, labels, masks"),
+        (
+            {"outputs": {"boxes": "boxes"}},
+            "segmenter.options.outputs boxes: declare boxes, labels, masks",
+        ),
         (
             {"outputs": dict.fromkeys(GOOD, "b")},
             "has no output b.* are boxes, labels, scores, masks",

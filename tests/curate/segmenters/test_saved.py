@@ -94,7 +94,7 @@ def test_class_ids_in_16_bits_are_declared(tmp_path):
     assert read(tmp_path, divisor=1)[0, :3].tolist() == [7, 15, 255]
 
 
-def test_small_values_of_an_unknown_divisor_are_refused_with_both_readings(tmp_path):
+def test_small_values_of_an_unknown_divisor_are_rejected_with_both_readings(tmp_path):
     """Class 7 without an instance, or instance 7 of class 0."""
     save(tmp_path, row(26_010, 7))
     words = "contains 7, which can be class 7 without an instance, or instance 7 of class 0; set "
@@ -187,7 +187,7 @@ def test_classes_in_colours(tmp_path, name, colours, ids, mode):
 
 
 def test_a_table_of_colours_of_your_own(tmp_path):
-    """Class 1 is red; any other colour is refused with its place."""
+    """Class 1 is red; any other colour is rejected with its place."""
     pixels = np.zeros((5, 12, 3), np.uint8)
     pixels[2, 3] = (255, 0, 0)
     Image.fromarray(pixels).save(tmp_path / "000001.png")
@@ -205,7 +205,7 @@ def test_the_class_in_one_channel(tmp_path):
     assert read(tmp_path, channel="red")[0, 3:6].tolist() == [0, 10, 0]
 
 
-def test_a_palette_in_another_order_than_the_class_set_is_refused(tmp_path):
+def test_a_palette_in_another_order_than_the_class_set_is_rejected(tmp_path):
     """A map in VOC's colours that was saved with a palette of its own."""
     values = np.zeros((5, 12), np.uint8)
     values[0, 0] = 1
@@ -238,7 +238,7 @@ def test_an_array_of_class_ids(tmp_path, kind):
         (np.array([[object()]]), "not a readable .npy array"),
     ],
 )
-def test_an_array_that_is_not_a_map_is_refused(tmp_path, values, message):
+def test_an_array_that_is_not_a_map_is_rejected(tmp_path, values, message):
     """With its type and shape."""
     np.save(tmp_path / "000001.npy", values, allow_pickle=True)
     with pytest.raises(DataError, match=message):
@@ -246,7 +246,7 @@ def test_an_array_that_is_not_a_map_is_refused(tmp_path, values, message):
 
 
 @pytest.mark.parametrize("name", ["000001.jpg", "000001.png"])
-def test_a_jpeg_is_refused(tmp_path, name):
+def test_a_jpeg_is_rejected(tmp_path, name):
     """Its values are not those that were saved, whatever its name."""
     _, content = cv2.imencode(".jpg", np.zeros((5, 12), np.uint8))
     (tmp_path / name).write_bytes(content.tobytes())
@@ -267,7 +267,7 @@ def test_a_jpeg_is_refused(tmp_path, name):
         ({"colours": "voc", "divisor": 256}, "declare only one of divisor, colours and channel"),
     ],
 )
-def test_invalid_options_are_refused(tmp_path, options, message):
+def test_invalid_options_are_rejected(tmp_path, options, message):
     """When the segmenter is opened."""
     with pytest.raises(ConfigError, match=message):
         SavedSegmenter(tmp_path, CLASSES, **options)

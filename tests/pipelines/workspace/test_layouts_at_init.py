@@ -35,7 +35,7 @@ def with_rings(points: np.ndarray) -> np.ndarray:
     return np.column_stack([points[:400], np.arange(400) % 64])
 
 
-def test_five_columns_are_refused_until_they_are_declared(init, tmp_path: Path) -> None:
+def test_five_columns_are_rejected_until_they_are_declared(init, tmp_path: Path) -> None:
     """Case 08: 400 points of five numbers have the size of 500 points of four."""
     root = tmp_path / "kitti"
     write_toy_kitti(root, frames=6)
@@ -53,7 +53,7 @@ def test_five_columns_are_refused_until_they_are_declared(init, tmp_path: Path) 
     assert "dataset.column_names has 5 names, but columns is 4" in message
 
 
-def test_a_size_that_does_not_fit_is_refused_with_what_fits(init, tmp_path: Path) -> None:
+def test_a_size_that_does_not_fit_is_rejected_with_what_fits(init, tmp_path: Path) -> None:
     """Case 08, the other frame: 399 points of five numbers."""
     root = tmp_path / "kitti"
     write_toy_kitti(root, frames=3)
@@ -65,7 +65,7 @@ def test_a_size_that_does_not_fit_is_refused_with_what_fits(init, tmp_path: Path
 
 
 @pytest.mark.parametrize("kind", ["kitti", "kitti-raw", "kitti-tracking", "folder"])
-def test_intensities_up_to_255_are_refused_until_declared(init, tmp_path: Path, kind: str) -> None:
+def test_intensities_up_to_255_are_rejected_until_declared(init, tmp_path: Path, kind: str) -> None:
     """Case 10, in every kind of data set that has no scale of its own."""
     root = tmp_path / "data"
     write = {
@@ -98,7 +98,7 @@ def test_a_folder_and_its_workspace_must_not_contradict_each_other(init, tmp_pat
     assert init(root, "--dataset", "folder", "--set", "dataset.intensity_scale=255")[0] == 0
 
 
-def test_a_data_set_class_without_the_argument_refuses_the_setting(
+def test_a_data_set_class_without_the_argument_rejects_the_setting(
     init, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It would have no effect otherwise."""

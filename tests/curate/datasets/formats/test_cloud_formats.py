@@ -225,7 +225,7 @@ def test_the_intensity_is_found_by_its_usual_names(tmp_path: Path, name: str) ->
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), TWO)
 
 
-def test_two_fields_that_may_be_the_intensity_are_refused_by_name(tmp_path: Path) -> None:
+def test_two_fields_that_may_be_the_intensity_are_rejected_by_name(tmp_path: Path) -> None:
     """Ouster's driver writes intensity and reflectivity."""
     fields = "x F4 1, y F4 1, z F4 1, intensity F4 1, reflectivity U2 1"
     rows = [struct.pack("<4fH", *point[:3], 700, 51 * k) for k, point in enumerate(TWO.tolist())]

@@ -22,7 +22,7 @@ def cloud(count: int = 100, full: float = 1.0) -> np.ndarray:
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize(("full", "scale"), [(229, "255"), (4000, "4095"), (60000, "65535")])
-def test_intensities_above_the_full_one_are_refused(
+def test_intensities_above_the_full_one_are_rejected(
     tmp_path: Path, suffix: str, full: float, scale: str
 ) -> None:
     """The message contains the setting that fixes it."""
@@ -34,7 +34,7 @@ def test_intensities_above_the_full_one_are_refused(
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_negative_intensities_are_refused(tmp_path: Path, suffix: str) -> None:
+def test_negative_intensities_are_rejected(tmp_path: Path, suffix: str) -> None:
     """The column is another one."""
     points = cloud()
     points[:, 3] -= 2

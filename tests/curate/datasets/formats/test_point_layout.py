@@ -25,7 +25,7 @@ from curate.errors import ConfigError, DataError
         ),
     ],
 )
-def test_an_invalid_layout_is_refused(values: dict, message: str) -> None:
+def test_an_invalid_layout_is_rejected(values: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         PointLayout(**values)
 
@@ -48,7 +48,7 @@ def test_other_columns_are_not_the_intensity() -> None:
 
 
 def test_one_of_two_candidates_is_chosen_by_name() -> None:
-    """The exact name comes before one in other letters."""
+    """The exact name comes before one in another spelling."""
     names = ["x", "y", "z", "intensity", "Reflectivity"]
     with pytest.raises(DataError, match=r"a\.pcd: intensity and Reflectivity may all be"):
         PointLayout().indices("a.pcd", names)

@@ -71,7 +71,7 @@ def scale_of(shape: str) -> PointLayout:
 
 @pytest.mark.parametrize("shape", SHAPES)
 @given(seed=st.integers(0, 2**32), count=st.integers(0, 300))
-def test_four_columns_are_never_refused(shape: str, seed: int, count: int) -> None:
+def test_four_columns_are_never_rejected(shape: str, seed: int, count: int) -> None:
     """Of any kind and number of points."""
     points = random_cloud(np.random.default_rng(seed), count, shape)
     assert better_readings(points.reshape(-1), 4, least_rows=4) == ()
@@ -87,7 +87,7 @@ def test_more_columns_are_found(shape: str, seed: int, columns: int, count: int)
 
 
 @pytest.mark.parametrize("columns", [5, 6, 7, 8])
-def test_a_file_with_two_readings_is_refused_with_both(tmp_path: Path, columns: int) -> None:
+def test_a_file_with_two_readings_is_rejected_with_both(tmp_path: Path, columns: int) -> None:
     """And read as declared."""
     generator = np.random.default_rng(columns)
     points = random_cloud(generator, 440, "forward")
@@ -103,7 +103,7 @@ def test_a_file_with_two_readings_is_refused_with_both(tmp_path: Path, columns: 
     np.testing.assert_array_equal(found, points)
 
 
-def test_a_plausible_reading_is_refused_if_another_one_fits_better(tmp_path: Path) -> None:
+def test_a_plausible_reading_is_rejected_if_another_one_fits_better(tmp_path: Path) -> None:
     """With x, y and z above 0 and intensities up to 255, no value is out of range."""
     generator = np.random.default_rng(0)
     points = random_cloud(generator, 400, "corner")
@@ -131,7 +131,7 @@ def test_a_truncated_file_is_not_taken_for_another_layout(tmp_path: Path) -> Non
         read_cloud(tmp_path / "a.bin")
 
 
-def test_a_wrong_declaration_is_refused_with_the_right_number(tmp_path: Path) -> None:
+def test_a_wrong_declaration_is_rejected_with_the_right_number(tmp_path: Path) -> None:
     random_cloud(np.random.default_rng(0), 100).tofile(tmp_path / "a.bin")
     with pytest.raises(DataError, match=r"80 points of 5 float32 .* more likely, 100 of 4"):
         read_cloud(tmp_path / "a.bin", PointLayout(columns=5))

@@ -153,6 +153,7 @@ def test_entities_are_rejected(tmp_path: Path, head: str) -> None:
         (tracklet(pose(), h=0), r"xml:7: size of 0 x 1.6 x 4 m of a Car"),
         (tracklet(pose(), objectType=""), r"xml:7: <item> must have one <objectType>"),
         (tracklet(pose()).replace("<ty>0</ty>", ""), r"xml:\d+: <item> must have one <ty>"),
+        (tracklet(pose(ry=0.5)), r"xml:\d+: rotated about x or y; only rotation about z"),
         ("<item>", "not XML: mismatched tag"),
         ("<a>" * 30 + "</a>" * 30, "too many nested elements"),
     ],

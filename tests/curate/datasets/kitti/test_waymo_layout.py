@@ -83,7 +83,7 @@ def test_segments_stay_whole(tmp_path: Path) -> None:
     assert dataset.sequence_of("000008") is None
 
 
-def test_a_camera_without_images_is_refused(tmp_path: Path) -> None:
+def test_a_camera_without_images_is_rejected(tmp_path: Path) -> None:
     write_waymo(tmp_path)
     with pytest.raises(ConfigError, match=r"no folder image_4; its cameras are 0 \(image_0\), 1"):
         KittiDataset(tmp_path, camera=4)

@@ -92,7 +92,7 @@ def test_an_invalid_pattern_is_rejected(tmp_path, pattern, message):
     [
         ({"score": None, "qw": None}, "no column score, qw; it has tx_m, ty_m"),
         ({"tx_m": ["1", "2", "3"]}, "column tx_m is of type string, expected numbers"),
-        ({"timestamp_ns": [1, None, 2]}, "record batch 0: 1 rows have no timestamp_ns"),
+        ({"timestamp_ns": [1, None, 2]}, "record batch 0: no timestamp_ns in 1 of 3 rows"),
         ({"qw": [0.1, 1.0, 1.0]}, f"{FRAMES[0]}: box 0: rotation .* is not a unit quaternion"),
         ({"qw": [np.nan, 1.0, 1.0]}, "box 0: rotation .* is not a unit quaternion"),
         (

@@ -489,7 +489,7 @@ def test_scores_before_the_sigmoid_are_converted_where_that_is_declared(tmp_path
         "000001": Detections(boxes, np.array([99.0, 80, 20, 5]), frames["000001"].categories)
     }
     path = write(tmp_path / f"percent-{kind}", percent)
-    with pytest.raises(DataError, match=r"scores from 0 to 99 .*; divide them by 100 if they are"):
+    with pytest.raises(DataError, match=r"scores up to 99 .*; divide them by 100 if they are"):
         RecordedDetector(path, **options).predict(frame("000001"))
 
 

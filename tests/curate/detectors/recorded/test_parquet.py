@@ -106,7 +106,7 @@ def test_missing_views_are_reported_once(tmp_path, caplog):
         ({"score": None, "yaw": None}, "no column score, yaw; it has frame, category, x"),
         ({"view": [0, 0, 0]}, "no column flip_y, rotation_rad, scale"),
         ({"x": ["1", "2", "3"]}, "column x is of type string"),
-        ({"frame": ["a", None, "b"]}, "row group 0: 1 rows have no frame"),
+        ({"frame": ["a", None, "b"]}, "row group 0: no frame in 1 of 2 rows"),
     ],
 )
 def test_a_file_that_cannot_be_a_record_is_rejected(tmp_path, changes, message):
@@ -124,10 +124,10 @@ VIEWS = {"view": [0, 1, 1], "flip_y": [0, 1, 1], "rotation_rad": [0, 0, 0], "sca
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"score": [0.9, 1.5, 0.5]}, "frame a: scores from 0 to 1.5 are not in"),
+        ({"score": [0.9, 1.5, 0.5]}, "frame a: scores up to 1.5 are not in"),
         ({"length": [0.0, 1.0, 4.0]}, "frame a: box 0: length, width or height is not positive"),
         ({"z": [np.nan, 1.0, 4.0]}, "frame a: box 0: a number is NaN"),
-        ({"z": [None, 1.0, 4.0]}, "row group 0: 1 rows have no z"),
+        ({"z": [None, 1.0, 4.0]}, "row group 0: no z in 1 of 2 rows"),
         (VIEWS | {"view": [0.5, 1, 1]}, "box 0: view is not 0, 1, 2"),
         (VIEWS | {"flip_y": [0, 2, 1]}, "box 1: flip_y is neither"),
         (VIEWS | {"scale": [2, 1, 1]}, "box 0: view 0 is the original frame"),

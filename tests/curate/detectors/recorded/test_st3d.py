@@ -80,7 +80,7 @@ def test_a_shift_of_the_coordinates_is_undone(tmp_path):
         ([[*BOX, np.nan, 0.9]], {}, "category nan, but"),
         ([BOX], {}, r"gt_boxes \[1, 7\]; expected \[n, 9\]"),
         ([[*BOX, 1]], {}, "has neither a ninth column of scores nor cls_scores"),
-        ([[*BOX, 1, 1.5]], {}, "scores from 0 to 1.5 are not in"),
+        ([[*BOX, 1, 1.5]], {}, "scores up to 1.5 are not in"),
         ([[*BOX, 1, 0.5]], {"iou_scores": [0.5, 0.5]}, "iou_scores are not 1 numbers from 0 to 1"),
         ([["a"] * 9], {}, "gt_boxes must be numbers"),
     ],

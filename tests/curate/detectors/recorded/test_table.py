@@ -128,7 +128,7 @@ def test_other_columns_and_their_order_do_not_matter(tmp_path):
         (PLAIN.replace("12.0", "far"), "'far' is not a number"),
         (PLAIN.replace("12.0", "nan"), "a number is NaN or infinite"),
         (PLAIN.replace("0.9", "inf"), "a number is NaN or infinite"),
-        (PLAIN.replace("0.9", "1.2"), "scores from 0 to 1.2 are not in [0, 1]"),
+        (PLAIN.replace("0.9", "1.2"), "scores up to 1.2 are not in [0, 1]"),
         (PLAIN.replace("0.9", "-0.1"), "scores from -0.1 to 0.9 are not in [0, 1]"),
         (PLAIN.replace("1.6,1.5", "1.6,-1.5"), "length, width or height is not positive"),
         (PLAIN.replace("000001,0", "000001,0.5"), "view is not 0, 1, 2, ..."),

@@ -6,7 +6,7 @@ detector returns, or what a segmenter has classes for. Example, with the categor
     the other side    finding
     Car, Cyclist      none
     car, cyclist      wrong: no name is the same; dataset.rename={car="Car", cyclist="Cyclist"}
-    Car, cyclist      wrong: the same name in other letters
+    Car, cyclist      wrong: the same name in another spelling
     Car, Bus          suspect: Bus is left out; Cyclist never occurs
 """
 
@@ -107,7 +107,7 @@ def compare_names(side: NamedSide, categories: Sequence[str]) -> list[NameFindin
     other_letters = [name for name in unknown if letters(name) in by_letters]
     accepted = {*side.accepted, *(name for name, same in side.rename.items() if name == same)}
     if wrong := [name for name in other_letters if name not in accepted]:
-        problem = f"{side.title} have {_shown(side, wrong)}, but {declared}, in other letters"
+        problem = f"{side.title} have {_shown(side, wrong)}, but {declared}, in another spelling"
         findings.append(NameFinding(True, f"{problem}; {_remedy(side, wrong, categories)}"))
     others = [name for name in unknown if name not in {*other_letters, *accepted}]
     if others:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from curate.category_names import NamedSide, check_rename, compare_names, listed, renamed
 from curate.detections import Detections, as_categories
 from curate.errors import ConfigError
-from curate.names import NamedSide, check_rename, compare_names, listed, renamed
 
 CATEGORIES = ("Car", "Pedestrian", "Cyclist")
 
@@ -42,7 +42,7 @@ def test_names_without_a_similar_category_get_an_example():
 def test_other_letters_are_wrong(name):
     """Even if other names agree."""
     found = compare("Pedestrian", name)
-    assert [message for wrong, message in found if wrong and "in other letters" in message]
+    assert [message for wrong, message in found if wrong and "in another spelling" in message]
 
 
 def test_an_unlisted_name_and_a_missing_one_are_warnings():
