@@ -368,8 +368,9 @@ def _line_problem(
     if len(row) == LABEL_FIELDS and scored:
         return "15 fields: the score is missing; result lines end with it as the 16th field"
     if not LABEL_FIELDS <= len(row) <= RESULT_FIELDS:
+        expected_fields = RESULT_FIELDS if scored else LABEL_FIELDS
         expected = "result lines have 16" if scored else "label lines have 15, or 16 with a score"
-        return f"{len(row)} fields, but {expected}"
+        return f"{len(row)} fields, but {expected}{_extra_fields(row, expected_fields)}"
     if categories is not None and row[0] not in categories:
         meant = did_you_mean(row[0], categories)
         return (
@@ -378,6 +379,32 @@ def _line_problem(
     fields = RESULT_FIELDS if scored else LABEL_FIELDS
     problem = next(filter(None, map(_number_problem, row[1:fields])), None)
     return problem or _size_problem(row)
+
+
+def _extra_fields(row: Sequence[str], expected: int) -> str:
+    """Return where the expected fields are in a line with more fields, and what to do.
+
+    Tracking lines begin with the frame and the track; converters append ids, dates or counts. "" if
+    the line has neither form.
+    """
+    if _begins_like_kitti(row[2:]) and all(field.lstrip("-").isdigit() for field in row[:2]):
+        return (
+            f"; it begins with the frame and the track, as in KITTI tracking: keep fields 3 to "
+            f"{expected + 2}, in a file per frame"
+        )
+    if _begins_like_kitti(row):
+        return f"; keep the first {expected}, without {' '.join(row[expected:])[:60]}"
+    return ""
+
+
+def _begins_like_kitti(row: Sequence[str]) -> bool:
+    """Return whether a line begins with a category and the 14 numbers of KITTI's format."""
+    numbers = row[1:LABEL_FIELDS]
+    return (
+        len(numbers) == LABEL_FIELDS - 1
+        and _number_problem(row[0]) is not None
+        and not any(map(_number_problem, numbers))
+    )
 
 
 def _size_problem(row: Sequence[str]) -> str | None:

@@ -114,6 +114,10 @@ def test_an_empty_file_has_no_objects(tmp_path, text):
     [
         (CAR.rsplit(" ", 1)[0], False, "14 fields, but label lines have 15"),
         (f"{CAR} 0.5 0.5", False, "17 fields, but label lines have 15, or 16 with a score"),
+        (f"{CAR} 436 2018_03_07 0002 ", False, "; keep the first 15, without 436 2018_03_07 0002"),
+        (f"0 -1 {CAR} 0.0 33 True", False, "20 fields, but label lines have 15, or 16 with"),
+        (f"0 -1 {CAR} 0.0 33 True", False, "as in KITTI tracking: keep fields 3 to 17, in"),
+        (f"0 7 {CAR} 0.5", True, "as in KITTI tracking: keep fields 3 to 18, in a file per frame"),
         (CAR, True, "15 fields: the score is missing; result lines end with it"),
         (f"{CAR} 0.5 0.5", True, "17 fields, but result lines have 16"),
         ("Car", False, "1 fields"),
