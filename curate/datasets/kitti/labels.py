@@ -96,7 +96,7 @@ def read_objects(
     Raises:
         DataError: if the file is missing or not text, or if a line has a wrong number of fields, a
             field that is not a finite number, an unknown category, or a size that is not positive
-            (unless it is a DontCare region).
+            (unless it is a DontCare region), or if a label file has an object twice.
     """
     path = Path(path)
     return parse_rows(path, read_rows(path), scored=scored, categories=categories)
@@ -136,6 +136,8 @@ def parse_rows(
         or _has_no_size(names, values[:, 7:10])
     ):
         raise _first_error(path, numbered, categories, scored=scored)
+    if not scored:
+        _check_repeated(path, numbered)
     return KittiObjects(as_categories(names), *_columns(values))
 
 
@@ -338,6 +340,20 @@ def _format(objects: KittiObjects, index: int) -> str:
         f"{category} {objects.truncated[index]:.2f} {objects.occluded[index]} "
         f"{objects.alpha[index]:.4f} {box_2d} {' '.join(f'{number:.4f}' for number in shape)}"
     )
+
+
+def _check_repeated(path: Path, numbered: Sequence[tuple[int, Sequence[str]]]) -> None:
+    """Raise DataError if a label file has an object twice: one of them would always be missed."""
+    first: dict[tuple[str, ...], int] = {}
+    for number, row in numbered:
+        if row[0] == DONT_CARE:
+            continue
+        earlier = first.setdefault((row[0], *row[8:LABEL_FIELDS]), number)
+        if earlier != number:
+            raise DataError(
+                f"{path}:{number}: the {row[0]} has the same 3D box as in line {earlier}; remove "
+                "one of them (labels written twice into one file count twice as missed objects)"
+            )
 
 
 def _has_no_size(categories: Sequence[str], dimensions: np.ndarray) -> bool:
