@@ -204,8 +204,8 @@ def _intensity_problem(intensities: Float[np.ndarray, " n"], full: float) -> str
     if tolerated < above <= _LONG_TAIL_SHARE * len(intensities) and high > _LONG_TAIL * full:
         return (
             f"{above} of {len(intensities)} intensities are above the full intensity {full:g}, up "
-            f"to {high:.4g}, but {1 - above / len(intensities):.1%} are not: limit them in the "
-            "files, by the minimum or the tanh, or, if large values are usual, set "
+            f"to {high:.4g}, but {1 - above / len(intensities):.1%} are not: clip them to {full:g} "
+            "or take their tanh in the files or, if large values are usual, set "
             "dataset.intensity_scale to the value of full intensity"
         )
     if above > tolerated:

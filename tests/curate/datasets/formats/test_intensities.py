@@ -62,6 +62,6 @@ def test_a_scale_that_would_turn_almost_all_points_dark_is_not_suggested(tmp_pat
     points = cloud(3000)
     points[:30, 3] = np.linspace(2, 40000, 30)
     write_cloud(tmp_path / "a.bin", points)
-    with pytest.raises(DataError, match=r"but 99\.0% are not: limit them in the files") as caught:
+    with pytest.raises(DataError, match=r"but 99\.0% are not: clip them to 1 or take") as caught:
         read_cloud(tmp_path / "a.bin")
     assert "65535" not in str(caught.value)
