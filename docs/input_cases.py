@@ -295,7 +295,13 @@ READERS = (
     Reader(
         "KITTI labels", "One text file per frame, a line of 15 fields per object.",
         "label_2/000001.txt", read_objects, _LABELS,
-        [*_label_cases(_LABELS), Case("16 fields, the last is a score", _RESULTS, other=True)],
+        [
+            *_label_cases(_LABELS),
+            Case("16 fields, the last is a score", _RESULTS, other=True),
+            Case("18 fields: an id, a date and a drive", f"{_CAR} 436 2018_03_07 0002\n"),
+            Case("20 fields: frame and track first", f"0 1 {_CAR} 0.9 33 True\n"),
+            Case("an object twice", _LABELS + _LABELS),
+        ],
     ),
     Reader(
         "KITTI results",

@@ -12,6 +12,8 @@ import numpy as np
 
 from curate.frames import Calibration, RotationY
 from curate.geometry.mounting import (
+    Mounting,
+    bottom_centres_in_camera,
     defines_headings,
     rotations_y_of_yaws,
     yaws_of_rotations_y,
@@ -38,6 +40,7 @@ _LONG_CATEGORIES = frozenset(
     {"car", "van", "truck", "bus", "tram", "vehicle", "cyclist", "bicycle", "motorcycle"}
 )
 _SWAPPED_RATIO = 1.1
+_LEAST_CAMERA_YAW_RAD = np.deg2rad(5)
 
 _Conversion = Callable[[np.ndarray, Calibration], np.ndarray]
 
@@ -52,7 +55,7 @@ class _Mistake:
         convert: returns the corrected boxes.
         limit: of the ratio of gained and lost points.
         label_cause: what is probably wrong with labels; the same if empty.
-        only_labels: whether boxes of a detector are not examined for it.
+        of: "labels" or "results" if only these are examined for it.
     """
 
     change: str
@@ -60,7 +63,7 @@ class _Mistake:
     convert: _Conversion
     limit: float
     label_cause: str = ""
-    only_labels: bool = False
+    of: str = ""
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def suspect_convention(sweeps: Sequence[BoxesInSweep], *, labels: bool) -> Suspi
         return Suspicion(swapped, certain=True, inside=inside)
     best, best_ratio = "", 0.0
     for mistake in _MISTAKES:
-        if mistake.only_labels and not labels:
+        if mistake.of not in ("", "labels" if labels else "results"):
             continue
         exchanged = [
             _exchanged(each.points, each.boxes, mistake.convert(each.boxes, each.calibration))
@@ -182,6 +185,16 @@ def _other_rotation_y(boxes: np.ndarray, calibration: Calibration) -> np.ndarray
     return _with(boxes, yaw=yaws_of_rotations_y(rotations_y, calibration, other))
 
 
+def _turned_camera(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """Return what `_other_rotation_y` does, but boxes as they are if the camera looks forward.
+
+    The boxes of a detector are not precise enough to show a difference of a degree.
+    """
+    if abs(Mounting.of(calibration).yaw_rad) < _LEAST_CAMERA_YAW_RAD:
+        return boxes
+    return _other_rotation_y(boxes, calibration)
+
+
 def _raised(boxes: np.ndarray, _calibration: Calibration) -> np.ndarray:
     return _with(boxes, centres=boxes[:, :3] + np.outer(boxes[:, 5] / 2, [0, 0, 1]))
 
@@ -197,11 +210,27 @@ def _from_camera(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
     return _with(_rotation_y(boxes, calibration), centres=centres)
 
 
+def _from_lidar(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """Return the boxes with the numbers of their file as centre and yaw in the LiDAR frame."""
+    if not defines_headings(calibration):
+        return boxes
+    return _with(
+        boxes,
+        yaw=rotations_y_of_yaws(boxes[:, 6], calibration),
+        centres=bottom_centres_in_camera(boxes, calibration),
+    )
+
+
 _MISTAKES = (
     _Mistake(
         "turned by the yaw of the camera",
         "rotation_y has another meaning, set dataset.options.rotation_y",
-        _other_rotation_y, _TURNED_LIMIT, only_labels=True,
+        _other_rotation_y, _TURNED_LIMIT, of="labels",
+    ),
+    _Mistake(
+        "turned by the yaw of the camera",
+        "rotation_y of KITTI's result files has another meaning, set detector.options.rotation_y",
+        _turned_camera, _TURNED_LIMIT, of="results",
     ),
     _Mistake(
         "turned by 90 degrees", "yaw is measured from y, or length and width are swapped",
@@ -225,6 +254,12 @@ _MISTAKES = (
     _Mistake(
         "converted from the camera frame", "their numbers are those of KITTI's label files",
         _from_camera, _TURNED_LIMIT,
+    ),
+    _Mistake(
+        "read in the LiDAR frame",
+        "location and rotation_y of their files are in the LiDAR frame; in KITTI's files they are "
+        "in the camera frame",
+        _from_lidar, _TURNED_LIMIT,
     ),
 )  # fmt: skip
 

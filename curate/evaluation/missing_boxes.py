@@ -18,6 +18,8 @@ from curate.shapes import Bool, Float
 # From the frame of `camera_boxes` (x right, y forward, z up) to the camera frame.
 _TO_CAMERA = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _NO_BOX, _OUTSIDE = 0.0, -1.0
+# Equal 2D boxes of fewer objects may be chance.
+_LEAST_BOXES = 3
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,23 @@ def without_box(objects: KittiObjects) -> Bool[np.ndarray, " n"]:
     """Return (n,) bool, True for objects with a 2D box without height; DontCare is False."""
     heights = objects.boxes_2d[:, 3] - objects.boxes_2d[:, 1]
     return np.asarray(~(heights > 0) & (objects.categories != DONT_CARE))
+
+
+def describe_placeholder(boxes_2d: Float[np.ndarray, "n 4"]) -> str:
+    """Return that all 2D boxes are the same, and what to do; "" if they differ or are few.
+
+    Converters of data without images write one in place of 2D boxes, for example 0 0 50 50.
+
+    Args:
+        boxes_2d: (n, 4) left, top, right, bottom in pixels, of the objects with a height.
+    """
+    if len(boxes_2d) < _LEAST_BOXES or len(np.unique(boxes_2d, axis=0)) > 1:
+        return ""
+    shown = " ".join(f"{pixel:g}" for pixel in boxes_2d[0])
+    return (
+        f"all {len(boxes_2d)} 2D boxes are {shown}, a placeholder: difficulty, image AP and AOS "
+        "follow from it; write 0 0 0 0 in its place to use the projected 3D boxes"
+    )
 
 
 def with_projected_boxes(

@@ -6,14 +6,24 @@ from pathlib import Path
 
 import numpy as np
 
-from curate.datasets.kitti.labels import KittiObjects, from_annotations, from_detections
+from curate.datasets.kitti.labels import (
+    DONT_CARE,
+    KittiObjects,
+    from_annotations,
+    from_detections,
+)
 from curate.detections import Annotations, Detections
 from curate.errors import FramesFailed, WorkspaceError
 from curate.evaluation.difficulties import Difficulty, open_difficulty
 from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
 from curate.evaluation.kitti_matching import objects_in_lidar_frame
 from curate.evaluation.kitti_rules import neighbours_of, overlaps_of
-from curate.evaluation.missing_boxes import ProjectedBoxes, with_projected_boxes
+from curate.evaluation.missing_boxes import (
+    ProjectedBoxes,
+    describe_placeholder,
+    with_projected_boxes,
+    without_box,
+)
 from curate.evaluation.reliability import MatchSettings, Overlap
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
@@ -155,7 +165,7 @@ def val_objects(workspace: Workspace, found: Mapping[str, Detections]) -> ValObj
     overlaps = configured_overlaps(workspace.config)
     if difficulty.in_image:
         labels, results, projected = _in_camera_frame(frames, truth, found)
-        notes += projection_notes(projected, (0, 0))
+        notes += [*projection_notes(projected, (0, 0)), *placeholder_notes(labels, ())]
         return ValObjects(labels, results, difficulty, overlaps, None, tuple(notes))
     points = None
     if difficulty.kind == "points":
@@ -193,6 +203,18 @@ def projection_notes(labels: tuple[int, int], results: tuple[int, int]) -> list[
         if missing
     ]
     return [f"2D boxes from the projected 3D boxes: {' and '.join(parts)}"]
+
+
+def placeholder_notes(labels: Sequence[KittiObjects], results: Sequence[KittiObjects]) -> list[str]:
+    """Return a sentence for each side whose 2D boxes are all the same."""
+    found = []
+    for side, frames in (("objects", labels), ("results", results)):
+        boxes = [
+            each.boxes_2d[(each.categories != DONT_CARE) & ~without_box(each)] for each in frames
+        ]
+        if boxes and (problem := describe_placeholder(np.concatenate(boxes))):
+            found.append(f"{side}: {problem}")
+    return found
 
 
 def _in_camera_frame(

@@ -245,7 +245,7 @@ def _evaluate_folders(
     from curate.evaluation.difficulties import open_difficulty
     from curate.evaluation.kitti_folders import load_folders
     from curate.evaluation.kitti_rules import overlaps_of
-    from pipelines.assessment.evaluation import ValObjects, projection_notes
+    from pipelines.assessment.evaluation import ValObjects, placeholder_notes, projection_notes
     from pipelines.reports.evaluation_report import EvaluationReport
 
     try:
@@ -268,10 +268,13 @@ def _evaluate_folders(
             raise DataError(f"{error}; --categories evaluates other names") from error
         raise
     objects = ValObjects(loaded.labels, loaded.results, levels, overlaps, loaded.points)
+    notes = projection_notes(*loaded.projected)
+    if levels.in_image:
+        notes += placeholder_notes(loaded.labels, loaded.results)
     return EvaluationReport(
         _compare(objects),
         f"{results} on {len(loaded.frame_ids)} frames",
-        tuple(projection_notes(*loaded.projected)),
+        tuple(notes),
         "give --calib and --images (or --image-size) to project the 3D boxes, or use "
         "--difficulty distance, which needs no 2D boxes",
     )

@@ -247,6 +247,11 @@ def _choose(
         )
     if share == 0:
         return []
+    if not pool:
+        raise ConfigError(
+            f"--{split} {selection}: all frames are val frames already; give --val a share below 1 "
+            "or a file of frame ids"
+        )
     with_label = [name for name in sorted(pool) if dataset.files(name).label]
     count = max(1, round(share * len(pool)))
     if count > len(with_label):

@@ -39,6 +39,7 @@ _PLY_TYPES = {
 }  # fmt: skip
 _PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _PCD_SIZES = {"F": "48", "I": "1248", "U": "1248"}
+_PCD_LISTS = ("FIELDS", "SIZE", "TYPE", "COUNT")
 _PCD_PADDING = "_"
 _PCD_IDENTITY = [0.0, 0, 0, 1, 0, 0, 0]  # position, and rotation as a quaternion, w first
 
@@ -165,9 +166,10 @@ def _pcd_header(path: Path, lines: Sequence[str]) -> _PcdHeader:
         encoding = entries["DATA"][0].lower()
         pose = [float(number) for number in entries.get("VIEWPOINT", _PCD_IDENTITY)]
     except (KeyError, IndexError, ValueError):
+        lengths = ", ".join(f"{key} {len(entries[key])}" for key in _PCD_LISTS if key in entries)
         raise DataError(
             f"{path}: malformed PCD header; FIELDS, SIZE, TYPE and COUNT need one value for each "
-            "field, and POINTS and DATA are needed"
+            f"field (number of values: {lengths}), and POINTS and DATA are needed"
         ) from None
     if pose != _PCD_IDENTITY:
         _warn_of_pose(path, " ".join(entries["VIEWPOINT"])[:80])

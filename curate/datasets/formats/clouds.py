@@ -26,6 +26,9 @@ _VALUE_BYTES = 4
 # retroreflectors are; these are clipped.
 _ROUNDING = 0.01
 _SATURATED_SHARE = 0.001
+# If at most this share of the points is above full intensity, and one of them is this many times as
+# bright, then a larger scale would turn all others dark. Waymo's raw intensities are like this.
+_LONG_TAIL_SHARE, _LONG_TAIL = 0.05, 10
 _USUAL_SCALES = (255, 4095, 65535)
 # A file without an apparent problem is not rejected because a few rows look better otherwise.
 _LEAST_ROWS = 4
@@ -157,6 +160,12 @@ def _problem(points: Float[np.ndarray, "n 4"], layout: PointLayout) -> str | Non
     if low < -MAX_RANGE_METRES or high > MAX_RANGE_METRES:
         far = np.abs(points[:, :3]).max(axis=1)
         k = int(far.argmax())
+        if np.median(far) > MAX_RANGE_METRES:
+            return (
+                f"most points are {np.median(far):.4g} m away; points must be in metres from the "
+                "LiDAR, so subtract its position if these are coordinates of a map, and divide by "
+                "1000 if they are millimetres"
+            )
         if far[k] > MAX_RANGE_METRES:
             return (
                 f"point {k} is {far[k]:.4g} m away; points must be in metres from the LiDAR, "
@@ -179,6 +188,13 @@ def _intensity_problem(intensities: Float[np.ndarray, " n"], full: float) -> str
             "this column is not the intensity, name the columns in dataset.column_names"
         )
     above = int((intensities > full + margin).sum())
+    if tolerated < above <= _LONG_TAIL_SHARE * len(intensities) and high > _LONG_TAIL * full:
+        return (
+            f"{above} of {len(intensities)} intensities are above the full intensity {full:g}, up "
+            f"to {high:.4g}, but {1 - above / len(intensities):.1%} are not: clip them to {full:g} "
+            "or take their tanh in the files or, if large values are usual, set "
+            "dataset.intensity_scale to the value of full intensity"
+        )
     if above > tolerated:
         usual = [scale for scale in _USUAL_SCALES if high <= scale]
         value = f"dataset.intensity_scale = {usual[0]}" if usual else "dataset.intensity_scale"

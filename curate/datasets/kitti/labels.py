@@ -96,7 +96,7 @@ def read_objects(
     Raises:
         DataError: if the file is missing or not text, or if a line has a wrong number of fields, a
             field that is not a finite number, an unknown category, or a size that is not positive
-            (unless it is a DontCare region).
+            (unless it is a DontCare region), or if a label file has an object twice.
     """
     path = Path(path)
     return parse_rows(path, read_rows(path), scored=scored, categories=categories)
@@ -136,6 +136,8 @@ def parse_rows(
         or _has_no_size(names, values[:, 7:10])
     ):
         raise _first_error(path, numbered, categories, scored=scored)
+    if not scored:
+        _check_repeated(path, numbered)
     return KittiObjects(as_categories(names), *_columns(values))
 
 
@@ -340,6 +342,20 @@ def _format(objects: KittiObjects, index: int) -> str:
     )
 
 
+def _check_repeated(path: Path, numbered: Sequence[tuple[int, Sequence[str]]]) -> None:
+    """Raise DataError if a label file has an object twice: one of them would always be missed."""
+    first: dict[tuple[str, ...], int] = {}
+    for number, row in numbered:
+        if row[0] == DONT_CARE:
+            continue
+        earlier = first.setdefault((row[0], *row[8:LABEL_FIELDS]), number)
+        if earlier != number:
+            raise DataError(
+                f"{path}:{number}: the {row[0]} has the same 3D box as in line {earlier}; remove "
+                "one of them (labels written twice into one file count twice as missed objects)"
+            )
+
+
 def _has_no_size(categories: Sequence[str], dimensions: np.ndarray) -> bool:
     """Return whether an object other than a DontCare region has a size that is not positive."""
     if dimensions.min(initial=1) > 0:
@@ -368,8 +384,9 @@ def _line_problem(
     if len(row) == LABEL_FIELDS and scored:
         return "15 fields: the score is missing; result lines end with it as the 16th field"
     if not LABEL_FIELDS <= len(row) <= RESULT_FIELDS:
+        expected_fields = RESULT_FIELDS if scored else LABEL_FIELDS
         expected = "result lines have 16" if scored else "label lines have 15, or 16 with a score"
-        return f"{len(row)} fields, but {expected}"
+        return f"{len(row)} fields, but {expected}{_extra_fields(row, expected_fields)}"
     if categories is not None and row[0] not in categories:
         meant = did_you_mean(row[0], categories)
         return (
@@ -378,6 +395,32 @@ def _line_problem(
     fields = RESULT_FIELDS if scored else LABEL_FIELDS
     problem = next(filter(None, map(_number_problem, row[1:fields])), None)
     return problem or _size_problem(row)
+
+
+def _extra_fields(row: Sequence[str], expected: int) -> str:
+    """Return where the expected fields are in a line with more fields, and what to do.
+
+    Tracking lines begin with the frame and the track; converters append ids, dates or counts. "" if
+    the line has neither form.
+    """
+    if _begins_like_kitti(row[2:]) and all(field.lstrip("-").isdigit() for field in row[:2]):
+        return (
+            f"; it begins with the frame and the track, as in KITTI tracking: keep fields 3 to "
+            f"{expected + 2}, in a file per frame"
+        )
+    if _begins_like_kitti(row):
+        return f"; keep the first {expected}, without {' '.join(row[expected:])[:60]}"
+    return ""
+
+
+def _begins_like_kitti(row: Sequence[str]) -> bool:
+    """Return whether a line begins with a category and the 14 numbers of KITTI's format."""
+    numbers = row[1:LABEL_FIELDS]
+    return (
+        len(numbers) == LABEL_FIELDS - 1
+        and _number_problem(row[0]) is not None
+        and not any(map(_number_problem, numbers))
+    )
 
 
 def _size_problem(row: Sequence[str]) -> str | None:

@@ -201,7 +201,7 @@ def rows_by_frame(path: Path) -> Mapping[int, Sequence[tuple[int, Sequence[str]]
         if len(row) - _FIRST_FIELDS not in (LABEL_FIELDS, LABEL_FIELDS + 1):
             raise DataError(
                 f"{path}:{number}: {len(row)} fields, but lines of KITTI tracking have 17, or 18 "
-                "with a score"
+                "with a score: frame, track, and the fields of KITTI's object data set"
             )
         try:
             frame, _track = map(int, row[:_FIRST_FIELDS])

@@ -82,6 +82,12 @@ def test_a_correct_frame_passes():
             ),
             "converted from the camera frame",
         ),
+        (
+            lambda b: np.column_stack(
+                [b[:, 2] - b[:, 5] / 2, -b[:, 0], -b[:, 1], b[:, 3:6], -b[:, 6] - np.pi / 2]
+            ),
+            "read in the LiDAR frame: location and rotation_y of their files are in the LiDAR",
+        ),
     ],
 )
 def test_a_wrong_convention_is_reported(change, message):
@@ -189,6 +195,17 @@ def test_another_meaning_of_rotation_y_is_reported(read, written):
     assert checks([(frame, to_annotations(objects, right))])["label boxes"].state == "ok"
 
 
+@pytest.mark.parametrize(("yaw_degrees", "state"), [(107, "wrong"), (20, "wrong"), (1, "ok")])
+def test_another_meaning_of_rotation_y_of_results_is_reported(yaw_degrees, state):
+    """OpenPCDet's result files, read with the meaning of the calibration."""
+    aside = Rig(yaw=np.deg2rad(yaw_degrees)).calibration
+    objects = from_annotations(labels(BOXES), replace(aside, rotation_y="openpcdet"))
+    boxes = to_annotations(objects, aside).boxes
+    finding = convention(replace(street(), calibration=aside), detections(BOXES), boxes)
+    assert finding.state == state
+    assert ("set detector.options.rotation_y" in finding.message) == (state == "wrong")
+
+
 def test_labels_without_points_are_reported():
     """All of them, or many; a single one may be hidden."""
     frame, far = street(), BOXES + np.array([60, 0, 0, 0, 0, 0, 0])
@@ -222,7 +239,16 @@ def test_labels_of_an_image_of_another_size_are_reported():
     assert found.state == "suspect"
     assert "2D boxes are 2.0" in found.message
     placeholders = replace(labels(BOXES), boxes_2d=np.tile([0.0, 0, 50, 30], (3, 1)))
-    assert checks([(close[0][0], placeholders)])["label image"].state == "ok"
+    found = checks([(close[0][0], placeholders)])["label image"]
+    assert found.state == "suspect"
+    assert found.message.startswith("all 3 2D boxes are 0 0 50 30, a placeholder: difficulty, ")
+    nothing = replace(labels(BOXES), boxes_2d=np.zeros((3, 4)))
+    assert checks([(large, nothing)])["label image"].message.startswith("no 2D boxes; the proj")
+    aside = labels(BOXES, large)
+    aside = replace(aside, boxes_2d=aside.boxes_2d + np.array([200, 0, 200, 0]))
+    found = checks([(replace(large, image_size=(1200, 320)), aside)])["label image"]
+    assert found.state == "suspect"
+    assert "but their IoU is only 0." in found.message
 
 
 @pytest.mark.parametrize(

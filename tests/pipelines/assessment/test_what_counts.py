@@ -124,7 +124,7 @@ def test_results_without_2d_boxes_are_projected_too(curate: Curate, made: LidarO
     bare = evaluate(curate, made.labels, made.results)
     assert bare["objects"]["Car"] == [6, 6, 6]
     assert bare["AP_R40"]["Car"]["3d"] == bare["recall_3d"]["Car"]["0.7"] == [None] * 3
-    assert "None of the 18 results" in bare["notes"][0]
+    assert "None of the 18 results" in bare["notes"][-1]
 
 
 def test_in_a_workspace_the_2d_boxes_are_projected(curate: Curate, work: Path) -> None:
@@ -215,7 +215,7 @@ def test_other_reasons_are_given_with_what_to_do(
     """Occluded or truncated beyond the limits, too small."""
     made.rewrite_labels(old, new)
     found = evaluate(curate, made.labels, made.results)
-    assert f"18 {reason}; --difficulty points or distance" in found["notes"][0]
+    assert f"18 {reason}; --difficulty points or distance" in found["notes"][-1]
     far = evaluate(curate, made.labels, made.results, "--difficulty", "distance")
     assert far["AP_R40"]["Pedestrian"]["3d"] == [100.0, None, None]
 

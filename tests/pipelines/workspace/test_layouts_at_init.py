@@ -155,3 +155,11 @@ def test_another_layout_is_named(init, tmp_path: Path, kind: str) -> None:
     code, message = init(root, "--dataset", kind)
     assert code == 3
     assert "it looks like KITTI tracking: use --dataset kitti-tracking" in message
+
+
+def test_val_frames_that_leave_no_frame_to_label(init, tmp_path: Path) -> None:
+    """--val 1 is a share of 1, not one frame."""
+    write_toy_kitti(tmp_path / "kitti", frames=4)
+    code, message = init(tmp_path / "kitti", "--val", "1", "--labeled", "0.5")
+    assert code == 2
+    assert "--labeled 0.5: all frames are val frames already; give --val a share below 1" in message

@@ -55,3 +55,13 @@ def test_rounding_and_a_few_saturated_points_are_clipped(tmp_path: Path, suffix:
     write_cloud(tmp_path / f"a{suffix}", points)
     with pytest.raises(DataError, match=r"5 of 3000 intensities are above the full intensity 1"):
         read_cloud(tmp_path / f"a{suffix}")
+
+
+def test_a_scale_that_would_turn_almost_all_points_dark_is_not_suggested(tmp_path: Path) -> None:
+    """Raw intensities of the Waymo Open Dataset: most are below 1, a few reach 40,000."""
+    points = cloud(3000)
+    points[:30, 3] = np.linspace(2, 40000, 30)
+    write_cloud(tmp_path / "a.bin", points)
+    with pytest.raises(DataError, match=r"but 99\.0% are not: clip them to 1 or take") as caught:
+        read_cloud(tmp_path / "a.bin")
+    assert "65535" not in str(caught.value)

@@ -89,9 +89,10 @@ def test_scores_of_results_are_read(tmp_path):
 
 def test_files_of_other_systems_are_read_equally(tmp_path):
     """A byte order mark, carriage returns, tabs and extra spaces are ignored."""
-    (tmp_path / "a.txt").write_text(f"{CAR}\n{CAR}\n")
-    foreign = CAR.replace(" ", " \t ") + " \r\n"
-    (tmp_path / "b.txt").write_bytes(b"\xef\xbb\xbf" + foreign.encode() * 2 + b"\r\n")
+    van = CAR.replace("Car", "Van")
+    (tmp_path / "a.txt").write_text(f"{CAR}\n{van}\n")
+    foreign = "".join(line.replace(" ", " \t ") + " \r\n" for line in (CAR, van))
+    (tmp_path / "b.txt").write_bytes(b"\xef\xbb\xbf" + foreign.encode() + b"\r\n")
     ours, other = read_objects(tmp_path / "a.txt"), read_objects(tmp_path / "b.txt")
     assert other.categories.tolist() == ours.categories.tolist()
     assert other.locations.tolist() == ours.locations.tolist()
@@ -109,11 +110,25 @@ def test_an_empty_file_has_no_objects(tmp_path, text):
         assert len(to_annotations(found, toy_calibration())) == 0
 
 
+def test_an_object_twice_in_a_label_file_is_rejected(tmp_path):
+    """A converter that appends writes all lines twice. Regions and results may repeat."""
+    path = write(tmp_path / "a.txt", CAR, CAR.replace("Car", "Van"), "", CAR)
+    with pytest.raises(DataError, match=r"a\.txt:4: the Car has the same 3D box as in line 1; rem"):
+        read_objects(path)
+    region = "DontCare -1 -1 -10 1 2 30 40 -1 -1 -1 -1000 -1000 -1000 -10"
+    assert len(read_objects(write(path, region, CAR, region))) == 3
+    assert len(read_objects(write(path, f"{CAR} 0.5", f"{CAR} 0.4"), scored=True)) == 2
+
+
 @pytest.mark.parametrize(
     ("line", "scored", "message"),
     [
         (CAR.rsplit(" ", 1)[0], False, "14 fields, but label lines have 15"),
         (f"{CAR} 0.5 0.5", False, "17 fields, but label lines have 15, or 16 with a score"),
+        (f"{CAR} 436 2018_03_07 0002 ", False, "; keep the first 15, without 436 2018_03_07 0002"),
+        (f"0 -1 {CAR} 0.0 33 True", False, "20 fields, but label lines have 15, or 16 with"),
+        (f"0 -1 {CAR} 0.0 33 True", False, "as in KITTI tracking: keep fields 3 to 17, in"),
+        (f"0 7 {CAR} 0.5", True, "as in KITTI tracking: keep fields 3 to 18, in a file per frame"),
         (CAR, True, "15 fields: the score is missing; result lines end with it"),
         (f"{CAR} 0.5 0.5", True, "17 fields, but result lines have 16"),
         ("Car", False, "1 fields"),
@@ -227,8 +242,10 @@ def test_a_file_keeps_boxes_to_a_millimetre(tmp_path_factory, boxes, rig):
     calibration = rig.calibration
     path = tmp_path_factory.mktemp("labels") / "a.txt"
     annotations = annotations_of(boxes)
-    write_objects(path, from_annotations(annotations, calibration))
-    back = to_annotations(read_objects(path), calibration)
+    # With scores, because label files must not contain a box twice.
+    scored = replace(from_annotations(annotations, calibration), scores=np.full(len(boxes), 0.5))
+    write_objects(path, scored)
+    back = to_annotations(read_objects(path, scored=len(boxes) > 0), calibration)
     difference = back.boxes - boxes
     difference[:, 6] = np.angle(np.exp(1j * difference[:, 6]))
     assert np.abs(difference).max(initial=0) < 1e-3
@@ -290,7 +307,7 @@ def test_numbers_that_are_not_finite_are_not_written(tmp_path, field, value, mes
 
 def test_scores_for_some_objects_only_are_rejected(tmp_path):
     """A file has scores for all objects or for none."""
-    objects = read_objects(write(tmp_path / "a.txt", CAR, CAR))
+    objects = read_objects(write(tmp_path / "a.txt", CAR, CAR.replace("Car", "Van")))
     objects.scores[0] = 0.5
     with pytest.raises(DataError, match="1 of 2 objects have no score"):
         write_objects(tmp_path / "b.txt", objects)
