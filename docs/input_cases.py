@@ -298,8 +298,8 @@ READERS = (
         [
             *_label_cases(_LABELS),
             Case("16 fields, the last is a score", _RESULTS, other=True),
-            Case("18 fields: an id, a date and a drive", f"{_CAR} 436 2018_03_07 0002\n"),
-            Case("20 fields: frame and track first", f"0 1 {_CAR} 0.9 33 True\n"),
+            Case("18 fields: an id, a date and a drive", f"{CAR} 436 2018_03_07 0002\n"),
+            Case("20 fields: frame and track first", f"0 1 {CAR} 0.9 33 True\n"),
             Case("an object twice", _LABELS + _LABELS),
         ],
     ),
