@@ -15,6 +15,7 @@ from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
 from pipelines.category_names import detector_differences, find_differences
 from pipelines.engine.rounds import newest_checkpoint
+from pipelines.missing_results import describe_missing_results
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace, read_truth
@@ -76,10 +77,12 @@ def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     config = workspace.config
     detector = open_detector(config, newest_checkpoint(workspace))
+    missing = describe_missing_results(workspace, detector)
     seen = visible(frame, config)
     found = renamed(detector.predict(seen), config.detector.rename)
     findings = [
         *_names(detector_differences(config, detector)),
+        *([Finding("results", "suspect", missing)] if missing else []),
         *examine_detections(seen, found, config.dataset.categories),
     ]
     checked(found, config, detector)
