@@ -1,13 +1,17 @@
 """Check one frame from end to end: data set, detector, augmented views, segmenter."""
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from curate.detectors.base import RecordedViews
+from curate.detections import Detections
+from curate.detectors.base import Detector, RecordedViews
+from curate.detectors.recorded import RecordedDetector
 from curate.errors import ConfigError, CurateError
 from curate.evaluation.camera_examination import examine_camera
 from curate.evaluation.examination import Finding, examine_detections, examine_frame
+from curate.evaluation.heading_examination import examine_headings
 from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
 from curate.names import NameFinding, renamed
@@ -22,6 +26,8 @@ from pipelines.workspace.workspace import Workspace, read_truth
 
 # Labeled frames whose labels are checked together.
 _LABELED_FRAMES = 5
+# Frames with recorded results that are checked together with the frame.
+_RESULT_FRAMES = 4
 
 
 def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Finding]]:
@@ -83,8 +89,11 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     findings = [
         *_names(detector_differences(config, detector)),
         *([Finding("results", "suspect", missing)] if missing else []),
-        *examine_detections(seen, found, config.dataset.categories),
+        *examine_detections(
+            seen, found, config.dataset.categories, _other_results(workspace, detector, frame)
+        ),
     ]
+    findings += _headings(workspace, detector)
     checked(found, config, detector)
     if isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
@@ -101,6 +110,41 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
                 if finding.check == "boxes" and finding.state == "wrong"
             ]
     return findings
+
+
+def _other_results(
+    workspace: Workspace, detector: Detector, frame: Frame
+) -> list[tuple[Frame, Detections]]:
+    """Return some more frames with recorded results, which cost nothing to compute."""
+    found: list[tuple[Frame, Detections]] = []
+    names = (name for name in workspace.frames("unlabeled", "val") if name != frame.frame_id)
+    if not isinstance(detector, RecordedDetector):
+        return found
+    for name in itertools.islice(names, _RESULT_FRAMES):
+        try:
+            other = visible(workspace.dataset.read(name, image=False), workspace.config)
+            result = renamed(detector.predict(other), workspace.config.detector.rename)
+        except CurateError:
+            continue  # the frame fails later, with its own error
+        found.append((other, result))
+    return found
+
+
+def _headings(workspace: Workspace, detector: Detector) -> list[Finding]:
+    """Compare recorded results of labeled and val frames with the ground truth."""
+    names = list(workspace.frames("labeled", "val"))
+    if not isinstance(detector, RecordedDetector):
+        return []
+    recorded = sorted({*names} - {*detector.missing_frames(names)})[:_LABELED_FRAMES]
+    pairs = []
+    for name in recorded:
+        try:
+            frame = workspace.dataset.read(name, points=False)
+            found = renamed(detector.predict(frame), workspace.config.detector.rename)
+        except CurateError:
+            continue  # the frame fails later, with its own error
+        pairs.append((found, read_truth(workspace.config, workspace.dataset, name)))
+    return examine_headings(pairs)
 
 
 def _names(differences: Sequence[NameFinding]) -> list[Finding]:

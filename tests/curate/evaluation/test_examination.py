@@ -108,6 +108,18 @@ def test_sizes_in_another_order_are_reported(order, message):
     assert (finding.state, message in finding.message) == ("wrong", True), finding.message
 
 
+def test_more_frames_decide_where_one_cannot():
+    """Boxes along the street look the same if their yaw is negated."""
+    straight = BOXES * [1, 1, 1, 1, 1, 1, 0]
+    negated = BOXES * [1, 1, 1, 1, 1, 1, -1]
+    alone = examine_detections(street(straight), detections(straight), CATEGORIES)
+    assert alone[-1].state == "ok"
+    others = [(street(seed=seed), detections(negated)) for seed in (1, 2)]
+    found = examine_detections(street(straight), detections(straight), CATEGORIES, others)
+    assert found[-1].state == "wrong"
+    assert "with the highest scores of 3 frames" in found[-1].message
+
+
 def test_a_turn_that_points_cannot_show_is_not_reported():
     """Narrow boxes gain and lose points at random if they are turned by one degree."""
     cos, sin = np.cos(np.radians(1)), np.sin(np.radians(1))
