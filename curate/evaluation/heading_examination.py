@@ -4,7 +4,7 @@ Points cannot show which end of a box is its front, and hardly whether the yaw o
 straight street is negated.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -18,7 +18,7 @@ _MIN_PAIRS = 10
 _MIN_DIFFERENCE = np.radians(3)
 _HALVED = 0.5
 
-_CONVENTIONS = (
+_CONVENTIONS: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     ("yaw + pi (the front is the rear)", lambda yaws: yaws + np.pi),
     ("-yaw (it grows clockwise)", lambda yaws: -yaws),
     ("pi - yaw", lambda yaws: np.pi - yaws),

@@ -17,9 +17,9 @@ from curate.frames import Frame
 from curate.names import NameFinding, renamed
 from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
+from pipelines.assessment.missing_results import describe_missing_results
 from pipelines.category_names import detector_differences, find_differences
 from pipelines.engine.rounds import newest_checkpoint
-from pipelines.missing_results import describe_missing_results
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace, read_truth

@@ -96,8 +96,8 @@ def init(
     from curate.errors import ConfigError
     from curate.names import listed
     from pipelines.assembly import check_extensions
+    from pipelines.assessment.missing_results import report_missing_results
     from pipelines.category_names import check_before_init, stored_names
-    from pipelines.missing_results import report_missing_results
     from pipelines.workspace.config import change_setting, make_config
     from pipelines.workspace.images import fit_priors, report_images
     from pipelines.workspace.setup import check_files, initialise
