@@ -47,6 +47,11 @@ class Calibration:
         """The (3, 4) projection from the LiDAR frame to homogeneous image pixels."""
         return np.asarray(self.projection @ self.lidar_to_camera)
 
+    @property
+    def has_camera(self) -> bool:
+        """Whether there is a camera; see `calibration_without_camera`."""
+        return not np.array_equal(self.projection, np.eye(3, 4))
+
     def pose_in_map(self) -> Float[np.ndarray, "4 4"]:
         """Return the (4, 4) transform from the LiDAR frame to the map frame.
 

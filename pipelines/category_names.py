@@ -20,7 +20,7 @@ from pipelines import registry
 from pipelines.assembly import check_segmenter_names, open_detector
 from pipelines.workspace.config import Config
 from pipelines.workspace.setup import label_names
-from pipelines.workspace.workspace import Workspace
+from pipelines.workspace.workspace import Workspace, open_dataset
 
 _log = logging.getLogger(__name__)
 
@@ -58,14 +58,14 @@ def detector_differences(config: Config, detector: Detector) -> list[NameFinding
     """Return the differences between a detector's names and `dataset.categories`."""
     if not isinstance(detector, NamesCategories):
         return []
-    path = config.detector.path
-    title = (
-        f"the results {path}" if config.detector.name == "recorded" else "the detector's outputs"
-    )
+    names, recorded = sorted(detector.category_names()), config.detector.name == "recorded"
+    title = f"the results {config.detector.path}" if recorded else "the detector's outputs"
+    if recorded and not names:
+        return [NameFinding(False, f"{title} have no boxes: every frame will be empty")]
     return compare_names(
         NamedSide(
             title,
-            sorted(detector.category_names()),
+            names,
             "detector.rename",
             config.detector.rename or {},
         ),
@@ -73,13 +73,18 @@ def detector_differences(config: Config, detector: Detector) -> list[NameFinding
     )
 
 
-def check_before_init(config: Config) -> None:
+def check_before_init(config: Config) -> Detector | None:
     """Compare the names of settings, segmenter and a user-supplied detector with each other.
+
+    Returns:
+        The detector, if it has a file and could be opened.
 
     Raises:
         ConfigError: if names differ so that no work can start.
     """
-    report([*_settings(config), *_segmenter(config), *_supplied_detector(config)])
+    detector, differences = _supplied_detector(config)
+    report([*_settings(config), *_segmenter(config), *differences])
+    return detector
 
 
 def report(findings: Iterable[NameFinding], warn: Callable[[str], None] = _log.warning) -> None:
@@ -100,21 +105,23 @@ def report(findings: Iterable[NameFinding], warn: Callable[[str], None] = _log.w
 
 def all_differences(workspace: Workspace) -> list[NameFinding]:
     """Return the differences between all sides, the detector included; nothing is changed."""
-    return [*find_differences(workspace), *_supplied_detector(workspace.config)]
+    return [*find_differences(workspace), *_supplied_detector(workspace.config)[1]]
 
 
-def _supplied_detector(config: Config) -> list[NameFinding]:
-    """Return the differences of a detector with a file of the user, if its class knows names.
+def _supplied_detector(config: Config) -> tuple[Detector | None, list[NameFinding]]:
+    """Return a detector with a file of the user, if its class knows names, and its differences.
 
     A detector that cannot be opened is a warning: the commands that need it report it as an error.
     """
     path = config.detector.path
     if path is None or not hasattr(registry.DETECTORS.load(config.detector.name), "category_names"):
-        return []
+        return None, []
+    open_dataset(config).frame_ids()  # an error of the data set is not one of the detector
     try:
-        return detector_differences(config, open_detector(config, path))
+        detector = open_detector(config, path)
+        return detector, detector_differences(config, detector)
     except CurateError as error:
-        return [NameFinding(False, str(error))]
+        return None, [NameFinding(False, str(error))]
 
 
 def stored_names(workspace: Workspace) -> Mapping[str, int]:

@@ -309,7 +309,10 @@ def _read_description(path: Path) -> Mapping[str, Any]:
         and "cameras" not in content
         and has_camera | ("labels" in content)
     ):
-        raise DataError(f"{path}: no key calibration")
+        needed_by = (
+            "images" if has_camera else "labels in KITTI's form, which are in a camera frame,"
+        )
+        raise DataError(f"{path}: no key calibration; {needed_by} need it, see docs/datasets.md")
     invalid = [key for key in _TEXTS if not isinstance(content.get(key, ""), str)]
     if not isinstance(content.get("calibration", ""), str | dict):
         invalid.append("calibration")

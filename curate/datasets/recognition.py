@@ -29,6 +29,16 @@ def layout_hint(root: Path, kind: str) -> str:
     return f"; it looks like {name}: use --dataset {known_kind}"
 
 
+def label_hint(root: Path) -> str:
+    """Return a hint if a folder of labels contains files, but no text file; else ""."""
+    for folder in (folder for home in _homes(root) for folder in _folders(home)):
+        suffixes = {path.suffix.lower() for path, is_folder in _entries(folder) if not is_folder}
+        if folder.name.startswith("label") and suffixes and ".txt" not in suffixes:
+            kinds = ", ".join(f"*{suffix}" for suffix in sorted(suffixes))
+            return f"; {folder} contains {kinds}, but labels are KITTI's text files: convert them"
+    return ""
+
+
 def recognised(root: Path) -> tuple[str, str | None] | None:
     """Return the name of a folder's layout and its kind of data set; None if it is unknown.
 
@@ -43,6 +53,22 @@ def _hint_of_folder_inside(root: Path) -> str:
         found = recognised(folder)
         if found is not None and found[1] is not None:
             return f"; {folder} looks like {found[0]}: use --dataset {found[1]} --root {folder}"
+    return _hint_of_points(root)
+
+
+def _hint_of_points(root: Path) -> str:
+    """Return a hint if a folder with another name than expected contains point files."""
+    for home in _homes(root):
+        for folder in _folders(home):
+            if not _has(folder, *CLOUD_SUFFIXES):
+                continue
+            if folder.name.startswith("velodyne"):
+                return f"; {folder} contains point files: rename it to velodyne"
+            return (
+                f"; {folder} contains point files: write {root / 'dataset.toml'} with points = "
+                f'"{folder.relative_to(root).as_posix()}" (docs/datasets.md, "Plain folders") and '
+                "use --dataset folder"
+            )
     return ""
 
 

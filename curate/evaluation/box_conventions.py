@@ -28,6 +28,8 @@ from curate.shapes import Float, Num, Shaped
 # the third in 75 % (lowered boxes gain points of the ground), and the last in about a third. The
 # ground truth of these frames and of 24 simulated ones stayed below half of the last three.
 _TURNED_LIMIT, _RAISED_LIMIT, _LOWERED_LIMIT, _NEGATED_LIMIT = 1.0, 0.75, 2.25, 2.5
+# Points cannot show a smaller turn of a box, in radians.
+_VISIBLE_TURN = np.radians(3)
 # At this multiple of the limit the mistake is certain.
 _CERTAIN = 1.3
 # Added to gained and lost points, because the ratio of a few points is noise.
@@ -38,6 +40,15 @@ _MAX_POINTS_PER_BOX = 100
 # Objects of these categories are longer than wide.
 _LONG_CATEGORIES = frozenset(
     {"car", "van", "truck", "bus", "tram", "vehicle", "cyclist", "bicycle", "motorcycle"}
+)
+# Objects of these categories are higher than wide.
+_HIGH_CATEGORIES = frozenset({"pedestrian", "person", "cyclist", "bicycle", "motorcycle"})
+# Sizes that would be swapped, categories, and the indices in (length, width, height) of the size
+# that is larger in a median object of these categories, and of the smaller one.
+_EXPECTED_SIZES = (
+    ("length and width", _LONG_CATEGORIES, 0, 1),
+    ("height and width", _HIGH_CATEGORIES, 2, 1),
+    ("height and length", frozenset({"pedestrian", "person"}), 2, 0),
 )
 _SWAPPED_RATIO = 1.1
 _LEAST_CAMERA_YAW_RAD = np.deg2rad(5)
@@ -132,20 +143,24 @@ def suspect_convention(sweeps: Sequence[BoxesInSweep], *, labels: bool) -> Suspi
 
 
 def _swapped_sizes(sweeps: Sequence[BoxesInSweep]) -> str:
-    """Return the finding for categories that are wider than long, "" if there are none."""
+    """Return the finding for categories with sizes in another order, "" if there are none."""
     boxes = np.concatenate([each.boxes for each in sweeps]) if sweeps else np.zeros((0, 7))
     names = [name for each in sweeps for name in each.categories.tolist()]
-    long = np.array([name.casefold() in _LONG_CATEGORIES for name in names], dtype=bool)
-    if not long.any():
-        return ""
-    length, width = np.median(boxes[long, 3:5], axis=0)
-    if width < _SWAPPED_RATIO * length:
-        return ""
-    kinds = ", ".join(sorted({name for name, one in zip(names, long, strict=True) if one}))
-    return (
-        f"length and width are swapped: {kinds} boxes are {length:.1f} m long and {width:.1f} m "
-        "wide (median)"
-    )
+    for pair, categories, larger, smaller in _EXPECTED_SIZES:
+        chosen = np.array([name.casefold() in categories for name in names], dtype=bool)
+        if not chosen.any():
+            continue
+        sizes = np.median(boxes[chosen, 3:6], axis=0)
+        if sizes[smaller] >= _SWAPPED_RATIO * sizes[larger]:
+            kinds = ", ".join(
+                sorted({name for name, one in zip(names, chosen, strict=True) if one})
+            )
+            length, width, height = sizes
+            return (
+                f"{pair} are swapped: {kinds} boxes are {length:.1f} m long, {width:.1f} m wide "
+                f"and {height:.1f} m high (median)"
+            )
+    return ""
 
 
 def _exchanged(points: np.ndarray, boxes: np.ndarray, others: np.ndarray) -> tuple[int, int]:
@@ -182,7 +197,10 @@ def _other_rotation_y(boxes: np.ndarray, calibration: Calibration) -> np.ndarray
         return boxes
     other: RotationY = "openpcdet" if calibration.rotation_y == "calibration" else "calibration"
     rotations_y = rotations_y_of_yaws(boxes[:, 6], calibration)
-    return _with(boxes, yaw=yaws_of_rotations_y(rotations_y, calibration, other))
+    yaws = yaws_of_rotations_y(rotations_y, calibration, other)
+    if np.abs(wrap_angle(yaws - boxes[:, 6])).max(initial=0) < _VISIBLE_TURN:
+        return boxes
+    return _with(boxes, yaw=yaws)
 
 
 def _turned_camera(boxes: np.ndarray, calibration: Calibration) -> np.ndarray:
@@ -236,9 +254,15 @@ _MISTAKES = (
         "turned by 90 degrees", "yaw is measured from y, or length and width are swapped",
         _turned, _TURNED_LIMIT,
     ),
-    _Mistake("their yaw is negated", "it grows clockwise", _mirrored, _NEGATED_LIMIT),
     _Mistake(
-        "their yaw is converted", "it is KITTI's rotation_y, but must be -rotation_y - pi/2",
+        "their yaw is negated",
+        "seen from above, yaw must grow counter-clockwise, and KITTI's rotation_y clockwise",
+        _mirrored, _NEGATED_LIMIT,
+    ),
+    _Mistake(
+        "their yaw is converted",
+        "KITTI's rotation_y stands for the yaw in the LiDAR frame, which is -rotation_y - pi/2, or "
+        "the other way round",
         _rotation_y, _TURNED_LIMIT,
     ),
     _Mistake(
@@ -247,7 +271,9 @@ _MISTAKES = (
         "their location is too low; in KITTI's files it is the bottom of the box",
     ),
     _Mistake(
-        "lowered by half their height", "z is the top of the box, not its centre",
+        "lowered by half their height",
+        "z is the top of the box, not its centre (location in KITTI's files: the centre, not the "
+        "bottom)",
         _lowered, _LOWERED_LIMIT,
         "their location is the centre of the box; in KITTI's files it is the bottom",
     ),

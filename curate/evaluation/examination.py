@@ -69,13 +69,20 @@ def examine_frame(frame: Frame) -> list[Finding]:
     ]  # fmt: skip
 
 
-def examine_detections(frame: Frame, found: Detections, categories: Sequence[str]) -> list[Finding]:
+def examine_detections(
+    frame: Frame,
+    found: Detections,
+    categories: Sequence[str],
+    others: Sequence[tuple[Frame, Detections]] = (),
+) -> list[Finding]:
     """Check the output of a detector.
 
     Args:
         frame: the frame with the points that the detector was given.
         found: the complete output, before it is filtered by category and score.
         categories: the configured categories of the workspace.
+        others: more frames with their outputs, for the check of the convention: on a straight
+            street, many boxes look the same if their yaw is negated.
     """
     if len(found) == 0:
         return [Finding("detections", "suspect", "the detector finds nothing in this frame")]
@@ -85,7 +92,7 @@ def examine_detections(frame: Frame, found: Detections, categories: Sequence[str
         _names(found, categories),
         _points(frame, found),
         *([_projections(frame, found)] if frame.cameras else []),
-        _convention(frame, found),
+        _convention([(frame, found), *others]),
     ]
 
 
@@ -121,11 +128,15 @@ def _projections(frame: Frame, found: Detections) -> Finding:
     return Finding("image", "ok", summary)
 
 
-def _convention(frame: Frame, found: Detections) -> Finding:
-    top = found.select(np.argsort(-found.scores, kind="stable")[:_TOP_BOXES])
-    sweep = BoxesInSweep(frame.points, top.boxes, top.categories, frame.calibration)
-    where = f"the {len(top)} boxes with the highest scores"
-    return judge_convention("convention", [sweep], where, labels=False)
+def _convention(outputs: Sequence[tuple[Frame, Detections]]) -> Finding:
+    sweeps = []
+    for frame, found in outputs:
+        top = found.select(np.argsort(-found.scores, kind="stable")[:_TOP_BOXES])
+        sweeps.append(BoxesInSweep(frame.points, top.boxes, top.categories, frame.calibration))
+    count = sum(len(each.boxes) for each in sweeps)
+    frames = f" of {len(sweeps)} frames" if len(sweeps) > 1 else ""
+    where = f"the {count} boxes with the highest scores{frames}"
+    return judge_convention("convention", sweeps, where, labels=False)
 
 
 def judge_convention(

@@ -43,7 +43,7 @@ FIGURES = ("image", "aos", "bev", "3d")
 """The averaged figures: precision by 2D, BEV and 3D overlap; aos: orientation similarity by 2D."""
 
 _POSITIONS = 41  # recall 0, 1/40, ..., 1
-_UNKNOWN_ALPHA = -10.0
+UNKNOWN_ALPHA = -10.0
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def evaluate(
             recalls[c, :, d] = [
                 match.recall_3d(*states[:2], overlap) for overlap in recall_overlaps
             ]
-    has_orientation = bool(np.all(pooled_results.objects.alpha != _UNKNOWN_ALPHA))
+    has_orientation = bool(np.all(pooled_results.objects.alpha != UNKNOWN_ALPHA))
     return KittiEvaluation(
         dict(min_overlaps),
         difficulty,

@@ -301,6 +301,11 @@ def read_folders(
 def _text_files(folder: Path) -> list[Path]:
     """Return the text files in a folder."""
     if not folder.is_dir():
+        if folder.is_file():
+            raise DataError(
+                f"{folder}: a file, expected a folder with one text file per frame; evaluate other "
+                f"formats in a workspace: curate init --detector recorded --detector-path {folder}"
+            )
         raise DataError(f"{folder}: no such folder; use a folder with one text file per frame")
     # macOS creates hidden ._ files on disks of other systems.
     found = [path for path in folder.glob("*.txt") if not path.name.startswith(".")]

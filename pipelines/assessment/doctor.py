@@ -1,18 +1,23 @@
 """Check one frame from end to end: data set, detector, augmented views, segmenter."""
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from curate.category_names import NameFinding, renamed
-from curate.detectors.base import RecordedViews
+from curate.detections import Detections
+from curate.detectors.base import Detector, RecordedViews
+from curate.detectors.recorded import RecordedDetector
 from curate.errors import ConfigError, CurateError
 from curate.evaluation.camera_examination import examine_camera
 from curate.evaluation.examination import Finding, examine_detections, examine_frame
+from curate.evaluation.heading_examination import examine_headings
 from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
 from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
+from pipelines.assessment.missing_results import describe_missing_results
 from pipelines.category_names import detector_differences, find_differences
 from pipelines.engine.rounds import newest_checkpoint
 from pipelines.stages.predict import checked, visible
@@ -21,6 +26,8 @@ from pipelines.workspace.workspace import Workspace, read_truth
 
 # Labeled frames whose labels are checked together.
 _LABELED_FRAMES = 5
+# Frames with recorded results that are checked together with the frame.
+_RESULT_FRAMES = 4
 
 
 def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Finding]]:
@@ -76,12 +83,17 @@ def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     config = workspace.config
     detector = open_detector(config, newest_checkpoint(workspace))
+    missing = describe_missing_results(workspace, detector)
     seen = visible(frame, config)
     found = renamed(detector.predict(seen), config.detector.rename)
     findings = [
         *_names(detector_differences(config, detector)),
-        *examine_detections(seen, found, config.dataset.categories),
+        *([Finding("results", "suspect", missing)] if missing else []),
+        *examine_detections(
+            seen, found, config.dataset.categories, _other_results(workspace, detector, frame)
+        ),
     ]
+    findings += _headings(workspace, detector)
     checked(found, config, detector)
     if isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
@@ -98,6 +110,41 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
                 if finding.check == "boxes" and finding.state == "wrong"
             ]
     return findings
+
+
+def _other_results(
+    workspace: Workspace, detector: Detector, frame: Frame
+) -> list[tuple[Frame, Detections]]:
+    """Return some more frames with recorded results, which cost nothing to compute."""
+    found: list[tuple[Frame, Detections]] = []
+    names = (name for name in workspace.frames("unlabeled", "val") if name != frame.frame_id)
+    if not isinstance(detector, RecordedDetector):
+        return found
+    for name in itertools.islice(names, _RESULT_FRAMES):
+        try:
+            other = visible(workspace.dataset.read(name, image=False), workspace.config)
+            result = renamed(detector.predict(other), workspace.config.detector.rename)
+        except CurateError:
+            continue  # the frame fails later, with its own error
+        found.append((other, result))
+    return found
+
+
+def _headings(workspace: Workspace, detector: Detector) -> list[Finding]:
+    """Compare recorded results of labeled and val frames with the ground truth."""
+    names = list(workspace.frames("labeled", "val"))
+    if not isinstance(detector, RecordedDetector):
+        return []
+    recorded = sorted({*names} - {*detector.missing_frames(names)})[:_LABELED_FRAMES]
+    pairs = []
+    for name in recorded:
+        try:
+            frame = workspace.dataset.read(name, points=False)
+            found = renamed(detector.predict(frame), workspace.config.detector.rename)
+        except CurateError:
+            continue  # the frame fails later, with its own error
+        pairs.append((found, read_truth(workspace.config, workspace.dataset, name)))
+    return examine_headings(pairs)
 
 
 def _names(differences: Sequence[NameFinding]) -> list[Finding]:

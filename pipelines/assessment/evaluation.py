@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from curate.category_names import listed
 from curate.datasets.kitti.labels import (
     DONT_CARE,
     KittiObjects,
@@ -15,7 +16,7 @@ from curate.datasets.kitti.labels import (
 from curate.detections import Annotations, Detections
 from curate.errors import FramesFailed, WorkspaceError
 from curate.evaluation.difficulties import Difficulty, open_difficulty
-from curate.evaluation.kitti_ap import KittiEvaluation, evaluate
+from curate.evaluation.kitti_ap import UNKNOWN_ALPHA, KittiEvaluation, evaluate
 from curate.evaluation.kitti_matching import objects_in_lidar_frame
 from curate.evaluation.kitti_rules import neighbours_of, overlaps_of
 from curate.evaluation.missing_boxes import (
@@ -134,6 +135,7 @@ def stored_val(workspace: Workspace, round_number: int) -> dict[str, Detections]
         raise WorkspaceError(
             f"round {round_number} has no predictions for {missing} of {len(keys)} val frames; "
             f"run `curate predict --split val --round {round_number}`"
+            + ("; `curate status --failed` shows why frames failed" if states.failed else "")
         )
     stored = workspace.predictions(round_number, list(keys.values()))
     return {name: stored[key] for name, key in keys.items()}
@@ -215,6 +217,20 @@ def placeholder_notes(labels: Sequence[KittiObjects], results: Sequence[KittiObj
         if boxes and (problem := describe_placeholder(np.concatenate(boxes))):
             found.append(f"{side}: {problem}")
     return found
+
+
+def orientation_notes(results: Sequence[KittiObjects], difficulty: Difficulty) -> list[str]:
+    """Return a sentence if results without an observation angle prevent aos."""
+    unknown = [np.flatnonzero(frame.alpha == UNKNOWN_ALPHA) for frame in results]
+    count = sum(map(len, unknown))
+    if not count or not difficulty.in_image:
+        return []
+    names = {
+        str(frame.categories[i]) for frame, rows in zip(results, unknown, strict=True) for i in rows
+    }
+    total = sum(map(len, results))
+    shown = listed(sorted(names))
+    return [f"aos is not computed: {count} of {total} results have alpha -10, unknown ({shown})"]
 
 
 def _in_camera_frame(

@@ -245,7 +245,12 @@ def _evaluate_folders(
     from curate.evaluation.difficulties import open_difficulty
     from curate.evaluation.kitti_folders import load_folders
     from curate.evaluation.kitti_rules import overlaps_of
-    from pipelines.assessment.evaluation import ValObjects, placeholder_notes, projection_notes
+    from pipelines.assessment.evaluation import (
+        ValObjects,
+        orientation_notes,
+        placeholder_notes,
+        projection_notes,
+    )
     from pipelines.reports.evaluation_report import EvaluationReport
 
     try:
@@ -274,7 +279,7 @@ def _evaluate_folders(
     return EvaluationReport(
         _compare(objects),
         f"{results} on {len(loaded.frame_ids)} frames",
-        tuple(notes),
+        (*notes, *orientation_notes(loaded.results, levels)),
         "give --calib and --images (or --image-size) to project the 3D boxes, or use "
         "--difficulty distance, which needs no 2D boxes",
     )

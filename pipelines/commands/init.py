@@ -96,6 +96,7 @@ def init(
     from curate.category_names import listed
     from curate.errors import ConfigError
     from pipelines.assembly import check_extensions
+    from pipelines.assessment.missing_results import report_missing_results
     from pipelines.category_names import check_before_init, stored_names
     from pipelines.workspace.config import change_setting, make_config
     from pipelines.workspace.images import fit_priors, report_images
@@ -126,10 +127,11 @@ def init(
     config = make_config(document, "curate init")
     check_extensions(config)
     check_files(config)
-    check_before_init(config)
+    supplied = check_before_init(config)
     chosen = any(setting.partition("=")[0].strip() == "run.priors" for setting in settings or ())
     config = fit_priors(config, open_dataset(config), explicit=chosen)
     workspace = initialise(directory, config, labeled, val)
+    report_missing_results(workspace, supplied)
     report_images(config, workspace.dataset, list(workspace.frames(*SPLITS)))
     counts = {split: len(workspace.frames(split)) for split in SPLITS}
     objects = stored_names(workspace)

@@ -15,6 +15,7 @@ from curate.datasets.base import Dataset, sequences_of
 from curate.datasets.formats.containment import check_frame_id
 from curate.datasets.frame_names import FrameNames, match_frame_list
 from curate.datasets.kitti.labels import KITTI_CATEGORIES
+from curate.datasets.recognition import label_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError, LeakageError, WorkspaceError
 from curate.exporters.base import named
@@ -203,7 +204,7 @@ def choose_split(
     if without_label:
         raise ConfigError(
             f"val frame {without_label[0]} has no label file; give --val 0 for no val "
-            "frames, or a list of frames that have one"
+            f"frames, or a list of frames that have one{_label_hint(dataset)}"
         )
     pool = [frame for frame in frames if frame not in set(held_out)]
     chosen = _choose(dataset, pool, labeled, generator, "labeled", sequences)
@@ -285,8 +286,15 @@ def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> li
         raise ConfigError(f"--{split} {path}: frame {outside[0]} is not among the training frames")
     without_label = [name for name in names if not dataset.files(name).label]
     if without_label:
-        raise ConfigError(f"--{split} {path}: frame {without_label[0]} has no label file")
+        raise ConfigError(
+            f"--{split} {path}: frame {without_label[0]} has no label file{_label_hint(dataset)}"
+        )
     return list(names)
+
+
+def _label_hint(dataset: Dataset) -> str:
+    root = getattr(dataset, "root", None)
+    return label_hint(root) if isinstance(root, Path) else ""
 
 
 def _store(

@@ -158,3 +158,50 @@ def test_the_class_numbers_of_a_segmenter_must_be_specified(
     assert code == 0, err
     code, out, _ = curate("doctor", "-w", tmp_path / "w")
     assert "000" in out
+
+
+def test_frames_without_a_result_are_reported_before_work_starts(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """At init and by doctor; labeled frames need no result."""
+    work = tmp_path / "work"
+    begin(curate, work, toy_kitti, results)
+    assert "no results for" not in caplog.text
+    rows = json.loads(curate("query", "SELECT frame, split FROM frame", "--json", "-w", work)[1])
+    by_split: dict[str, list[str]] = {}
+    for row in rows:
+        by_split.setdefault(row["split"], []).append(row["frame"])
+    for names in by_split.values():
+        (results / f"{names[0]}.txt").unlink()
+    begin(curate, tmp_path / "other", toy_kitti, results)
+    expected = (
+        f"no results for 1 of {len(by_split['unlabeled'])} unlabeled frames "
+        f"({by_split['unlabeled'][0]}) and 1 of {len(by_split['val'])} val frames"
+    )
+    assert expected in caplog.text
+    _, out, _ = curate("doctor", by_split["unlabeled"][1], "-w", tmp_path / "other")
+    assert "suspect  results" in out
+
+
+def test_results_without_a_box_are_reported_at_init(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, results: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for path in results.iterdir():
+        path.write_text("")
+    begin(curate, tmp_path / "work", toy_kitti, results)
+    assert f"the results {results} have no boxes: every frame will be empty" in caplog.text
+
+
+def test_lines_without_alpha_are_named_when_aos_is_missing(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """Ground truth against itself, with a score after each line, DontCare regions included."""
+    labels, copies = toy_kitti / "training" / "label_2", tmp_path / "copies"
+    copies.mkdir()
+    region = "DontCare -1 -1 -10 1 1 9 9 -1 -1 -1 -1000 -1000 -1000 -10"
+    for path in labels.iterdir():
+        lines = [*path.read_text().splitlines(), region]
+        (copies / path.name).write_text("".join(f"{line} 1\n" for line in lines))
+    code, out, err = curate("evaluate", "--labels", labels, "--results", copies)
+    assert code == 0, err
+    assert "results have alpha -10, unknown (DontCare)" in out

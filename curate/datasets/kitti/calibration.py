@@ -64,6 +64,11 @@ class CalibrationLines:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        if not path.exists() and not any(path.parent.glob("*.txt")):
+            raise DataError(
+                f"{path}: no such calibration file, nor any other in the folder; if the data have "
+                'no camera, describe them as a plain folder (docs/datasets.md, "Plain folders")'
+            )
         self.lines: dict[str, list[CalibrationLine]] = {}
         for number, text in enumerate(read_lines(path, "calibration"), start=1):
             if match := _LINE.fullmatch(text):

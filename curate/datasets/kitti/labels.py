@@ -43,6 +43,8 @@ KITTI_CATEGORIES = frozenset(
 """All categories in the label files of KITTI."""
 
 LABEL_FIELDS, RESULT_FIELDS = 15, 16
+# "x y z dx dy dz heading name" of OpenPCDet's custom data sets.
+_CUSTOM_FIELDS = 8
 # Largest accepted absolute value of a field; KITTI's placeholders go down to -1000.
 _MAX_VALUE = 1e6
 
@@ -261,8 +263,8 @@ def from_detections(
     """Return detections as KITTI objects, in the same order.
 
     The 2D box is the projected 3D box, clipped to the image. A box outside the image gets (-1, -1,
-    -1, -1); its height is 0, so KITTI's evaluation ignores it. Truncation and occlusion are unknown
-    (-1).
+    -1, -1); its height is 0, so KITTI's evaluation ignores it. Without a camera, 2D boxes are 0.
+    Truncation and occlusion are unknown (-1).
 
     Args:
         detections: boxes in the LiDAR frame.
@@ -276,8 +278,10 @@ def from_detections(
         DataError: if the mounting of the camera does not define the headings.
     """
     dimensions, locations, rotations_y = _boxes_camera(detections.boxes, calibration, rotation_y)
-    boxes_2d = image_rectangles(detections.boxes, calibration, image_size)
     count = len(detections)
+    boxes_2d = np.zeros((count, 4))
+    if calibration.has_camera:
+        boxes_2d = image_rectangles(detections.boxes, calibration, image_size)
     return KittiObjects(
         detections.categories,
         np.full(count, -1.0),
@@ -386,6 +390,11 @@ def _line_problem(
     if not LABEL_FIELDS <= len(row) <= RESULT_FIELDS:
         expected_fields = RESULT_FIELDS if scored else LABEL_FIELDS
         expected = "result lines have 16" if scored else "label lines have 15, or 16 with a score"
+        if len(row) == _CUSTOM_FIELDS and not _number_problem(row[0]):
+            expected += (
+                '; "x y z dx dy dz heading name" of OpenPCDet is in the LiDAR frame, and must be '
+                'converted (docs/datasets.md, "Boxes in the LiDAR frame")'
+            )
         return f"{len(row)} fields, but {expected}{_extra_fields(row, expected_fields)}"
     if categories is not None and row[0] not in categories:
         meant = did_you_mean(row[0], categories)

@@ -118,9 +118,12 @@ class NuScenesDataset:
             missing = f"the files of {len(frames) - len(present)} of {len(frames)} key frames"
             if not present:
                 first = next(iter(frames.values())).points
+                folder = first.split("/")[0]
+                similar = sorted(path.name for path in self.root.glob(f"*_{folder}"))
+                remedy = f"rename {similar[0]} to {folder}, or " if similar else ""
                 raise DataError(
-                    f"{self.root}: {missing} are missing, such as {first}; set the root to the "
-                    "folder with samples/"
+                    f"{self.root}: {missing} are missing, such as {first}; {remedy}set the root to "
+                    f"the folder with {folder}/"
                 )
         return present, has_images
 

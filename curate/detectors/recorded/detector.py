@@ -165,6 +165,13 @@ class RecordedDetector:
         """Return the recorded frames, in sorted order, by the names that the record gives them."""
         return tuple(self._record.frame_ids())
 
+    def missing_frames(self, frame_ids: Iterable[str]) -> tuple[str, ...]:
+        """Return those of the frames that have no result, in the given order."""
+        recorded = set(self._record.frame_ids())
+        return tuple(
+            frame for frame in frame_ids if self._recorded_as.get(frame, frame) not in recorded
+        )
+
     def category_names(self) -> frozenset[str]:
         """Return the category names of all recorded boxes, after `rename`.
 

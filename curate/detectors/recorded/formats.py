@@ -77,6 +77,8 @@ def read_results(path: Path, kind: str, options: ReadOptions) -> ResultsByFrame:
         return read_st3d(path, content, options)
     if kind == "st3d":
         raise DataError(f"{path}: not ST3D's pseudo-labels; expected a dict of frames")
+    if not content:
+        raise DataError(f"{path}: contains no frames")
     if not isinstance(content, list | tuple):
         raise DataError(f"{path}: contains a {type(content).__name__}, not a list of frames")
     if kind == "list":
@@ -95,8 +97,6 @@ def category_names(results: ResultsByFrame) -> frozenset[str]:
 
 def _detect_list_kind(path: Path, entries: Sequence[Any]) -> str:
     """Return the format of a list, detected from its first entry."""
-    if not entries:
-        raise DataError(f"{path}: contains no frames")
     first = entries[0]
     if holds_boxes(first):
         return "mmdetection3d"

@@ -9,7 +9,7 @@ from support.dataset_layouts import write_toy_folder, write_toy_raw, write_toy_t
 from support.nuscenes_scenes import write_nuscenes
 from support.toys import write_toy_kitti
 
-from curate.datasets.recognition import layout_hint, recognised
+from curate.datasets.recognition import label_hint, layout_hint, recognised
 from curate.errors import CurateError
 from pipelines.registry import DATASETS
 
@@ -93,3 +93,40 @@ def test_a_folder_of_other_files_says_which(tmp_path: Path) -> None:
         (tmp_path / "velodyne" / f"{k}.las").touch()
     with pytest.raises(CurateError, match=r"velodyne: no point files .*; it contains 3 \*\.las"):
         DATASETS.build("kitti", tmp_path, offered={}, options={}).frame_ids()
+
+
+def test_points_under_another_name_are_shown(tmp_path: Path) -> None:
+    """OpenPCDet's velodyne_reduced, and its custom data sets with points, labels and ImageSets."""
+    write_toy_kitti(tmp_path / "kitti", frames=4)
+    home = tmp_path / "kitti" / "training"
+    (home / "velodyne").rename(home / "velodyne_reduced")
+    with pytest.raises(CurateError, match=r"velodyne_reduced contains .*: rename it to velodyne$"):
+        DATASETS.build("kitti", tmp_path / "kitti", offered={}, options={})
+    (tmp_path / "custom").mkdir()
+    (home / "velodyne_reduced").rename(tmp_path / "custom" / "points")
+    for kind in ("kitti", "folder"):
+        with pytest.raises(CurateError, match=r'dataset\.toml with points = "points" .*folder$'):
+            DATASETS.build(kind, tmp_path / "custom", offered={}, options={})
+
+
+def test_labels_of_other_programs_are_shown(tmp_path: Path) -> None:
+    write_toy_kitti(tmp_path, frames=4)
+    assert label_hint(tmp_path) == ""
+    folder = tmp_path / "training" / "label_2"
+    for path in folder.glob("*.txt"):
+        path.rename(path.with_suffix(".json"))
+    assert label_hint(tmp_path).startswith(f"; {folder} contains *.json, but labels are KITTI's")
+
+
+def test_no_calibration_at_all_suggests_a_plain_folder(tmp_path: Path) -> None:
+    """A single missing file is not data without a camera."""
+    write_toy_kitti(tmp_path, frames=4)
+    dataset = DATASETS.build("kitti", tmp_path, offered={}, options={})
+    first, *others = sorted((tmp_path / "training" / "calib").iterdir())
+    first.unlink()
+    with pytest.raises(CurateError, match=r"no such calibration file$"):
+        dataset.read("000000")
+    for path in others:
+        path.unlink()
+    with pytest.raises(CurateError, match="if the data have no camera, describe them as a plain"):
+        dataset.read("000000")

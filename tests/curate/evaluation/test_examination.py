@@ -97,6 +97,48 @@ def test_a_wrong_convention_is_reported(change, message):
     assert message in finding.message
 
 
+@pytest.mark.parametrize(
+    ("order", "message"),
+    [
+        ([4, 3, 5], "length and width are swapped: Car boxes are 1.6 m long, 4.0 m wide and 1.5 m"),
+        ([5, 3, 4], "length and width are swapped: Car boxes are 1.5 m long, 4.0 m wide and 1.6 m"),
+        ([3, 5, 4], "height and width are swapped: Pedestrian boxes are 0.8 m long, 1.7 m wide"),
+    ],
+)
+def test_sizes_in_another_order_are_reported(order, message):
+    """Some orders show in cars, others only in pedestrians."""
+    boxes = np.vstack([BOXES, [[15.0, 0, -0.8, 0.8, 0.6, 1.7, 0.2]]])
+    boxes = boxes[:, [0, 1, 2, *order, 6]]
+    found = detections(boxes, ("Car", "Car", "Car", "Pedestrian"))
+    finding = convention(street(), found, boxes)
+    assert (finding.state, message in finding.message) == ("wrong", True), finding.message
+
+
+def test_more_frames_decide_where_one_cannot():
+    """Boxes along the street look the same if their yaw is negated."""
+    straight = BOXES * [1, 1, 1, 1, 1, 1, 0]
+    negated = BOXES * [1, 1, 1, 1, 1, 1, -1]
+    alone = examine_detections(street(straight), detections(straight), CATEGORIES)
+    assert alone[-1].state == "ok"
+    others = [(street(seed=seed), detections(negated)) for seed in (1, 2)]
+    found = examine_detections(street(straight), detections(straight), CATEGORIES, others)
+    assert found[-1].state == "wrong"
+    assert "with the highest scores of 3 frames" in found[-1].message
+
+
+def test_a_turn_that_points_cannot_show_is_not_reported():
+    """Narrow boxes gain and lose points at random if they are turned by one degree."""
+    cos, sin = np.cos(np.radians(1)), np.sin(np.radians(1))
+    turned = np.array([[cos, sin, 0, 0], [-sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    calibration = toy_calibration()
+    calibration = replace(calibration, lidar_to_camera=calibration.lidar_to_camera @ turned)
+    frame = replace(street(), calibration=calibration)
+    boxes = BOXES + np.array([0, 0, 0, 0, 0, 0, np.radians(1)])
+    boxes[:, 4] *= 0.3
+    finding = checks([(frame, labels(boxes, frame))])["label boxes"]
+    assert "turned by the yaw of the camera" not in finding.message
+
+
 def test_names_points_and_projections_are_checked():
     """All wrong, some wrong."""
     frame = street()

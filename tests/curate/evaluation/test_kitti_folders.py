@@ -86,6 +86,14 @@ def test_invalid_result_lines_are_reported(folders, line, message):
         read_folders(*folders)
 
 
+def test_a_file_of_results_is_not_a_folder(folders, tmp_path):
+    """OpenPCDet's result.pkl is evaluated in a workspace."""
+    path = tmp_path / "result.pkl"
+    path.write_bytes(b"")
+    with pytest.raises(DataError, match=r"a file, expected a folder .* --detector-path .*pkl$"):
+        evaluate_folders(folders[0], path)
+
+
 def test_folders_without_text_files_are_rejected(folders, tmp_path):
     """A wrong path and an empty folder give different errors."""
     with pytest.raises(DataError, match="no such folder"):

@@ -50,6 +50,20 @@ def test_a_correct_chain_passes(curate: Curate, tmp_path: Path, toy_kitti: Path)
     assert "ok       convention" in out
 
 
+def test_exchanged_front_and_rear_are_found_in_labeled_frames(
+    curate: Curate, tmp_path: Path, toy_kitti: Path
+) -> None:
+    """Points cannot show it; frames without a result, and spare ones, do not matter."""
+    turned = [0.0, 0, 0, 0, 0, 0, np.pi]
+    results = write_results(tmp_path / "a.pkl", toy_kitti, lambda b: b + turned)
+    begin(curate, tmp_path / "w", toy_kitti, results)
+    code, out, _ = curate("doctor", "-w", tmp_path / "w")
+    assert code == 1
+    assert "wrong    headings" in out
+    assert "if their yaw is yaw + pi (the front is the rear)" in out
+    assert "ok       convention" in out
+
+
 def test_a_wrong_convention_fails(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
     """Boxes with their origin at the bottom, also as JSON; an unknown frame is an error."""
     results = write_results(

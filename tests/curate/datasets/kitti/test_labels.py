@@ -21,8 +21,9 @@ from curate.datasets.kitti.labels import (
     to_detections,
     write_objects,
 )
-from curate.detections import Annotations, Detections
+from curate.detections import Annotations, Detections, as_categories
 from curate.errors import DataError
+from curate.frames import calibration_without_camera
 from curate.geometry.overlap import bev_iou
 
 CAR = "Car 0.00 1 -1.33 597.59 176.18 720.90 261.14 1.47 1.60 3.66 -1.07 1.55 14.44 -1.25"
@@ -123,6 +124,7 @@ def test_an_object_twice_in_a_label_file_is_rejected(tmp_path):
 @pytest.mark.parametrize(
     ("line", "scored", "message"),
     [
+        ("9.4 3.3 -0.9 4.1 1.7 1.2 0.0 Car", False, "OpenPCDet is in the LiDAR frame, and must be"),
         (CAR.rsplit(" ", 1)[0], False, "14 fields, but label lines have 15"),
         (f"{CAR} 0.5 0.5", False, "17 fields, but label lines have 15, or 16 with a score"),
         (f"{CAR} 436 2018_03_07 0002 ", False, "; keep the first 15, without 436 2018_03_07 0002"),
@@ -379,3 +381,13 @@ def rectangle_iou(a, b):
     sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     common = np.prod(np.maximum(sides, 0))
     return common / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - common)
+
+
+def test_without_a_camera_there_are_no_2d_boxes():
+    """Not the projection by a placeholder; everything else is kept."""
+    boxes = np.array([[10.0, 2.0, -1.0, 4.0, 1.8, 1.5, 0.3]])
+    found = Detections(boxes, np.array([0.5]), as_categories(["Car"]))
+    calibration = calibration_without_camera()
+    objects = from_detections(found, calibration, None)
+    assert objects.boxes_2d.tolist() == [[0, 0, 0, 0]]
+    assert np.allclose(to_detections(objects, calibration).boxes, boxes)

@@ -42,6 +42,16 @@ def test_boxes_categories_and_scores_are_read(tmp_path):
     assert len(record.predict(empty_frame("000002"))) == 0
 
 
+def test_an_empty_file_and_missing_frames_are_shown(tmp_path):
+    """Self-training that found nothing writes an empty dict."""
+    path = write(tmp_path / "ps_label_e0.pkl", [[*BOX, 1, 0.9]])
+    record = RecordedDetector(path, classes=CLASSES, frame_ids=("000001", "000002", "000003"))
+    assert record.missing_frames(["000003", "000001", "000002"]) == ("000003",)
+    path.write_bytes(pickle.dumps({}))
+    with pytest.raises(DataError, match="contains no frames"):
+        read(path)
+
+
 def test_the_detectors_own_estimates_are_kept(tmp_path):
     """iou_scores, and cls_scores where gt_boxes has no scores."""
     more = {"cls_scores": np.float32([0.75, 0.5]), "iou_scores": np.float32([0.25, 0.5])}
