@@ -434,6 +434,9 @@ READERS = (
                     _CSV.splitlines()))),
             Case("values in quotes", _CSV.replace("000001", '"000001"').replace("Car", '"Car"')),
             Case("semicolons between the values", _CSV.replace(",", ";")),
+            Case("no columns of views", "".join(
+                ",".join([line.split(",")[0], *line.split(",")[5:]]) for line in
+                _CSV.splitlines(keepends=True))),
             Case("a column is missing", _CSV.replace(",yaw\n", ",heading\n")),
             Case("a row is too short", _CSV.replace(",0.1\n", "\n")),
             Case("a word in place of a number", _CSV.replace(",0.1\n", ",left\n")),

@@ -16,6 +16,8 @@ _TOP_BOXES = 20
 _EMPTY_SHARE = 0.5
 # Share of boxes outside the image above which they are reported: some are cut by its border.
 _OUTSIDE_LIMIT = 0.1
+# A sweep whose brightest point has a lower intensity was divided by too large a scale.
+_DARK = 0.02
 
 
 @dataclass(frozen=True)
@@ -47,17 +49,12 @@ def examine_frame(frame: Frame) -> list[Finding]:
         f"{axis} {a:.1f}..{b:.1f}" for axis, a, b in zip("xyz", low, high, strict=True)
     )
     tall = np.ptp(frame.points[:, 2]) > max(np.ptp(frame.points[:, 0]), np.ptp(frame.points[:, 1]))
-    intensity = float(frame.points[:, 3].max())
     seen = float(in_camera_view(frame).mean())
     return [
         Finding("points", "ok", f"{count} points, {ranges} m")
         if not tall
         else Finding("points", "suspect", f"higher than wide ({ranges} m): is z up?"),
-        Finding("intensity", "ok", f"up to {intensity:.2f}")
-        if 0 < intensity <= 1
-        else Finding(
-            "intensity", "suspect", f"up to {intensity:.2f}: expected in [0, 1], not all 0"
-        ),
+        _intensity(float(frame.points[:, 3].max())),
         Finding("camera", "ok", "none: nothing is compared with images")
         if not frame.cameras
         else Finding("calibration", "ok", f"{seen:.0%} of the points appear in the image")
@@ -67,6 +64,25 @@ def examine_frame(frame: Frame) -> list[Finding]:
             "and does the calibration belong to these sensors?",
         ),
     ]  # fmt: skip
+
+
+def _intensity(highest: float) -> Finding:
+    """Judge the highest intensity of a sweep."""
+    if highest == 0:
+        return Finding(
+            "intensity", "suspect", "all 0; the files may have none, or in another column"
+        )
+    if highest < _DARK:
+        return Finding(
+            "intensity", "suspect", f"up to {highest:.2g} of 1; dataset.intensity_scale may be "
+            "larger than the value of full intensity in the files",
+        )  # fmt: skip
+    if highest > 1:
+        return Finding(
+            "intensity", "suspect", f"up to {highest:.2f}: expected in [0, 1]; set "
+            "dataset.intensity_scale to the value of full intensity in the files",
+        )  # fmt: skip
+    return Finding("intensity", "ok", f"up to {highest:.2f}")
 
 
 def examine_detections(

@@ -20,6 +20,7 @@ from pipelines.assembly import open_detector, open_segmenter, wants_views
 from pipelines.assessment.missing_results import describe_missing_results
 from pipelines.category_names import detector_differences, find_differences
 from pipelines.engine.rounds import newest_checkpoint
+from pipelines.labels.of_one_frame import find_frame
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace, read_truth
@@ -35,16 +36,16 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
 
     Args:
         workspace: see `Workspace`.
-        frame_id: the frame to check; None for the first unlabeled frame.
+        frame_id: any name of the frame to check; None for the first unlabeled frame.
 
     Raises:
-        ConfigError: if the frame is not in the workspace.
+        ConfigError: if no frame of the workspace has that name, or several have.
     """
     names = list(workspace.frames("unlabeled", "val", "labeled"))
     unlabeled = list(workspace.frames("unlabeled"))
-    name = frame_id or next(iter(unlabeled or names), None)
-    if name not in names:
-        raise ConfigError(f"doctor: frame {name} is not in the workspace {workspace.root}")
+    if not names:
+        raise ConfigError(f"doctor: the workspace {workspace.root} has no frames")
+    name = find_frame(workspace, frame_id) if frame_id else (unlabeled or names)[0]
     semantic = "semantic" in workspace.config.run.priors
     try:
         frame = workspace.dataset.read(name, image=semantic)

@@ -11,7 +11,7 @@ from pipelines.reports.terminal import print_json, print_line
 def doctor(
     frame: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Argument(help="Frame id, e.g. 000008; default: the first unlabeled frame."),
+        typer.Argument(help="Frame id or number, e.g. 000008; default: the first unlabeled frame."),
     ] = None,
     workspace: WorkspaceOption = None,
     as_json: JsonOption = False,

@@ -1,14 +1,13 @@
 """The stored boxes of one frame in a round: labels, repredictions, ground truth outside X_u."""
 
 from dataclasses import dataclass
-from pathlib import PurePosixPath
 
 import numpy as np
 from sqlalchemy import func, select
 
+from curate.datasets.frame_names import FrameNames
 from curate.detections import Annotations, Detections, as_categories
 from curate.errors import ConfigError, WorkspaceError
-from curate.spelling import did_you_mean
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
@@ -142,24 +141,13 @@ def _with_decisions(
 
 
 def find_frame(workspace: Workspace, name: str) -> str:
-    """Return the id of a frame that is named by its id, its number, or the name of a file of it.
+    """Return the id of a frame from any of its names, see `FrameNames`.
 
     Raises:
         ConfigError: if no frame has that name, or several could have it.
     """
     frames = workspace.frames(*SPLITS)
-    if name in frames:
-        return name
-    stem = PurePosixPath(name.replace("\\", "/")).stem
-    fitting = [each for each in frames if each == stem or each.lstrip("0") == stem.lstrip("0")]
-    if len(fitting) > 1:
-        raise ConfigError(
-            f"'{name}' could be frame {' or '.join(fitting[:2])}; write the whole frame id"
-        )
-    if not fitting:
-        hint = did_you_mean(stem, frames) or "; the table frame lists all frames"
-        raise ConfigError(f"no frame is named '{name}'{hint}")
-    return fitting[0]
+    return name if name in frames else FrameNames(frames).require(name, error_type=ConfigError)
 
 
 def _find(workspace: Workspace, name: str) -> tuple[str, int]:

@@ -463,6 +463,17 @@ def test_every_reader_of_kitti_text_rejects_a_line_without_a_3d_box(tmp_path, re
         READERS[reader].read(path)
 
 
+@pytest.mark.parametrize("location", ["-1000 -1000 -1000 -10", "0 0 0 0", "0.00 -0.00 0 1.57"])
+@pytest.mark.parametrize("reader", KITTI_TEXT)
+def test_every_reader_of_kitti_text_rejects_a_box_without_a_location(tmp_path, reader, location):
+    """Sizes of the category with a placeholder for the location would be a box in the camera."""
+    path = READERS[reader].write(tmp_path)
+    path.write_text(f"{path.read_text()}\nCar 0 0 0 1 1 9 9 1.5 1.7 4.1 {location} 0.5\n")
+    line = len(path.read_text().splitlines())
+    with pytest.raises(CurateError, match=rf":{line}: no 3D box: the Car is at "):
+        READERS[reader].read(path)
+
+
 @pytest.mark.parametrize("reader", ["results", "recorded kitti results"])
 def test_every_reader_of_results_needs_the_score(tmp_path, reader):
     path = READERS[reader].write(tmp_path)

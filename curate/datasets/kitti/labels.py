@@ -35,6 +35,7 @@ from curate.geometry.mounting import (
 from curate.geometry.projection import image_rectangles
 from curate.shapes import Float, Int, Shaped
 from curate.spelling import did_you_mean
+from curate.warnings_once import warn_once
 
 DONT_CARE = "DontCare"
 KITTI_CATEGORIES = frozenset(
@@ -47,6 +48,12 @@ LABEL_FIELDS, RESULT_FIELDS = 15, 16
 _CUSTOM_FIELDS = 8
 # Largest accepted absolute value of a field; KITTI's placeholders go down to -1000.
 _MAX_VALUE = 1e6
+# Locations that mean "unknown": KITTI's placeholder, and the camera itself.
+_NO_LOCATION = ((-1000.0, -1000.0, -1000.0), (0.0, 0.0, 0.0))
+_WITHOUT_3D = (
+    f"delete the line, or set its category to {DONT_CARE} to keep its 2D box as a region that is "
+    "neither object nor background"
+)
 
 
 @dataclass(frozen=True)
@@ -135,7 +142,7 @@ def parse_rows(
         any(not fields <= len(row) <= RESULT_FIELDS for _, row in numbered)
         or not (np.abs(values) <= _MAX_VALUE).all()
         or (categories is not None and not frozenset(categories).issuperset(names))
-        or _has_no_size(names, values[:, 7:10])
+        or _has_no_box(names, values[:, 7:13])
     ):
         raise _first_error(path, numbered, categories, scored=scored)
     if not scored:
@@ -347,25 +354,37 @@ def _format(objects: KittiObjects, index: int) -> str:
 
 
 def _check_repeated(path: Path, numbered: Sequence[tuple[int, Sequence[str]]]) -> None:
-    """Raise DataError if a label file has an object twice: one of them would always be missed."""
+    """Raise DataError if a label file was written twice; warn about single repeated objects.
+
+    In an evaluation, one of two equal objects is always missed.
+    """
     first: dict[tuple[str, ...], int] = {}
+    repeated = ""
+    objects = 0
     for number, row in numbered:
         if row[0] == DONT_CARE:
             continue
+        objects += 1
         earlier = first.setdefault((row[0], *row[8:LABEL_FIELDS]), number)
-        if earlier != number:
-            raise DataError(
-                f"{path}:{number}: the {row[0]} has the same 3D box as in line {earlier}; remove "
-                "one of them (labels written twice into one file count twice as missed objects)"
-            )
+        if earlier != number and not repeated:
+            repeated = f"{path}:{number}: the {row[0]} has the same 3D box as in line {earlier}"
+    if repeated and 2 * len(first) <= objects:
+        raise DataError(f"{repeated}, and so on: the file was written twice; keep one half")
+    if repeated:
+        warn_once(f"{repeated}; remove one of them, because it counts twice as a missed object")
 
 
-def _has_no_size(categories: Sequence[str], dimensions: np.ndarray) -> bool:
-    """Return whether an object other than a DontCare region has a size that is not positive."""
-    if dimensions.min(initial=1) > 0:
-        return False
-    rows = np.flatnonzero((dimensions <= 0).any(axis=1)).tolist()
-    return any(categories[row] != DONT_CARE for row in rows)
+def _has_no_box(categories: Sequence[str], shapes: np.ndarray) -> bool:
+    """Return whether an object other than a DontCare region has no 3D box, see `_box_problem`.
+
+    Args:
+        categories: n names.
+        shapes: (n, 6) height, width, length and location.
+    """
+    invalid = (shapes[:, :3] <= 0).any(axis=1)
+    for location in _NO_LOCATION:
+        invalid |= (shapes[:, 3:] == location).all(axis=1)
+    return any(categories[row] != DONT_CARE for row in np.flatnonzero(invalid).tolist())
 
 
 def _first_error(
@@ -403,7 +422,7 @@ def _line_problem(
         )
     fields = RESULT_FIELDS if scored else LABEL_FIELDS
     problem = next(filter(None, map(_number_problem, row[1:fields])), None)
-    return problem or _size_problem(row)
+    return problem or _box_problem(row)
 
 
 def _extra_fields(row: Sequence[str], expected: int) -> str:
@@ -432,17 +451,19 @@ def _begins_like_kitti(row: Sequence[str]) -> bool:
     )
 
 
-def _size_problem(row: Sequence[str]) -> str | None:
-    """Return what is wrong with the size of the 3D box of a line, or None."""
+def _box_problem(row: Sequence[str]) -> str | None:
+    """Return what is wrong with the size and location of the 3D box of a line, or None."""
     sizes = [float(field) for field in row[8:11]]
-    if row[0] == DONT_CARE or min(sizes) > 0:
+    if row[0] == DONT_CARE:
         return None
+    location = tuple(float(field) for field in row[11:14])
+    if min(sizes) > 0 and location not in _NO_LOCATION:
+        return None
+    if min(sizes) > 0:
+        return f"no 3D box: the {row[0]} is at {' '.join(row[11:14])}; {_WITHOUT_3D}"
     shown = f"height, width and length of the {row[0]} are {' '.join(row[8:11])}"
     if max(sizes) <= 0:
-        return (
-            f"no 3D box: {shown}; delete the line, or set its category to {DONT_CARE} to keep its "
-            "2D box as a region that is neither object nor background"
-        )
+        return f"no 3D box: {shown}; {_WITHOUT_3D}"
     return f"{shown}, but must be positive"
 
 

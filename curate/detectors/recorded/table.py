@@ -1,10 +1,11 @@
 """Detections and augmented views in one CSV file.
 
 The record is a CSV file with a header and one row per box: frame, view, flip_y, rotation_rad,
-scale, category, score, x, y, z, length, width, height, yaw; other columns are ignored. View 0 is
-the original frame; view v >= 1 is an augmented copy A(x) with A given by flip_y, rotation_rad and
-scale (see `Similarity`). Boxes are centre boxes in the LiDAR frame of their view, in metres and
-radians. See `curate.files.csv_text` for the variations of CSV that are read.
+scale, category, score, x, y, z, length, width, height, yaw; other columns are ignored. Without the
+columns view, flip_y, rotation_rad and scale every row belongs to the original frame. View 0 is the
+original frame; view v >= 1 is an augmented copy A(x) with A given by flip_y, rotation_rad and scale
+(see `Similarity`). Boxes are centre boxes in the LiDAR frame of their view, in metres and radians.
+See `curate.files.csv_text` for the variations of CSV that are read.
 
 A frame or view without boxes has no row in such a file and cannot be distinguished from one that
 was never recorded. A frame without any row is therefore an error: it is reported as a failed frame,
@@ -36,6 +37,7 @@ _NUMBERS = (
     "x", "y", "z", "length", "width", "height", "yaw",
 )  # fmt: skip
 _COLUMNS = ("frame", "category", *_NUMBERS)
+_ORIGINAL = {"view": "0", "flip_y": "0", "rotation_rad": "0", "scale": "1"}  # without views
 BLOCK_ROWS = 4096  # rows checked at once
 
 
@@ -46,7 +48,7 @@ class TableRecord:
     Attributes:
         path: the file.
         header: its first row.
-        order: index of each of `_COLUMNS` in a row.
+        order: index of each of `_COLUMNS` in a row; None for a column of views if there are none.
         names: (n,) the frame of each run of consecutive rows, as UTF-8, sorted.
         places: (n, 3) first byte, end byte and first line of each run.
         categories: the category names of all rows.
@@ -55,7 +57,7 @@ class TableRecord:
 
     path: Path
     header: Header
-    order: tuple[int, ...]
+    order: tuple[int | None, ...]
     names: np.ndarray
     places: np.ndarray
     categories: frozenset[str]
@@ -76,7 +78,7 @@ class TableRecord:
         try:
             with path.open("rb") as file:
                 rows = _Rows(path, file)
-                order = rows.header.places(path, _COLUMNS)
+                order = _places(path, rows.header)
                 categories: set[str] = set()
                 runs = []
                 for block in rows.blocks(order):
@@ -96,8 +98,8 @@ class TableRecord:
 
     @property
     def has_views(self) -> bool:
-        """Always true: the columns for views are required, and a view without boxes has no row."""
-        return True
+        """Whether there are columns of views; a view without boxes has no row."""
+        return None not in self.order
 
     def frame_ids(self) -> Iterator[str]:
         """Return the recorded frames, in sorted order."""
@@ -139,7 +141,7 @@ class TableRecord:
                 file.seek(begin)
                 text = io.StringIO(file.read(end - begin).decode(), newline="")
                 for number, row in self.header.rows(text, self.path, line):
-                    fields.append([row[place] for place in self.order])
+                    fields.append(_ordered(row, self.order))
                     lines.append(number)
         return _views_of(self.path, fields, lines, _numbers(self.path, fields, lines, self.sigmoid))
 
@@ -186,18 +188,35 @@ class _Rows:
                 "the file as UTF-8"
             ) from None
 
-    def blocks(self, order: Sequence[int]) -> Iterator[_Block]:
+    def blocks(self, order: Sequence[int | None]) -> Iterator[_Block]:
         """Yield all rows in blocks; raise DataError for a row with a wrong number of fields."""
         for block in batched(self._rows_with_places(order), BLOCK_ROWS):
             yield _Block([row for row, _ in block], np.array([place for _, place in block]))
 
     def _rows_with_places(
-        self, order: Sequence[int]
+        self, order: Sequence[int | None]
     ) -> Iterator[tuple[list[str], tuple[int, int, int]]]:
         begin = self._end
         for line, row in self.header.rows(self._lines, self.path, self.header.line + 1):
-            yield [row[place] for place in order], (begin, self._end, line)
+            yield _ordered(row, order), (begin, self._end, line)
             begin = self._end
+
+
+def _places(path: Path, header: Header) -> tuple[int | None, ...]:
+    """Return the index of each of `_COLUMNS` in a row, None for views that a file does not have."""
+    known = {name.casefold() for name in header.names}
+    without = known.isdisjoint(_ORIGINAL)
+    needed = [name for name in _COLUMNS if not (without and name in _ORIGINAL)]
+    found = dict(zip(needed, header.places(path, needed), strict=True))
+    return tuple(found.get(name) for name in _COLUMNS)
+
+
+def _ordered(row: Sequence[str], order: Sequence[int | None]) -> list[str]:
+    """Return the fields of a row in the order of `_COLUMNS`."""
+    return [
+        _ORIGINAL[name] if place is None else row[place]
+        for name, place in zip(_COLUMNS, order, strict=True)
+    ]
 
 
 def _check_block(

@@ -160,6 +160,11 @@ def test_impossible_data_is_reported():
     assert {one.check: one.state for one in examine_frame(behind)}["calibration"] == "wrong"
     bright = frame.with_points(frame.points * np.float32([1, 1, 1, 255]))
     assert {one.check: one.state for one in examine_frame(bright)}["intensity"] == "suspect"
+    for factor in (0, 1 / 255):
+        dark = frame.with_points(frame.points * np.float32([1, 1, 1, factor]))
+        found = {one.check: one for one in examine_frame(dark)}["intensity"]
+        assert found.state == "suspect"
+        assert ("dataset.intensity_scale" in found.message) == (factor > 0)
     upright = frame.with_points(frame.points[:, [2, 1, 0, 3]])
     upright = replace(upright, points=upright.points * np.float32([1, 0.1, 1, 1]))
     assert {one.check: one.state for one in examine_frame(upright)}["points"] == "suspect"

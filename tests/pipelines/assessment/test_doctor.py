@@ -79,7 +79,9 @@ def test_a_wrong_convention_fails(curate: Curate, tmp_path: Path, toy_kitti: Pat
     assert found["convention"] == "wrong"
     code, _, err = curate("doctor", "999999", "-w", tmp_path / "w")
     assert code == 2
-    assert "frame 999999 is not in the workspace" in err
+    assert "there is no frame '999999'; the nearest are '" in err
+    _, out, _ = curate("doctor", "3", "-w", tmp_path / "w")
+    assert out.splitlines()[0] == "frame 000003"
 
 
 def change_labels(root: Path, change) -> None:

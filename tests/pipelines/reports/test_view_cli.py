@@ -130,7 +130,7 @@ def test_a_plot_shows_the_k_that_explain_takes(weighted: Workspace) -> None:
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["gone"], "no frame is named 'gone'"),
+        (["gone"], "there is no frame 'gone'"),
         (["FRAME", "--output", "no/where.png"], "--output"),
         (["FRAME", "--format", "gif"], "--format gif: use svg, png, pdf"),
         (["FRAME", "--output", "a.png", "--format", "pdf"], "the suffix of a pdf file is .pdf"),

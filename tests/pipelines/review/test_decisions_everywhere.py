@@ -286,7 +286,7 @@ def test_an_unknown_frame_gets_a_suggestion(curate: Curate, reviewed: Reviewed) 
     for command in (("explain", f"1{frame}x", 0), ("view", f"1{frame}x")):
         code, _, err = curate(*command, "-w", workspace.root)
         assert code == 2
-        assert f"no frame is named '1{frame}x'; did you mean '" in err
+        assert f"there is no frame '1{frame}x'; the nearest are '" in err
 
 
 def test_the_working_database_and_an_export_have_the_same_decisions(

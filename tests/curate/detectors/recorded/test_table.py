@@ -149,13 +149,27 @@ def test_an_invalid_row_gives_one_line_with_its_position(tmp_path, row, message)
     assert "\n" not in str(caught.value)
 
 
+def test_the_columns_of_views_are_optional(tmp_path):
+    """As in Parquet: every row then belongs to the original frame. All four, or none."""
+    header = "frame,category,score,x,y,z,length,width,height,yaw"
+    path = write(tmp_path / "a.csv", f"000001,Car,0.9,{BOX}", header=header)
+    detector = RecordedDetector(path)
+    assert detector.predict(empty_frame("000001")).boxes.tolist() == [
+        [12.0, 4.2, -0.8, 3.9, 1.6, 1.5, -3.0]
+    ]
+    assert detector.views("000001") == []
+    write(path, f"000001,0,Car,0.9,{BOX}", header=header.replace(",", ",view,", 1))
+    with pytest.raises(DataError, match=r"a\.csv:1: no column flip_y, rotation_rad, scale"):
+        RecordedDetector(path)
+
+
 def test_missing_columns_and_files_are_reported(tmp_path):
     """An empty file has no columns at all."""
     path = write(tmp_path / "a.csv", header=HEADER.replace("score,", "").replace(",yaw", ""))
     with pytest.raises(DataError, match=r"a\.csv:1: no column score, yaw in the header"):
         RecordedDetector(path)
     path.write_text("")
-    with pytest.raises(DataError, match=r"a\.csv:1: no column frame, category, view,"):
+    with pytest.raises(DataError, match=r"a\.csv:1: no column frame, category, score,"):
         RecordedDetector(path)
     with pytest.raises(DataError, match=r"b\.csv: no such file of recorded detections"):
         RecordedDetector(tmp_path / "b.csv")
