@@ -58,7 +58,7 @@ def check_labels(
             break
     if lost and not workspace.allow_empty:
         raise LabelsVanished(
-            f"{'; '.join(lost)}; the former exports are kept: fix the detector's results or names, "
+            f"{'; '.join(lost)}; the former exports are kept: fix the cause, "
             "or write it all the same with --allow-empty"
         )
     if lost or not weighted:
@@ -114,19 +114,22 @@ def _counts(workspace: Workspace, round_number: int, policy: str) -> tuple[int, 
 
 
 def _states(workspace: Workspace, round_number: int, frames: int) -> str:
-    """Return how many frames the detector failed on, or found nothing in."""
+    """Return how many frames each stage failed on, and in how many the detector found nothing."""
     task, frame = bulk.table("task"), bulk.table("frame")
     query = (
-        select(task.c.state, func.count())
+        select(task.c.stage, task.c.state, func.count())
         .join(frame, frame.c.id == task.c.frame_id)
-        .where(
-            task.c.round == round_number, task.c.stage == "predict", frame.c.split == "unlabeled"
-        )
-        .group_by(task.c.state)
+        .where(task.c.round == round_number, frame.c.split == "unlabeled")
+        .group_by(task.c.stage, task.c.state)
     )
-    states: dict[str, int] = dict(workspace.database.rows(query))
-    failed, empty = states.get("failed", 0), states.get("empty", 0)
+    states = {(stage, state): count for stage, state, count in workspace.database.rows(query)}
+    failed = [
+        f"{count} failed in {stage}"
+        for (stage, state), count in states.items()
+        if state == "failed"
+    ]
     return (
-        f"of {frames} unlabeled frames, {failed} failed in predict (`curate status --failed`) and "
-        f"{empty} have no box of dataset.categories above detector.minimum_score"
+        f"of {frames} unlabeled frames, {' and '.join(failed) or 'none failed'}"
+        f"{' (`curate status --failed`)' * bool(failed)}, and {states.get(('predict', 'empty'), 0)} "
+        "have no box of dataset.categories above detector.minimum_score"
     )

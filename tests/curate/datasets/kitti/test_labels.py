@@ -111,11 +111,15 @@ def test_an_empty_file_has_no_objects(tmp_path, text):
         assert len(to_annotations(found, toy_calibration())) == 0
 
 
-def test_an_object_twice_in_a_label_file_is_rejected(tmp_path):
+def test_a_label_file_that_was_written_twice_is_rejected(tmp_path, caplog):
     """A converter that appends writes all lines twice. Regions and results may repeat."""
-    path = write(tmp_path / "a.txt", CAR, CAR.replace("Car", "Van"), "", CAR)
-    with pytest.raises(DataError, match=r"a\.txt:4: the Car has the same 3D box as in line 1; rem"):
+    van = CAR.replace("Car", "Van")
+    path = write(tmp_path / "a.txt", CAR, van, "", CAR, van)
+    with pytest.raises(DataError, match=r"a\.txt:4: the Car has the same 3D box as in line 1, and"):
         read_objects(path)
+    path = write(tmp_path / "b.txt", CAR, van, CAR)
+    assert len(read_objects(path)) == 3
+    assert "b.txt:3: the Car has the same 3D box as in line 1; remove one of them" in caplog.text
     region = "DontCare -1 -1 -10 1 2 30 40 -1 -1 -1 -1000 -1000 -1000 -10"
     assert len(read_objects(write(path, region, CAR, region))) == 3
     assert len(read_objects(write(path, f"{CAR} 0.5", f"{CAR} 0.4"), scored=True)) == 2
