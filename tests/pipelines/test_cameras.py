@@ -93,7 +93,7 @@ def test_without_images_everything_works_that_needs_no_pixels(
     assert ("the detector gets the points all around" in said) is not has_size
     assert 'priors = ["points"]' in (work / "curate.toml").read_text()
     here = ("--workspace", work)
-    for command in ("doctor", "predict", "repredict", "score", "solve", "report"):
+    for command in ("doctor", "check", "predict", "repredict", "score", "solve", "report"):
         code, out, err = curate(command, *here)
         assert code == 0, f"{command}: {out}{err}"
     for kind in ("sqlite", "kitti", "csv", "st3d", "mmdet3d", "parquet"):
@@ -427,6 +427,31 @@ def test_a_folder_with_two_cameras(tmp_path: Path, weights_file: Path, curate: C
     cars = [row for row in rows if row["category"] == "Car"]
     assert all(float(row["rho_anno"]) == 0 for row in cars if float(row["x"]) < 0)
     assert all(float(row["rho_anno"]) > 0.9 for row in cars if float(row["x"]) > 0)
+
+
+def test_check_compares_the_images_of_every_camera(
+    tmp_path: Path, weights_file: Path, curate: Curate
+) -> None:
+    """An image of the second camera that is in two splits is found."""
+    root, work = tmp_path / "data", tmp_path / "work"
+    two_cameras(root)
+    rng = np.random.default_rng(0)
+    for path in (root / "back").iterdir():
+        cv2.imwrite(str(path), rng.integers(0, 256, (40, 120, 3), np.uint8))
+    (tmp_path / "labeled.txt").write_text("000000\n")
+    code, _, err = curate(
+        "init", work, "--dataset", "folder", "--root", root, "--val", "0",
+        "--labeled", tmp_path / "labeled.txt",
+        "--detector", "support.toys:ToyDetector", "--detector-path", weights_file,
+    )  # fmt: skip
+    assert code == 0, err
+    code, out, err = curate("check", "--workspace", work)
+    assert code == 0, err
+    assert "30 point files and images differ" in out
+    shutil.copy(root / "back" / "000000.png", root / "back" / "000007.png")
+    code, _, err = curate("check", "--workspace", work)
+    assert code == 5
+    assert "labeled 000000 and unlabeled 000007 (image)" in err
 
 
 def behind_the_car(
