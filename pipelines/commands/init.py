@@ -95,7 +95,7 @@ def init(
     """
     from curate.errors import ConfigError
     from curate.names import listed
-    from pipelines.assembly import check_extensions
+    from pipelines.assembly import check_extensions, check_labels_format
     from pipelines.category_names import check_before_init, stored_names
     from pipelines.workspace.config import change_setting, make_config
     from pipelines.workspace.images import fit_priors, report_images
@@ -128,7 +128,10 @@ def init(
     check_files(config)
     check_before_init(config)
     chosen = any(setting.partition("=")[0].strip() == "run.priors" for setting in settings or ())
-    config = fit_priors(config, open_dataset(config), explicit=chosen)
+    dataset = open_dataset(config)
+    if config.train.command is not None:
+        check_labels_format(config, dataset)
+    config = fit_priors(config, dataset, explicit=chosen)
     workspace = initialise(directory, config, labeled, val)
     report_images(config, workspace.dataset, list(workspace.frames(*SPLITS)))
     counts = {split: len(workspace.frames(split)) for split in SPLITS}

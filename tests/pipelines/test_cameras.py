@@ -527,3 +527,48 @@ def test_the_former_rule_is_still_a_setting(tmp_path: Path, curate: Curate) -> N
     assert float(unseen["rho_anno"]) == float(unseen["score"])
     _, out, _ = curate("explain", unseen["frame"], unseen["k"], "--workspace", work)
     assert "outside = 'neutral' applies: rho_anno = s with s = 0.9000" in out
+
+
+@pytest.mark.parametrize("kind", ["coco", "openpcdet", "nuscenes"])
+def test_a_format_for_the_trainer_that_cannot_hold_the_labels_is_an_error_at_the_start(
+    tmp_path: Path, weights_file: Path, curate: Curate, kind: str
+) -> None:
+    """At init, and at run if the setting comes later; no frame is worked on."""
+    kitti(tmp_path / "data")
+    arguments = (
+        "--root", tmp_path / "data", "--labeled", "0.3", "--detector", "support.toys:ToyDetector",
+        "--detector-path", weights_file, "--set", "train.command=true {labels}",
+    )  # fmt: skip
+    reason = "this data set has none" if kind == "nuscenes" else "the data set has no"
+    code, _, err = curate(
+        "init", tmp_path / "a", *arguments, "--set", f"train.labels_format={kind}"
+    )
+    assert code == 2
+    assert "train.labels_format: " in err
+    assert reason in err
+    assert not (tmp_path / "a").exists()
+    assert curate("init", tmp_path / "b", *arguments)[0] == 0
+    path = tmp_path / "b" / "curate.toml"
+    path.write_text(
+        path.read_text().replace('labels_format = "sqlite"', f'labels_format = "{kind}"')
+    )
+    code, out, err = curate("run", "--workspace", tmp_path / "b")
+    assert code == 2
+    assert reason in err
+    assert "predict" not in out
+
+
+def test_categories_that_nuscenes_does_not_have_are_an_error_at_the_start(
+    nuscenes: Path, tmp_path: Path, curate: Curate
+) -> None:
+    """If the labels are exported in nuScenes' format for the trainer."""
+    results = write_results(tmp_path / "results.json")
+    code, _, err = curate(
+        "init", tmp_path / "work", "--dataset", "nuscenes", "--root", nuscenes, "--labeled", "0.5",
+        "--detector", "recorded", "--detector-path", results,
+        "--set", 'dataset.categories=["PKW"]', "--set", 'dataset.rename={car="PKW"}',
+        "--set", 'detector.rename={Car="PKW"}', "--set", "train.command=true {labels}",
+        "--set", "train.labels_format=nuscenes",
+    )  # fmt: skip
+    assert code == 2
+    assert "category 'PKW' is not in nuScenes' detection task" in err
