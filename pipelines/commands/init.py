@@ -128,10 +128,10 @@ def init(
     check_files(config)
     check_before_init(config)
     chosen = any(setting.partition("=")[0].strip() == "run.priors" for setting in settings or ())
-    dataset = open_dataset(config)
+    frames = open_dataset(config)
     if config.train.command is not None:
-        check_labels_format(config, dataset)
-    config = fit_priors(config, dataset, explicit=chosen)
+        check_labels_format(config, frames)
+    config = fit_priors(config, frames, explicit=chosen)
     workspace = initialise(directory, config, labeled, val)
     report_images(config, workspace.dataset, list(workspace.frames(*SPLITS)))
     counts = {split: len(workspace.frames(split)) for split in SPLITS}

@@ -88,7 +88,7 @@ def duplicates(workspace: Workspace, record: SplitRecord) -> Finding:
     rule = "no recording is in two splits"
     pairs, count = [], 0
     found = {name: workspace.dataset.files(name) for name in record.split_of}
-    paths_of = {
+    paths_of: dict[str, dict[str, tuple[Path, ...]]] = {
         "points": {name: (files.points,) for name, files in found.items()},
         "image": {name: files.images for name, files in found.items()},
     }
