@@ -5,14 +5,17 @@ No other module creates detectors, segmenters, priors or policies.
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 from curate.category_names import inline_table, listed, mapping
 from curate.consistency import ConsistencySettings
+from curate.datasets.base import Dataset
 from curate.datasets.frame_names import FrameNames
 from curate.detectors.base import Detector, TrainableDetector, choose_preset
-from curate.errors import ConfigError, CurateError, error_prefix
+from curate.errors import ConfigError, CurateError, DataError, error_prefix
+from curate.exporters.base import DataToExport, Selective
 from curate.files.toml_text import toml_key
 from curate.frames import Calibration
 from curate.priors.base import EvidenceSource, SequenceSource
@@ -270,14 +273,25 @@ def check_executor(config: Config) -> None:
         registry.EXECUTORS.check(section.executor, offered=("workers",), options=options)
 
 
-def check_labels_format(config: Config) -> None:
+def check_labels_format(config: Config, dataset: Dataset | None = None) -> None:
     """Check that the labels can be exported in the format for the user's trainer.
 
+    Args:
+        config: the configuration.
+        dataset: the data set, to check whether the format can hold its labels.
+
     Raises:
-        ConfigError: if the exporter cannot be imported or created.
+        ConfigError: if the exporter cannot be imported or created, or cannot write such labels.
     """
     with error_prefix("train.labels_format"):
-        registry.EXPORTERS.build(config.train.labels_format, offered={}, options={})
+        exporter = registry.EXPORTERS.build(config.train.labels_format, offered={}, options={})
+        if dataset is None or not isinstance(exporter, Selective):
+            return
+        for name in dataset.frame_ids()[:1]:
+            with suppress(DataError):  # a damaged frame fails later, in its stage
+                frame = dataset.read(name, points=False)
+                images = dataset.files(name).images
+                exporter.check_data(DataToExport(frame, images, config.dataset.categories))
 
 
 def check_extensions(config: Config) -> None:

@@ -4,7 +4,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -112,11 +112,29 @@ COMMANDS = tuple(
 )
 
 
+class _CurrentStderr(logging.StreamHandler[TextIO]):
+    """Logs to what is standard error at the time, so that a progress bar moves below a warning."""
+
+    def __init__(self) -> None:
+        logging.Handler.__init__(self)
+        self.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+
+    @property
+    def stream(self) -> TextIO:  # type: ignore[override]
+        """Return the stream, which rich replaces while it draws a bar."""
+        return sys.stderr
+
+
+def log_warnings() -> None:
+    """Print warnings to standard error, above a progress bar if there is one."""
+    logging.basicConfig(level=logging.WARNING, handlers=[_CurrentStderr()])
+
+
 def main() -> None:
     """Run the command line; an error ends in one line on stderr and its own exit code."""
     # Idle threads of torch's pool sleep instead of spinning on the core of another process.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    log_warnings()
     try:
         app(prog_name="curate")
     except CurateError as error:

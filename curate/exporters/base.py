@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, groupby
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -173,6 +173,34 @@ class Exporter(Protocol):
         Raises:
             ConfigError: if something other than a previous export is at the path.
             DataError: if a label is invalid, for example its weight is not in [0, 1].
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class DataToExport:
+    """What is known of a data set before any work.
+
+    Attributes:
+        frame: any frame, without points.
+        images: the paths of its images.
+        categories: the categories to learn.
+    """
+
+    frame: Frame
+    images: tuple[Path, ...]
+    categories: tuple[str, ...]
+
+
+@runtime_checkable
+class Selective(Protocol):
+    """An exporter whose format cannot hold the labels of every data set."""
+
+    def check_data(self, data: DataToExport) -> None:
+        """Check before any work whether labels of a data set can be written.
+
+        Raises:
+            ConfigError: if they cannot.
         """
         ...
 

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from curate.errors import ConfigError
-from curate.exporters.base import LabelFileDescription, LabelSet
+from curate.exporters.base import DataToExport, LabelFileDescription, LabelSet
 from curate.exporters.objects import FrameObjects, categories_of, count_labels, frame_objects
 from curate.exporters.place import check_place, has_description
 from curate.files.atomic import replace_file
@@ -47,6 +47,14 @@ class CocoExporter:
         replace_file(path, json.dumps(document, allow_nan=False).encode())
         return count_labels(frames)
 
+    def check_data(self, data: DataToExport) -> None:
+        """See `curate.exporters.base.Selective`.
+
+        Raises:
+            ConfigError: if the data set has no images.
+        """
+        _check_images(data.frame, data.images)
+
 
 def _document(
     about: LabelFileDescription, frames: Sequence[FrameObjects], read: Callable[[str], Frame]
@@ -58,7 +66,7 @@ def _document(
     background: list[dict[str, Any]] = []
     for objects in frames:
         frame = read(objects.frame_id)
-        _check_images(frame, objects)
+        _check_images(frame, objects.images)
         shown_by = camera_of_boxes(objects.detections.boxes, frame.cameras)
         for number, camera in enumerate(frame.cameras):
             images.append(_image(len(images) + 1, objects, camera, number))
@@ -84,9 +92,9 @@ def _document(
     }
 
 
-def _check_images(frame: Frame, objects: FrameObjects) -> None:
+def _check_images(frame: Frame, images: Sequence[Any]) -> None:
     """Raise ConfigError if a frame has no camera, or no image."""
-    if not frame.cameras or not objects.images:
+    if not frame.cameras or not images:
         raise ConfigError(
             f"frame {frame.frame_id}: COCO's annotations need images, and the data set has none; "
             "export another format, such as kitti, csv or parquet"

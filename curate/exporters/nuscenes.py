@@ -18,8 +18,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from curate.datasets.nuscenes.names import detection_name
-from curate.errors import DataError
-from curate.exporters.base import LabelSet
+from curate.errors import ConfigError, error_prefix
+from curate.exporters.base import DataToExport, LabelSet
 from curate.exporters.objects import FrameObjects, frame_objects
 from curate.exporters.place import check_place, has_description
 from curate.files.atomic import replace_file
@@ -38,9 +38,8 @@ class NuScenesExporter:
         """See `curate.exporters.base.Exporter`.
 
         Raises:
-            ConfigError: if the data set has no poses.
-            DataError: if the calibration of a frame cannot be read, or a category does not exist in
-                nuScenes.
+            ConfigError: if the data set has no poses, or a category does not exist in nuScenes.
+            DataError: if the calibration of a frame cannot be read.
         """
         check_place(path, has_description("meta", _FORMAT))
         parts: dict[str, dict[str, list[dict[str, Any]]]] = {
@@ -73,6 +72,16 @@ class NuScenesExporter:
         }
         replace_file(path, json.dumps(document, allow_nan=False).encode())
         return count
+
+    def check_data(self, data: DataToExport) -> None:
+        """See `curate.exporters.base.Selective`.
+
+        Raises:
+            ConfigError: if the data set has no poses, or a category does not exist in nuScenes.
+        """
+        data.frame.calibration.pose_in_map()
+        for category in data.categories:
+            _detection_name(category)
 
 
 def _boxes(objects: FrameObjects, calibration: Calibration) -> list[dict[str, Any]]:
@@ -108,11 +117,15 @@ def _quaternions(pose: np.ndarray, yaw: np.ndarray) -> np.ndarray:
 
 
 def _name(objects: FrameObjects, k: int) -> str:
-    category = str(objects.detections.categories[k])
+    with error_prefix(f"frame {objects.frame_id}"):
+        return _detection_name(str(objects.detections.categories[k]))
+
+
+def _detection_name(category: str) -> str:
     name = detection_name(category)
     if name is None:
-        raise DataError(
-            f"frame {objects.frame_id}: category {category!r} is not in nuScenes' detection task; "
-            "use nuScenes' categories in dataset.categories"
+        raise ConfigError(
+            f"category {category!r} is not in nuScenes' detection task; use nuScenes' categories "
+            "in dataset.categories"
         )
     return name

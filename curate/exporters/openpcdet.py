@@ -30,7 +30,7 @@ import numpy as np
 
 from curate.datasets.kitti.labels import DONT_CARE, KittiObjects, from_detections
 from curate.errors import ConfigError
-from curate.exporters.base import LabelSet
+from curate.exporters.base import DataToExport, LabelSet
 from curate.exporters.folder import write_folder, write_pickle
 from curate.exporters.objects import UNKNOWN, FrameObjects, difficulties, frame_objects
 from curate.frames import Frame
@@ -56,6 +56,14 @@ class OpenPCDetExporter:
         """
         return int(write_folder(path, _FORMAT, partial(_fill, labels=labels))["labels"])
 
+    def check_data(self, data: DataToExport) -> None:
+        """See `curate.exporters.base.Selective`.
+
+        Raises:
+            ConfigError: if the frame has no image size.
+        """
+        _image_size(data.frame)
+
 
 def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
     infos: list[Info] = []
@@ -76,14 +84,18 @@ def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
     return {"zero_weight": zero_weight, "frames": len(infos), "labels": count}
 
 
-def _info(objects: FrameObjects, frame: Frame) -> Info:
+def _image_size(frame: Frame) -> tuple[int, int]:
     if frame.image_size is None:
         raise ConfigError(
             f"frame {frame.frame_id}: OpenPCDet's infos need the size of the camera's image, and "
             "the data set has no camera; declare its image_size (docs/datasets.md), or export "
             "kitti, mmdet3d or csv"
         )
-    width, height = frame.image_size
+    return frame.image_size
+
+
+def _info(objects: FrameObjects, frame: Frame) -> Info:
+    width, height = _image_size(frame)
     last_row = np.array([[0.0, 0, 0, 1]])
     in_camera = from_detections(
         objects.detections, frame.calibration, frame.image_size, "openpcdet"

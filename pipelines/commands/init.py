@@ -95,7 +95,7 @@ def init(
     """
     from curate.category_names import listed
     from curate.errors import ConfigError
-    from pipelines.assembly import check_extensions
+    from pipelines.assembly import check_extensions, check_labels_format
     from pipelines.assessment.missing_results import report_missing_results
     from pipelines.category_names import check_before_init, stored_names
     from pipelines.workspace.config import change_setting, make_config
@@ -129,7 +129,10 @@ def init(
     check_files(config)
     supplied = check_before_init(config)
     chosen = any(setting.partition("=")[0].strip() == "run.priors" for setting in settings or ())
-    config = fit_priors(config, open_dataset(config), explicit=chosen)
+    frames = open_dataset(config)
+    if config.train.command is not None:
+        check_labels_format(config, frames)
+    config = fit_priors(config, frames, explicit=chosen)
     workspace = initialise(directory, config, labeled, val)
     report_missing_results(workspace, supplied)
     report_images(config, workspace.dataset, list(workspace.frames(*SPLITS)))

@@ -84,13 +84,19 @@ def _frame_names(stem: str) -> Iterator[str]:
 
 
 def duplicates(workspace: Workspace, record: SplitRecord) -> Finding:
-    """Check that no point file or image has a copy in another split."""
+    """Check that no point file or image of any camera has a copy in another split."""
     rule = "no recording is in two splits"
     pairs, count = [], 0
-    for kind in ("points", "image"):
+    found = {name: workspace.dataset.files(name) for name in record.split_of}
+    paths_of: dict[str, dict[str, tuple[Path, ...]]] = {
+        "points": {name: (files.points,) for name, files in found.items()},
+        "image": {name: files.images for name, files in found.items()},
+    }
+    for kind, paths in paths_of.items():
         files = [
-            SplitFile(split, name, getattr(workspace.dataset.files(name), kind))
+            SplitFile(split, name, path)
             for name, split in record.split_of.items()
+            for path in paths[name]
         ]
         heads = HeadHashes(workspace.root / _HASHES)
         count += len(files)

@@ -1,10 +1,12 @@
 """The output of `curate evaluate`: AP, what counts, and a warning if nothing does."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from curate.spelling import letters
 from pipelines.reports.count_table import print_counts, short_level
 from pipelines.reports.terminal import print_json, print_line, print_table, terminal_width
 
@@ -58,7 +60,7 @@ def _limits(difficulty: "Difficulty") -> str:
 
 
 def _warnings(found: EvaluationReport) -> list[str]:
-    """Return a sentence if no object counts, or none of the results does."""
+    """Return sentences on sides of which nothing counts, and on names in other letters."""
     figures = found.figures
     sides = {"objects": figures.counts, "results": figures.result_counts}
     names = ", ".join(figures.min_overlaps)
@@ -79,7 +81,25 @@ def _warnings(found: EvaluationReport) -> list[str]:
             )
         elif not evaluated:
             warnings.append(f"There are no {side} of {names}")
+        alike = _in_other_letters(counts.not_evaluated, figures.min_overlaps)
+        warnings += [
+            f"The {side} have {number} {name}, which is not {category}: they do not count; write "
+            "the names alike"
+            for name, number, category in alike
+        ]
     return warnings
+
+
+def _in_other_letters(
+    others: Mapping[str, int], evaluated: Iterable[str]
+) -> list[tuple[str, int, str]]:
+    """Return name, number and category of each name that differs from one in its letters only."""
+    of_letters = {letters(category): category for category in evaluated}
+    return [
+        (name, number, of_letters[letters(name)])
+        for name, number in others.items()
+        if letters(name) in of_letters
+    ]
 
 
 def _remedy(reason: str, found: EvaluationReport) -> str:

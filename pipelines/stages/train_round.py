@@ -87,7 +87,7 @@ def check(workspace: Workspace, policy: str) -> None:
     config = workspace.config
     check_policy(config, policy)
     if config.train.command is not None:
-        check_labels_format(config)
+        check_labels_format(config, workspace.dataset)
     elif trainable_detector(config):
         section, method = config.train, method_of(config, policy)
         training_settings(workspace, section.round_steps, section.round_learning_rate, 1, method)

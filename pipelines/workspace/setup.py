@@ -127,25 +127,28 @@ def _compare_names(config: Config, dataset: Dataset, truth: Mapping[str, Annotat
         raise ConfigError("; ".join(wrong))
     known = {*config.dataset.categories, *side.accepted, *side.rename}
     if config.dataset.kind.startswith("kitti"):
+        unknown = [name for name in side.names if name not in known]
         for frame, found in truth.items():
             for name in found.categories.tolist():
-                if name not in known:
-                    raise _unknown_name(dataset, frame, name, known)
+                if name in unknown:
+                    helps = {each: closest(each, known) or each for each in unknown}
+                    raise _unknown_name(dataset, frame, name, known, {**side.rename, **helps})
     for finding in findings:
         _log.warning("%s", finding.message)
 
 
-def _unknown_name(dataset: Dataset, frame: str, name: str, known: Collection[str]) -> DataError:
-    """Return the error for a name in the label file of a frame."""
+def _unknown_name(
+    dataset: Dataset, frame: str, name: str, known: Collection[str], rename: Mapping[str, str]
+) -> DataError:
+    """Return the error for a name in the label file of a frame, with the mapping that helps."""
     path = dataset.files(frame).label
     lines = path.read_bytes().splitlines() if path else []
     line = next((i for i, text in enumerate(lines, 1) if text.split()[:1] == [name.encode()]), 1)
-    similar = closest(name, known)
-    verb = "map it with" if similar else "leave it out with"
+    verb = "leave it out with" if rename[name] == name else "map it with"
     return DataError(
         f"{path}:{line}: unknown category {name[:40]!r}{did_you_mean(name, known)}; known are "
         f"{', '.join(sorted(known))}; add it to dataset.categories, or {verb} --set "
-        f"'dataset.rename={inline_table({name: similar or name})}'"
+        f"'dataset.rename={inline_table(rename)}'"
     )
 
 

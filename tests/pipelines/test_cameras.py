@@ -93,7 +93,7 @@ def test_without_images_everything_works_that_needs_no_pixels(
     assert ("the detector gets the points all around" in said) is not has_size
     assert 'priors = ["points"]' in (work / "curate.toml").read_text()
     here = ("--workspace", work)
-    for command in ("doctor", "predict", "repredict", "score", "solve", "report"):
+    for command in ("doctor", "check", "predict", "repredict", "score", "solve", "report"):
         code, out, err = curate(command, *here)
         assert code == 0, f"{command}: {out}{err}"
     for kind in ("sqlite", "kitti", "csv", "st3d", "mmdet3d", "parquet"):
@@ -429,6 +429,31 @@ def test_a_folder_with_two_cameras(tmp_path: Path, weights_file: Path, curate: C
     assert all(float(row["rho_anno"]) > 0.9 for row in cars if float(row["x"]) > 0)
 
 
+def test_check_compares_the_images_of_every_camera(
+    tmp_path: Path, weights_file: Path, curate: Curate
+) -> None:
+    """An image of the second camera that is in two splits is found."""
+    root, work = tmp_path / "data", tmp_path / "work"
+    two_cameras(root)
+    rng = np.random.default_rng(0)
+    for path in (root / "back").iterdir():
+        cv2.imwrite(str(path), rng.integers(0, 256, (40, 120, 3), np.uint8))
+    (tmp_path / "labeled.txt").write_text("000000\n")
+    code, _, err = curate(
+        "init", work, "--dataset", "folder", "--root", root, "--val", "0",
+        "--labeled", tmp_path / "labeled.txt",
+        "--detector", "support.toys:ToyDetector", "--detector-path", weights_file,
+    )  # fmt: skip
+    assert code == 0, err
+    code, out, err = curate("check", "--workspace", work)
+    assert code == 0, err
+    assert "30 point files and images differ" in out
+    shutil.copy(root / "back" / "000000.png", root / "back" / "000007.png")
+    code, _, err = curate("check", "--workspace", work)
+    assert code == 5
+    assert "labeled 000000 and unlabeled 000007 (image)" in err
+
+
 def behind_the_car(
     curate: Curate, work: Path, root: Path, record: Path, maps: Path, *options: str
 ) -> list[dict[str, str]]:
@@ -502,3 +527,48 @@ def test_the_former_rule_is_still_a_setting(tmp_path: Path, curate: Curate) -> N
     assert float(unseen["rho_anno"]) == float(unseen["score"])
     _, out, _ = curate("explain", unseen["frame"], unseen["k"], "--workspace", work)
     assert "outside = 'neutral' applies: rho_anno = s with s = 0.9000" in out
+
+
+@pytest.mark.parametrize("kind", ["coco", "openpcdet", "nuscenes"])
+def test_a_format_for_the_trainer_that_cannot_hold_the_labels_is_an_error_at_the_start(
+    tmp_path: Path, weights_file: Path, curate: Curate, kind: str
+) -> None:
+    """At init, and at run if the setting comes later; no frame is worked on."""
+    kitti(tmp_path / "data")
+    arguments = (
+        "--root", tmp_path / "data", "--labeled", "0.3", "--detector", "support.toys:ToyDetector",
+        "--detector-path", weights_file, "--set", "train.command=true {labels}",
+    )  # fmt: skip
+    reason = "this data set has none" if kind == "nuscenes" else "the data set has no"
+    code, _, err = curate(
+        "init", tmp_path / "a", *arguments, "--set", f"train.labels_format={kind}"
+    )
+    assert code == 2
+    assert "train.labels_format: " in err
+    assert reason in err
+    assert not (tmp_path / "a").exists()
+    assert curate("init", tmp_path / "b", *arguments)[0] == 0
+    path = tmp_path / "b" / "curate.toml"
+    path.write_text(
+        path.read_text().replace('labels_format = "sqlite"', f'labels_format = "{kind}"')
+    )
+    code, out, err = curate("run", "--workspace", tmp_path / "b")
+    assert code == 2
+    assert reason in err
+    assert "predict" not in out
+
+
+def test_categories_that_nuscenes_does_not_have_are_an_error_at_the_start(
+    nuscenes: Path, tmp_path: Path, curate: Curate
+) -> None:
+    """If the labels are exported in nuScenes' format for the trainer."""
+    results = write_results(tmp_path / "results.json")
+    code, _, err = curate(
+        "init", tmp_path / "work", "--dataset", "nuscenes", "--root", nuscenes, "--labeled", "0.5",
+        "--detector", "recorded", "--detector-path", results,
+        "--set", 'dataset.categories=["PKW"]', "--set", 'dataset.rename={car="PKW"}',
+        "--set", 'detector.rename={Car="PKW"}', "--set", "train.command=true {labels}",
+        "--set", "train.labels_format=nuscenes",
+    )  # fmt: skip
+    assert code == 2
+    assert "category 'PKW' is not in nuScenes' detection task" in err

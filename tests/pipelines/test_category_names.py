@@ -134,6 +134,23 @@ def test_a_typing_error_in_kittis_layout_is_rejected(curate: Curate, tmp_path: P
     assert """--set 'dataset.rename={Cyclsit="Cyclist"}'""" in err
 
 
+def test_the_mapping_shown_has_every_unknown_name_and_the_names_that_are_mapped(
+    curate: Curate, tmp_path: Path
+) -> None:
+    """Used as it is shown, it ends the errors; it does not undo the mapping so far."""
+    root, labels = toy_kitti_layout(tmp_path / "data")
+    rewrite_labels(labels, str.lower)
+    begin = ("init", tmp_path / "w", "--root", root, "--labeled", "0.5", "--val", "0")
+    cars = ("--set", 'dataset.categories=["Car"]', "--set", 'dataset.rename={car="Car"}')
+    code, _, err = curate(*begin, *cars)
+    assert code == DataError.exit_code
+    shown = re.search(r"--set '(dataset.rename=.*?)'$", err.strip())
+    assert shown
+    assert 'car="Car"' in shown[1]
+    code, _, err = curate(*begin, *cars[:2], "--set", shown[1])
+    assert code == 0, err
+
+
 def test_labels_of_unlabeled_frames_are_not_read(curate: Curate, tmp_path: Path) -> None:
     """Not even their names: a wrong one there is not found."""
     root, labels = toy_kitti_layout(tmp_path / "data")

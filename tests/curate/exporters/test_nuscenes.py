@@ -17,7 +17,7 @@ from support.nuscenes_scenes import into_map, sample_token, vehicle_pose, write_
 
 from curate.datasets.nuscenes import NuScenesDataset
 from curate.detectors.recorded import RecordedDetector
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError
 from curate.exporters.nuscenes import NuScenesExporter
 
 
@@ -91,5 +91,5 @@ def test_an_unknown_category_is_rejected(dataset, tmp_path):
     """The devkit would fail on it."""
     labels = labels_of(dataset)
     rows = [row | {"category": "Tram"} for row in rows_of(labels)]
-    with pytest.raises(DataError, match="category 'Tram' is not in nuScenes'"):
+    with pytest.raises(ConfigError, match="category 'Tram' is not in nuScenes'"):
         NuScenesExporter().write(tmp_path / "a.json", with_rows(labels, rows))

@@ -241,6 +241,20 @@ def test_other_categories_are_counted(curate: Curate, made: LidarOnly) -> None:
     assert "--categories" in warning
 
 
+def test_names_in_other_letters_are_said(curate: Curate, made: LidarOnly) -> None:
+    """Else all cars would be missed, and AP 0, without a word."""
+    for path in made.results.iterdir():
+        path.write_text(path.read_text().replace("Car", "car"))
+    categories = ("--categories", "Car,Bus")
+    notes = evaluate(curate, made.labels, made.results, *categories)["notes"]
+    assert "The results have 6 car, which is not Car: they do not count; write the names alike" in (
+        notes
+    )
+    made.rewrite_labels("Pedestrian", "bus")
+    notes = evaluate(curate, made.labels, made.results, *categories)["notes"]
+    assert any(note.startswith("The objects have 6 bus, which is not Bus") for note in notes)
+
+
 def test_any_category_can_be_evaluated(curate: Curate, made: LidarOnly) -> None:
     """With its own IoU threshold; the default is printed."""
     for folder in (made.labels, made.results):

@@ -124,6 +124,25 @@ def test_a_process_in_a_terminal(workspace: Path, width: int) -> None:
     assert "\x1b" not in screen.text
 
 
+def test_a_warning_stands_in_its_own_line_above_the_progress_bar() -> None:
+    """It does not follow a bar on the same line, where it is easily missed."""
+    script = (
+        "import logging; from pipelines.cli import log_warnings\n"
+        "from pipelines.engine.progress import Bar\n"
+        "log_warnings()\n"
+        "with Bar().track('predict', 2) as advance:\n"
+        "    logging.getLogger('x').warning('no Van')\n"
+        "    advance(1, '')\n"
+    )
+    with open_terminal(80, TALL) as (screen, slave):
+        subprocess.run(
+            [sys.executable, "-c", script], stdin=slave, stdout=slave, stderr=slave,
+            env={**os.environ, "TERM": "xterm"}, check=True,
+        )  # fmt: skip
+    line = next(line for line in screen.lines if "WARNING: no Van" in line)
+    assert line.split("\x1b[2K")[-1].strip() == "WARNING: no Van"
+
+
 def test_a_pipe_gets_the_same_text_at_any_width(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, workspace: Path
 ) -> None:
