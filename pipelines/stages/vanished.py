@@ -128,8 +128,9 @@ def _states(workspace: Workspace, round_number: int, frames: int) -> str:
         for (stage, state), count in states.items()
         if state == "failed"
     ]
+    empty = states.get(("predict", "empty"), 0)
     return (
         f"of {frames} unlabeled frames, {' and '.join(failed) or 'none failed'}"
-        f"{' (`curate status --failed`)' * bool(failed)}, and {states.get(('predict', 'empty'), 0)} "
-        "have no box of dataset.categories above detector.minimum_score"
+        f"{' (`curate status --failed`)' * bool(failed)}, and {empty} have no box of "
+        "dataset.categories above detector.minimum_score"
     )

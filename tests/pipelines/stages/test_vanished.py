@@ -86,7 +86,7 @@ def test_a_run_without_any_label_fails(curate: Curate, work: Path, record: Recor
     record("Car", "Pedestrian", "Cyclist", score=0.05)
     code, _, err = curate("run", "-w", work)
     assert code == LabelsVanished.exit_code
-    assert "round 1 has no label for policy pspsl; of 6 unlabeled frames, 0 failed" in err
+    assert "round 1 has no label for policy pspsl; of 6 unlabeled frames, none failed" in err
     assert "6 have no box of dataset.categories above detector.minimum_score" in err
     assert exports(work) == before
     code, _, err = curate("run", "--allow-empty", "-w", work)
