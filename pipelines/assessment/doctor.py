@@ -1,6 +1,7 @@
 """Check one frame from end to end: data set, detector, augmented views, segmenter."""
 
 import itertools
+import logging
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -24,6 +25,8 @@ from pipelines.labels.of_one_frame import find_frame
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace, read_truth
+
+_log = logging.getLogger(__name__)
 
 # Labeled frames whose labels are checked together.
 _LABELED_FRAMES = 5
@@ -58,6 +61,27 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     if semantic:
         findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
     return name, findings
+
+
+def report_wrong_inputs(workspace: Workspace) -> None:
+    """Log what is wrong with the label files and the semantic maps, from a few frames.
+
+    The detector is left out: results are compared when they are opened, and models take time.
+    """
+    name = next(iter(workspace.frames("unlabeled", "val", "labeled")), None)
+    if name is None:
+        return
+    semantic = "semantic" in workspace.config.run.priors
+    try:
+        frame = workspace.dataset.read(name, image=semantic)
+    except CurateError:
+        return  # the frames that cannot be read are reported by their own check
+    findings = [*_guarded("labels", lambda: _labels(workspace, frame))]
+    if semantic:
+        findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
+    for finding in findings:
+        if finding.state == "wrong":
+            _log.warning("%s: %s; see `curate doctor`", finding.check, finding.message)
 
 
 def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:

@@ -96,6 +96,7 @@ def init(
     from curate.category_names import listed
     from curate.errors import ConfigError
     from pipelines.assembly import check_extensions, check_labels_format
+    from pipelines.assessment.doctor import report_wrong_inputs
     from pipelines.assessment.missing_results import report_missing_results
     from pipelines.category_names import check_before_init, stored_names
     from pipelines.workspace.config import change_setting, make_config
@@ -135,6 +136,7 @@ def init(
     config = fit_priors(config, frames, explicit=chosen)
     workspace = initialise(directory, config, labeled, val)
     report_missing_results(workspace, supplied)
+    report_wrong_inputs(workspace)
     report_images(config, workspace.dataset, list(workspace.frames(*SPLITS)))
     counts = {split: len(workspace.frames(split)) for split in SPLITS}
     objects = stored_names(workspace)

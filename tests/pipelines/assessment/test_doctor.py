@@ -132,6 +132,19 @@ def test_ground_truth_is_judged_like_detections(
     assert {found[name]["state"] for name in ("boxes", "convention", "calibration")} == {"ok"}
 
 
+def test_init_warns_of_labels_in_a_wrong_convention(
+    curate: Curate, tmp_path: Path, toy_kitti: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Before any work; right labels get no warning."""
+    results = write_results(tmp_path / "a.pkl", toy_kitti)
+    begin(curate, tmp_path / "right", toy_kitti, results)
+    assert "curate doctor" not in caplog.text
+    change_labels(toy_kitti, lambda f: [*f[:9], f[10], f[9], *f[11:]])
+    begin(curate, tmp_path / "swapped", toy_kitti, results)
+    assert "length and width are swapped" in caplog.text
+    assert "see `curate doctor`" in caplog.text
+
+
 def test_a_reduced_image_fails(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
     """The images have half the size, the calibration is that of the large ones."""
     import cv2

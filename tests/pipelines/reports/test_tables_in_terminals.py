@@ -38,7 +38,7 @@ COMMANDS = (
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
 _SECONDS = re.compile(r"\(\d+\.\d s\)")
 # A path that is longer than a line has to break, anywhere; how long it is depends on the machine.
-_PICTURE = re.compile(r"^picture: .*\Z", re.MULTILINE | re.DOTALL)
+_PICTURE = re.compile(r"^picture:.*\Z", re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture(scope="module")
