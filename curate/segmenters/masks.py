@@ -21,6 +21,9 @@ from curate.errors import DataError
 # Largest accepted coordinate in pixels, far beyond any image.
 _MAX_COORDINATE = 1e7
 
+# Sides of masks that are shown in messages.
+_MAX_SIDE = 10**9
+
 
 def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
     """Return the mask of an object.
@@ -41,7 +44,7 @@ def decode_mask(segmentation: Any, size: tuple[int, int]) -> np.ndarray:
         mask_size = segmentation.get("size")
         if mask_size != [height, width]:
             match mask_size:
-                case [int(rows), int(columns)]:
+                case [int(rows), int(columns)] if max(abs(rows), abs(columns)) < _MAX_SIDE:
                     shown = f"is {columns:.6g} x {rows:.6g} pixels"
                 case _:
                     shown = "has no valid size"

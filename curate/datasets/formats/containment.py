@@ -15,10 +15,11 @@ from curate.errors import DataError
 
 def check_frame_id(frame_id: str) -> None:
     """Raise DataError if the id is not a plain file name that can be printed in a message."""
-    plain = frame_id.isprintable() and not {"/", "\\"} & set(frame_id)
-    if not frame_id or frame_id.startswith(".") or not plain:
+    # A database may have a null or a number in its place.
+    is_text = isinstance(frame_id, str) and frame_id.isprintable() and frame_id != ""
+    if not is_text or frame_id.startswith(".") or {"/", "\\"} & set(frame_id):
         raise DataError(
-            f"{frame_id[:80]!r} is not a frame id: it must be a plain file name such as 000008"
+            f"{str(frame_id)[:80]!r} is not a frame id: it must be a plain file name such as 000008"
         )
 
 

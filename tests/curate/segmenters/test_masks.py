@@ -85,6 +85,7 @@ def test_adjacent_polygons_share_no_pixel() -> None:
     [
         ({"size": [6, 8], "counts": [48]}, "the mask is 8 x 6 pixels, the image is 9 x 6"),
         ({"counts": [54]}, "the mask has no valid size"),
+        ({"size": [10**400, 8], "counts": [48]}, "the mask has no valid size"),
         (
             {"size": [6, 9], "counts": [50]},
             "the run lengths add up to 50; an image of 9 x 6 has 54 pixels",

@@ -47,6 +47,13 @@ def test_no_frame_id_leads_outside(tmp_path: Path, layout: str, name: str) -> No
         kind(tmp_path).files(name)
 
 
+@pytest.mark.parametrize("frame_id", [None, 7, b"000001", ""])
+def test_a_frame_id_is_text(frame_id: object) -> None:
+    """A damaged database may have a null or a number in its place."""
+    with pytest.raises(DataError, match="not a frame id"):
+        check_frame_id(frame_id)
+
+
 @pytest.mark.parametrize("line", ["../../secret", "/etc/passwd", "a\\b", "\a"])
 def test_a_list_with_a_path_in_it_is_rejected(tmp_path: Path, line: str) -> None:
     """The error contains the line."""
