@@ -88,6 +88,7 @@ def test_links_lead_from_a_query_to_an_image(browser: Any, pages: Pages) -> None
     page = viewer.open(pages.url)
     page.get_by_role("link", name="kept").first.click()
     page.locator("tbody tr").first.wait_for()
+    page.wait_for_load_state("load")  # leaving earlier would abort the requests of this page
     page.goto(pages.url + "/labels/weighted_labels")
     page.locator("td.col-k a").first.click()
     page.wait_for_load_state("load")
