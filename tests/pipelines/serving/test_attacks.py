@@ -64,7 +64,7 @@ TOO_MUCH = (
 )
 ENDLESS = (
     "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT count(*) FROM n",
-    "SELECT count(*) FROM frame a, frame b, frame c, frame d, frame e, frame f, frame g, frame h",
+    f"SELECT count(*) FROM {', '.join(f'frame f{i}' for i in range(16))}",
 )
 NO_FRAMES = (
     "../../../../etc/passwd",
