@@ -1,7 +1,7 @@
 """Reading an SQLite file in a folder without write permission.
 
 SQLite reads a database with write-ahead log through a file that it creates beside it, so it cannot
-open one in such a folder, unless it is told that the file does not change ("immutable"). That is
+open one in such a folder, unless it is opened as a file that does not change ("immutable"). That is
 true as long as nobody can write there and the log is empty.
 """
 

@@ -391,6 +391,6 @@ def semantic_settings(config: Config) -> SemanticSettings:
 
 
 def _from_section(settings: type[Kind], section: Any) -> Kind:
-    """Return a settings object whose fields have the section's values of the same names."""
+    """Return a settings object with the section's values in the fields of the same names."""
     names = [field.name for field in dataclasses.fields(settings)]  # type: ignore[arg-type]
     return settings(**{name: getattr(section, name) for name in names})

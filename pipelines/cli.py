@@ -47,7 +47,7 @@ GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
 
 
 class GroupedCommands(TyperGroup):
-    """A command group whose help lists commands under headings, with untruncated descriptions."""
+    """A command group with help under headings, and with untruncated descriptions."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write one section per heading."""

@@ -48,7 +48,7 @@ class Sequenced(Protocol):
 
 @runtime_checkable
 class FileNamed(Protocol):
-    """A data set whose files are not named like their frames."""
+    """A data set with file names that differ from the names of its frames."""
 
     def file_names(self) -> Mapping[str, str]:
         """Return the frame of each name of a file without suffix."""

@@ -16,7 +16,7 @@ _TOP_BOXES = 20
 _EMPTY_SHARE = 0.5
 # Share of boxes outside the image above which they are reported: some are cut by its border.
 _OUTSIDE_LIMIT = 0.1
-# A sweep whose brightest point has a lower intensity was divided by too large a scale.
+# A sweep without a point of at least this intensity was divided by too large a scale.
 _DARK = 0.02
 
 

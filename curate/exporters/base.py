@@ -194,7 +194,7 @@ class DataToExport:
 
 @runtime_checkable
 class Selective(Protocol):
-    """An exporter whose format cannot hold the labels of every data set."""
+    """An exporter to a format that cannot hold the labels of every data set."""
 
     def check_data(self, data: DataToExport) -> None:
         """Check before any work whether labels of a data set can be written.

@@ -71,7 +71,7 @@ def checked_classes(classes: Mapping[str, Sequence[int]]) -> ClassMap:
 
 
 def missing_classes(segmenter: str) -> ConfigError:
-    """Return the error for a segmenter with class ids whose meaning is not configured."""
+    """Return the error for a segmenter with class ids that have no configured category."""
     return ConfigError(
         f"segmenter '{segmenter}': the meaning of its class ids is not configured: set "
         f"segmenter.classes (at init: --segmenter-classes) to one of {', '.join(CLASS_MAPS)}, or "

@@ -8,7 +8,7 @@ from curate.segmenters.base import Segmenter, SemanticMap
 
 
 class RenamedSegmenter:
-    """A `Segmenter` whose categories are renamed; its maps stay the same.
+    """A `Segmenter` with renamed categories; its maps stay the same.
 
     Args:
         segmenter: the segmenter.

@@ -208,7 +208,7 @@ def projection_notes(labels: tuple[int, int], results: tuple[int, int]) -> list[
 
 
 def placeholder_notes(labels: Sequence[KittiObjects], results: Sequence[KittiObjects]) -> list[str]:
-    """Return a sentence for each side whose 2D boxes are all the same."""
+    """Return a sentence for each side that has the same 2D box for all objects."""
     found = []
     for side, frames in (("objects", labels), ("results", results)):
         boxes = [

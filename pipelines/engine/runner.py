@@ -370,7 +370,7 @@ class _Writer:
             self.errors.append((job.frame, outcome.error))
 
     def _clear(self, connection: Connection, keys: Sequence[int]) -> None:
-        """Delete the stage's former rows of these frames, and the tasks whose rows are lost.
+        """Delete the stage's former rows of these frames, and the tasks that lost their rows.
 
         Deleting predictions deletes all evidence and weights of the frame by foreign keys. If a
         task of such evidence stayed, the frame would count as done after a change back to the

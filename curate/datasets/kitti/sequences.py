@@ -1,4 +1,4 @@
-"""The frames of data sets whose files are numbered within each sequence."""
+"""The frames of data sets with files numbered within each sequence."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -64,8 +64,8 @@ class TrackletTable:
         """Return the objects in the camera's view, in the LiDAR frame, in the file's order.
 
         The file has no 2D boxes: these, and truncation and alpha, follow from the projection.
-        Objects whose state is "outside" or "behind" the image are left out, too. Without a camera,
-        all objects are returned.
+        Objects with the state "outside" or "behind" (of the image) are left out, too. Without a
+        camera, all objects are returned.
 
         Args:
             number: number of the frame in the drive, from 0.
